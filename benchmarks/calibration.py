@@ -33,17 +33,9 @@ from calibration_rows import CONFIDENCE, Row, document, kept, merged, write_docs
 from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
 
 import consistency as cs
-from consistency.bench.runs.records import record_of
-from consistency.referee.diagnostics import (
-    Evidence,
-    Settings,
-    Verdict,
-    e_process,
-    follow,
-    judge,
-    nees,
-    sequential_design,
-)
+from consistency.bench.runs.results_to_records import record_of
+from consistency.referee.diagnostics import Evidence, Settings, Verdict, e_process, follow, judge, sequential_design
+from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.types import Array
 
 BATCH = 25  # gates handed to a worker at once

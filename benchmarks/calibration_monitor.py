@@ -22,7 +22,13 @@ import numpy as np
 from calibration_count import row, show
 from numpy.typing import NDArray
 
-from consistency.referee.diagnostics.monitor import EXPONENT, LARGEST, bet_on, rest_after_rejection, start_share
+from consistency.referee.diagnostics.monitoring.monitor import (
+    EXPONENT,
+    LARGEST,
+    bet_on,
+    rest_after_rejection,
+    start_share,
+)
 
 Array = NDArray[Any]
 

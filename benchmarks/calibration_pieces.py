@@ -13,8 +13,9 @@ from calibration_count import row, show
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics import Evidence, judge, nees
-from consistency.referee.diagnostics.log_pieces import in_pieces
+from consistency.referee.diagnostics import Evidence, judge
+from consistency.referee.diagnostics.records.log_pieces import in_pieces
+from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.geometry.space_errors import spatial_error
 from consistency.referee.types import Array

@@ -15,7 +15,7 @@ from calibration_count import row
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Evidence, Verdict, judge, mean_shape
-from consistency.referee.diagnostics.questions import SHARES, STEP
+from consistency.referee.diagnostics.verdict.answers import SHARES, STEP
 from consistency.referee.types import Array
 
 RATES = (0.05, 1e-3)  # of commands and of gates

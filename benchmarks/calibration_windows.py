@@ -14,7 +14,7 @@ from calibration_count import row, show
 from scipy import signal, stats
 
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.diagnostics.independence import ENOUGH, independence
+from consistency.referee.diagnostics.questions.independence import ENOUGH, independence
 from consistency.referee.types import Array
 
 DOF = 3

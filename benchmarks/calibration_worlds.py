@@ -29,7 +29,7 @@ from scipy import special
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.readers.record import Track, assemble, symmetric
+from consistency.referee.readers.runs_to_record import Track, assemble, symmetric
 from consistency.referee.types import Array
 
 AXES = ("x", "y", "heading")

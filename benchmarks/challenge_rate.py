@@ -23,7 +23,7 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.challenging.challenge import Plan, challenge
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.kernel.jit import Outlook
+from consistency.bench.filters.compiler.jit import Outlook
 from consistency.bench.models.motion import dead_reckoning, unicycle_jacobian, unicycle_noise
 from consistency.bench.types import Estimates
 

@@ -25,14 +25,14 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.defaults import DETECT
 from consistency.referee.errors import InputError
-from consistency.referee.fitting.drives import Drive, drive_of
-from consistency.referee.fitting.likelihood import terms_of
-from consistency.referee.fitting.noise import fit_noise, intervals
-from consistency.referee.fitting.noise_model import decided
-from consistency.referee.fitting.persistence import doubts, persistent
-from consistency.referee.fitting.ratios import folds_of, judged_by
-from consistency.referee.fitting.refusals import growth_of, require_sound
-from consistency.referee.fitting.windows import PLANE, SPACE, Windows, span_of, windows_of
+from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
+from consistency.referee.fit_covariance.drives import Drive, drive_of
+from consistency.referee.fit_covariance.noise_model import decided
+from consistency.referee.fit_covariance.persistence import doubts, persistent
+from consistency.referee.fit_covariance.refusals import growth_of, require_sound
+from consistency.referee.fit_covariance.variances import terms_of
+from consistency.referee.fit_covariance.white_noise import fit_noise, intervals
+from consistency.referee.fit_covariance.windows import PLANE, SPACE, Windows, span_of, windows_of
 from consistency.referee.geometry.groups import composed, matrices, vectors
 from consistency.referee.types import Array
 

@@ -22,9 +22,9 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.hints import hints
+from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.poses import Poses
-from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array
 
 AXES = {

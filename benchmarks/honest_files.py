@@ -22,11 +22,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Verdict, judge
-from consistency.referee.parsing.options import Reading
-from consistency.referee.readers import read_recordings
-from consistency.referee.readers.geodetic import axes_at, centred, geodetic
+from consistency.referee.readers.formats.geodetic import axes_at, centred, geodetic
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.read_files import read_recordings
 from consistency.referee.types import Array
-from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch
+from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch
 
 HELPERS = Path(__file__).parents[1] / "tests/helpers"  # writers of flight logs and bags
 

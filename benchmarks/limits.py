@@ -23,7 +23,7 @@ from calibration_windows import undoubted, windows_of
 from scipy import stats
 
 from consistency.referee.diagnostics import Evidence, RunSummary, Verdict, compare, e_process, judge
-from consistency.referee.readers.archive import record_of_arrays
+from consistency.referee.readers.formats.numpy_archive import record_of_arrays
 from consistency.referee.types import Array
 
 Rng = np.random.Generator

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import consistency as cs
-from consistency.bench.runs.footprint import trial_bytes
+from consistency.bench.runs.memory_needed import trial_bytes
 from consistency.bench.store.trial_rows import outcome_of
 
 MIB = 2**20

@@ -21,14 +21,14 @@ from scipy import stats
 from scipy.linalg import expm
 
 from consistency.referee.diagnostics import Evidence, Verdict
-from consistency.referee.diagnostics.planning import power_of
-from consistency.referee.diagnostics.questions import MAIN, SHARES
+from consistency.referee.diagnostics.planning.number_of_runs import power_of
+from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.geometry.groups import carried, composed, to_left, vectors
-from consistency.referee.readers.relative import Stretch, relative_recording
-from consistency.referee.readers.sheet import Places
+from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.windows import relative_of
 from consistency.referee.types import Array
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 DT, SPEED = 0.1, 1.5  # s, m/s
 TURN = 0.03  # rad a step, and its spread

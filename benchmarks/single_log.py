@@ -20,7 +20,7 @@ import numpy as np
 from scipy import signal, stats
 
 from consistency.referee.diagnostics import Evidence, Settings, judge
-from consistency.referee.diagnostics.single_log import within
+from consistency.referee.diagnostics.planning.single_log import within
 from consistency.referee.types import Array
 
 WORLDS = [

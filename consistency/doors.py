@@ -13,13 +13,19 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 DOORS = {
-    **dict.fromkeys(("diagnostics", "errors"), "referee"),
-    **dict.fromkeys(
-        ("challenging", "filters", "protocols", "runs", "scenario", "simulation", "store", "sweeps", "tuning", "types"),
-        "bench",
-    ),
-    **dict.fromkeys(("imaging", "vision"), "stereo"),
-}
+    **{name: f"referee.{name}" for name in ("diagnostics", "errors")},
+    **{
+        name: f"bench.{name}"
+        for name in (
+            "challenging", "filters", "protocols", "runs", "scenario", "simulation", "store", "sweeps", "tuning",
+            "types",
+        )
+    },
+    "imaging": "stereo.rendered_images",
+    "vision": "stereo.visual_odometry",
+    "diagnostics.shared_errors": "referee.diagnostics.imperfect_truth.shared_errors",
+    "diagnostics.skipping": "referee.diagnostics.records.skipping",
+}  # fmt: skip
 
 
 class Doors(MetaPathFinder, Loader):
@@ -33,8 +39,11 @@ class Doors(MetaPathFinder, Loader):
         return ModuleSpec(fullname, self) if top == "consistency" and room in DOORS else None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        rest = spec.name.partition(".")[2]
-        module = import_module(f"consistency.{DOORS[rest.partition('.')[0]]}.{rest}")
+        name, below = spec.name.partition(".")[2], ""
+        while name not in DOORS:
+            name, _, last = name.rpartition(".")
+            below = f".{last}{below}"
+        module = import_module(f"consistency.{DOORS[name]}{below}")
         spec.loader_state = module.__spec__
         return module
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from _pytest.reports import TestReport  # public under the name of pytest from 7.0 on
 
-from consistency.referee.gating.budget import in_place_rate
+from consistency.referee.gating.false_alarm_budget import in_place_rate
 from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, refusal, to_property
 from consistency.referee.gating.watch import DEFAULTS, Entry, Watch, current, watching
 
@@ -132,7 +132,7 @@ class Gates:
     def _keep(self, item: pytest.Item, entry: Entry) -> None:
         item.user_properties.append(to_property(entry))
         if self.path is not None and self.path.suffix.lower() == ".json":
-            from consistency.referee.diagnostics.export import plain
+            from consistency.referee.diagnostics.verdict.as_dictionary import plain
 
             self.statistics.append(plain(entry.statistics))
 

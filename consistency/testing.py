@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Comparison, Record, Settings, Verdict, gate_runs, judge
 from consistency.referee.diagnostics.comparison import FEWEST
-from consistency.referee.gating.checks import checked, of_results, planned_dof, shares
 from consistency.referee.gating.comparing import Sides, of_arrays, of_filters
+from consistency.referee.gating.input_checks import checked, of_results, planned_dof, shares
 from consistency.referee.gating.watch import DEFAULTS, Entry, Terms, current, terms
 from consistency.referee.gating.wording import fault_text, few_to_compare, undecided_text
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline
-    from consistency.referee.verdicts.judge import Results
+    from consistency.referee.verdicts.sources import Results
 
 
 class ConsistencyError(AssertionError):

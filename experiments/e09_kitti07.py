@@ -26,14 +26,15 @@ import pandas as pd
 import consistency as cs
 from consistency.bench.models import point, stereo
 from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.runs.claims import findings_table
+from consistency.bench.runs.claims_table import findings_table
 from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.log import Log, write_log
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
-from consistency.referee.diagnostics import anees_interval, chi2_mean_interval, coverage
+from consistency.referee.diagnostics import anees_interval, chi2_mean_interval
+from consistency.referee.diagnostics.statistics.coverage import coverage
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of

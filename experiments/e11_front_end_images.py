@@ -21,14 +21,15 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.claims import findings_table
+from consistency.bench.runs.claims_table import findings_table
 from consistency.bench.runs.findings import OURS, command_line, sibling
-from consistency.referee.diagnostics import Evidence, Verdict, judge, nees
+from consistency.referee.diagnostics import Evidence, Verdict, judge
+from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.show.terminal import show
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import require_free
 from consistency.referee.types import Array
-from consistency.stereo.vision import (
+from consistency.stereo.visual_odometry import (
     RelativePose,
     StereoRig,
     refine_reprojection,
@@ -37,8 +38,8 @@ from consistency.stereo.vision import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.vision.motion import MotionSettings, RelativeMotion, diagonal
-from consistency.stereo.vision.shared import SHARED, fit_shared, sensitivities
+from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion, diagonal
+from consistency.stereo.visual_odometry.shared import SHARED, fit_shared, sensitivities
 
 if TYPE_CHECKING:
     import front_end_data as data

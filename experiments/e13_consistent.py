@@ -14,10 +14,10 @@ from consistency.bench.filters.methods.robocentric import PARKED, compiled
 from consistency.bench.filters.textbook.inverse_range import Corrections
 from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
 from consistency.bench.runs.findings import script, sibling
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_scores import log_rmse
 from consistency.bench.scenario import UniformLandmarks
-from consistency.referee.terminal.progress import each
+from consistency.referee.system.progress import each
 
 FINDINGS = (
     "consistent-at-9cm",

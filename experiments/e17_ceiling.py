@@ -7,7 +7,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.bench.runs.findings import script, sibling
-from consistency.referee.terminal.progress import each
+from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 
 FINDINGS = ("map-ceiling",)

@@ -14,14 +14,14 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.runs.findings import script
 from consistency.referee.errors import InputError
-from consistency.referee.terminal.progress import each
+from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.imaging.calibration import track_means
-from consistency.stereo.imaging.camera import Camera, Lens, StereoCamera
-from consistency.stereo.imaging.chain import MISMATCH, Chain, Tracks
-from consistency.stereo.imaging.filtering import LeftRightCheck
-from consistency.stereo.imaging.protocols import Stops, stand
-from consistency.stereo.vision.features import opencv
+from consistency.stereo.rendered_images.calibration import track_means
+from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
+from consistency.stereo.rendered_images.chain import MISMATCH, Chain, Tracks
+from consistency.stereo.rendered_images.filtering import LeftRightCheck
+from consistency.stereo.rendered_images.protocols import Stops, stand
+from consistency.stereo.visual_odometry.features import opencv
 
 FINDINGS = ("fig4-protocol", "fig5a", "fig5b", "fig5c", "fig7-8")
 LONG = True

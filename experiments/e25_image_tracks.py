@@ -17,16 +17,16 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.runs.findings import OURS, script, sibling
 from consistency.referee.errors import InputError
-from consistency.referee.terminal.progress import each
+from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.imaging.camera import Camera, Lens, StereoCamera
-from consistency.stereo.imaging.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, joined
-from consistency.stereo.imaging.correspondence import KnownDisparity
-from consistency.stereo.imaging.filtering import LeftRightCheck, TrackResidual
-from consistency.stereo.imaging.protocols import Stops, pose_at, stand
-from consistency.stereo.imaging.selection import Spread
-from consistency.stereo.imaging.tracking import KnownProjection
-from consistency.stereo.vision.features import opencv
+from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
+from consistency.stereo.rendered_images.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, joined
+from consistency.stereo.rendered_images.correspondence import KnownDisparity
+from consistency.stereo.rendered_images.filtering import LeftRightCheck, TrackResidual
+from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand
+from consistency.stereo.rendered_images.selection import Spread
+from consistency.stereo.rendered_images.tracking import KnownProjection
+from consistency.stereo.visual_odometry.features import opencv
 
 drives = sibling(__file__, "image_drives")
 

@@ -23,16 +23,16 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.claims import findings_table
+from consistency.bench.runs.claims_table import findings_table
 from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
-from consistency.referee.terminal.progress import each
+from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.vision import RelativePose, StereoRig, triangulate
-from consistency.stereo.vision.errors import ConsensusError
-from consistency.stereo.vision.features import opencv
-from consistency.stereo.vision.motion import MotionSettings, estimate_motion
+from consistency.stereo.visual_odometry import RelativePose, StereoRig, triangulate
+from consistency.stereo.visual_odometry.features import opencv
+from consistency.stereo.visual_odometry.input_errors import ConsensusError
+from consistency.stereo.visual_odometry.motion import MotionSettings, estimate_motion
 
 if TYPE_CHECKING:
     import front_end_data as data

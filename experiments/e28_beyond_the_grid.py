@@ -15,9 +15,9 @@ from consistency.bench.filters.methods.robocentric import PARKED, ROBOCENTRIC, c
 from consistency.bench.filters.textbook.inverse_range import Corrections
 from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
 from consistency.bench.runs.findings import script
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_scores import log_rmse, run_means
-from consistency.referee.terminal.progress import each
+from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 
 FINDINGS = ("consistent-elsewhere",)

@@ -6,8 +6,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from consistency.referee.document.colours import COLOURS, DASHES, TRUTH, Look
 from consistency.referee.document.drawing import Axis, Line, Panel, Points, Sheet, xy
-from consistency.referee.document.looks import COLOURS, DASHES, TRUTH, Look
 from consistency.referee.show import with_matplotlib
 from consistency.referee.types import Array
 

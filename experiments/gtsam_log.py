@@ -28,8 +28,8 @@ from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 from consistency.stereo.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
 from consistency.stereo.frontend.planar_log import CAMERA, relative
-from consistency.stereo.frontend.tum import trajectory_text
-from consistency.stereo.vision.sequence import read_table
+from consistency.stereo.frontend.tum_output import trajectory_text
+from consistency.stereo.visual_odometry.sequence import read_table
 
 if TYPE_CHECKING:
     import kitti07_log as conversion

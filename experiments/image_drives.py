@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.referee.types import Array
-from consistency.stereo.imaging.camera import StereoCamera
-from consistency.stereo.imaging.chain import Chain, Tracks
-from consistency.stereo.imaging.protocols import Stops, pose_at, wall_texture
-from consistency.stereo.imaging.render import film
-from consistency.stereo.imaging.scene import Layer, Scene
-from consistency.stereo.imaging.texture import Plain, RandomTexture
+from consistency.stereo.rendered_images.camera import StereoCamera
+from consistency.stereo.rendered_images.chain import Chain, Tracks
+from consistency.stereo.rendered_images.protocols import Stops, pose_at, wall_texture
+from consistency.stereo.rendered_images.render import film
+from consistency.stereo.rendered_images.scene import Layer, Scene
+from consistency.stereo.rendered_images.texture import Plain, RandomTexture
 
 
 def retreat(chain: Chain, camera: StereoCamera, stops: Stops, rng: np.random.Generator, shake: float = 0.0) -> Tracks:

@@ -19,10 +19,10 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.referee.parsing import reading
 from consistency.referee.types import Array
-from consistency.stereo.vision import tracks
-from consistency.stereo.vision.common_motion import screened
-from consistency.stereo.vision.sequence import read_table
-from consistency.stereo.vision.tracks import PIXELS
+from consistency.stereo.visual_odometry import tracks
+from consistency.stereo.visual_odometry.common_motion import screened
+from consistency.stereo.visual_odometry.sequence import read_table
+from consistency.stereo.visual_odometry.tracks import PIXELS
 
 SIGMA_V, SIGMA_OMEGA = 0.5, 0.05  # m/s, rad/s: white noise that the course added to the velocities
 SIGMA_PX = (1.0, 3.3, 0.7)  # rms of u, v, d against the planar truth; v carries pitch and roll

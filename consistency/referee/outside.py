@@ -7,11 +7,11 @@ from importlib import import_module
 from typing import Any
 
 OUTSIDE = {  # may need an extra
-    "results": "bench.runs.records:source_of",  # of the bench, in memory or in a folder
-    "innovations": "bench.runs.records:innovations_of",  # of one run in a folder of results
+    "results": "bench.runs.results_to_records:source_of",  # of the bench, in memory or in a folder
+    "innovations": "bench.runs.results_to_records:innovations_of",  # of one run in a folder of results
     "report": "bench.pages:write_reports",  # of a folder of results
-    "pilot": "bench.runs.pilots:pilots_in",  # runs in a folder of results, to plan by
-    "pilot runs": "bench.runs.pilots:pilots_in_world",  # runs of a scenario, to plan by
+    "pilot": "bench.runs.pilot_runs:pilots_in",  # runs in a folder of results, to plan by
+    "pilot runs": "bench.runs.pilot_runs:pilots_in_world",  # runs of a scenario, to plan by
     "columns": "bench.store.parquet:read_columns",  # of a Parquet file
 }
 

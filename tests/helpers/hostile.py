@@ -25,7 +25,7 @@ from consistency.bench.store.data_frames import failures_table, rejections_table
 from consistency.bench.store.log import read_log
 from consistency.bench.store.trial_rows import Rejected
 from consistency.referee.cli import main
-from consistency.referee.readers.kitti import read_drive
+from consistency.referee.readers.formats.kitti_oxts import read_drive
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Failure
 
@@ -302,8 +302,8 @@ def _findings(folder: Path) -> None:
 
 def _cameras(calibration: str | None = None) -> Callable[[Path], object]:
     def read(folder: Path) -> None:
-        from consistency.stereo.frontend.truth import find_truth, read_truth
-        from consistency.stereo.vision.sequence import read_sequence
+        from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
+        from consistency.stereo.visual_odometry.sequence import read_sequence
 
         sequence = read_sequence(folder, None if calibration is None else folder / calibration)
         rig = sequence.rectification.rig

@@ -14,7 +14,7 @@ import tomli_w
 from hostile import LINE_TWICE, OPENCV, OPTIMAL, RESULTS, TOML, TREE, TWICE, Target, command, quietly
 
 import consistency as cs
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.simulation import World
 from consistency.bench.store.results import open_results
 from consistency.bench.sweeps.cell import CellOutcome, CellResult, runs_table

@@ -18,9 +18,9 @@ import consistency as cs
 from consistency.bench.filters import usable_names
 from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.compiled import Compiled, problem_for
-from consistency.bench.filters.kernel.dispatch import require_fitting
+from consistency.bench.filters.compiler.dispatch import require_fitting
 from consistency.bench.filters.kernel.gain import linearise_seen
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     State,
     insert_error,
     landmark_width,
@@ -31,7 +31,7 @@ from consistency.bench.filters.kernel.slam import (
     retract,
     stands_apart,
 )
-from consistency.bench.filters.kernel.work import make_work
+from consistency.bench.filters.kernel.work_arrays import make_work
 from consistency.bench.filters.motion.unicycle import Unicycle
 from consistency.bench.filters.point.truth import AtTruth
 from consistency.bench.filters.stepping import step_through

@@ -25,9 +25,9 @@ from consistency.referee.types import Array
 
 gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
 
-from consistency.bench.filters.external import planar_factors  # noqa: E402
+from consistency.bench.filters.external import gtsam_factors  # noqa: E402
 from consistency.bench.filters.external.gtsam import FixedLag, Incremental, WholeTrialSmoother  # noqa: E402
-from consistency.bench.filters.external.planar_factors import PlanarStereo, factor, landmark_key, pose_key  # noqa: E402
+from consistency.bench.filters.external.gtsam_factors import PlanarStereo, factor, landmark_key, pose_key  # noqa: E402
 
 Small = Callable[..., cs.Scenario]
 NAMES = ("gtsam-batch-uvd", "gtsam-lag-uvd", "gtsam-map-uvd")
@@ -148,7 +148,7 @@ def test_certainty_across_the_heading_is_a_limit(sparse: cs.Scenario, monkeypatc
     ours = smoothed(trial, sparse)
     assert np.isnan(cs.run_trials(sparse, ["gtsam-lag-uvd"], runs=1).estimates["nees"][0])  # of rank two
     for across, nearness in ((0.0, 1e-5), (1e-5, 1e-5), (1e-1, np.inf)):
-        monkeypatch.setattr(planar_factors, "ACROSS", across)
+        monkeypatch.setattr(gtsam_factors, "ACROSS", across)
         other = smoothed(trial, sparse)
         gap = np.abs(other.covariance - ours.covariance)[1:].max() / ours.covariance[1:].max()
         assert gap < nearness

@@ -14,13 +14,13 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.filters.compiled import Compiled, problem_of
-from consistency.bench.filters.guard import deciding, joint
-from consistency.bench.filters.guard.deciding import kept
-from consistency.bench.filters.guard.parts import guard_part
+from consistency.bench.filters.compiler.jit import Kernel
+from consistency.bench.filters.guard import joint_compatibility, plain_rules
+from consistency.bench.filters.guard.guard_part import guard_part
+from consistency.bench.filters.guard.plain_rules import kept
 from consistency.bench.filters.guard.settings import KINDS, limits_of
 from consistency.bench.filters.kernel import loop
-from consistency.bench.filters.kernel.jit import Kernel
-from consistency.bench.filters.kernel.slam import keep_some, make_watch
+from consistency.bench.filters.kernel.part_functions import keep_some, make_watch
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Estimates, Observation
@@ -120,7 +120,7 @@ def test_kinds_differ(rng: np.random.Generator) -> None:
 def test_a_search_that_is_cut_short_is_so_at_the_same_node(
     nodes: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (deciding, joint):
+    for module in (plain_rules, joint_compatibility):
         monkeypatch.setattr(module, "MOST_NODES", nodes)
     for _ in range(40):
         step = Step(rng, 6, 3)

@@ -14,18 +14,18 @@ import consistency as cs
 from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.covariance_update.parking import Parking, _is_worth_it, make_clones, unpark
 from consistency.bench.filters.error.invariant_pose import bend
-from consistency.bench.filters.kernel.slam import Frame, State
+from consistency.bench.filters.kernel.part_functions import Frame, State
 from consistency.bench.filters.landmark.inverse_range import curvature
 from consistency.bench.filters.methods import robocentric as rc
 from consistency.bench.filters.sensor.conversion import Pixels
 from consistency.bench.filters.sensor.growth import Growth
 from consistency.bench.filters.stepping import step_through
-from consistency.bench.filters.textbook import centred, inverse_range
+from consistency.bench.filters.textbook import inverse_range, robocentric_state
 from consistency.bench.filters.textbook import robocentric as textbook
 from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.filters.update.converting import Converting, converting_room
 from consistency.bench.filters.update.retraction_chain import aim_chained, cast_columns, cast_rows, unchain
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.types import Control
 from consistency.referee.types import Array
 
@@ -88,7 +88,7 @@ def test_the_noise_of_a_motion_spreads_landmarks_to_second_order(small: Small, t
     motion, trial, of_rho, dt = scenario.belief.motion, cs.simulate(scenario), 0.003, 0.5
     P = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, of_rho])
     x = np.append([1.0, 2.0, 0.5], Y[i])
-    state = centred.CentredState(x, P, problem_of(trial, scenario.belief), places={0: 3})
+    state = robocentric_state.CentredState(x, P, problem_of(trial, scenario.belief), places={0: 3})
     first, plain = (
         textbook.RobotCentredKalman("trial", inverse_range.Corrections(spread=spread)).predict(
             state, Control(dt, DRIVE / dt, TURN / dt)
@@ -122,8 +122,8 @@ def test_a_parked_landmark_has_the_derivatives_it_says(small: Small, tilted: dic
     clone, pose = np.array([1.0, -0.5, 0.4]), np.array([1.6, 0.3, -0.7])
 
     def seen(y: Array, clone: Array, pose: Array) -> tuple[Array, Array, Array]:
-        state = centred.CentredState(pose, np.zeros((3, 3)), problem_of(trial, scenario.belief))
-        return centred.seen_from(state, clone, y)
+        state = robocentric_state.CentredState(pose, np.zeros((3, 3)), problem_of(trial, scenario.belief))
+        return robocentric_state.seen_from(state, clone, y)
 
     _, J, by_shift = seen(y, clone, pose)
     assert close(J, along(lambda y: seen(y, clone, pose)[0], y))

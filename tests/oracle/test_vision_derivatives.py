@@ -10,13 +10,13 @@ import pytest
 from hyperdual import HyperDual, derivatives
 
 from consistency.referee.geometry import rotation
-from consistency.stereo.vision import RelativePose, StereoRig, register_svd, triangulate
-from consistency.stereo.vision.propagation import registration_derivatives, triangulation_derivatives
-from consistency.stereo.vision.refinement import _profile
-from consistency.stereo.vision.rig import solved
-from consistency.stereo.vision.robust_loss import loss
-from consistency.stereo.vision.twoframe import Measure, PixelMatches, PointMatches, TwoFrames
-from consistency.stereo.vision.twoframe import derivatives as two_frame_derivatives
+from consistency.stereo.visual_odometry import RelativePose, StereoRig, register_svd, triangulate
+from consistency.stereo.visual_odometry.cameras.rig import solved
+from consistency.stereo.visual_odometry.propagation import registration_derivatives, triangulation_derivatives
+from consistency.stereo.visual_odometry.refinement import _profile
+from consistency.stereo.visual_odometry.robust_loss import loss
+from consistency.stereo.visual_odometry.two_frame_cost import Measure, PixelMatches, PointMatches, TwoFrames
+from consistency.stereo.visual_odometry.two_frame_cost import derivatives as two_frame_derivatives
 
 Array = np.ndarray[Any, Any]
 TOLERANCE = 1e-8  # of the largest entry

@@ -10,7 +10,7 @@ from rigs import MOTION, RIG
 from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 
-from consistency.stereo.vision import (
+from consistency.stereo.visual_odometry import (
     RelativePose,
     refine_reprojection,
     register_horn,

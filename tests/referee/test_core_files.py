@@ -15,10 +15,10 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.geometry.space_errors import se3_log, spatial_error
-from consistency.referee.parsing.options import Reading
-from consistency.referee.readers import read_recordings
-from consistency.referee.readers.hints import hints
-from consistency.referee.readers.sheet import read_sheet
+from consistency.referee.readers.formats.sheet import read_sheet
+from consistency.referee.readers.mix_ups.hints import hints
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.read_files import read_recordings
 from consistency.referee.verdicts.baselines import _known
 
 

@@ -13,7 +13,7 @@ COMPILING = 300.0  # s, of a command that may compile
 IMPORTS = """
 import consistency as cs
 import consistency.referee.cli, consistency.referee.show.html, consistency.referee.show.with_matplotlib
-import consistency.referee.show.pdf, consistency.referee.verdicts.comparison, consistency.bench.runs.sequential
+import consistency.referee.show.pdf, consistency.referee.verdicts.compare_sources, consistency.bench.runs.sequential
 import consistency.bench.sweeps.running
 
 cs.get_filter("ekf-uvd")

@@ -226,7 +226,7 @@ def long_loop(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_ctrl_c_keeps_what_is_finished(tmp_path: Path, long_loop: Path, name: str) -> None:
     """Interrupted after the first runs, then resumed: the bytes of an uninterrupted run."""
     interrupted = f"""
-from consistency.bench.runs.work import TrialWork
+from consistency.bench.runs.trial_work import TrialWork
 one, count = TrialWork.__call__, []
 def interrupt(work, run):
     count.append(run)

@@ -11,7 +11,7 @@ import pytest
 import scene
 from command import consistency
 
-from consistency.stereo.vision import RelativePose
+from consistency.stereo.visual_odometry import RelativePose
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 

@@ -12,7 +12,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.pages import write_reports
-from consistency.referee.diagnostics.verdict_parts import STATUSES
+from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.pages.questions import MARKS
 
 pytestmark = pytest.mark.browser

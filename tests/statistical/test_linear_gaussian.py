@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.referee.diagnostics import Record
 
 pytestmark = pytest.mark.slow

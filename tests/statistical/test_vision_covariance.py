@@ -13,7 +13,7 @@ import pytest
 from rigs import RIG
 from scipy import stats
 
-from consistency.stereo.vision import (
+from consistency.stereo.visual_odometry import (
     RelativePose,
     refine_reprojection,
     register_svd,
@@ -22,7 +22,7 @@ from consistency.stereo.vision import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.vision.registration import rigid_motions
+from consistency.stereo.visual_odometry.registration import rigid_motions
 
 pytestmark = pytest.mark.slow
 

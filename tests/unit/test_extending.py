@@ -79,13 +79,14 @@ def test_the_question_of_the_document_is_asked(copy: Path) -> None:
     """Three files; runs whose errors grow are found at fault, the same runs in random order are not."""
     statistic, table, line = code("Add a question of the verdict")
     folder = copy / "consistency/referee/diagnostics"
-    (folder / "trend.py").write_text(statistic, encoding="utf-8")
-    changed(folder / "questions.py", "\n\ndef answers(", f"{table}\n\ndef answers(")
+    (folder / "questions/trend.py").write_text(statistic, encoding="utf-8")
+    changed(folder / "verdict/answers.py", "\n\ndef answers(", f"{table}\n\ndef answers(")
     first = "    distribution = pit(sample.nees, sample.dof)\n"
-    changed(folder / "hypothesis_tests.py", first, f"    {line.strip()}\n{first}")
+    changed(folder / "verdict/p_values.py", first, f"    {line.strip()}\n{first}")
     changed(
-        folder / "hypothesis_tests.py", "from consistency.referee.diagnostics.whitening",
-        "from consistency.referee.diagnostics.trend import trend\nfrom consistency.referee.diagnostics.whitening",
+        folder / "verdict/p_values.py", "from consistency.referee.diagnostics.records.whitening",
+        "from consistency.referee.diagnostics.questions.trend import trend\n"
+        "from consistency.referee.diagnostics.records.whitening",
     )  # fmt: skip
     done = python(
         copy,

@@ -18,7 +18,7 @@ import consistency
 from consistency import testing
 from consistency.referee import diagnostics
 from consistency.referee.cli.commands import COMMANDS
-from consistency.stereo import vision
+from consistency.stereo import visual_odometry
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -152,7 +152,7 @@ def test_every_public_name_stands_in_the_reference() -> None:
     gates = [name for name, value in vars(testing).items() if getattr(value, "__module__", "") == testing.__name__]
     public = {f"consistency.{name}" for name in consistency.__all__}
     public |= {f"consistency.testing.{name}" for name in gates if not name.startswith("_")}
-    public |= {f"consistency.vision.{name}" for name in vision.__all__}
+    public |= {f"consistency.vision.{name}" for name in visual_odometry.__all__}
     at_top = {id(getattr(consistency, name)) for name in consistency.__all__}
     public |= {
         f"consistency.diagnostics.{name}"

@@ -20,10 +20,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
-from consistency.referee.diagnostics import Evidence, Interval, Settings, Verdict, judge, outliers
-from consistency.referee.diagnostics.export import plain
-from consistency.referee.diagnostics.verdict_in_words import off_by, p_text, plural, short
-from consistency.referee.diagnostics.verdict_parts import STATUSES
+from consistency.referee.diagnostics import Evidence, Interval, Settings, Verdict, judge
+from consistency.referee.diagnostics.questions.outliers import outliers
+from consistency.referee.diagnostics.verdict.as_dictionary import plain
+from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.words.sentences import off_by, p_text, plural, short
 from consistency.referee.types import Array, Failure
 
 SURE = 1e-5

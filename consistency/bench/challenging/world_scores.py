@@ -15,14 +15,14 @@ from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
-from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
 from consistency.bench.store.results import JOINT
 from consistency.bench.store.trial_rows import RunOutcome, outcome_of
+from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
-from consistency.referee.parsing.columns import POSE
 from consistency.referee.types import Array
 
 WORST = float(np.log(1e4))  # of a run that failed, and the most of one that did not

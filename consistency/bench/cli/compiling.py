@@ -32,7 +32,7 @@ def compile_(
 
     FILTER is a name, or FILTER+gate; without one, every filter that fits the scenario.
     """
-    from consistency.bench.filters.kernel.processor import aim_at
+    from consistency.bench.filters.compiler.processor import aim_at
 
     environment = {} if cpu is None else aim_at(cpu)
     from consistency.bench.runs.compiling_ahead import compile_ahead

@@ -94,8 +94,8 @@ def run(
     from consistency.bench.store.results import Results, StoredResults
     from consistency.referee.document.verdict import document
     from consistency.referee.show import terminal
-    from consistency.referee.terminal.progress import say
-    from consistency.referee.verdicts.judge import analyse
+    from consistency.referee.system.progress import say
+    from consistency.referee.verdicts.sources import analyse
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
@@ -119,7 +119,7 @@ def run(
                 raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
             recorded = read_log(log)
             if screen is not None:
-                screening = import_module("consistency.stereo.frontend.screening")  # the bench does not know it
+                screening = import_module("consistency.stereo.frontend.log_screening")  # the bench does not know it
                 recorded = screening.screened_log(recorded, screen)
                 say(screening.screening_line(recorded))
             resolve_filters(filters, recorded.belief, recorded.name)
@@ -165,7 +165,7 @@ def reproduce(
 ) -> None:
     """Set each published finding beside what is measured here; exit 1 if a published one is not reproduced."""
     from consistency.bench.pages import write_reports
-    from consistency.bench.runs.claims import findings_table
+    from consistency.bench.runs.claims_table import findings_table
     from consistency.bench.runs.findings import reproduce as reproduce_findings
     from consistency.bench.types import OURS
     from consistency.referee.show import terminal

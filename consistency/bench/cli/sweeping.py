@@ -55,8 +55,8 @@ def sweep(
     from consistency.bench.sweeps.plan import load_sweep
     from consistency.bench.sweeps.regime import regime_of, write_regime
     from consistency.bench.sweeps.running import run_sweep
+    from consistency.referee.system.progress import say
     from consistency.referee.system.stopping import stoppable
-    from consistency.referee.terminal.progress import say
 
     if out is None and Path(source).is_dir():
         if filters or share or overwrite:

@@ -13,16 +13,16 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from consistency.bench.filters.believed_noise import bias_at, sensor_noise
+from consistency.bench.filters.compiler.dispatch import fits, require_fitting
+from consistency.bench.filters.compiler.jit import Outlook
 from consistency.bench.filters.covariance_update.local import LOCAL_FROM, Local
 from consistency.bench.filters.covariance_update.parking import Parking
+from consistency.bench.filters.guard.guard_part import guard_part
 from consistency.bench.filters.guard.guarded import Guarded
-from consistency.bench.filters.guard.parts import guard_part
 from consistency.bench.filters.guard.settings import KINDS
-from consistency.bench.filters.kernel.dispatch import fits, require_fitting
 from consistency.bench.filters.kernel.gain import HALTED, REASONS
-from consistency.bench.filters.kernel.jit import Outlook
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
-from consistency.bench.filters.kernel.slam import Data, Slam, landmark_width, robot_width
+from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width, robot_width
 from consistency.bench.protocols import Filter, Problem, TrialTruth
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import Control, Estimates, Gaussian, Info, Map, Observation, Trial

@@ -10,7 +10,7 @@ import numpy as np
 
 from consistency.bench.filters.compiled import problem_for
 from consistency.bench.filters.kernel.linalg import definiteness
-from consistency.bench.filters.record import RunRecord
+from consistency.bench.filters.recorder import RunRecord
 from consistency.bench.protocols import Filter, WholeTrial
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Gaussian, Info, Map, Trial

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from consistency.referee.pages import require_pages, require_writable, write_document
+from consistency.referee.pages.write_pages import require_pages, require_writable, write_document
 
 if TYPE_CHECKING:
     from consistency.bench.sweeps.regime import Regime
@@ -40,7 +40,7 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     manifest = read_manifest(Path(folder))
     require_pages(html, pdf, overwrite)
     from consistency.bench.pages.build import build_report, compose, folders_of
-    from consistency.referee.terminal.progress import progress
+    from consistency.referee.system.progress import progress
 
     parts = len(folders_of(Path(folder), manifest)) + sum(path is not None for path in (html, pdf))
     with progress("report", parts, "parts", brief=True) as advance:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from consistency.bench.pages.model import Study, Track
+from consistency.bench.pages.report_input import Study, Track
 from consistency.bench.types import outcome
-from consistency.referee.diagnostics.verdict_in_words import plural
-from consistency.referee.diagnostics.verdict_parts import STATUSES
+from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.words.sentences import plural
 from consistency.referee.document.wording import listed
 
 LISTED = 6  # filters that the first paragraph names one by one

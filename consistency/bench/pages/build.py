@@ -11,19 +11,19 @@ import numpy as np
 
 from consistency.bench.pages.answer import answer
 from consistency.bench.pages.contents import SECTIONS
-from consistency.bench.pages.model import Report, Study, Track
+from consistency.bench.pages.report_input import Report, Study, Track
 from consistency.bench.runs.findings import read_findings
-from consistency.bench.runs.records import design_of, record_of, steps_of
+from consistency.bench.runs.results_to_records import design_of, record_of, steps_of
 from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Settings
-from consistency.referee.diagnostics.judging import judge_runs, with_map
+from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.errors import InputError
 from consistency.referee.pages.clock import clock_of
 from consistency.referee.pages.section import OPENING, STUDY, Section
 from consistency.referee.system.folders import read_manifest
-from consistency.referee.terminal.progress import Advance
+from consistency.referee.system.progress import Advance
 
 
 def folders_of(folder: Path, manifest: dict[str, Any]) -> list[Path]:

@@ -8,8 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from consistency.bench.pages.model import Report
-from consistency.bench.pages.tables import extra_table
+from consistency.bench.pages.experiment_tables import extra_table
+from consistency.bench.pages.report_input import Report
 from consistency.bench.types import outcome
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Small, Stack, Status, Table, table
 from consistency.referee.document.drawing import Figure, Key, Panel, Sheet

@@ -13,8 +13,8 @@ from consistency.bench.sweeps.axes import Axis as GridAxis
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell
 from consistency.bench.sweeps.regime import Regime
+from consistency.referee.document.colours import COLOURS, Look
 from consistency.referee.document.drawing import Axis, Figure, Key, Panel, Sheet, Tiles, Tips
-from consistency.referee.document.looks import COLOURS, Look
 from consistency.referee.document.wording import brief
 
 SMALL, LARGE = COLOURS[0], COLOURS[1]  # of a ratio below and above 1: blue and vermilion, told apart by everybody

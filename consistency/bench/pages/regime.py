@@ -14,7 +14,7 @@ from consistency.bench.sweeps.plan import Cell as GridCell
 from consistency.bench.sweeps.plan import text_alone
 from consistency.bench.sweeps.printing import by_verdict
 from consistency.bench.sweeps.regime import Regime
-from consistency.referee.diagnostics.verdict_parts import STATUSES
+from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.document.blocks import (
     Block,
     Cell,
@@ -28,8 +28,8 @@ from consistency.referee.document.blocks import (
     Text,
     table,
 )
+from consistency.referee.document.colours import COLOURS, Look, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet, Tips
-from consistency.referee.document.looks import COLOURS, Look, style
 from consistency.referee.document.wording import listed, number
 from consistency.referee.pages.provenance import facts
 from consistency.referee.types import Array

@@ -13,12 +13,12 @@ from consistency.bench.filters.stepping import error_of, name_of, optimal_gain
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.gather import Gathered, SoFar
 from consistency.bench.runs.resuming import ResultsPlace
-from consistency.bench.runs.work import Backend, TrialWork
+from consistency.bench.runs.trial_work import Backend, TrialWork
 from consistency.bench.store.results import Results, StoredResults
 from consistency.referee.geometry.conventions import ADDITIVE
+from consistency.referee.system.progress import progress
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.system.stopping import Stop, stoppable
-from consistency.referee.terminal.progress import progress
 
 
 class Interrupted(KeyboardInterrupt):

@@ -13,17 +13,17 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.kernel import foreseen, kept
-from consistency.bench.filters.kernel.jit import Outlook
+from consistency.bench.filters.compiler import compile_time, disk_cache
+from consistency.bench.filters.compiler.jit import Outlook
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter, WholeTrial
 from consistency.bench.scenario import Belief, Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
+from consistency.referee.system import progress
 from consistency.referee.system.ending import die_with_parent
 from consistency.referee.system.stopping import STOPS, undisturbed
-from consistency.referee.terminal import progress
 
 GLANCE = 0.1  # s between looks, for a signal that another thread was given
 NAMED = 3  # filters that are named where several are compiled
@@ -89,7 +89,7 @@ def _compile(missing: Sequence[Need], jobs: int) -> None:
     shared = sorted(
         (need for need in missing if need.outlook.is_shared), key=lambda need: need.outlook.seconds, reverse=True
     )
-    workers = min(jobs, len(shared)) if len(shared) > 1 and _may_fork() and not kept.refusal() else 1
+    workers = min(jobs, len(shared)) if len(shared) > 1 and _may_fork() and not disk_cache.refusal() else 1
     seconds = _wall([need.outlook.seconds for need in missing], workers)
     with _processes(shared, workers if workers > 1 else 0) as links, progress.foreseen(_label(missing), seconds):
         _side_by_side(len(shared), links)
@@ -108,7 +108,7 @@ def _label(missing: Sequence[Need]) -> str:
 def _wall(seconds: Sequence[float], workers: int) -> float:
     """Seconds for all of them: the first of each process in full, as later ones share functions with it."""
     longest = sorted(seconds, reverse=True)
-    total = sum(longest[:workers]) + foreseen.AGAIN * sum(longest[workers:])
+    total = sum(longest[:workers]) + compile_time.AGAIN * sum(longest[workers:])
     return max(longest[0], total / workers)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from consistency.bench.filters import get_filter, usable_names
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.kernel import kept
+from consistency.bench.filters.compiler import disk_cache
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import worker_count
@@ -54,18 +54,18 @@ def compile_ahead(names: Sequence[str], scenario: str | None, into: Path | None 
     _require_folder(into)
     needs = compile_all(wanted, worker_count(jobs))
     _require_folder(into)
-    if lost := [name_of(need.filter) for need in needs if not kept.place(need.outlook.key).exists()]:
-        raise InputError(f"{kept.folder()}: does not hold the kernel of {lost[0]}; is there room on the disk?")
+    if lost := [name_of(need.filter) for need in needs if not disk_cache.place(need.outlook.key).exists()]:
+        raise InputError(f"{disk_cache.folder()}: does not hold the kernel of {lost[0]}; is there room on the disk?")
     if into is not None:
-        kept.open_to_readers()
+        disk_cache.open_to_readers()
     compiled = sum(not need.outlook.is_ready for need in needs)
-    return Ahead(len(needs), compiled, len({name_of(filter_) for filter_, _, _ in wanted}), kept.folder().parent)
+    return Ahead(len(needs), compiled, len({name_of(filter_) for filter_, _, _ in wanted}), disk_cache.folder().parent)
 
 
 def _require_folder(into: Path | None) -> None:
-    if refusal := kept.refusal():
+    if refusal := disk_cache.refusal():
         named = "" if into is None else f"--into {into}: "
-        raise InputError(f"{named}{kept.folder()} takes no compiled code ({refusal}); name a folder by --into")
+        raise InputError(f"{named}{disk_cache.folder()} takes no compiled code ({refusal}); name a folder by --into")
 
 
 def _wanted(names: Sequence[str], scenario: str | None) -> list[Wanted]:

@@ -17,10 +17,10 @@ from joblib.externals.loky import Future, ProcessPoolExecutor
 
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.backends.local import worker_count
-from consistency.bench.runs.claims import findings_table
+from consistency.bench.runs.claims_table import findings_table
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.scenario import Scenario, data_folder, load_scenario
 from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.results import Results, joined
@@ -31,9 +31,9 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_json, reading
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
+from consistency.referee.system.progress import quiet, say
 from consistency.referee.system.provenance import manifest_of
-from consistency.referee.terminal.progress import quiet, say
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 WAITING = 30.0  # seconds between lines on a process that is waited for

@@ -26,8 +26,8 @@ from consistency.bench.store.journal import Journal
 from consistency.bench.store.parquet import Columns, Writer, write_table
 from consistency.bench.store.results import MAP_NUMBERS, NUMBERS, OWN_NUMBERS, Results, StoredResults, Tables
 from consistency.bench.store.trial_rows import Rejected, RunOutcome
+from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
-from consistency.referee.parsing.columns import COLUMNS
 from consistency.referee.system.folders import NewFolder
 from consistency.referee.system.machine import this_machine
 from consistency.referee.system.stopping import undisturbed

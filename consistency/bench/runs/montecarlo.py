@@ -16,11 +16,11 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.campaign import Campaign, own_errors
 from consistency.bench.runs.campaign import Interrupted as Interrupted
-from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.runs.resuming import PLAN, place_for, place_with
-from consistency.bench.runs.work import Backend, Recorded, Simulated, TrialWork
+from consistency.bench.runs.trial_work import Backend, Recorded, Simulated, TrialWork
 from consistency.bench.scenario import Belief, Scenario
-from consistency.bench.scenario.tables import UNITS
+from consistency.bench.scenario.toml_tables import UNITS
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.log import Log, write_log

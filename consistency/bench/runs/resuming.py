@@ -13,7 +13,7 @@ from consistency.bench.store.results import StoredResults, Tables, open_results
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import NewFolder
 from consistency.referee.system.machine import in_words, this_machine
-from consistency.referee.terminal.progress import say
+from consistency.referee.system.progress import say
 
 PLAN = "until_decided"
 KEYS = {

@@ -12,17 +12,17 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.campaign import Campaign
 from consistency.bench.runs.montecarlo import studied
-from consistency.bench.runs.records import record_of
-from consistency.bench.runs.work import Backend
+from consistency.bench.runs.results_to_records import record_of
+from consistency.bench.runs.trial_work import Backend
 from consistency.bench.scenario import Scenario
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.results import Results, StoredResults, Tables
+from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import Design, Record, Verdict, look, sequential_design, speaks
-from consistency.referee.diagnostics.judging import of_look, with_map
+from consistency.referee.diagnostics.verdict.judge import of_look, with_map
 from consistency.referee.errors import InputError
-from consistency.referee.parsing.columns import POSE
-from consistency.referee.terminal.progress import say
+from consistency.referee.system.progress import say
 from consistency.referee.verdicts.options import refused
 
 

@@ -9,7 +9,7 @@ simulation's.
 from consistency.bench.scenario.agreement import misbelief
 from consistency.bench.scenario.belief import Belief, BelievedMotion, GuardSettings, SigmaPoints
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
-from consistency.bench.scenario.record import Scenario, load_scenario, scenario_names
+from consistency.bench.scenario.scenario import Scenario, load_scenario, scenario_names
 from consistency.bench.scenario.sensor import (
     BelievedSensor,
     LinearSensor,
@@ -20,7 +20,8 @@ from consistency.bench.scenario.sensor import (
     UvdSensor,
     XyzSensor,
 )
-from consistency.bench.scenario.tables import (
+from consistency.bench.scenario.sensor_view import PLANAR_SENSORS, Mount
+from consistency.bench.scenario.toml_tables import (
     Count,
     Finite,
     Interval,
@@ -46,7 +47,6 @@ from consistency.bench.scenario.truth import (
     UniformLandmarks,
     Waypoints,
 )
-from consistency.bench.scenario.view import PLANAR_SENSORS, Mount
 from consistency.bench.scenario.writing import scenario_text, toml_text
 from consistency.referee.shipped import data_folder
 

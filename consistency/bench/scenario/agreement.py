@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from consistency.bench.scenario.effects import LocalBias
-from consistency.bench.scenario.record import Scenario
+from consistency.bench.scenario.scenario import Scenario
 
 # keys of both halves; of the second kind one half may have what the other leaves out
 NUMBERS = (("motion", ("sigma_v", "sigma_omega")), ("sensor", ("sigma", "mount", "f", "B", "disparity")))

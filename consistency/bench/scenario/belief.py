@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from consistency.bench.scenario.sensor import BelievedSensor
-from consistency.bench.scenario.tables import Count, Finite, NonNegative, Positive, Table
+from consistency.bench.scenario.toml_tables import Count, Finite, NonNegative, Positive, Table
 
 Share = Annotated[float, Field(gt=0, lt=1, strict=True)]
 

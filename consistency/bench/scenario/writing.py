@@ -8,7 +8,7 @@ from typing import Any
 
 import tomli_w
 
-from consistency.bench.scenario.record import Scenario
+from consistency.bench.scenario.scenario import Scenario
 
 NUMBERS = re.compile(r"\[\n((?: +[-+.\w]+,\n)+) *\]")  # an array of numbers, each on a line
 

@@ -12,7 +12,7 @@ from consistency.bench.store.parquet import OPTIONAL, Columns
 from consistency.bench.store.results import JOINT
 from consistency.bench.store.trial_rows import Rejected, truth_columns
 from consistency.bench.types import Trial
-from consistency.referee.parsing.columns import COLUMNS
+from consistency.referee.column_names import COLUMNS
 from consistency.referee.types import Array, Failure
 
 

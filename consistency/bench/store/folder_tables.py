@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
-from consistency.referee.parsing.columns import COLUMNS
 from consistency.referee.system import folders
 from consistency.referee.system.folders import NewFolder
 

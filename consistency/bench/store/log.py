@@ -24,14 +24,14 @@ from consistency.bench.scenario import (
     read_table,
     toml_text,
 )
-from consistency.bench.scenario.tables import SIGMA_UNITS
+from consistency.bench.scenario.toml_tables import SIGMA_UNITS
 from consistency.bench.store.data_frames import controls_table, observations_table, truth_of
 from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.log_tables import read_table_file, require_format, table_file
 from consistency.bench.types import Trial
+from consistency.referee.column_names import COLUMNS, POSE
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading
-from consistency.referee.parsing.columns import COLUMNS, POSE
 from consistency.referee.types import Array, Indices
 
 STRAY = 0.05  # share of pixels that gross errors may put outside the image; other units put more there

@@ -10,9 +10,9 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from consistency.bench.store.parquet import OPTIONAL, check_column, read_parquet, require_table
+from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading, require_room
-from consistency.referee.parsing.columns import COLUMNS
 
 FORMATS = ("parquet", "csv")
 DAMAGED = "cannot be read as CSV; needs a header, and in each row as many numbers, with commas between them"

@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from consistency.referee.column_names import COLUMNS, OWN_COVARIANCE
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, LARGEST_NUMBER, MOST_DOF, WHOLE, is_file, one_line, reading, require_room
-from consistency.referee.parsing.columns import COLUMNS, OWN_COVARIANCE
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from consistency.bench.scenario import Scenario
 from consistency.bench.store.parquet import read_batches, require_table
+from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line, reading, require_name
-from consistency.referee.parsing.columns import COLUMNS
 
 AGAIN = "the folder was changed or damaged; write it again"
 Whole = Annotated[int, Field(ge=0, lt=2**53)]

@@ -13,12 +13,12 @@ from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.store.parquet import Columns
 from consistency.bench.store.results import JOINT
 from consistency.bench.types import Estimates, Map, Trial
-from consistency.referee.diagnostics.landmarks import joint_nees
-from consistency.referee.diagnostics.whitening import whiten
+from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
+from consistency.referee.diagnostics.maps.map_score import joint_nees
+from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.geometry import pose_error
 from consistency.referee.geometry.conventions import planar_error, planar_map_error
 from consistency.referee.parsing import LARGEST_NUMBER
-from consistency.referee.parsing.columns import COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
 from consistency.referee.types import Array, Failure
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor
-from consistency.bench.scenario.tables import UNITS
+from consistency.bench.scenario.toml_tables import UNITS
 from consistency.bench.simulation import draw_landmarks
 from consistency.bench.simulation.path import lap_length
 from consistency.bench.simulation.variation import course_of, mount_of

@@ -16,18 +16,18 @@ from consistency.bench.filters import get_filter
 from consistency.bench.filters.compiled import Compiled, one_blas_thread
 from consistency.bench.filters.stepping import run_filter
 from consistency.bench.protocols import Filter, WholeTrial
-from consistency.bench.runs.isolating import Isolation
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.bench.runs.work import Backend
+from consistency.bench.runs.trial_work import Backend
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import simulate
 from consistency.bench.store.journal import Journal
 from consistency.bench.sweeps.plan import Cell, Sweep
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics import Record, Verdict
-from consistency.referee.terminal.progress import quiet
+from consistency.referee.system.progress import quiet
 
 TIMED = 3  # times that a trial is timed, of which the least counts, and trials that are tried
 SLOW = 1.0  # s, a trial that takes longer is timed once

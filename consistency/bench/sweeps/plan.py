@@ -21,11 +21,11 @@ from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.runs.sequential import plan_of
 from consistency.bench.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
 from consistency.bench.sweeps.axes import QUANTITIES, Axis, leaves, require_key, with_changes
+from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, POWER
 from consistency.referee.diagnostics import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE
-from consistency.referee.parsing.columns import POSE
 
 MOST_CELLS = 20_000  # each is a scenario in memory, and a folder
 LONGEST = 150  # characters of a folder's name

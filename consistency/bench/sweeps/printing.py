@@ -13,9 +13,9 @@ from consistency.bench.sweeps.plan import text_alone
 from consistency.bench.sweeps.recommend import Advice, MapPlace, NearFilter
 from consistency.bench.sweeps.regime import Regime
 from consistency.bench.sweeps.rig import AxisPlace
-from consistency.referee.diagnostics.export import plain
-from consistency.referee.diagnostics.verdict_in_words import plural, short
-from consistency.referee.diagnostics.verdict_parts import STATUSES
+from consistency.referee.diagnostics.verdict.as_dictionary import plain
+from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.words.sentences import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Status, Table, Text, table
 from consistency.referee.document.wording import NONE
 

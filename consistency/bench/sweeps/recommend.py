@@ -22,10 +22,10 @@ from consistency.bench.sweeps.rig import (
     place_on,
     read_rig,
 )
+from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics import Verdict, gate_runs
 from consistency.referee.errors import InputError
-from consistency.referee.parsing.columns import POSE
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 CONFIRM = 4  # filters that are confirmed at most: each may have to be compiled
 OPEN = ("consistent", "undecided")  # what confirming runs say where they find no fault

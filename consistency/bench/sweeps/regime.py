@@ -17,7 +17,7 @@ from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.folder import SweepFolder, describe, open_sweep, sweep_from
 from consistency.bench.sweeps.plan import Cell, Sweep
 from consistency.referee.errors import InputError
-from consistency.referee.pages import write_file
+from consistency.referee.pages.write_pages import write_file
 from consistency.referee.parsing import read_json, reading
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 

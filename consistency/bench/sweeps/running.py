@@ -12,14 +12,14 @@ from pathlib import Path
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
-from consistency.bench.runs.work import Backend
+from consistency.bench.runs.trial_work import Backend
 from consistency.bench.store.journal import Busy, Journal
 from consistency.bench.sweeps.cell import CellResult, run_cell
 from consistency.bench.sweeps.folder import CellWork, SweepFolder
 from consistency.bench.sweeps.plan import Sweep
 from consistency.referee.errors import InputError
+from consistency.referee.system.progress import say
 from consistency.referee.system.stopping import Stop, stoppable
-from consistency.referee.terminal.progress import say
 
 LOOKED_AT = 400  # cells whose kernels are compiled ahead, 10 ms each; cells of one grid differ little
 PAUSE = 1.0  # s, between looks at whether another process has done what is left

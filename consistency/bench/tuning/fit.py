@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from consistency.bench.tuning.profile import AT_LIMIT, STEP, Profile
+from consistency.bench.tuning.profile_intervals import AT_LIMIT, STEP, Profile
 from consistency.referee.types import Array
 
 LIMIT = float(np.log(1e4))  # factors that are tried lie within 1e-4 and 1e4
@@ -38,8 +38,8 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> FactorFit | None:
     one Newton step at its end. The score is smooth, for all settings see the same trials.
 
     Intervals are those of the profile of the score, scaled by the spread of independent runs; fewer than 20 runs are
-    cut into blocks of steps (:mod:`consistency.tuning.profile`). They are open on a side on which all that may be
-    tried is inside.
+    cut into blocks of steps (:mod:`consistency.bench.tuning.profile_intervals`). They are open on a side on which all
+    that may be tried is inside.
     """
     search = _Search(score)
     start = next((start for start in starts if np.isfinite(search.total(start))), None)

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from consistency.bench.scenario import Belief, scenario_text, toml_text
-from consistency.bench.scenario.tables import SIGMA_UNITS
+from consistency.bench.scenario.toml_tables import SIGMA_UNITS
 from consistency.bench.store.log import Log, sensor_text
 from consistency.bench.tuning.fit import LIMIT
 from consistency.bench.tuning.noise_groups import NoiseGroup, sigma_by_channel
 from consistency.bench.tuning.split import Parts, with_belief
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.verdict_in_words import short
-from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.words.sentences import short
 
 TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}
 

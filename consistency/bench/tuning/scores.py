@@ -11,8 +11,8 @@ from consistency.bench.filters.stepping import name_of, rejects
 from consistency.bench.protocols import Filter
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Estimates, Trial
+from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
-from consistency.referee.parsing.columns import POSE
 from consistency.referee.types import Array
 
 BY = ("innovations", "nees")

@@ -14,11 +14,11 @@ from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_for
-from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.scenario import Belief
 from consistency.bench.tuning.scores import Score, score_of
 from consistency.bench.types import Trial
-from consistency.referee.terminal.progress import say
+from consistency.referee.system.progress import say
 from consistency.referee.types import Array
 
 EVERY = 5.0  # seconds between lines of progress

@@ -10,7 +10,7 @@ import numpy as np
 
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.montecarlo import run_log, run_trials
-from consistency.bench.runs.work import Simulated
+from consistency.bench.runs.trial_work import Simulated
 from consistency.bench.scenario import Belief, Scenario
 from consistency.bench.store.log import Log
 from consistency.bench.store.results import Results

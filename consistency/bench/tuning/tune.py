@@ -24,11 +24,11 @@ from consistency.bench.tuning.setting_scores import BeliefScorer
 from consistency.bench.tuning.split import Judging, Parts, parts_of
 from consistency.bench.tuning.why import Probe, is_at_fault, reasons_of
 from consistency.referee.diagnostics import Settings, Verdict
-from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
-from consistency.referee.terminal.progress import quiet, say
+from consistency.referee.system.progress import quiet, say
 from consistency.referee.types import Array
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 OTHER_STARTS = (10.0, 0.1, 100.0)  # common factors to begin with where a run fails at the one that the data ask for
 

@@ -12,7 +12,7 @@ from consistency.bench.store.log import Log
 from consistency.bench.tuning.noise_groups import sigma_by_channel
 from consistency.bench.tuning.result import Setting, Tuning, files
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.export import plain
+from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.system.provenance import manifest_of
 
 KIND = "tuning"

@@ -113,7 +113,7 @@ def _line(sentence: str) -> str:
 
 
 def _end(sentence: str, status: int) -> NoReturn:
-    from consistency.referee.terminal.progress import say
+    from consistency.referee.system.progress import say
 
     say(f"consistency: {sentence}")
     try:

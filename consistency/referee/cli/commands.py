@@ -44,7 +44,7 @@ ROWS = (
         "plan --dof 3 --detect 1.2",
         "plan --like results",
         "plan herath2007-stereo --filter ekf-uvd --detect 1.2"),
-    Row("fit-covariance", "referee.cli.fitting:fit_covariance", "",
+    Row("fit-covariance", "referee.cli.fit_covariance:fit_covariance", "",
         "fit-covariance wheels --truth truth --span 1m --out noise",
         "fit-covariance odometry.csv --truth truth.csv --span 1s --held-out half"),
     Row("monitor", "referee.cli.monitoring:monitor", "",

@@ -21,7 +21,7 @@ from consistency.referee.cli.options import (
 )
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.errors import InputError
-from consistency.referee.parsing.options import Reading, flag_of
+from consistency.referee.readers.options import Reading, flag_of
 
 
 @reads_files
@@ -44,7 +44,7 @@ def compare(
 ) -> None:
     """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
     from consistency.referee.verdicts.baselines import baseline, is_baseline, read_baseline
-    from consistency.referee.verdicts.comparison import compare_filters, compare_with, document
+    from consistency.referee.verdicts.compare_sources import compare_filters, compare_with, document
     from consistency.referee.verdicts.options import skip_asked
 
     require_word("--fail-on", fail_on, "worse")

@@ -32,7 +32,7 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy
 from consistency.referee.outside import outside
-from consistency.referee.parsing.options import Reading
+from consistency.referee.readers.options import Reading
 
 
 @reads_files
@@ -79,9 +79,9 @@ def analyse(
     """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
     from consistency.referee.document.verdict import document
     from consistency.referee.show import FORMATS
-    from consistency.referee.verdicts.judge import analyse as judge
-    from consistency.referee.verdicts.judge import source_of
     from consistency.referee.verdicts.options import settings_of, skip_asked
+    from consistency.referee.verdicts.sources import analyse as judge
+    from consistency.referee.verdicts.sources import source_of
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -96,7 +96,7 @@ def analyse(
         verdicts = judge(recordings, filters, settings=settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         if report is not None and not is_file:
-            from consistency.referee.pages import write_file_reports
+            from consistency.referee.pages.write_pages import write_file_reports
             from consistency.referee.show.as_json import render
             from consistency.referee.system.folders import require_free
 
@@ -124,7 +124,7 @@ def analyse(
             print(f"consistency: {text}", file=sys.stderr)
     shown = document(verdicts, path.name)
     if report is not None and is_file:
-        from consistency.referee.pages import write_text_file
+        from consistency.referee.pages.write_pages import write_text_file
 
         try:
             written = [write_text_file(shown, report, overwrite)]
@@ -154,8 +154,8 @@ def report(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Write a report of results as one offline HTML file and a PDF."""
-    from consistency.referee.pages import require_pages, write_file_pages
-    from consistency.referee.verdicts.judge import analyse as judge
+    from consistency.referee.pages.write_pages import require_pages, write_file_pages
+    from consistency.referee.verdicts.sources import analyse as judge
 
     estimates = are_files(path, files)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"

@@ -52,9 +52,9 @@ def monitor(
 ) -> None:
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
     from consistency.referee.document.monitor import monitor_document
-    from consistency.referee.pages import require_plot, write_monitor_plot
-    from consistency.referee.readers.dataflash import STATED, is_dataflash
-    from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch, watch_lines
+    from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
+    from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash
+    from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch, watch_lines
 
     require_word("--fail-on", fail_on, "alarm")
     if is_dataflash(Path(path)) and filter_name not in STATED:
@@ -87,9 +87,9 @@ def _show_ratios(
     path: Path, sensor: str | None, core: int | None, plot: Path | None, overwrite: bool, as_json: bool
 ) -> None:
     """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
-    from consistency.referee.document.ratios import ratios_document
-    from consistency.referee.pages import require_plot, write_monitor_plot
-    from consistency.referee.readers.dataflash import read_ratios
+    from consistency.referee.document.test_ratios_table import ratios_document
+    from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
+    from consistency.referee.readers.formats.ardupilot_log import read_ratios
 
     if plot is not None:
         require_plot(plot, overwrite)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing.options import Reading, flag_of
+from consistency.referee.readers.options import Reading, flag_of
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics import Evidence
@@ -87,14 +87,14 @@ def show(document: Document, as_json: bool, written: Sequence[Path] = ()) -> Non
 
 def are_files(path: Path, files: Reading) -> bool:
     """Whether a path is files of another estimator, and no folder of ``consistency run``."""
-    from consistency.referee.readers import is_recording
+    from consistency.referee.readers.read_files import is_recording
 
     return is_recording(path, files)
 
 
 def read_files(path: Path, files: Reading) -> list[Evidence]:
     """Files of another estimator."""
-    from consistency.referee.readers import read_recordings
+    from consistency.referee.readers.read_files import read_recordings
 
     return read_recordings(path, files)
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 if TYPE_CHECKING:
+    from consistency.referee.document.colours import Look
     from consistency.referee.document.drawing import Figure, Key
-    from consistency.referee.document.looks import Look
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from consistency.referee.document.looks import Look
-from consistency.referee.document.thin import thin
+from consistency.referee.document.colours import Look
+from consistency.referee.document.fewer_points import thin
 from consistency.referee.types import Array, Indices
 
 Tips: TypeAlias = tuple[tuple[str, str], ...]  # what is pointed at, and its value with @column{digits} for numbers

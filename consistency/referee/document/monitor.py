@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics import Alarm, Monitor
-from consistency.referee.diagnostics.monitor import CAVEAT, accepted_scales
+from consistency.referee.diagnostics.monitoring.monitor import CAVEAT, accepted_scales
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
 
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.export import flat
-from consistency.referee.diagnostics.verdict_in_words import (
+from consistency.referee.diagnostics.verdict.as_dictionary import flat
+from consistency.referee.diagnostics.words.sentences import (
     UNCERTAIN,
     p_text,
     percent,
@@ -41,7 +41,7 @@ from consistency.referee.document.wording import NONE, brief, number, p_cell
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 
 if TYPE_CHECKING:
-    from consistency.referee.document.looks import Look
+    from consistency.referee.document.colours import Look
 
 
 class Measure(NamedTuple):

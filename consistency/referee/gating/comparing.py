@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics import Comparison, Record, RunSummary, compare, summary
 from consistency.referee.diagnostics.comparison import FailedRuns
-from consistency.referee.diagnostics.skipping import Skip
-from consistency.referee.gating.checks import checked, of_results
-from consistency.referee.parsing.columns import POSE
+from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.gating.input_checks import checked, of_results
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline
-    from consistency.referee.verdicts.judge import Results
+    from consistency.referee.verdicts.sources import Results
 
 
 NONE_FAILED = FailedRuns(0, 0)

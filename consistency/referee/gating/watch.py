@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from consistency.referee.defaults import DETECT, GATE_FALSE_ALARM, POWER
-from consistency.referee.gating.budget import in_place_rate
+from consistency.referee.gating.false_alarm_budget import in_place_rate
 
 # of a gate that is told nothing else; dof plans the runs of a test without the marker: a planar pose
 DEFAULTS: dict[str, Any] = {

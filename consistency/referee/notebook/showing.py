@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from consistency.referee.diagnostics import Record, Verdict
-from consistency.referee.diagnostics.verdict_in_words import plural
+from consistency.referee.diagnostics.words.sentences import plural
 from consistency.referee.document.blocks import Bullets, Facts
 from consistency.referee.document.verdict import summary
 from consistency.referee.extras import require
@@ -42,7 +42,7 @@ def verdict_text(verdict: Verdict) -> str:
 
 def verdict_html(verdict: Verdict) -> str:
     """The sentence, the table, and below it the picture where the record is kept and one can be drawn."""
-    from consistency.referee.pages.plain import picture
+    from consistency.referee.pages.core_page import picture
 
     pictures = () if verdict.record is None else picture(verdict.record, verdict)
     return as_html.fragment(*summary(verdict)) + "".join(map(as_html.block, pictures))
@@ -50,7 +50,7 @@ def verdict_html(verdict: Verdict) -> str:
 
 def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Drawn:
     """See :meth:`Record.plot`."""
-    from consistency.referee.pages.files import record_sheet
+    from consistency.referee.pages.files_report import record_sheet
 
     sheet = record_sheet(record, verdict)
     require("a plot", "plot")
@@ -58,7 +58,7 @@ def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Dr
 
     figure = drawn(sheet)
     if path is not None:
-        from consistency.referee.pages import require_plot
+        from consistency.referee.pages.write_pages import require_plot
 
         path = Path(path)
         require_plot(path, overwrite=True)

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.coverage import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.coverage import TWO_SIGMA
+from consistency.referee.document.colours import EXPECTED, solid
 from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, dodge
-from consistency.referee.document.looks import EXPECTED, solid
 from consistency.referee.pages.judged import Estimator, Judged
 from consistency.referee.pages.section import STUDY, Section
 from consistency.referee.types import Array

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
+from consistency.referee.document.colours import Look, style
 from consistency.referee.document.drawing import Key, Owner
-from consistency.referee.document.looks import Look, style
 from consistency.referee.pages.clock import Clock
 from consistency.referee.types import Array, Failure, Indices
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.gate_ratios import GateRatios
+from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
+from consistency.referee.document.colours import EXPECTED, LIMIT, style
 from consistency.referee.document.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span
-from consistency.referee.document.looks import EXPECTED, LIMIT, style
-from consistency.referee.document.thin import thin
+from consistency.referee.document.fewer_points import thin
 from consistency.referee.show import with_matplotlib
 from consistency.referee.types import Array
-from consistency.referee.verdicts.monitoring import Watched
+from consistency.referee.verdicts.monitor_sources import Watched
 
 HEIGHT = 3.6  # inches
 POINTS = 600  # at most, of the NIS: few enough to see a change among them

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence, laws
-from consistency.referee.diagnostics.verdict_in_words import plural
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.words.sentences import plural
+from consistency.referee.document.colours import EXPECTED, SHADE, SIGMAS, ZERO, style
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Mark, Panel, Points, Rule, Sheet
-from consistency.referee.document.looks import EXPECTED, SHADE, SIGMAS, ZERO, style
 from consistency.referee.pages.judged import wide
 
 EACH = replace(style(0), size=2.5, alpha=0.7)
@@ -54,7 +55,7 @@ def nees_of_runs(record: Evidence) -> Figure | None:
     if record.nees is None or not np.isfinite(record.nees).any():
         return None
     runs, values = record.run_numbers.astype(float), record.nees[:, 0]
-    low, high = (np.full(len(runs), laws.chi2.ppf(q, record.dof)) for q in (0.025, 0.975))
+    low, high = (np.full(len(runs), distributions.chi2.ppf(q, record.dof)) for q in (0.025, 0.975))
     marks: list[Mark] = [Band(runs, low, high, SHADE), Rule("y", float(record.dof), EXPECTED)]
     marks.append(Points(runs, values, EACH, tips=(("run", "@x"), ("NEES", "@y{0.000}"))))
     keys = (Key("95 % band of one run", SHADE, "band"), Key("expected", EXPECTED), Key("NEES of a run", EACH, "points"))

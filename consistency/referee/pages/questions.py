@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from consistency.referee.diagnostics import Answer
-from consistency.referee.diagnostics.questions import ABOUT, MAIN
+from consistency.referee.diagnostics.verdict.answers import ABOUT, MAIN
 from consistency.referee.document import blocks
 from consistency.referee.document.blocks import Block, Column, Heading, Small, Stack, Text, table
 from consistency.referee.document.wording import p_cell

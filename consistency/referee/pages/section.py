@@ -30,8 +30,8 @@ FRONT_END = Part("front-end", "Stereo front-end", "Stereo front-end")
 class Section(Generic[Source, Record]):
     """One section.
 
-    ``read`` takes a :class:`~consistency.bench.pages.model.Study` where ``part`` is ``STUDY``, else a
-    :class:`~consistency.bench.pages.model.Report`. It gives a record, or None where the section does not apply.
+    ``read`` takes a :class:`~consistency.bench.pages.report_input.Study` where ``part`` is ``STUDY``, else a
+    :class:`~consistency.bench.pages.report_input.Report`. It gives a record, or None where the section does not apply.
     ``show`` gives the blocks of a record: figures with their captions, tables, text.
     """
 

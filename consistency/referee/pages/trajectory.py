@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence, laws
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.document.colours import TRUTH, Look, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet
-from consistency.referee.document.looks import TRUTH, Look, style
 from consistency.referee.types import Array, Indices
 
 IN_WORLD = ("so2", "so3", "so3-body", "vector")  # errors whose position is about the axes of the world
@@ -69,7 +70,7 @@ def trajectory(record: Evidence, row: int) -> Figure | None:
 def ellipse(centre: Array, P: Array) -> Array:
     """Outline (corners, 2) of the region that holds a share of 95 % about ``centre`` (2,) with covariance P (2, 2)."""
     angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
-    circle = np.sqrt(float(laws.chi2.ppf(SHARE, 2))) * np.column_stack([np.cos(angle), np.sin(angle)])
+    circle = np.sqrt(float(distributions.chi2.ppf(SHARE, 2))) * np.column_stack([np.cos(angle), np.sin(angle)])
     return np.asarray(centre + circle @ np.linalg.cholesky(P).T)
 
 

@@ -9,8 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from consistency.referee.parsing.options import Reading
-from consistency.referee.readers.named_poses import begins_with_numbers, clock_of, head_of, places_of, roles_of
+from consistency.referee.readers.formats.named_columns import (
+    begins_with_numbers,
+    clock_of,
+    head_of,
+    places_of,
+    roles_of,
+)
+from consistency.referee.readers.options import Reading
 
 TABLES = (".csv", ".parquet", ".pq")
 TRAJECTORIES = (".txt", ".tum")
@@ -93,8 +99,8 @@ KINDS = (  # a file is of the first that knows it
     Kind(
         lambda path, r: is_bag(path),
         ("state", "covariance", "covariance_order", "truth", "lever_arm"),
-        "referee.readers.bags:read_bags",
-        "referee.readers.bags:bag_poses",
+        "referee.readers.formats.ros_bag:read_bags",
+        "referee.readers.formats.ros_bag:bag_poses",
     ),
     Kind(
         lambda path, r: path.suffix.lower() == ".npz",
@@ -102,16 +108,21 @@ KINDS = (  # a file is of the first that knows it
             *OF_BAGS, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align",
             "lever_arm", "truth_covariance",
         ),
-        "referee.readers.archive:read_archive",
-        "referee.readers.archive:archive_poses",
+        "referee.readers.formats.numpy_archive:read_archive",
+        "referee.readers.formats.numpy_archive:archive_poses",
     ),
     Kind(
         _is_table,
         (*OF_BAGS, *OF_TRAJECTORIES),
-        "referee.readers.table:read_tables",
-        "referee.readers.table:table_poses",
+        "referee.readers.formats.table:read_tables",
+        "referee.readers.formats.table:table_poses",
     ),
-    Kind(_is_trajectory, (*OF_BAGS, "state"), "referee.readers.tum:read_tum", "referee.readers.tum:trajectory_poses"),
+    Kind(
+        _is_trajectory,
+        (*OF_BAGS, "state"),
+        "referee.readers.formats.tum:read_tum",
+        "referee.readers.formats.tum:trajectory_poses",
+    ),
 )  # fmt: skip
 SUFFIXES = (*TABLES, ".npz", *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
 

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.named_poses import UNIT_NAMES, unit_of
+from consistency.referee.readers.formats.named_columns import UNIT_NAMES, unit_of
 from consistency.referee.types import Array, Indices
 
 Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more

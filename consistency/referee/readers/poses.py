@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.geometry.conventions import planar_error
+from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.matching import Known, Manifold, nearest, truth_at
-from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array, Indices
 
 

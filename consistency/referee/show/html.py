@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from consistency.referee.document.blocks import Block, Document
 from consistency.referee.document.drawing import Figure, Panel, numbers
-from consistency.referee.document.thin import LIMIT
+from consistency.referee.document.fewer_points import LIMIT
 from consistency.referee.document.wording import written
 from consistency.referee.show.with_bokeh import Screen
 

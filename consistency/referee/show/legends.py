@@ -15,8 +15,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from consistency.referee.document.colours import Look
 from consistency.referee.document.drawing import Key, Sheet
-from consistency.referee.document.looks import Look
 
 LINE = 0.16  # inches, a line of a legend
 SMALL = 0.14  # inches, a line of the legend of one panel

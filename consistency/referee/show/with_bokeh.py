@@ -11,6 +11,7 @@ from bokeh.models.annotations import BoxAnnotation
 from bokeh.models.annotations import Span as Across
 from bokeh.plotting import figure
 
+from consistency.referee.document.colours import Look, solid
 from consistency.referee.document.drawing import (
     Axis,
     Band,
@@ -28,7 +29,6 @@ from consistency.referee.document.drawing import (
     Tiles,
     kept,
 )
-from consistency.referee.document.looks import Look, solid
 from consistency.referee.types import Array
 
 # Bokeh's names of the marker shapes in looks.MARKERS

@@ -32,7 +32,7 @@ from consistency.referee.document.drawing import (
     Tiles,
     kept,
 )
-from consistency.referee.document.thin import LIMIT
+from consistency.referee.document.fewer_points import LIMIT
 from consistency.referee.show.legends import (
     SMALL,
     dots,

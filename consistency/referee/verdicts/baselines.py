@@ -11,18 +11,18 @@ from typing import Any
 
 import numpy as np
 
+from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics import Record, RunSummary, summary
-from consistency.referee.diagnostics.export import plain
-from consistency.referee.diagnostics.record import numbered_axes
-from consistency.referee.diagnostics.skipping import Skip
+from consistency.referee.diagnostics.records.record import numbered_axes
+from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, read_json, reading
-from consistency.referee.parsing.columns import POSE
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
-from consistency.referee.verdicts.judge import Results, Source, source_of
 from consistency.referee.verdicts.options import skip_asked
+from consistency.referee.verdicts.sources import Results, Source, source_of
 
 HIGHEST_DOF = 1000  # of an error in a baseline
 FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")

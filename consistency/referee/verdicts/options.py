@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from consistency.referee.diagnostics import Settings
-from consistency.referee.diagnostics.skipping import Skip, skip_of
+from consistency.referee.diagnostics.records.skipping import Skip, skip_of
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
@@ -75,8 +75,8 @@ def plan(
     InputError
         A number out of its range, or pilots without truth.
     """
+    from consistency.referee.column_names import POSE
     from consistency.referee.diagnostics import Design, gate_runs, lost_runs, pilot_plan, required_runs
-    from consistency.referee.parsing.columns import POSE
 
     if allow not in (None, "conservative"):
         raise InputError(f"--allow must be 'conservative', got '{allow}'")

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from consistency.bench.scenario.effects.nodes import bilinear
+from consistency.bench.scenario.effects.node_tables import bilinear
 from consistency.referee.types import Array
-from consistency.stereo.characterising import coordinate
-from consistency.stereo.characterising.basis import FEW
+from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.likelihood import LikelihoodFit
+from consistency.stereo.characterising.piecewise_linear import FEW
 from consistency.stereo.characterising.residuals import Residuals
 
 GRID = (5, 4)  # nodes across and down
@@ -75,7 +75,7 @@ def estimate_bias(fits: Sequence[LikelihoodFit], grid: Grid, level: float, rate:
     value, half, believed = (np.full((3, len(known)), fill) for fill in (np.nan, np.nan, 0.0))
     p_value = np.ones(3)
     for k, fit in enumerate(fits):
-        beta, width, C = coordinate.bias(fit, level)
+        beta, width, C = coordinate_fit.bias(fit, level)
         value[k, known], half[k, known] = beta[known], width[known]
         if not known.any():
             continue

@@ -9,15 +9,15 @@ import numpy as np
 
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.scenario import PicturedSensor
-from consistency.bench.scenario.effects.nodes import hats
-from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.bench.scenario.effects.node_tables import hats
+from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.characterising import coordinate
-from consistency.stereo.characterising.basis import octaves
+from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
-from consistency.stereo.characterising.coordinate import Levels
+from consistency.stereo.characterising.coordinate_fit import Levels
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
+from consistency.stereo.characterising.piecewise_linear import octaves
 from consistency.stereo.characterising.residuals import Residuals, RowSelection, select
 from consistency.stereo.characterising.tails import ResidualTails, rate, ratios, tails
 
@@ -128,9 +128,11 @@ def characterise(
     growth = None
     if len(nodes) > 1:
         by_disparity = _fitted(kept, 2, X, cells.ridge, hats(kept.ideal[:, 2], nodes), chosen, source, alone)
-        p_value = coordinate.growth_p_value(by_disparity)
+        p_value = coordinate_fit.growth_p_value(by_disparity)
         shown = p_value < levels.rate / 6
-        growth = DisparityNoise(nodes, tuple(coordinate.at_nodes(by_disparity, levels.of("growth"))), p_value, shown)
+        growth = DisparityNoise(
+            nodes, tuple(coordinate_fit.at_nodes(by_disparity, levels.of("growth"))), p_value, shown
+        )
         fits[2] = by_disparity if shown else fits[2]
     return Characterisation(
         sensor, source, _coordinates(fits, kept, levels, alone), growth,
@@ -175,13 +177,13 @@ def _coordinate(k: int, of: LikelihoodFit, kept: Residuals, levels: Levels, alon
     r, rows = kept.r[:, k], of.rows
     n = np.diff(np.append(rows.first, len(r)))
     centred = r - (np.add.reduceat(r, rows.first) / n)[rows.track]
-    lags, bounds = coordinate.autocorrelation(of)
+    lags, bounds = coordinate_fit.autocorrelation(of)
     memory = rows.length >= 1.5 and not alone
     w = of.regression.residual
     return Coordinate(
-        NAMES[k], coordinate.noise(of, levels.of("sigma")), float(r.std(ddof=1)),
+        NAMES[k], coordinate_fit.noise(of, levels.of("sigma")), float(r.std(ddof=1)),
         float(np.sqrt((centred**2).sum() / max(len(r) - len(n), 1))),
-        coordinate.correlation(of, levels.of("correlation")) if memory else None,
-        coordinate.offset_share(of, levels.of("offset")) if memory else None,
+        coordinate_fit.correlation(of, levels.of("correlation")) if memory else None,
+        coordinate_fit.offset_share(of, levels.of("offset")) if memory else None,
         tails(w, levels.of("tails")), lags, bounds, w / w.std(),
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Text, table
 from consistency.stereo.characterising.characterise import Characterisation
 from consistency.stereo.characterising.wording import counted, interval, sentences

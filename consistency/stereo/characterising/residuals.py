@@ -9,10 +9,10 @@ import numpy as np
 
 from consistency.bench.models import point, stereo
 from consistency.bench.scenario import PicturedSensor
-from consistency.bench.scenario.effects.nodes import hats
+from consistency.bench.scenario.effects.node_tables import hats
 from consistency.bench.types import Trial
 from consistency.referee.types import Array, Indices
-from consistency.stereo.characterising.basis import FEW, octaves
+from consistency.stereo.characterising.piecewise_linear import FEW, octaves
 
 MARGIN = 4.0  # standard deviations from a limit within which the noise decides whether a row is there at all
 GROSS = 6.0  # robust standard deviations: a Gaussian error is beyond in 2 of 10^9

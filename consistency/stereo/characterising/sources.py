@@ -7,7 +7,7 @@ from pathlib import Path
 
 from consistency.referee.errors import InputError
 from consistency.stereo.characterising.bias import GRID
-from consistency.stereo.characterising.recorded import Measured, characterise_log, is_log
+from consistency.stereo.characterising.from_log import Measured, characterise_log, is_log
 
 WIDEST = 10.0  # m, of a square of a board; more are millimetres
 NODES, CORNERS = 2, 3  # least numbers across and down, of nodes of a bias map and of corners
@@ -63,14 +63,14 @@ def characterise_source(source: Path, options: SourceOptions) -> Measured:
         raise InputError("--seed: goes with images without a board; nothing is drawn at random from one")
     if options.at_rest or options.truth is not None:
         raise InputError("--board: goes neither with --at-rest nor with --truth; the poses of the board are fitted")
-    from consistency.stereo.characterising.plane import characterise_board
+    from consistency.stereo.characterising.board_residuals import characterise_board
 
     model = options.distortion or "full"
     return Measured(characterise_board(source, options.board, options.square, model, options.grid or GRID), {})
 
 
 def _of_sequence(source: Path, options: SourceOptions) -> Measured:
-    from consistency.stereo.characterising.pictures import Sources, characterise_images
+    from consistency.stereo.characterising.from_pairs import Sources, characterise_images
 
     if options.distortion is not None:
         raise InputError("--distortion: goes with --board; other images bring their calibration")

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special, stats
 
-from consistency.referee.diagnostics.gaussian import normality
-from consistency.referee.diagnostics.intervals import binomial_interval
-from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.referee.diagnostics.statistics.intervals import binomial_interval
+from consistency.referee.diagnostics.statistics.normality import normality
+from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.types import Array
 
 HEAVIEST = 0.49  # 1 / nu: at 1/2 the variance is infinite

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.referee.diagnostics.verdict_in_words import p_text
-from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.words.sentences import p_text
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
 
 GAUSSIAN = 1e-3  # p-value of normality below which a distribution is called other than Gaussian

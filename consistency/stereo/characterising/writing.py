@@ -15,7 +15,7 @@ import tomli_w
 from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.bias_map import BiasMap
 from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
-from consistency.referee.diagnostics.export import plain
+from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing

@@ -14,11 +14,11 @@ from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
-from consistency.stereo.vision.motion import RelativeMotion
-from consistency.stereo.vision.pose import RelativePose, angular
-from consistency.stereo.vision.rig import StereoRig
-from consistency.stereo.vision.sequence import Sequence
-from consistency.stereo.vision.tracks import PIXELS, TrackSelection, linked, thinned
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig
+from consistency.stereo.visual_odometry.motion import RelativeMotion
+from consistency.stereo.visual_odometry.pose import RelativePose, angular
+from consistency.stereo.visual_odometry.sequence import Sequence
+from consistency.stereo.visual_odometry.tracks import PIXELS, TrackSelection, linked, thinned
 
 MAX_AGE, MIN_LIFE, BANDS = 12, 2, 3  # observations of a landmark at most and at least, columns: as docs/kitti07.md
 NEAR = 10.0  # standard deviations of its disparity that a landmark has at least: its range is nearly Gaussian

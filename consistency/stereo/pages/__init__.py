@@ -21,7 +21,7 @@ def write_sensor_reports(of: Characterisation, folder: Path, data: str, overwrit
     InputError
         The folder exists or cannot be written.
     """
-    from consistency.referee.pages import write_document, write_file
+    from consistency.referee.pages.write_pages import write_document, write_file
     from consistency.referee.system.folders import write_folder
     from consistency.referee.system.provenance import manifest_of
     from consistency.stereo.pages.sensor import compose_sensor

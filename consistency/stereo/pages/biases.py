@@ -7,8 +7,8 @@ import pandas as pd
 
 from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, groups, listing, section, several, single
 from consistency.referee.document.blocks import Table
+from consistency.referee.document.colours import EXPECTED, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Panel, Points, Rule
-from consistency.referee.document.looks import EXPECTED, style
 from consistency.referee.pages.section import Part
 
 SENSOR = Part("sensor-issues", "The stereo sensor: biases and practical issues", "Sensor issues")

@@ -10,8 +10,8 @@ from scipy import stats
 
 from consistency.bench.pages.exhibits import Exhibit, Source, groups, listing, section, several, single
 from consistency.referee.document.blocks import Table
+from consistency.referee.document.colours import style
 from consistency.referee.document.drawing import Axis, Bars, Figure, Key, Line, Panel, Points, Sheet
-from consistency.referee.document.looks import style
 from consistency.referee.types import Array
 from consistency.stereo.pages.images import GAUSS, IMAGES, KEYS, SAMPLES
 

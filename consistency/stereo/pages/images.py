@@ -9,8 +9,8 @@ import pandas as pd
 
 from consistency.bench.pages.exhibits import Exhibit, Source, groups, listing, section, single
 from consistency.referee.document.blocks import Table
+from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, Look, style
 from consistency.referee.document.drawing import Axis, Bars, Figure, Key, Line, Panel, Points, Rule, Span, Stems
-from consistency.referee.document.looks import EXPECTED, LIMIT, SHADE, Look, style
 from consistency.referee.pages.section import Part
 
 IMAGES = Part("images", "The stereo sensor in rendered images", "Rendered images")

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.model import Report
-from consistency.bench.pages.tables import extra_table
+from consistency.bench.pages.experiment_tables import extra_table
+from consistency.bench.pages.report_input import Report
+from consistency.referee.document.colours import EXPECTED, SHADE, style
 from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span
-from consistency.referee.document.looks import EXPECTED, SHADE, style
 from consistency.referee.pages.section import FRONT_END, Section
 
 FILE = "frontend_fig23.parquet"

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Table, Text, table
+from consistency.referee.document.colours import COLOURS, EXPECTED, SHADE, Look, style
 from consistency.referee.document.drawing import (
     Axis,
     Band,
@@ -25,7 +26,6 @@ from consistency.referee.document.drawing import (
     Span,
     Stems,
 )
-from consistency.referee.document.looks import COLOURS, EXPECTED, SHADE, Look, style
 from consistency.referee.pages.provenance import facts
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate

@@ -6,8 +6,8 @@ import pandas as pd
 
 from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, section, several
 from consistency.referee.document.blocks import Table
+from consistency.referee.document.colours import COLOURS, EXPECTED, Look, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Panel, Points, Rule
-from consistency.referee.document.looks import COLOURS, EXPECTED, Look, style
 from consistency.referee.types import Array
 from consistency.stereo.pages.biases import SENSOR
 

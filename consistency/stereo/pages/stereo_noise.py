@@ -9,11 +9,11 @@ import pandas as pd
 from scipy import stats
 
 from consistency.bench.models.stereo import project, triangulate_jacobian
-from consistency.bench.pages.model import Report
-from consistency.bench.pages.tables import extra_table
+from consistency.bench.pages.experiment_tables import extra_table
+from consistency.bench.pages.report_input import Report
 from consistency.bench.types import Gaussian
+from consistency.referee.document.colours import Look, style
 from consistency.referee.document.drawing import Axis, Bars, Figure, Key, Line, Panel, Points, Sheet, xy
-from consistency.referee.document.looks import Look, style
 from consistency.referee.pages.section import Part, Section
 from consistency.referee.types import Array
 

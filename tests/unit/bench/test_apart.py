@@ -16,8 +16,8 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters.compiled import Compiled, Halted
-from consistency.bench.filters.kernel.apart import apart
-from consistency.bench.runs.isolating import Isolation
+from consistency.bench.filters.compiler.uninterrupted import apart
+from consistency.bench.runs.isolation.isolating import Isolation
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_what_was_given_up_is_waited_for_at_exit(seconds: float, ended: bool, tm
     """Compiled code that ends while Python shuts down would abort it."""
     program = f"""
 import os, signal, time, pathlib
-from consistency.bench.filters.kernel.apart import apart
+from consistency.bench.filters.compiler.uninterrupted import apart
 signal.signal(signal.SIGINT, signal.default_int_handler)
 def work():
     os.kill(os.getpid(), signal.SIGINT)
@@ -89,7 +89,7 @@ def test_what_cannot_be_stopped_is_not_waited_for(monkeypatch: pytest.MonkeyPatc
         os.kill(os.getpid(), signal.SIGINT)
         over.wait(20.0)
 
-    monkeypatch.setattr("consistency.bench.filters.kernel.apart.PATIENCE", 20.0)
+    monkeypatch.setattr("consistency.bench.filters.compiler.uninterrupted.PATIENCE", 20.0)
     begin = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         apart(work)
@@ -123,7 +123,7 @@ import atexit, ctypes, os, signal, sys, time
 libc = ctypes.CDLL(None)
 libc.on_exit(libc.abort, None)  # in place of a destructor
 atexit.register(print, "handled")
-from consistency.bench.filters.kernel.apart import apart
+from consistency.bench.filters.compiler.uninterrupted import apart
 signal.signal(signal.SIGINT, signal.default_int_handler)
 try:
     apart(lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep({seconds})))

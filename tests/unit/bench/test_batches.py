@@ -18,9 +18,9 @@ from consistency.bench.runs.backends.batches import Batch, Batches, Event, Worke
 from consistency.bench.runs.backends.choosing import backend_for
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
-from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.runs.work import Outcomes, Simulated, TrialWork
+from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
 from consistency.bench.store.results import open_results
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system.machine import this_machine

@@ -88,7 +88,7 @@ def test_rows_of_half_a_covariance(rng: np.random.Generator) -> None:
 KERNEL = """
 import numpy as np
 from consistency.bench.filters.kernel import blas
-from consistency.bench.filters.kernel.jit import Kernel
+from consistency.bench.filters.compiler.jit import Kernel
 
 def root_of(A):
     return blas.upper_cholesky(A)

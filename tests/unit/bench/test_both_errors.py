@@ -14,24 +14,24 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter, step_through
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.store.results import open_results
 from consistency.referee.cli import main
+from consistency.referee.column_names import OWN_COVARIANCE
 from consistency.referee.diagnostics import Interval, Settings, judge, map_score, sequential_design
-from consistency.referee.diagnostics.judging import judge_runs, with_map
-from consistency.referee.diagnostics.scale import ratio_interval
-from consistency.referee.diagnostics.verdict_parts import MapScore
+from consistency.referee.diagnostics.questions.scale import ratio_interval
+from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
+from consistency.referee.diagnostics.verdict.parts import MapScore
 from consistency.referee.document.map import map_text
 from consistency.referee.document.verdict import document
-from consistency.referee.gating.checks import of_results
-from consistency.referee.parsing.columns import OWN_COVARIANCE
+from consistency.referee.gating.input_checks import of_results
 from consistency.referee.show.as_json import render
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Failure
 from consistency.referee.verdicts.baselines import baseline
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 RUNS = 24
 KEYS = ["run", "step", "t", "x", "y", "heading"]

@@ -15,15 +15,16 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.results import open_results
-from consistency.referee.diagnostics import Evidence, Settings, blocks, judge, summary
-from consistency.referee.diagnostics.sample import sample_of
-from consistency.referee.diagnostics.symmetric import Symmetric
-from consistency.referee.diagnostics.whitening import all_finite, squared_length
+from consistency.referee.diagnostics import Evidence, Settings, judge, summary
+from consistency.referee.diagnostics.records import array_blocks
+from consistency.referee.diagnostics.records.sample import sample_of
+from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 STEPS = 200
 RUNS = 4000
@@ -79,8 +80,8 @@ def test_small_blocks_say_what_large_ones_do(settings: Settings, monkeypatch: py
     given.error[::7, 11:] = np.nan
     given.error[40:, 15:] *= 3.0
     whole = judge(given, settings)
-    monkeypatch.setattr(blocks, "ROWS", 400)
-    monkeypatch.setattr(blocks, "FEWER", 100)
+    monkeypatch.setattr(array_blocks, "ROWS", 400)
+    monkeypatch.setattr(array_blocks, "FEWER", 100)
     parts = judge(given, settings)
     assert parts.reasons == whole.reasons
     np.testing.assert_allclose(numbers(parts.statistics), numbers(whole.statistics), rtol=1e-12)
@@ -187,7 +188,7 @@ print(most() - before)
 READ = "from consistency.bench.store.results import open_results\n"
 WORK = {
     "analyse": READ
-    + "from consistency.referee.verdicts.judge import analyse\nwork = lambda f: analyse(open_results(f))",
+    + "from consistency.referee.verdicts.sources import analyse\nwork = lambda f: analyse(open_results(f))",
     "report": "from consistency.bench.pages.build import build_report as work",
     "baseline": "from consistency.referee.verdicts.baselines import read_baseline as work",
 }

@@ -15,11 +15,11 @@ from typing import Any
 import forks
 import pytest
 
-from consistency.bench.filters.kernel import foreseen, kept
-from consistency.bench.filters.kernel.content import Content
-from consistency.bench.filters.kernel.foreseen import FIRST
-from consistency.bench.filters.kernel.jit import Kernel, Outlook
-from consistency.bench.filters.kernel.slam import robot_width
+from consistency.bench.filters.compiler import compile_time, disk_cache
+from consistency.bench.filters.compiler.compile_time import FIRST
+from consistency.bench.filters.compiler.content_key import Content
+from consistency.bench.filters.compiler.jit import Kernel, Outlook
+from consistency.bench.filters.kernel.part_functions import robot_width
 from consistency.bench.runs import compiling
 from consistency.bench.runs.findings import experiments
 from consistency.bench.runs.montecarlo import resolve_filters
@@ -34,7 +34,7 @@ SCRIPT = """
 import multiprocessing, os, resource, signal, sys, time
 from pathlib import Path
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.kernel.jit import Kernel
+from consistency.bench.filters.compiler.jit import Kernel
 from consistency.bench.runs import compiling
 
 def total(values):
@@ -170,15 +170,15 @@ def test_kernels_of_root_serve_other_users(done: Done, folder: Path, monkeypatch
     out, err = done("nobody")
     assert out == "3.0 6.0 9.0 0 0 0"  # root's own cache is not for others to read
     assert "Permission denied" in err
-    kept.open_to_readers()
-    before = sorted(kept.folder().iterdir())
+    disk_cache.open_to_readers()
+    before = sorted(disk_cache.folder().iterdir())
     assert done("nobody") == ("3.0 6.0 9.0 1 1 1", "")
-    for path in kept.folder().glob("*.kernel"):
+    for path in disk_cache.folder().glob("*.kernel"):
         path.unlink()
     out, err = done("nobody")
     assert out == "3.0 6.0 9.0 0 0 0"
     assert err.count("is not kept") == 1
-    assert {*before} - {*kept.folder().iterdir()} == {path for path in before if path.suffix == ".kernel"}
+    assert {*before} - {*disk_cache.folder().iterdir()} == {path for path in before if path.suffix == ".kernel"}
 
 
 def test_what_others_cannot_read_is_compiled_here(capsys: pytest.CaptureFixture[str]) -> None:
@@ -210,26 +210,26 @@ def outer(x: float) -> float:
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    kept.folder().mkdir(mode=0o700)
-    return kept.folder() / foreseen.FILE
+    disk_cache.folder().mkdir(mode=0o700)
+    return disk_cache.folder() / compile_time.FILE
 
 
 def test_seconds_are_those_of_this_machine(cache: Path) -> None:
-    assert foreseen.seconds_for(10_000) == pytest.approx(10_000 * FIRST)
+    assert compile_time.seconds_for(10_000) == pytest.approx(10_000 * FIRST)
     cache.write_text("1000 2\nnonsense\n1000 4\n0 7\n1000 -1\n1000 nan\n2000 200\n")
-    assert foreseen.seconds_for(10_000) == pytest.approx(40.0)
-    cache.write_text("1 100\n" * 50 + "1000 2\n" * foreseen.RECENT)
-    assert foreseen.seconds_for(10_000) == pytest.approx(20.0)
+    assert compile_time.seconds_for(10_000) == pytest.approx(40.0)
+    cache.write_text("1 100\n" * 50 + "1000 2\n" * compile_time.RECENT)
+    assert compile_time.seconds_for(10_000) == pytest.approx(20.0)
 
 
 def test_what_compiling_took_is_kept(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foreseen.time, "monotonic", iter([0.0, 3.0, 5.0, 6.0, 7.0, 9.0]).__next__)
+    monkeypatch.setattr(compile_time.time, "monotonic", iter([0.0, 3.0, 5.0, 6.0, 7.0, 9.0]).__next__)
     for size in (1000.0, 500.0):
-        with foreseen.measured(size):
+        with compile_time.measured(size):
             pass
     assert cache.read_text() == "1000 3.000\n500 1.000\n"
-    monkeypatch.setattr(foreseen, "LONGEST", 5)
-    with foreseen.measured(10.0):
+    monkeypatch.setattr(compile_time, "LONGEST", 5)
+    with compile_time.measured(10.0):
         pass
     assert cache.read_text() == "10 2.000\n"
 
@@ -248,13 +248,13 @@ def test_what_only_chooses_a_body_has_no_size() -> None:
 
 
 def test_functions_that_were_compiled_before_count_less(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foreseen, "seconds_for", lambda size: size)
+    monkeypatch.setattr(compile_time, "seconds_for", lambda size: size)
     kernel = Kernel(total)
     first = kernel.outlook(1)
     assert (first.is_ready, first.is_shared, first.seconds) == (False, True, len(total.__code__.co_code))
     assert kernel(1.0) == 2.0
     assert kernel.outlook(1.0).is_ready
-    assert kernel.outlook(1) == first._replace(seconds=foreseen.AGAIN * first.seconds)
+    assert kernel.outlook(1) == first._replace(seconds=compile_time.AGAIN * first.seconds)
     assert float(cache.read_text().split()[0]) == first.seconds
 
 

@@ -16,10 +16,11 @@ from numba.core.runtime import context as runtime
 from numba.core.types import functions
 
 import consistency as cs
-from consistency.bench.filters.kernel import arrays, jit
-from consistency.bench.filters.kernel.inference import remembered_types
-from consistency.bench.runs.isolating import Isolation
-from consistency.bench.runs.work import Simulated, TrialWork
+from consistency.bench.filters.compiler import jit
+from consistency.bench.filters.compiler.type_inference import remembered_types
+from consistency.bench.filters.kernel import arrays
+from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.trial_work import Simulated, TrialWork
 from consistency.bench.simulation.world import World
 
 Counts = list[Any]
@@ -53,7 +54,7 @@ def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> Counts:
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Counts:
     """Calls whose type Numba has looked for."""
-    monkeypatch.setattr("consistency.bench.filters.kernel.inference._known", {})
+    monkeypatch.setattr("consistency.bench.filters.compiler.type_inference._known", {})
     return counted(monkeypatch, functions.BaseFunction, "get_call_type")
 
 

@@ -20,16 +20,16 @@ from forks import Program
 from numba.core import config
 from numba.core.registry import cpu_target
 
-from consistency.bench.filters.kernel import content, dispatch
-from consistency.bench.filters.kernel.content import Content
-from consistency.bench.filters.kernel.jit import Kernel
+from consistency.bench.filters.compiler import content_key, dispatch
+from consistency.bench.filters.compiler.content_key import Content
+from consistency.bench.filters.compiler.jit import Kernel
 
 SCRIPT = """
 import sys
 from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 import kinds, rules
-from consistency.bench.filters.kernel.jit import Kernel
+from consistency.bench.filters.compiler.jit import Kernel
 
 kernel = Kernel(rules.total)
 ready = 0
@@ -44,7 +44,7 @@ print(kernel.loaded, ready)
 KINDS = '''
 """Kinds of rules."""
 from typing import NamedTuple
-from consistency.bench.filters.kernel.dispatch import part
+from consistency.bench.filters.compiler.dispatch import part
 
 @part()
 class Single(NamedTuple):
@@ -59,8 +59,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import numbers_of_mine
-from consistency.bench.filters.kernel.dispatch import generic, implement
-from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.compiler.dispatch import generic, implement
+from consistency.bench.filters.compiler.jit import inner
 from kinds import Single, Triple
 from numbers_of_mine import THREE, shift
 
@@ -92,7 +92,7 @@ def total(rule, n):
     return values.sum()
 '''
 NUMBERS = '''
-from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.compiler.jit import inner
 
 ONE = 1.0
 THREE = (2.0,)
@@ -115,7 +115,7 @@ def script(tmp_path: Path) -> Path:
 
 IMPORTS = """
 import numba, pandas, pydantic, scipy.stats
-from consistency.bench.filters.kernel.jit import Kernel
+from consistency.bench.filters.compiler.jit import Kernel
 
 numba.njit(lambda x: x + 1.0)(1.0)  # the first of a process takes long
 """
@@ -220,19 +220,19 @@ def test_what_other_kernels_are_made_of_is_no_content(key: Keys) -> None:
 def test_settings_are_content(key: Keys, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
     before = key()
     monkeypatch.setattr(config, setting, 17)
-    content._versions.cache_clear()
+    content_key._versions.cache_clear()
     assert key() != before
     monkeypatch.undo()
-    content._versions.cache_clear()
+    content_key._versions.cache_clear()
 
 
 def test_the_processor_is_content(key: Keys, monkeypatch: pytest.MonkeyPatch) -> None:
     before, codegen = key(), cpu_target.target_context.codegen()
     monkeypatch.setattr(codegen, "magic_tuple", lambda: ("x86_64", "another", ""))
-    content._versions.cache_clear()
+    content_key._versions.cache_clear()
     assert key() != before
     monkeypatch.undo()
-    content._versions.cache_clear()
+    content_key._versions.cache_clear()
 
 
 def test_what_cannot_be_compared_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

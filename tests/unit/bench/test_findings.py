@@ -101,7 +101,7 @@ def test_scripts_are_said_as_they_begin(
     scripts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(module, "WAITING", 0.2)
-    said = "import time; from consistency.referee.terminal.progress import say; say('inside'); time.sleep(1)"
+    said = "import time; from consistency.referee.system.progress import say; say('inside'); time.sleep(1)"
     write(scripts, 2, ("two",), "OWN_PROCESS = True", said)
     reproduce(["one", "two"], 5, 0, 2, tmp_path / "out")
     lines = capfd.readouterr().err.splitlines()

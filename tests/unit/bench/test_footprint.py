@@ -14,13 +14,13 @@ from consistency.bench.filters.covariance_update.local import Local as Locally
 from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.kernel.local_state import make_factors
 from consistency.bench.filters.kernel.loop import _make_memory
-from consistency.bench.filters.kernel.slam import Data, Slam, make_local
-from consistency.bench.runs import footprint as module
-from consistency.bench.runs import touched_memory as touched
+from consistency.bench.filters.kernel.part_functions import Data, Slam, make_local
+from consistency.bench.runs import memory_needed as module
+from consistency.bench.runs import memory_touched as touched
 from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.footprint import footprint, memory_here, trial_bytes, workers_that_fit
-from consistency.bench.runs.isolating import Isolation
-from consistency.bench.runs.work import Recorded, TrialWork
+from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.memory_needed import footprint, memory_here, trial_bytes, workers_that_fit
+from consistency.bench.runs.trial_work import Recorded, TrialWork
 from consistency.referee.errors import InputError
 
 GIB = 2**30

@@ -22,10 +22,10 @@ import pytest
 from edited import accept_changes
 
 import consistency as cs
-from consistency.bench.runs import gather, work
+from consistency.bench.runs import gather, trial_work
 from consistency.bench.runs.backends import local
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.runs.work import TrialWork
+from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.simulation import World
 from consistency.bench.store import parquet
 from consistency.bench.store.results import StoredResults, open_results
@@ -176,7 +176,7 @@ def test_few_outcomes_wait_for_their_turn(uvd: cs.Scenario, tmp_path: Path, monk
         most.append(len(alive))
         return outcome
 
-    monkeypatch.setattr(work, "outcome_of", counted)
+    monkeypatch.setattr(trial_work, "outcome_of", counted)
     monkeypatch.setattr(local, "AHEAD", 2)
     cs.run_trials(uvd, ["ekf-uvd"], 60, jobs=2, out=tmp_path / "out")
     assert len(most) == 60

@@ -24,9 +24,9 @@ from threadpoolctl import threadpool_info
 
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter
-from consistency.bench.runs import isolating, supervising
 from consistency.bench.runs.gather import Gathered
-from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.isolation import isolating, supervising
+from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Control, Observation

@@ -26,7 +26,7 @@ def test_numba_knows_what_is_jitable_once_it_is_told() -> None:
     assert calls(1.5) == doubled(1.5) == 3.0
 
 
-@pytest.mark.parametrize(("module", "loads"), [("runs.records", False), ("store.trial_rows", True)])
+@pytest.mark.parametrize(("module", "loads"), [("runs.results_to_records", False), ("store.trial_rows", True)])
 def test_a_verdict_on_results_loads_no_numba(module: str, loads: bool) -> None:
     code = f"import sys, consistency.bench.{module}; sys.exit(('numba' in sys.modules) != {loads})"
     subprocess.run([sys.executable, "-c", code], check=True)

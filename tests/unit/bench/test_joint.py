@@ -11,12 +11,12 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.filters import get_filter
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.diagnostics import Evidence, JointNees, Settings, Verdict, judge
-from consistency.referee.diagnostics.joint import joint_test, near
-from consistency.referee.diagnostics.landmarks import joint_nees
-from consistency.referee.diagnostics.questions import JOINT, JOINT_DISTRIBUTION
+from consistency.referee.diagnostics.maps.joint_nees import joint_test, near
+from consistency.referee.diagnostics.maps.map_score import joint_nees
+from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
 from consistency.referee.geometry.conventions import planar_error, planar_map_error
 from consistency.referee.types import Array
 

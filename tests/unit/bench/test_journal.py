@@ -30,8 +30,8 @@ from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.results import open_results
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system import folders, stopping
+from consistency.referee.system.progress import progress, say
 from consistency.referee.system.stopping import Stop, stoppable
-from consistency.referee.terminal.progress import progress, say
 
 FILTER = ["ekf-uvd"]
 RUNS = 6

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from consistency.bench.filters.kernel import jit, kept, whole
+from consistency.bench.filters.compiler import disk_cache, jit, whole_program
 
 
 def total(n: int) -> float:
@@ -23,7 +23,7 @@ def total(n: int) -> float:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where kernels of this test are kept."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    kept._say.cache_clear()
+    disk_cache._say.cache_clear()
     return tmp_path / "cache"
 
 
@@ -37,7 +37,7 @@ def use() -> tuple[bool, int]:
 
 
 def code_in(cache: Path) -> Path:
-    (path,) = cache.rglob(f"*{kept.SUFFIX}")
+    (path,) = cache.rglob(f"*{disk_cache.SUFFIX}")
     return path
 
 
@@ -114,25 +114,25 @@ def test_code_that_cannot_be_kept_serves_its_process(
 
     monkeypatch.setattr(Path, "replace", full)
     assert use() == (False, 0)
-    assert not list(cache.rglob(".*")) + list(cache.rglob(f"*{kept.SUFFIX}"))
+    assert not list(cache.rglob(".*")) + list(cache.rglob(f"*{disk_cache.SUFFIX}"))
     assert capsys.readouterr().err.count("No space left on device; compiled code is not kept") == 1
 
 
 def test_what_was_not_used_for_longest_is_removed_first(tmp_path: Path) -> None:
     for age, name in enumerate("abcd"):
-        path = tmp_path / f"{name}{kept.SUFFIX}"
+        path = tmp_path / f"{name}{disk_cache.SUFFIX}"
         path.write_bytes(bytes(100))
         os.utime(path, (1e9 - age, 1e9 - age))
     unfinished, stale = tmp_path / ".new", tmp_path / ".old"
     for path, time in ((unfinished, 1e9), (stale, 1e9 - 2e5)):
         path.write_bytes(b"")
         os.utime(path, (time, time))
-    kept.prune(tmp_path, most=250)
+    disk_cache.prune(tmp_path, most=250)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".new", "a.kernel", "b.kernel"]
 
 
 def test_an_untried_numba_compiles_as_it_does(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whole, "numba", SimpleNamespace(__version__="99.1"))
-    assert not whole.is_supported()
+    monkeypatch.setattr(whole_program, "numba", SimpleNamespace(__version__="99.1"))
+    assert not whole_program.is_supported()
     assert use() == (False, 0)
     assert use() == (True, 1)

@@ -12,7 +12,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.work import TrialWork as Runs
+from consistency.bench.runs.trial_work import TrialWork as Runs
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.trial_rows import RunOutcome

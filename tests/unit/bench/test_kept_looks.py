@@ -16,7 +16,7 @@ import consistency as cs
 from consistency.bench.runs import gather, sequential
 from consistency.bench.runs.montecarlo import Interrupted, run_log, simulate_log
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.bench.runs.work import TrialWork
+from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import StoredResults, open_results
 from consistency.bench.store.trial_rows import RunOutcome

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_info
 import consistency as cs
 import consistency.bench.filters
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.loop import trial_kernel
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.models.motion import dead_reckoning

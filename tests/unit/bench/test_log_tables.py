@@ -15,7 +15,7 @@ from consistency.bench.store.log import read_log
 from consistency.referee.cli import main
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import read_manifest
-from consistency.stereo.characterising.recorded import is_log
+from consistency.stereo.characterising.from_log import is_log
 
 NAMES = ("controls", "observations", "truth", "landmarks")
 

@@ -9,20 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from consistency.bench.filters.belief_parts import sensor_of
 from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.covariance_update.dense import Dense
 from consistency.bench.filters.error.additive import Additive
-from consistency.bench.filters.kernel.measuring import linearise, linearise_at, observe, place_observed
-from consistency.bench.filters.kernel.slam import Slam, State, robot_frame
-from consistency.bench.filters.kernel.work import make_work
+from consistency.bench.filters.kernel.observation_model import linearise, linearise_at, observe, place_observed
+from consistency.bench.filters.kernel.part_functions import Slam, State, robot_frame
+from consistency.bench.filters.kernel.work_arrays import make_work
 from consistency.bench.filters.landmark.world_point import WorldPoint
 from consistency.bench.filters.motion import unicycle
-from consistency.bench.filters.parts import sensor_of
 from consistency.bench.filters.point.at_estimate import AtEstimate
 from consistency.bench.filters.point.reference import Reference, place_about_reference
 from consistency.bench.filters.textbook.basics import Unicycle
 from consistency.bench.filters.textbook.sensors import PointSensor
-from consistency.bench.filters.update.joint import Joint
+from consistency.bench.filters.update.joint_update import Joint
 from consistency.bench.models import motion, point, stereo
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.types import Control

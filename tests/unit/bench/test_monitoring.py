@@ -18,13 +18,13 @@ import consistency as cs
 from consistency.referee.document.blocks import Document
 from consistency.referee.document.monitor import monitor_document
 from consistency.referee.errors import InputError
-from consistency.referee.pages import require_plot, write_monitor_plot
 from consistency.referee.pages.monitor import POINTS, averaged, monitor_plot, sheet
-from consistency.referee.readers.nis import NisLog
+from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
+from consistency.referee.readers.formats.innovation_files import NisLog
 from consistency.referee.show import with_matplotlib
 from consistency.referee.show.as_json import render
 from consistency.referee.show.terminal import show
-from consistency.referee.verdicts.monitoring import Watched, make_monitor, read_innovations, watch, watch_lines
+from consistency.referee.verdicts.monitor_sources import Watched, make_monitor, read_innovations, watch, watch_lines
 
 NIS = [1.0, 2.5, math.nan, 0.25, 7.0]
 DOF = [2, 2, 0, 1, 3]

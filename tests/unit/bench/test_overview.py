@@ -12,7 +12,7 @@ import pytest
 import consistency as cs
 from consistency.bench.pages.answer import answer
 from consistency.bench.pages.build import build_report, compose
-from consistency.bench.pages.model import Report
+from consistency.bench.pages.report_input import Report
 from consistency.bench.pages.sections import overview
 from consistency.referee.document.blocks import Document, Name, Status, Table
 from consistency.referee.document.drawing import Figure, Intervals, Span

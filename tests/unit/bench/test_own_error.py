@@ -20,8 +20,8 @@ from consistency.bench.store.log import read_log
 from consistency.bench.store.results import OWN_NUMBERS, joined, open_results
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Estimates, Map, Trial
+from consistency.referee.column_names import OWN_COVARIANCE, POINT_COVARIANCE
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.parsing.columns import OWN_COVARIANCE, POINT_COVARIANCE
 from consistency.referee.types import Array, Failure
 
 FILTERS = ["ekf-uvd", Invariant()]

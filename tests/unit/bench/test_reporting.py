@@ -20,7 +20,7 @@ import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.answer import answer
 from consistency.bench.pages.build import build_report, compose
-from consistency.bench.pages.model import Report, Study, Track
+from consistency.bench.pages.report_input import Report, Study, Track
 from consistency.bench.pages.sections import (
     anees,
     first_order,
@@ -35,18 +35,18 @@ from consistency.bench.pages.sections import (
 from consistency.bench.runs.findings import Finding
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.results import read_results
+from consistency.referee.column_names import COVARIANCE
 from consistency.referee.diagnostics import Answer, Evidence, Interval, Settings, judge
-from consistency.referee.diagnostics.questions import DIRECTION, STEP
-from consistency.referee.diagnostics.verdict_in_words import short
-from consistency.referee.diagnostics.verdict_parts import STATUSES
+from consistency.referee.diagnostics.verdict.answers import DIRECTION, STEP
+from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.words.sentences import short
 from consistency.referee.document.blocks import Document
 from consistency.referee.document.drawing import Figure, Intervals, Line, Points, Span
-from consistency.referee.document.thin import thin
+from consistency.referee.document.fewer_points import thin
 from consistency.referee.document.verdict import FURTHER, factor, page, shown_inside
 from consistency.referee.document.wording import written
 from consistency.referee.pages import axes, questions, verdicts
 from consistency.referee.pages.clock import clock_of
-from consistency.referee.parsing.columns import COVARIANCE
 from consistency.referee.show import html, pdf
 from consistency.referee.types import Failure
 from consistency.stereo.pages import scenes, stereo_noise

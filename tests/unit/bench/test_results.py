@@ -18,10 +18,10 @@ from edited import accept_changes
 
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
-from consistency.bench.runs.records import record_of
+from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.parquet import check_column
 from consistency.bench.types import Control, Gaussian, Observation
-from consistency.referee.parsing.columns import COLUMNS
+from consistency.referee.column_names import COLUMNS
 from consistency.referee.system.folders import require_free
 
 TABLES = ("estimates", "failures", "truth", "landmarks", "map")

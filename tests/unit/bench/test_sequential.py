@@ -113,7 +113,7 @@ def test_runs_are_those_of_a_plain_run_and_the_plan_is_kept() -> None:
 
 
 def test_an_interrupted_plan_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    from consistency.bench.runs.work import TrialWork
+    from consistency.bench.runs.trial_work import TrialWork
 
     scenario = cs.load_scenario("linear-gaussian").variant("short", **SHORT)
     one, calls = TrialWork.__call__, []

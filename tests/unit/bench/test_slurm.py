@@ -14,9 +14,9 @@ import consistency as cs
 from consistency.bench.runs.backends import slurm
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.backends.slurm import Slurm, options_of
-from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.runs.work import Outcomes, Simulated, TrialWork
+from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
 
 pytestmark = [
     pytest.mark.skipif(os.name == "nt", reason="signals"),

@@ -32,8 +32,8 @@ from consistency.bench.tuning.why import with_noise
 from consistency.bench.tuning.writing import as_data
 from consistency.referee.cli import main
 from consistency.referee.diagnostics import Settings
-from consistency.referee.diagnostics.verdict_in_words import short
-from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.words.sentences import short
 from consistency.referee.geometry import pose_error
 from consistency.referee.geometry.conventions import planar_error
 

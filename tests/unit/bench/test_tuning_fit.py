@@ -9,7 +9,7 @@ import pytest
 from scipy import optimize, stats
 
 from consistency.bench.tuning.fit import LIMIT, FactorFit, _derivatives, _Search, maximise
-from consistency.bench.tuning.profile import UNITS, Profile, _guess
+from consistency.bench.tuning.profile_intervals import UNITS, Profile, _guess
 from consistency.referee.types import Array
 
 SIGMAS = 4.8  # bound on a normal number, so that each assertion fails by chance in less than 1e-5 of all runs

@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 import consistency as cs
 from consistency.referee.cli.app import app
-from consistency.referee.diagnostics import Evidence, Settings, fitted, judge
-from consistency.referee.diagnostics.equivalence import equivalence
-from consistency.referee.diagnostics.fitted import (
+from consistency.referee.diagnostics import Evidence, Settings, judge
+from consistency.referee.diagnostics.imperfect_truth import residuals_of_fit
+from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import (
     _at_most,
     _binned,
     _bins,
@@ -31,17 +31,19 @@ from consistency.referee.diagnostics.fitted import (
     inflation_of_mean,
     left_covariances,
 )
-from consistency.referee.diagnostics.questions import BIAS
+from consistency.referee.diagnostics.questions.equivalence import equivalence
+from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers import offset, residuals
-from consistency.referee.readers.alignment import Aligned
-from consistency.referee.readers.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.offset import clocks_and_frames
+from consistency.referee.readers import clock_offset
+from consistency.referee.readers.alignment import residuals
+from consistency.referee.readers.alignment.align import Aligned
+from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
+from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned
+from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
+from consistency.referee.readers.clock_offset import clocks_and_frames
+from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.poses import Poses
-from consistency.referee.readers.residuals import ALL_BUT_SCALE, FREE, aligned
-from consistency.referee.readers.sheet import Places
-from consistency.referee.readers.world_frames import WorldTransform, moved
 from consistency.referee.types import Array
 
 STEPS = 30
@@ -232,7 +234,7 @@ def test_shares_are_those_of_the_expected_products(tangents: list[Array]) -> Non
 @pytest.fixture
 def sure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors are called oscillating by chance in one of ten million tests."""
-    monkeypatch.setattr(fitted, "DOUBT", 1e-7)
+    monkeypatch.setattr(residuals_of_fit, "DOUBT", 1e-7)
 
 
 def residuals_of(
@@ -598,7 +600,7 @@ def test_clock_and_frame_are_found_in_turn_until_the_clock_settles(
     """To 0.1 ms, or five times."""
     then = iter(shifts)
     monkeypatch.setattr(residuals, "frames_of", lambda *_: [])
-    monkeypatch.setattr(offset, "clock_shift", lambda *_: (next(then), []))
+    monkeypatch.setattr(clock_offset, "clock_shift", lambda *_: (next(then), []))
     monkeypatch.setattr(residuals, "aligned", lambda *_: Aligned([]))
     assert clocks_and_frames("est", [], "estimate", "posyaw", range(3))[0] == said
 

@@ -146,7 +146,7 @@ def test_complex_numbers_are_refused(files: Path, key: str) -> None:
 
 
 def test_a_singular_matrix_of_a_camera_is_named(files: Path) -> None:
-    from consistency.stereo.vision.calibration import read_calibration
+    from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
 
     path = files / "kitti" / "calib.txt"
     path.write_text(path.read_text(encoding="utf-8").replace("P1: 700", "P1: 0"), encoding="utf-8")
@@ -171,7 +171,7 @@ def test_a_singular_matrix_of_a_camera_is_named(files: Path) -> None:
 def test_yaml_that_is_hostile(tmp_path: Path, text: str, said: str) -> None:
     pytest.importorskip("yaml")
     pytest.importorskip("cv2")
-    from consistency.stereo.vision.calibration import read_calibration
+    from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
 
     path = tmp_path / "c.yaml"
     path.write_text(text, encoding="utf-8")

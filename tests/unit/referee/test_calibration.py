@@ -20,7 +20,8 @@ from calibration_rows import Row, kept
 from recorded import read_recordings
 from scipy import stats
 
-from consistency.referee.diagnostics import nees, nis_of
+from consistency.referee.diagnostics import nis_of
+from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import planar_error
 
 ROOT = Path(__file__).parents[3]

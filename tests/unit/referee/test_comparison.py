@@ -15,12 +15,12 @@ from scipy import optimize, special, stats
 
 import consistency as cs
 from consistency.referee.diagnostics import Comparison, RunSummary, compare, summary
-from consistency.referee.diagnostics.log_ratio import Contrast, contrast, margin
+from consistency.referee.diagnostics.statistics.log_ratio import Contrast, contrast, margin
 from consistency.referee.gating.session import needed_at
 from consistency.referee.gating.watch import Watch, watching
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
-from consistency.referee.verdicts.comparison import Compared, compare_filters, compare_with
+from consistency.referee.verdicts.compare_sources import Compared, compare_filters, compare_with
 from consistency.testing import InsufficientTrials, assert_not_worse
 
 RATE = 1e-5  # false-failure rate of each statistical assertion below

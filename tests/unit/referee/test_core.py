@@ -79,10 +79,11 @@ print(*(name.removeprefix("consistency.referee.") for name in sys.modules if nam
 """
     ours = said(folder, code).split()
     assert len(ours) <= 90
-    assert {"readers.table", "diagnostics.scale"} <= {*ours}
+    assert {"readers.formats.table", "diagnostics.questions.scale"} <= {*ours}
     assert not {*ours} & {
-        "readers.bags", "readers.tum", "readers.archive", "readers.relative", "readers.mix_ups", "readers.residuals",
-        "diagnostics.monitor", "diagnostics.comparison", "diagnostics.uncertain_truth", "diagnostics.joint",
+        "readers.formats.ros_bag", "readers.formats.tum", "readers.formats.numpy_archive", "readers.relative_motions",
+        "readers.mix_ups.known", "readers.alignment.residuals", "diagnostics.comparison", "diagnostics.maps.joint_nees",
+        "diagnostics.monitoring.monitor", "diagnostics.imperfect_truth.uncertain_truth",
     }  # fmt: skip
 
 

@@ -13,11 +13,11 @@ import pytest
 from scipy import stats
 
 from consistency.referee.cli import main
-from consistency.referee.diagnostics.gate_ratios import GateRatios
+from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
 from consistency.referee.errors import InputError
-from consistency.referee.readers.dataflash import read_ratios
+from consistency.referee.readers.formats.ardupilot_log import read_ratios
 from consistency.referee.types import Array
-from consistency.referee.verdicts.monitoring import read_innovations
+from consistency.referee.verdicts.monitor_sources import read_innovations
 
 pytest.importorskip("pymavlink", reason="needs the extra 'ardupilot'")
 

@@ -13,7 +13,7 @@ from draws import autoregression, fully_dependent, independent, slow_axis, verdi
 from scipy import stats
 
 from consistency.referee.diagnostics import largest_direction, ratio_interval
-from consistency.referee.diagnostics.scale import scale_test
+from consistency.referee.diagnostics.questions.scale import scale_test
 from consistency.referee.types import Array
 
 SURE = 1e-5

@@ -12,9 +12,9 @@ import pytest
 
 from consistency.referee.diagnostics import Comparison, Evidence, Interval, MapScore, judge
 from consistency.referee.diagnostics.comparison import Difference
-from consistency.referee.diagnostics.questions import ABOUT, ALONE
-from consistency.referee.diagnostics.verdict_in_words import reasons
-from consistency.referee.diagnostics.verdict_parts import JointScore, RejectionScore
+from consistency.referee.diagnostics.verdict.answers import ABOUT, ALONE
+from consistency.referee.diagnostics.verdict.parts import JointScore, RejectionScore
+from consistency.referee.diagnostics.words.sentences import reasons
 from consistency.referee.document.blocks import (
     Answer,
     Bullets,
@@ -33,9 +33,9 @@ from consistency.referee.document.blocks import (
     Text,
     table,
 )
+from consistency.referee.document.colours import style
 from consistency.referee.document.comparison import comparison_table
 from consistency.referee.document.guard import rejection_cells, rejection_text
-from consistency.referee.document.looks import style
 from consistency.referee.document.map import COLUMNS, map_cells, map_lines, map_text
 from consistency.referee.document.plan import plan_lines
 from consistency.referee.document.verdict import FURTHER, TERMINAL, cells, document, page, with_values

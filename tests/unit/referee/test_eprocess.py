@@ -14,7 +14,8 @@ import pytest
 from draws import autoregression, fully_dependent, independent, slow_axis
 from scipy import integrate, stats
 
-from consistency.referee.diagnostics import e_process, eprocess, ever
+from consistency.referee.diagnostics import e_process, ever
+from consistency.referee.diagnostics.planning import e_process as betting
 from consistency.referee.types import Array
 
 SIGMAS = 5.0
@@ -23,7 +24,7 @@ STAKES = [("up", stake) for stake in (0.1, 0.25, 0.5, 1.0)] + [("down", stake) f
 
 def only(monkeypatch: pytest.MonkeyPatch, side: str, stake: float) -> None:
     """One stake in place of the mixture."""
-    monkeypatch.setattr(eprocess, side.upper(), np.array([stake]))
+    monkeypatch.setattr(betting, side.upper(), np.array([stake]))
 
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(60)
@@ -41,7 +42,7 @@ def mean_of_a_bet(side: str, n: int, ratio: float = 1.0, kink: float = 1.0) -> f
 
 
 def test_the_stakes_are_these() -> None:
-    assert [("up", s) for s in eprocess.UP] + [("down", s) for s in eprocess.DOWN] == STAKES
+    assert [("up", s) for s in betting.UP] + [("down", s) for s in betting.DOWN] == STAKES
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])

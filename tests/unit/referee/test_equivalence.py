@@ -12,9 +12,13 @@ import pytest
 from draws import independent, verdict_on
 from scipy import stats
 
-from consistency.referee.diagnostics import Evidence, Settings, e_process, equivalence, ever, judge, nis_test
-from consistency.referee.diagnostics.equivalence import equivalence_by_betting, equivalence_of_innovations
-from consistency.referee.diagnostics.scale import scale_test
+from consistency.referee.diagnostics import Evidence, Settings, e_process, ever, judge, nis_test
+from consistency.referee.diagnostics.questions.equivalence import (
+    equivalence,
+    equivalence_by_betting,
+    equivalence_of_innovations,
+)
+from consistency.referee.diagnostics.questions.scale import scale_test
 from consistency.referee.types import Array
 
 SURE = 1e-5

@@ -19,14 +19,14 @@ from fit_covariance import drives
 
 import consistency as cs
 from consistency.referee.cli.app import main
-from consistency.referee.diagnostics.export import flat, plain
+from consistency.referee.diagnostics.verdict.as_dictionary import flat, plain
 from consistency.referee.extras import is_installed
-from consistency.referee.fitting.drives import Drive, drive_of
-from consistency.referee.fitting.noise_model import NoiseModel
-from consistency.referee.fitting.snippets import ceres, gtsam, robot_localization, seconds, straight, toml
-from consistency.referee.fitting.writing import write_model
+from consistency.referee.fit_covariance.drives import Drive, drive_of
+from consistency.referee.fit_covariance.noise_model import NoiseModel
+from consistency.referee.fit_covariance.snippets import ceres, gtsam, robot_localization, seconds, straight, toml
+from consistency.referee.fit_covariance.writing import write_model
 from consistency.referee.geometry.groups import composed, vectors
-from consistency.referee.parsing.options import Reading
+from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array
 
 SPAN = "10m"

@@ -10,13 +10,13 @@ from fit_covariance import PER_M, World, drives, matrices_of
 
 import consistency as cs
 from consistency.referee.errors import InputError
-from consistency.referee.fitting.drives import Drive
-from consistency.referee.fitting.noise import fit_noise
-from consistency.referee.fitting.persistence import TERMS, Lasting, persistent
-from consistency.referee.fitting.ratios import Ratio
-from consistency.referee.fitting.refusals import Growth, body_turn, growth_of, revisits
-from consistency.referee.fitting.windows import span_of, windows_of
-from consistency.referee.fitting.wording import lines, sentence
+from consistency.referee.fit_covariance.covariance_ratios import Ratio
+from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.persistence import TERMS, Lasting, persistent
+from consistency.referee.fit_covariance.refusals import Growth, body_turn, growth_of, revisits
+from consistency.referee.fit_covariance.white_noise import fit_noise
+from consistency.referee.fit_covariance.windows import span_of, windows_of
+from consistency.referee.fit_covariance.wording import lines, sentence
 from consistency.referee.geometry.groups import composed, inverse, vectors
 from consistency.referee.types import Array
 

@@ -11,7 +11,7 @@ from test_layouts import STEPS, drive, lines, tum
 
 import consistency as cs
 from consistency.referee.cli import main
-from consistency.referee.readers.geodetic import axes_at, centred, leap_seconds, read_solution
+from consistency.referee.readers.formats.geodetic import axes_at, centred, leap_seconds, read_solution
 from consistency.referee.types import Array
 
 START = dt.datetime(2024, 3, 5, 10, 0, 0)  # of GPS, 18 s ahead of UTC

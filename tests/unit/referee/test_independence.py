@@ -8,9 +8,9 @@ import pytest
 from scipy import signal, stats
 
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.diagnostics.early_ending import early_ends
-from consistency.referee.diagnostics.export import flat
-from consistency.referee.diagnostics.independence import ALIKE, ENOUGH, FEWEST, RATE, SIZES, independence
+from consistency.referee.diagnostics.questions.early_ending import early_ends
+from consistency.referee.diagnostics.questions.independence import ALIKE, ENOUGH, FEWEST, RATE, SIZES, independence
+from consistency.referee.diagnostics.verdict.as_dictionary import flat
 from consistency.referee.types import Array
 
 SURE = 1e-5  # false-failure rate of each statistical assertion

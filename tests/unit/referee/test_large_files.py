@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from consistency.referee.diagnostics.blocks import FEWER as ROWS
+from consistency.referee.diagnostics.records.array_blocks import FEWER as ROWS
 from consistency.referee.errors import InputError
-from consistency.referee.readers import text_blocks
-from consistency.referee.readers.record import symmetric
-from consistency.referee.readers.sheet import Block, read_numbers, read_sheet
+from consistency.referee.readers.formats import text_blocks
+from consistency.referee.readers.formats.sheet import Block, read_numbers, read_sheet
+from consistency.referee.readers.runs_to_record import symmetric
 
 LAYOUT = "t and two numbers"
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from consistency.referee.diagnostics import early_ending, laws
+from consistency.referee.diagnostics.questions import early_ending
+from consistency.referee.diagnostics.statistics import distributions as laws
 
 DOF = np.array([1.0, 2.0, 2.5, 3.0, 6.0, 15.0, 1e3, 1e5])[:, None]
 TAILS = np.concatenate([10.0 ** np.linspace(-14, 0, 60), 1.0 - 10.0 ** np.linspace(-14, -1, 30), [0.0, 0.5, np.nan]])
@@ -18,7 +19,10 @@ VALUES = np.concatenate([np.geomspace(1e-6, 1e4, 80), [-1.0, 0.0, np.inf, np.nan
 
 @pytest.mark.parametrize("name", ["cdf", "sf"])
 def test_chi_square_and_student(name: str) -> None:
-    for ours, theirs, x in ((laws.chi2, stats.chi2, VALUES), (laws.t, stats.t, np.append(VALUES, -VALUES))):
+    for ours, theirs, x in (
+        (laws.chi2, stats.chi2, VALUES),
+        (laws.t, stats.t, np.append(VALUES, -VALUES)),
+    ):
         np.testing.assert_array_equal(getattr(ours, name)(x, DOF), getattr(theirs, name)(x, DOF))
 
 

@@ -13,9 +13,10 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.offset import Offset, clock_shift, offset_of, steps_of
+from consistency.referee.readers import clock_offset
+from consistency.referee.readers.clock_offset import Offset, clock_shift, offset_of, steps_of
+from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.poses import Poses
-from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array
 
 SIGMA = np.array([0.3, 0.3, 0.02])
@@ -61,7 +62,7 @@ def test_a_step_goes_to_the_offset(rng: np.random.Generator) -> None:
 def test_the_interval_by_hand(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Student's t of the steps that five runs would go from the offset: 2.7764 standard errors with 4 of freedom."""
     steps = iter([0.001, -0.002, 0.004, 0.0, 0.002])
-    monkeypatch.setattr("consistency.referee.readers.offset.steps_of", lambda *_: np.array([next(steps)]))
+    monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.array([next(steps)]))
     found = offset_of([run_of(rng, 0.04, noise=1e-3) for _ in range(5)])
     assert found is not None
     reach = 2.776445 * np.sqrt(5e-6 / 5)  # squares about the mean of 0.001 add up to 20e-6
@@ -86,10 +87,8 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(
         return np.array([0.001, -0.001, np.nan, 0.0])
 
     slope = (nees - then) / 0.04**2
-    monkeypatch.setattr(
-        "consistency.referee.readers.offset._size", lambda _, shift, __: then + slope * (shift - 0.04) ** 2
-    )
-    monkeypatch.setattr("consistency.referee.readers.offset.steps_of", steps)
+    monkeypatch.setattr(clock_offset, "_size", lambda _, shift, __: then + slope * (shift - 0.04) ** 2)
+    monkeypatch.setattr(clock_offset, "steps_of", steps)
     found = offset_of([run_of(rng, 0.0)])
     assert found is not None
     assert asked == [12]
@@ -107,15 +106,15 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(
 def test_steps_that_agree_are_certain_and_two_are_none(
     steps: tuple[float, ...], p: float | None, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("consistency.referee.readers.offset._size", lambda _, shift, __: 1.0 + (shift - 0.04) ** 2)
-    monkeypatch.setattr("consistency.referee.readers.offset.steps_of", lambda *_: np.array(steps))
+    monkeypatch.setattr(clock_offset, "_size", lambda _, shift, __: 1.0 + (shift - 0.04) ** 2)
+    monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.array(steps))
     found = offset_of([run_of(rng, 0.0)])
     assert (None if found is None else found.p_value) == p
 
 
 def test_steps_that_agree_on_no_offset_find_none(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("consistency.referee.readers.offset._size", lambda _, shift, __: 1.0 + abs(shift))
-    monkeypatch.setattr("consistency.referee.readers.offset.steps_of", lambda *_: np.zeros(4))
+    monkeypatch.setattr(clock_offset, "_size", lambda _, shift, __: 1.0 + abs(shift))
+    monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.zeros(4))
     found = offset_of([run_of(rng, 0.0)])
     assert found is not None
     assert (found.value, found.p_value) == (0.0, 1.0)
@@ -244,7 +243,7 @@ def test_what_has_truth_is_judged_at_every_offset(rng: np.random.Generator, monk
         asked.append(bool(judged.all()))
         return 1.0 + (shift - 0.04) ** 2
 
-    monkeypatch.setattr("consistency.referee.readers.offset._size", size)
+    monkeypatch.setattr(clock_offset, "_size", size)
     run = run_of(rng, 0.0)
     within = (run.true_t >= run.t[0]) & (run.true_t <= run.t[-1] + 1e-9)  # any shift leaves some without truth
     offset_of([replace(run, true_t=run.true_t[within], truth=run.truth[within])])

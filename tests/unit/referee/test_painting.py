@@ -12,6 +12,7 @@ from bokeh.models.annotations import BoxAnnotation
 from bokeh.models.annotations import Span as Across
 from matplotlib.colors import to_hex
 
+from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SHADE, style
 from consistency.referee.document.drawing import (
     Axis,
     Band,
@@ -31,7 +32,6 @@ from consistency.referee.document.drawing import (
     kept,
     numbers,
 )
-from consistency.referee.document.looks import BAND, EXPECTED, LIMIT, SHADE, style
 from consistency.referee.show import with_matplotlib
 from consistency.referee.show.with_bokeh import MARKERS, Screen
 

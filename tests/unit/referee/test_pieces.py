@@ -12,10 +12,10 @@ from scipy import signal
 
 import consistency as cs
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.diagnostics.independence import independence
-from consistency.referee.diagnostics.log_pieces import LEAST, in_pieces, memory_of
-from consistency.referee.diagnostics.questions import BIAS
-from consistency.referee.diagnostics.single_log import APART, MOST
+from consistency.referee.diagnostics.planning.single_log import APART, MOST
+from consistency.referee.diagnostics.questions.independence import independence
+from consistency.referee.diagnostics.records.log_pieces import LEAST, in_pieces, memory_of
+from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.types import Array
 

@@ -10,7 +10,7 @@ from draws import autoregression
 from scipy import stats
 
 from consistency.referee.diagnostics import gate_runs, pilot_plan, power_of, required_runs
-from consistency.referee.diagnostics.scale import scale_test
+from consistency.referee.diagnostics.questions.scale import scale_test
 from consistency.referee.types import Array
 
 

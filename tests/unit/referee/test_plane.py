@@ -12,8 +12,8 @@ from recorded import read_recordings
 from test_layouts import DATA, EPOCH, STEPS, lines, nanoseconds, with_w_first
 
 import consistency as cs
-from consistency.referee.readers.plane import motions_of, poses_of
-from consistency.referee.readers.table import planar_sheet
+from consistency.referee.readers.formats.planar_columns import motions_of, poses_of
+from consistency.referee.readers.formats.table import planar_sheet
 from consistency.referee.types import Array
 
 P = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]

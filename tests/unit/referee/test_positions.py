@@ -11,7 +11,7 @@ from test_layouts import POSE, SPACE, STEPS, Drive, drive, lines, matrix, nanose
 
 import consistency as cs
 from consistency.referee.cli import main
-from consistency.referee.readers.positions import _jacobian
+from consistency.referee.readers.formats.position_truth import _jacobian
 from consistency.referee.types import Array
 
 ARM = np.array([0.3, -0.2, 0.5])

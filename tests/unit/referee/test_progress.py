@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from consistency.referee.terminal import progress as module
-from consistency.referee.terminal.progress import each, foreseen, progress, quiet, say
+from consistency.referee.system import progress as module
+from consistency.referee.system.progress import each, foreseen, progress, quiet, say
 
 
 def test_what_is_foreseen_to_take_long_is_said_at_once_and_once(capsys: pytest.CaptureFixture[str]) -> None:

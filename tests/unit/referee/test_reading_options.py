@@ -12,7 +12,7 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.referee.cli import main
-from consistency.referee.parsing.options import MAX_DT, Reading, flag_of
+from consistency.referee.readers.options import MAX_DT, Reading, flag_of
 from consistency.testing import assert_consistent
 
 

@@ -21,13 +21,14 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.referee.cli import main
-from consistency.referee.diagnostics import Settings, nees
+from consistency.referee.diagnostics import Settings
+from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import planar_error, se2_log
 from consistency.referee.geometry.space_errors import se3_log, spatial_error
 from consistency.referee.readers.matching import associate, common_times
 from consistency.referee.types import Array
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 ROOT = Path(__file__).parents[3]
 POSE_COLUMNS = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]

@@ -32,7 +32,6 @@ from consistency.referee.diagnostics import (
     nis_test,
     nis_whiteness,
     noncredibility,
-    outliers,
     pit,
     power_of,
     ratio_interval,
@@ -45,7 +44,8 @@ from consistency.referee.diagnostics import (
     whiten,
     whiteness,
 )
-from consistency.referee.diagnostics.questions import MAIN, SHARES
+from consistency.referee.diagnostics.questions.outliers import outliers
+from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.types import Array
 
 AXES = ("x", "y", "heading")

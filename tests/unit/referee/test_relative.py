@@ -17,15 +17,15 @@ from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stre
 import consistency as cs
 from consistency.referee.cli import main as command
 from consistency.referee.diagnostics import Evidence, Verdict
-from consistency.referee.diagnostics.export import plain
-from consistency.referee.diagnostics.independence import ENOUGH
+from consistency.referee.diagnostics.questions.independence import ENOUGH
+from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.geometry.groups import carried, composed, matrices, to_left
-from consistency.referee.readers.relative import Stretch, windows_of
+from consistency.referee.readers.relative_motions import Stretch, windows_of
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline
-from consistency.referee.verdicts.comparison import compare_with
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.compare_sources import compare_with
+from consistency.referee.verdicts.sources import analyse
 
 GROUPS = tuple(world.SIGMA)
 SURE = 1e-5  # false-alarm rate of a verdict in a test
@@ -316,8 +316,8 @@ def test_the_command_and_its_report(motion_file: Path, capsys: pytest.CaptureFix
 def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[object], Array]:
     """Motions of a front-end, and true poses (number + 1, 4, 4); errors are of roll, pitch, yaw."""
     from consistency.referee.geometry import rotation
-    from consistency.stereo.vision.motion import RelativeMotion
-    from consistency.stereo.vision.pose import RelativePose
+    from consistency.stereo.visual_odometry.motion import RelativeMotion
+    from consistency.stereo.visual_odometry.pose import RelativePose
 
     root = np.diag([0.02, 0.01, 0.03, 0.002, 0.004, 0.003]) @ (np.eye(6) + 0.3 * rng.normal(size=(6, 6)))
     found, steps = list[object](), [np.eye(4)]
@@ -339,8 +339,8 @@ def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[objec
 
 def test_motions_of_the_front_end_are_read_and_right(tmp_path: Path, rng: np.random.Generator) -> None:
     """Without images: 400 motions with large turns; x1.5 is found in all but 1e-5 of all draws."""
-    from consistency.stereo.frontend.tum import motions_text
-    from consistency.stereo.vision.odometry import motion_covariances
+    from consistency.stereo.frontend.tum_output import motions_text
+    from consistency.stereo.visual_odometry.odometry import motion_covariances
 
     motions, truth = simulated_motions(rng, 400)
     R, t = np.array([m.pose.R for m in motions]), np.array([m.pose.t for m in motions])  # type: ignore[attr-defined]

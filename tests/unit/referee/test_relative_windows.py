@@ -12,14 +12,14 @@ from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stre
 
 import consistency as cs
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.independence import ENOUGH
+from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, to_left
 from consistency.referee.geometry.space_errors import spatial_error
-from consistency.referee.readers.relative import windows_of
+from consistency.referee.readers.relative_motions import windows_of
 from consistency.referee.readers.windows import Relative, relative_of, windows
 from consistency.referee.types import Array
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 GROUPS = tuple(world.SIGMA)
 

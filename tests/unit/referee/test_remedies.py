@@ -9,9 +9,9 @@ import pytest
 from test_layouts import lines
 
 import consistency as cs
+from consistency.referee.readers.formats.named_columns import fields_of, require_units
+from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.readers.matching import unit_apart
-from consistency.referee.readers.named_poses import fields_of, require_units
-from consistency.referee.readers.sheet import TableRows
 
 T = 100.0 + 0.1 * np.arange(60)
 P = np.array([[0.04, 0.01, 0.005], [0.01, 0.09, -0.01], [0.005, -0.01, 0.01]])

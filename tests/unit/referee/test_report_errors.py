@@ -11,7 +11,7 @@ from invariant import Invariant
 import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.model import Study
+from consistency.bench.pages.report_input import Study
 from consistency.bench.pages.sections import anees, maps, own_errors
 from consistency.referee.diagnostics import Interval, MapScore
 from consistency.referee.document.blocks import Cell, Name, Quantity, Status, Table

@@ -17,7 +17,7 @@ import consistency as cs
 from consistency.referee import cli
 from consistency.referee.document.blocks import Table, Text
 from consistency.referee.document.drawing import Band, Figure, Line, Points
-from consistency.referee.pages.files import (
+from consistency.referee.pages.files_report import (
     clock_of,
     compose_files,
     observed_coverage,
@@ -25,7 +25,7 @@ from consistency.referee.pages.files import (
     shown_run,
     unit_of,
 )
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 RUNS, STEPS = 30, 25
 

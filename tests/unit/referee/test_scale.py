@@ -14,7 +14,7 @@ from draws import autoregression, fully_dependent
 from scipy import optimize, special, stats
 
 from consistency.referee.diagnostics import mean_test, ratio_interval
-from consistency.referee.diagnostics.scale import acceptance, run_means, scale_test
+from consistency.referee.diagnostics.questions.scale import acceptance, run_means, scale_test
 from consistency.referee.types import Array
 
 SURE = 1e-5

@@ -15,10 +15,10 @@ from draws import fully_dependent, identities, independent, verdict_on
 from scipy import stats
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.referee.diagnostics.faults_in_words import bias_text, scale_text, shape_text
-from consistency.referee.diagnostics.numbers_in_words import plain, short
-from consistency.referee.diagnostics.verdict_in_words import reasons
-from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.words.faults import bias_text, scale_text, shape_text
+from consistency.referee.diagnostics.words.numbers import plain, short
+from consistency.referee.diagnostics.words.sentences import reasons
 from consistency.referee.document.blocks import Quantity
 from consistency.referee.document.verdict import TERMINAL, document, rows
 from consistency.referee.show.terminal import show

@@ -26,8 +26,8 @@ from consistency.referee.diagnostics import (
     look,
     sequential_design,
 )
-from consistency.referee.diagnostics.equivalence import equivalence_by_betting
-from consistency.referee.diagnostics.verdict import Look, judge_alone
+from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
+from consistency.referee.diagnostics.verdict.verdict import Look, judge_alone
 from consistency.referee.types import Array, Failure
 
 SURE = 1e-5

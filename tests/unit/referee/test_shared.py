@@ -13,10 +13,17 @@ from scipy.linalg import block_diag
 import consistency as cs
 from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.diagnostics.questions import BIAS
-from consistency.referee.diagnostics.shared_errors import KINDS, VAGUE, fit_record, growth, halves, without_shared
+from consistency.referee.diagnostics.imperfect_truth.shared_errors import (
+    KINDS,
+    VAGUE,
+    fit_record,
+    growth,
+    halves,
+    without_shared,
+)
+from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.errors import InputError
-from consistency.referee.readers.shared_errors import ONE_LOG, less_shared
+from consistency.referee.readers.shared_calibration import ONE_LOG, less_shared
 from consistency.referee.types import Array
 
 RUNS, STEPS, N = 40, 12, 3

@@ -13,9 +13,9 @@ from scipy import stats
 from single_log import errors
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.referee.diagnostics.single_log import correlation_time, within
+from consistency.referee.diagnostics.planning.single_log import correlation_time, within
 from consistency.referee.types import Array
-from consistency.referee.verdicts.judge import analyse
+from consistency.referee.verdicts.sources import analyse
 
 SETTINGS = Settings()
 SURE = 1e-5

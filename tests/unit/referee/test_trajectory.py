@@ -12,7 +12,7 @@ from scipy import stats
 import consistency as cs
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.document.drawing import Line, Points
-from consistency.referee.pages.files import record_figures, record_sheet, unit_of
+from consistency.referee.pages.files_report import record_figures, record_sheet, unit_of
 from consistency.referee.pages.trajectory import ELLIPSE, MOST, ellipse, trajectory
 from consistency.referee.types import Array
 

@@ -14,7 +14,7 @@ from scipy import stats
 from consistency.referee.cli import main
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch
+from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch
 
 pytest.importorskip("pyulog", reason="needs the extra 'ulog'")
 

@@ -15,10 +15,15 @@ from scipy import stats
 import consistency as cs
 from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.referee.diagnostics.shape import weighted_chi_square_tail
-from consistency.referee.diagnostics.uncertain_truth import contrasts, of_both, uncertain_truth, upper_weights
+from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
+    contrasts,
+    of_both,
+    uncertain_truth,
+    upper_weights,
+)
+from consistency.referee.diagnostics.questions.shape import weighted_chi_square_tail
 from consistency.referee.document.drawing import Line
-from consistency.referee.pages.files import record_figures
+from consistency.referee.pages.files_report import record_figures
 from consistency.referee.types import Array
 
 RUNS, STEPS, N = 50, 8, 3

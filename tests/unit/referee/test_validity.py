@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from consistency.referee.diagnostics.blocks import FEWER as ROWS
-from consistency.referee.diagnostics.validity import (
+from consistency.referee.diagnostics.records.array_blocks import FEWER as ROWS
+from consistency.referee.diagnostics.records.validity import (  # fmt: skip
     DEFICIENT,
     EXACT,
     NEGATIVE,
@@ -16,7 +16,7 @@ from consistency.referee.diagnostics.validity import (
     asymmetric,
     classify,
     negative,
-)  # fmt: skip
+)
 from consistency.referee.types import Array
 
 FULL = np.array([[2.0, 0.9, 0.1], [0.9, 1.0, 0.2], [0.1, 0.2, 0.5]])

@@ -9,19 +9,11 @@ import numpy as np
 import pytest
 from draws import identities, independent, verdict_on
 
-from consistency.referee.diagnostics import (
-    Answer,
-    Equivalence,
-    Evidence,
-    Interval,
-    Settings,
-    Verdict,
-    judge,
-    verdict_parts,
-)
-from consistency.referee.diagnostics.questions import ABOUT, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, answers
-from consistency.referee.diagnostics.skipping import Skip, Skipped
-from consistency.referee.diagnostics.verdict_parts import Innovations
+from consistency.referee.diagnostics import Answer, Equivalence, Evidence, Interval, Settings, Verdict, judge
+from consistency.referee.diagnostics.records.skipping import Skip, Skipped
+from consistency.referee.diagnostics.verdict import parts
+from consistency.referee.diagnostics.verdict.answers import ABOUT, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, answers
+from consistency.referee.diagnostics.verdict.parts import Innovations
 from consistency.referee.types import Array
 
 # --- settings ------------------------------------------------------------------------------------------
@@ -163,7 +155,7 @@ def test_scale_counts_the_steps_that_are_judged() -> None:
 
 
 def test_every_status_has_a_meaning_and_every_question_a_share() -> None:
-    assert list(verdict_parts.STATUSES) == [
+    assert list(parts.STATUSES) == [
         "consistent", "overconfident", "conservative", "biased", "heavy-tailed", "inconsistent", "undecided", "failed",
     ]  # fmt: skip
     assert set(SHARES) == set(ABOUT)

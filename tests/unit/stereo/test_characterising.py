@@ -13,16 +13,16 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.bias_map import BiasMap
-from consistency.bench.scenario.effects.nodes import bilinear, hats
+from consistency.bench.scenario.effects.node_tables import bilinear, hats
 from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.characterising import coordinate
-from consistency.stereo.characterising.basis import octaves
+from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias import estimate_bias, grid_of, shrunken
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.coordinate import Levels
+from consistency.stereo.characterising.coordinate_fit import Levels
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Parameters, Rows, fit, regress
+from consistency.stereo.characterising.piecewise_linear import octaves
 from consistency.stereo.characterising.residuals import Residuals, residuals_of, select
 from consistency.stereo.characterising.tails import rate, ratios, tails
 
@@ -161,12 +161,12 @@ def test_a_fit_is_the_top_of_the_likelihood(rng: np.random.Generator) -> None:
 
 def test_noise_memory_and_offsets_are_told_apart(rng: np.random.Generator) -> None:
     found = fit(rows_of(rng, 400, 25, 1.5, 0.5, 0.9), 1.0)
-    assert coordinate.noise(found, LEVEL).holds(1.5)
-    assert coordinate.correlation(found, LEVEL).holds(0.5)
-    assert coordinate.correlation(found, LEVEL).low > 0.3
-    assert coordinate.offset_share(found, LEVEL).holds(0.81 / (0.81 + 2.25))
-    assert coordinate.offset_share(found, LEVEL).low > 0.1
-    lags, _ = coordinate.autocorrelation(found)
+    assert coordinate_fit.noise(found, LEVEL).holds(1.5)
+    assert coordinate_fit.correlation(found, LEVEL).holds(0.5)
+    assert coordinate_fit.correlation(found, LEVEL).low > 0.3
+    assert coordinate_fit.offset_share(found, LEVEL).holds(0.81 / (0.81 + 2.25))
+    assert coordinate_fit.offset_share(found, LEVEL).low > 0.1
+    lags, _ = coordinate_fit.autocorrelation(found)
     # about the means of tracks: the pooled correlations keep the shape, if not the size
     assert 0.3 < lags[0] < 0.6
     assert lags[0] > lags[1] > lags[3]
@@ -174,8 +174,8 @@ def test_noise_memory_and_offsets_are_told_apart(rng: np.random.Generator) -> No
 
 def test_white_noise_without_offsets_is_found_as_such(rng: np.random.Generator) -> None:
     found = fit(rows_of(rng, 300, 20), 1.0)
-    assert coordinate.correlation(found, LEVEL).holds(0.0)
-    share = coordinate.offset_share(found, LEVEL)
+    assert coordinate_fit.correlation(found, LEVEL).holds(0.0)
+    share = coordinate_fit.offset_share(found, LEVEL)
     assert share.low == 0.0
     assert share.high < 0.1
 
@@ -185,7 +185,7 @@ def test_intervals_of_heavy_tailed_noise_are_wider(rng: np.random.Generator) -> 
     rows = rows_of(rng, 1000, 10)
     heavy = Rows(stats.t.rvs(6, size=10_000, random_state=rng), *list(vars(rows).values())[1:])
     found = [fit(each, 1.0) for each in (rows, heavy)]
-    width = [np.log(coordinate.noise(f, 0.01).high / coordinate.noise(f, 0.01).low) for f in found]
+    width = [np.log(coordinate_fit.noise(f, 0.01).high / coordinate_fit.noise(f, 0.01).low) for f in found]
     assert 1.2 < width[1] / width[0] < 3.0
     assert np.isclose(found[1].robust[0, 0] / found[1].cov[0, 0], 2.5, rtol=0.6)
 
@@ -328,7 +328,7 @@ def test_a_bias_scatters_as_tracks_do_where_offsets_are_not_modelled(rng: np.ran
     """40 tracks of 50 rows with offsets: 1 / 40 of their variance, 40 times what independent rows would have."""
     rows = rows_of(rng, 40, 50, 0.5, 0.0, 1.0)
     found = fit(rows, 1.0, memory=False)
-    _, half, cov = coordinate.bias(found, 0.01)
+    _, half, cov = coordinate_fit.bias(found, 0.01)
     assert 10.0 < cov[0, 0] / found.regression.cov[0, 0] < 120.0
     assert np.isclose(half[0], stats.t.isf(0.005, 39) * np.sqrt(cov[0, 0]), rtol=1e-6)
 

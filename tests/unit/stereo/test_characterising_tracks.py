@@ -19,11 +19,11 @@ from consistency.bench.scenario import Mount, PicturedSensor
 from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.characterising.boards import Calibrated, Corners, calibrate, find_corners
-from consistency.stereo.characterising.landmarks import Seen, fit_points, without_gross
-from consistency.stereo.characterising.plane import residuals_about_boards
-from consistency.stereo.characterising.posed import characterise_posed, correlations, log_interval
-from consistency.stereo.characterising.recorded import seen_of as seen_of_log
+from consistency.stereo.characterising.board_images import Calibrated, Corners, calibrate, find_corners
+from consistency.stereo.characterising.board_residuals import residuals_about_boards
+from consistency.stereo.characterising.from_log import seen_of as seen_of_log
+from consistency.stereo.characterising.known_poses import characterise_posed, correlations, log_interval
+from consistency.stereo.characterising.unknown_landmarks import Seen, fit_points, without_gross
 
 F, B = 400.0, 0.1
 SIGMA = np.array([0.5, 0.8, 0.3])

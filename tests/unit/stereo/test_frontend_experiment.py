@@ -10,8 +10,8 @@ import pytest
 import scripts
 
 import consistency as cs
-from consistency.referee.document.looks import style
-from consistency.stereo.vision import RelativePose
+from consistency.referee.document.colours import style
+from consistency.stereo.visual_odometry import RelativePose
 
 figures = scripts.experiment("front_end_figures")
 

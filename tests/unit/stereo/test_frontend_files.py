@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.referee.geometry import rotation
-from consistency.stereo.frontend.truth import read_truth
-from consistency.stereo.vision.calibration import read_calibration
-from consistency.stereo.vision.kitti import read_kitti
-from consistency.stereo.vision.rectification import rectify
-from consistency.stereo.vision.sequence import read_image, read_sequence
+from consistency.stereo.frontend.dataset_truth import read_truth
+from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
+from consistency.stereo.visual_odometry.cameras.kitti_calibration import read_kitti
+from consistency.stereo.visual_odometry.cameras.rectification import rectify
+from consistency.stereo.visual_odometry.sequence import read_image, read_sequence
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 

@@ -10,9 +10,9 @@ import pytest
 import consistency as cs
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array
-from consistency.stereo.vision import StereoRig
-from consistency.stereo.vision.features import Features, grey, opencv
-from consistency.stereo.vision.matching import (
+from consistency.stereo.visual_odometry import StereoRig
+from consistency.stereo.visual_odometry.features import Features, grey, opencv
+from consistency.stereo.visual_odometry.matching import (
     StereoFeatures,
     circular_matches,
     epipolar_gate,

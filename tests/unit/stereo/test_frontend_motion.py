@@ -19,14 +19,14 @@ from consistency.referee.geometry.space_errors import spatial_error
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.types import Array
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
+from consistency.stereo.frontend.dataset_truth import read_truth
 from consistency.stereo.frontend.planar import OPTICAL, in_robot_axes, planar_motions, planar_path, robot_axes
 from consistency.stereo.frontend.planar_log import relative
-from consistency.stereo.frontend.truth import read_truth
-from consistency.stereo.vision import ConsensusError, RelativePose, relative_motion
-from consistency.stereo.vision.motion import ESTIMATORS, MotionSettings, RelativeMotion
-from consistency.stereo.vision.odometry import trajectory, visual_odometry
-from consistency.stereo.vision.sequence import read_sequence
-from consistency.stereo.vision.tracks import linked
+from consistency.stereo.visual_odometry import ConsensusError, RelativePose, relative_motion
+from consistency.stereo.visual_odometry.motion import ESTIMATORS, MotionSettings, RelativeMotion
+from consistency.stereo.visual_odometry.odometry import trajectory, visual_odometry
+from consistency.stereo.visual_odometry.sequence import read_sequence
+from consistency.stereo.visual_odometry.tracks import linked
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 ROOT = Path(__file__).parents[3]

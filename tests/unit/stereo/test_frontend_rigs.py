@@ -19,15 +19,15 @@ from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor
 from consistency.bench.store.log import read_log
 from consistency.bench.types import Trial
 from consistency.referee.geometry import rotation
-from consistency.referee.readers.kitti import drive_poses
+from consistency.referee.readers.formats.kitti_oxts import drive_poses
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
+from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import plane_of
-from consistency.stereo.frontend.truth import find_truth, missing_of_drive, read_truth
-from consistency.stereo.vision import RelativePose
-from consistency.stereo.vision.calibration import read_calibration
-from consistency.stereo.vision.motion import RelativeMotion
-from consistency.stereo.vision.rectification import rectify
-from consistency.stereo.vision.sequence import read_sequence
+from consistency.stereo.visual_odometry import RelativePose
+from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
+from consistency.stereo.visual_odometry.cameras.rectification import rectify
+from consistency.stereo.visual_odometry.motion import RelativeMotion
+from consistency.stereo.visual_odometry.sequence import read_sequence
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 FULL = (SIZE[0] + 40, SIZE[1] + 20)  # px of unrectified images

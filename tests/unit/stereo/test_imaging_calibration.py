@@ -8,7 +8,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.types import Array
-from consistency.stereo.imaging.calibration import (
+from consistency.stereo.rendered_images.calibration import (
     Biases,
     Growth,
     TrackMeans,
@@ -17,10 +17,10 @@ from consistency.stereo.imaging.calibration import (
     hats,
     track_means,
 )
-from consistency.stereo.imaging.camera import StereoCamera
-from consistency.stereo.imaging.chain import MISMATCH, POINT, Chain, Tracks
-from consistency.stereo.imaging.protocols import Stops, stand
-from consistency.stereo.imaging.selection import Spread
+from consistency.stereo.rendered_images.camera import StereoCamera
+from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Chain, Tracks
+from consistency.stereo.rendered_images.protocols import Stops, stand
+from consistency.stereo.rendered_images.selection import Spread
 
 NODES = np.array([2.25, 6.0, 10.0, 13.5])
 U, V = np.array([-90.0, 0.0, 90.0]), np.array([-90.0, 0.0, 90.0])

@@ -8,9 +8,9 @@ from scripts import experiment
 
 import consistency as cs
 from consistency.referee.types import Array
-from consistency.stereo.imaging import chain as module
-from consistency.stereo.imaging.camera import Camera, Lens, StereoCamera
-from consistency.stereo.imaging.chain import (
+from consistency.stereo.rendered_images import chain as module
+from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
+from consistency.stereo.rendered_images.chain import (
     DRIFTED,
     JUNCTION,
     KEPT,
@@ -24,20 +24,26 @@ from consistency.stereo.imaging.chain import (
     joined,
     stage,
 )
-from consistency.stereo.imaging.correspondence import (
+from consistency.stereo.rendered_images.correspondence import (
     BlockMatching,
     Correspondence,
     KltAcross,
     KnownDisparity,
     SemiGlobal,
 )
-from consistency.stereo.imaging.filtering import LeftRightCheck, PairObservations, TrackResidual, dissimilarity, patches
-from consistency.stereo.imaging.protocols import Stops, pose_at, stand, wall_texture
-from consistency.stereo.imaging.render import film
-from consistency.stereo.imaging.scene import Layer, Scene
-from consistency.stereo.imaging.selection import GoodFeatures, Spread
-from consistency.stereo.imaging.texture import Plain, RandomTexture
-from consistency.stereo.imaging.tracking import Klt, KnownProjection
+from consistency.stereo.rendered_images.filtering import (
+    LeftRightCheck,
+    PairObservations,
+    TrackResidual,
+    dissimilarity,
+    patches,
+)
+from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand, wall_texture
+from consistency.stereo.rendered_images.render import film
+from consistency.stereo.rendered_images.scene import Layer, Scene
+from consistency.stereo.rendered_images.selection import GoodFeatures, Spread
+from consistency.stereo.rendered_images.texture import Plain, RandomTexture
+from consistency.stereo.rendered_images.tracking import Klt, KnownProjection
 
 pytest.importorskip("cv2")
 

@@ -15,10 +15,10 @@ import consistency as cs
 from consistency.bench.pages.build import build_report
 from consistency.referee.document.blocks import Heading, Table
 from consistency.referee.document.drawing import Bars, Figure, Line, Points, Stems
-from consistency.stereo.imaging.chain import MISMATCH, POINT, Tracks
-from consistency.stereo.imaging.protocols import Stops, wall_texture
-from consistency.stereo.imaging.scene import Layer, Scene
 from consistency.stereo.pages import image_tracks, images
+from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Tracks
+from consistency.stereo.rendered_images.protocols import Stops, wall_texture
+from consistency.stereo.rendered_images.scene import Layer, Scene
 
 pytest.importorskip("cv2")
 

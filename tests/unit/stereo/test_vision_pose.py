@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.stereo.vision import (
+from consistency.stereo.visual_odometry import (
     GimbalLockError,
     RelativePose,
     compose,
@@ -19,7 +19,7 @@ from consistency.stereo.vision import (
     register_svd,
     registration_covariance,
 )
-from consistency.stereo.vision.pose import rotation_derivatives
+from consistency.stereo.visual_odometry.pose import rotation_derivatives
 
 Array = np.ndarray[Any, Any]
 A = np.array([0.3, -0.2, 0.9, 0.5, -0.7, 2.0])

@@ -9,7 +9,7 @@ import pytest
 from rigs import MOTION, RIG
 
 from consistency.referee.errors import InputError
-from consistency.stereo.vision import (
+from consistency.stereo.visual_odometry import (
     ConvergenceError,
     DegenerateError,
     PointError,
@@ -22,7 +22,7 @@ from consistency.stereo.vision import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.vision import refinement as module
+from consistency.stereo.visual_odometry import refinement as module
 
 Array = np.ndarray[Any, Any]
 S = 0.25 * np.eye(4)

@@ -12,7 +12,7 @@ from rigs import MOTION
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.stereo.vision import (
+from consistency.stereo.visual_odometry import (
     ConsensusError,
     ConvergenceError,
     DegenerateError,
@@ -24,7 +24,7 @@ from consistency.stereo.vision import (
     register_weighted,
     registration_covariance,
 )
-from consistency.stereo.vision.consensus import squared_distances
+from consistency.stereo.visual_odometry.consensus import squared_distances
 
 Array = np.ndarray[Any, Any]
 BOTH = pytest.mark.parametrize("register", [register_svd, register_horn])

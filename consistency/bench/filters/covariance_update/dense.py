@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.kernel.local_state import Factors, make_factors
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -18,7 +18,7 @@ from consistency.bench.filters.kernel.slam import (
     spare_width,
     withhold,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.referee.types import Array, Indices
 
 

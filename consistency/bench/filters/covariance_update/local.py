@@ -26,6 +26,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.covariance_update.splitting import (
     add_label,
     append_rows,
@@ -36,10 +38,8 @@ from consistency.bench.filters.covariance_update.splitting import (
     wake,
 )
 from consistency.bench.filters.kernel.arrays import copy, fill
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.local_state import Factors, make_factors
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -53,7 +53,7 @@ from consistency.bench.filters.kernel.slam import (
     spare_width,
     withhold,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.referee.types import Array, Indices
 
 LOCAL_FROM = 100  # variables in the state from which local updating is tried; measured, as the next three

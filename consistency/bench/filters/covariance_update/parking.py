@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.covariance_update.local import LOCAL_FROM
 from consistency.bench.filters.covariance_update.splitting import (
     add_label,
@@ -23,10 +25,8 @@ from consistency.bench.filters.covariance_update.splitting import (
 from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, fill, fill_matrix, filled_matrix, integers, matrix
 from consistency.bench.filters.kernel.covariance import gather_rows, replace_rows
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.local_state import Factors, make_factors
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -38,7 +38,7 @@ from consistency.bench.filters.kernel.slam import (
     spare_width,
     withhold,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.referee.types import Array, Indices
 
 WORTH = 1.1  # variables of the whole state for each of active part and base from which updating is local; measured

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.bench.filters.compiler.dispatch import generic
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
 from consistency.bench.filters.kernel.blas import (
     add_symmetric_product,
@@ -14,10 +16,8 @@ from consistency.bench.filters.kernel.blas import (
     times_symmetric,
 )
 from consistency.bench.filters.kernel.covariance import gather_rows, state_index
-from consistency.bench.filters.kernel.dispatch import generic
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.slam import Slam, State, landmark_width, robot_width
+from consistency.bench.filters.kernel.part_functions import Slam, State, landmark_width, robot_width
 from consistency.referee.types import Array
 
 

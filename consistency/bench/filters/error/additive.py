@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.kernel.arrays import copy_matrix
 from consistency.bench.filters.kernel.blas import add_transposed_times
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     add_motion_noise,
@@ -23,7 +23,7 @@ from consistency.bench.filters.kernel.slam import (
     robot_width,
     to_error,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.referee.types import Array
 
 

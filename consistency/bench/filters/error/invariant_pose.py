@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.planar import exponential, shifted_covariance
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.jit import inner
-from consistency.bench.filters.kernel.slam import insert_error, pose_covariance, to_error
+from consistency.bench.filters.kernel.part_functions import insert_error, pose_covariance, to_error
 from consistency.referee.types import Array
 
 FLAT = 1e-9  # determinant of a covariance of positions over its squared trace, up to which they are on a line

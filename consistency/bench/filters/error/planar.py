@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.compiler.jit import inner
 from consistency.referee.types import Array
 
 ROUNDED = 1e-14  # of what cancels in a variance: less is rounding

@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.invariant_pose import move_pose
 from consistency.bench.filters.error.planar import shifted_covariance
 from consistency.bench.filters.kernel.arrays import fill
 from consistency.bench.filters.kernel.blas import add_gram, add_transposed_times
 from consistency.bench.filters.kernel.covariance import move_block
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.jit import inner
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Frame,
     Sensor,
     Slam,
@@ -31,7 +31,7 @@ from consistency.bench.filters.kernel.slam import (
     robot_frame,
     to_error,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.landmark.inverse_range import inward, outward
 from consistency.bench.filters.landmark.sensor_point import SensorPoint, sight
 from consistency.bench.models import point
@@ -45,7 +45,7 @@ class Polar(NamedTuple):
 
 
 class PolarSlam(NamedTuple):
-    """The parts of such a filter, a :class:`consistency.filters.kernel.slam.Slam` of these types."""
+    """The parts of such a filter, a :class:`consistency.bench.filters.kernel.part_functions.Slam` of these types."""
 
     motion: NamedTuple
     sensor: Sensor

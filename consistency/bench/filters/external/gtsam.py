@@ -1,8 +1,8 @@
 """gtsam 4.x in the bench: smoothers of all data so far and of a window, and the smoother of the whole trial.
 
 gtsam chooses the order of elimination, linearises again what has moved, solves, and gives the marginals; the models are
-those of the belief (:mod:`consistency.filters.external.planar_factors`). iSAM2: Kaess et al., Int. J. Robotics Research
-31(2), 2012. Systems are solved by QR, because a step is nearly certain across the heading.
+those of the belief (:mod:`consistency.bench.filters.external.gtsam_factors`). iSAM2: Kaess et al., Int. J. Robotics
+Research 31(2), 2012. Systems are solved by QR, because a step is nearly certain across the heading.
 
 gtsam's smoothers change in place: a state is good for one step forward, and no older one can be gone back to.
 """
@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 
 from consistency.bench.filters.compiled import problem_of
-from consistency.bench.filters.external.planar_factors import PlanarStereo, landmark_key, pose_key
+from consistency.bench.filters.external.gtsam_factors import PlanarStereo, landmark_key, pose_key
 from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import Belief

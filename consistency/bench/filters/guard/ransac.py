@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.guard.screening import (
     Watch,
     added_distance,
 )
-from consistency.bench.filters.kernel.jit import inner
 from consistency.referee.types import Array
 
 

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.gain import INNOVATION
-from consistency.bench.filters.kernel.jit import inner
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -17,7 +17,7 @@ from consistency.bench.filters.kernel.slam import (
     predict_innovation,
     withhold,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.referee.types import Array, Indices
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.compiler.jit import inner
 from consistency.referee.types import Array, Indices
 
 

@@ -22,7 +22,7 @@ from numba import types
 from numba.core import cgutils
 from scipy.linalg import cython_blas, cython_lapack
 
-from consistency.bench.filters.kernel.dispatch import routine
+from consistency.bench.filters.compiler.dispatch import routine
 
 SMALL = 512  # size up to which strips of dgemm are faster than dsyrk; measured with OpenBLAS
 ROUTINES = dict.fromkeys(("dgemm", "dgemv", "dsymm", "dsyrk", "dtrsm"), cython_blas) | {"dpotrf": cython_lapack}

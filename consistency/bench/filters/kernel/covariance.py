@@ -6,9 +6,9 @@ writes P does it here, but for the block and the rows of the robot, which are wh
 
 from __future__ import annotations
 
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import copy_matrix, fill_matrix
 from consistency.bench.filters.kernel.blas import add_gram, upper_cholesky
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.linalg import DEFICIENT
 from consistency.referee.types import Array, Indices
 

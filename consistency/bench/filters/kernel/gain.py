@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import copy_matrix, sum_of
 from consistency.bench.filters.kernel.blas import (
     add_gram,
@@ -14,10 +15,9 @@ from consistency.bench.filters.kernel.blas import (
     solve_transposed,
 )
 from consistency.bench.filters.kernel.covariance import definite_root, gather_rows, subtract_gram
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.measuring import linearise
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.observation_model import linearise
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -30,7 +30,7 @@ from consistency.bench.filters.kernel.slam import (
     to_error,
     wrap_residual,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.referee.types import Array
 
 NOT_FINITE, INNOVATION, POSE, HALTED = 1, 2, 3, 4

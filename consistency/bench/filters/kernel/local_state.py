@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import filled, integers, matrix, vector
-from consistency.bench.filters.kernel.jit import inner
 from consistency.referee.types import Array, Indices
 
 

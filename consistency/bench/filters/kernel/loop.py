@@ -6,7 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.guard import open as _open  # noqa: F401, registers the bodies of a filter without a guard
+from consistency.bench.filters.compiler.by_reference import by_reference, keep
+from consistency.bench.filters.compiler.jit import Kernel, inner
+from consistency.bench.filters.guard import no_guard as _open  # noqa: F401, registers the bodies of a filter without a guard
 from consistency.bench.filters.kernel.arrays import (
     copy,
     copy_matrix,
@@ -19,12 +21,10 @@ from consistency.bench.filters.kernel.arrays import (
     matrix,
     sum_of,
 )
-from consistency.bench.filters.kernel.by_reference import by_reference, keep
 from consistency.bench.filters.kernel.covariance import begin_landmark
 from consistency.bench.filters.kernel.gain import HALTED, NOT_FINITE, POSE
-from consistency.bench.filters.kernel.jit import Kernel, inner
 from consistency.bench.filters.kernel.linalg import definiteness_with
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -50,7 +50,7 @@ from consistency.bench.filters.kernel.slam import (
     to_error,
     world_point,
 )
-from consistency.bench.filters.kernel.work import Work, make_work
+from consistency.bench.filters.kernel.work_arrays import Work, make_work
 from consistency.referee.types import Array, Indices
 
 

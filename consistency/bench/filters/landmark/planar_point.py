@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.kernel.arrays import fill_matrix
 from consistency.bench.filters.kernel.covariance import combine_rows
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Frame,
     Triple,
     combine,

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import fill, fill_matrix
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.jit import inner
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Frame,
     Nine,
     Triple,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.kernel.slam import Slam
+from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.methods import ukf
 from consistency.bench.filters.textbook.ckf import CUBATURE, CubatureKalman
 from consistency.bench.filters.update.unscented import Unscented

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from consistency.bench.filters.belief_parts import landmark_of, motion_of, sensor_of
 from consistency.bench.filters.compiled import Compiled, planar
 from consistency.bench.filters.covariance_update.dense import Dense
 from consistency.bench.filters.error.additive import Additive
-from consistency.bench.filters.kernel.slam import Slam
-from consistency.bench.filters.parts import landmark_of, motion_of, sensor_of
+from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.point.at_estimate import AtEstimate
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
-from consistency.bench.filters.update.joint import Joint
+from consistency.bench.filters.update.joint_update import Joint
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 

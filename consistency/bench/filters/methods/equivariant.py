@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.polar import Polar
-from consistency.bench.filters.kernel.dispatch import implement, part
 from consistency.bench.filters.kernel.gain import (
     add_noise,
     combine_seen,
@@ -15,9 +16,8 @@ from consistency.bench.filters.kernel.gain import (
     innovate,
     linearise_seen,
 )
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Sensor,
     Slam,
@@ -29,11 +29,11 @@ from consistency.bench.filters.kernel.slam import (
     predict,
     predict_innovation,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.landmark.sensor_point import SensorPoint, sight
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.equivariant import EquivariantKalman
-from consistency.bench.filters.update.joint import NoRoom, joint_room, predict_by_error
+from consistency.bench.filters.update.joint_update import NoRoom, joint_room, predict_by_error
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from consistency.bench.filters.compiled import Compiled, planar
-from consistency.bench.filters.kernel.slam import Slam
+from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.point.first_estimate import FirstEstimate
 from consistency.bench.filters.textbook.fej import FirstEstimateKalman

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.bench.filters.compiled import Compiled, planar
-from consistency.bench.filters.kernel.slam import Slam, landmark_width
+from consistency.bench.filters.kernel.part_functions import Slam, landmark_width
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.point.truth import AtTruth
 from consistency.bench.filters.textbook.ideal import IdealKalman, truth_of

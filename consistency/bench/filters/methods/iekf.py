@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.bench.filters.compiled import Compiled, planar
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import vector
 from consistency.bench.filters.kernel.covariance import state_index
-from consistency.bench.filters.kernel.dispatch import implement, part
 from consistency.bench.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, shift, whiten
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -25,10 +25,10 @@ from consistency.bench.filters.kernel.slam import (
     predict_innovation,
     robot_width,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.iekf import PASSES, IteratedKalman
-from consistency.bench.filters.update.joint import predict_by_error, predict_innovation_linearised
+from consistency.bench.filters.update.joint_update import predict_by_error, predict_innovation_linearised
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 

@@ -6,13 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters.belief_parts import sensor_of
 from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.covariance import state_index
-from consistency.bench.filters.kernel.dispatch import implement, part
 from consistency.bench.filters.kernel.gain import POSE, apply, gather, innovate, shift, whiten
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -23,9 +24,8 @@ from consistency.bench.filters.kernel.slam import (
     predict_innovation,
     robot_width,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ukf
-from consistency.bench.filters.parts import sensor_of
 from consistency.bench.filters.textbook.ispkf import PASSES, IteratedPointsKalman
 from consistency.bench.filters.update.unscented import SigmaRoom, Unscented, innovate_by_points
 from consistency.bench.protocols import Problem

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.bench.filters.belief_parts import motion_of, sensor_of
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.covariance_update.dense import Dense
 from consistency.bench.filters.error.additive import Additive
-from consistency.bench.filters.kernel.slam import Slam
+from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.landmark.world_point import WorldPoint
-from consistency.bench.filters.parts import motion_of, sensor_of
 from consistency.bench.filters.point.reference import Reference
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.kf import LinearKalman
-from consistency.bench.filters.update.joint import Joint
+from consistency.bench.filters.update.joint_update import Joint
 from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array

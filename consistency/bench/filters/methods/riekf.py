@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from consistency.bench.filters.compiled import Compiled, planar
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.planar import exponential, shifted_covariance
 from consistency.bench.filters.kernel.arrays import fill
 from consistency.bench.filters.kernel.blas import add_gram, add_transposed_times
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.jit import inner
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     insert_error,
@@ -22,7 +22,7 @@ from consistency.bench.filters.kernel.slam import (
     retract,
     to_error,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.riekf import RightInvariantKalman
 from consistency.bench.protocols import Problem

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.bench.filters.belief_parts import motion_of, sensor_of
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.error.invariant_pose import InvariantPose
-from consistency.bench.filters.kernel.slam import Slam
+from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.landmark.inverse_range import InverseRange
-from consistency.bench.filters.parts import motion_of, sensor_of
 from consistency.bench.filters.sensor.conversion import Pixels
 from consistency.bench.filters.sensor.growth import growth_of
 from consistency.bench.filters.textbook.inverse_range import Corrections, searched

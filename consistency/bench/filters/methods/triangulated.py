@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import sum_of
-from consistency.bench.filters.kernel.dispatch import implement, part
 from consistency.bench.filters.kernel.gain import combine_seen, correct_at_once, gather, innovate, linearise_seen
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -26,7 +26,7 @@ from consistency.bench.filters.kernel.slam import (
     predict_innovation,
     wrap_residual,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.sensor.growth import Growth, growth_of, ratio_at
 from consistency.bench.filters.sensor.xyz import (
@@ -37,7 +37,7 @@ from consistency.bench.filters.sensor.xyz import (
     xyz_width,
 )
 from consistency.bench.filters.textbook.triangulated import TriangulatedKalman
-from consistency.bench.filters.update.joint import NoRoom, joint_room, predict_by_error
+from consistency.bench.filters.update.joint_update import NoRoom, joint_room, predict_by_error
 from consistency.bench.models import stereo
 from consistency.bench.models.point import Mounting
 from consistency.bench.protocols import Problem

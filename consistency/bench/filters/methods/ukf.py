@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from consistency.bench.filters.belief_parts import landmark_of, motion_of, sensor_of
 from consistency.bench.filters.compiled import Compiled, planar
 from consistency.bench.filters.covariance_update.dense import Dense
 from consistency.bench.filters.error.additive import Additive
-from consistency.bench.filters.kernel.slam import Slam
-from consistency.bench.filters.parts import landmark_of, motion_of, sensor_of
+from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.point.at_estimate import AtEstimate
 from consistency.bench.filters.textbook.ukf import UnscentedKalman
 from consistency.bench.filters.update.unscented import Unscented

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.jit import inner
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
+from consistency.bench.filters.kernel.part_functions import (
     Frame,
     add_motion_noise,
     move,

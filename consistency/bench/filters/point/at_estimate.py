@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.measuring import place_observed
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.kernel.observation_model import place_observed
+from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     expands,
@@ -20,7 +20,7 @@ from consistency.bench.filters.kernel.slam import (
     robot_width,
     stands_apart,
 )
-from consistency.bench.filters.kernel.work import NoNotes, Work
+from consistency.bench.filters.kernel.work_arrays import NoNotes, Work
 from consistency.referee.types import Array
 
 

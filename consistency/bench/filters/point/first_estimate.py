@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.kernel.arrays import copy, matrix
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.measuring import place_observed
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.observation_model import place_observed
+from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     expands,
@@ -29,7 +29,7 @@ from consistency.bench.filters.kernel.slam import (
     propagate_covariance_by,
     stands_apart,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.referee.types import Array
 
 

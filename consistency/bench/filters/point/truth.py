@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.kernel.arrays import copy_matrix, matrix, vector
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.measuring import linearise_at, place_observed
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.observation_model import linearise_at, place_observed
+from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     expands,
@@ -29,7 +29,7 @@ from consistency.bench.filters.kernel.slam import (
     robot_frame,
     stands_apart,
 )
-from consistency.bench.filters.kernel.work import NoNotes, Work
+from consistency.bench.filters.kernel.work_arrays import NoNotes, Work
 from consistency.referee.types import Array
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.sensor.growth import Growth, ratio_at
 from consistency.bench.filters.sensor.uvd import Uvd
 from consistency.referee.types import Array

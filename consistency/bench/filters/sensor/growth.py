@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.scenario import BelievedSensor
 from consistency.referee.types import Array
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.kernel.part_functions import (
     Pair,
     Six,
     Triple,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.kernel.part_functions import (
     Nine,
     Triple,
     locate,

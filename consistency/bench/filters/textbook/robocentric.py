@@ -45,7 +45,19 @@ import numpy as np
 
 from consistency.bench.filters.believed_noise import bias_at, variance_at
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.centred import (
+from consistency.bench.filters.textbook.inverse_range import (
+    Corrections,
+    apart,
+    bias,
+    carried,
+    chained,
+    converted,
+    curvature,
+    moments,
+    observed,
+    searched,
+)
+from consistency.bench.filters.textbook.robocentric_state import (
     CentredState,
     Chart,
     activated,
@@ -60,18 +72,6 @@ from consistency.bench.filters.textbook.centred import (
     without_block,
     without_idle_clones,
     world_point,
-)
-from consistency.bench.filters.textbook.inverse_range import (
-    Corrections,
-    apart,
-    bias,
-    carried,
-    chained,
-    converted,
-    curvature,
-    moments,
-    observed,
-    searched,
 )
 from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.protocols import Problem

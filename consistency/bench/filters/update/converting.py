@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.covariance_update.parking import Clones, Parking
 from consistency.bench.filters.kernel.arrays import blocks, copy, fill_matrix, integers, matrix, vector
 from consistency.bench.filters.kernel.blas import add_gram
-from consistency.bench.filters.kernel.dispatch import implement, part
-from consistency.bench.filters.kernel.jit import inner
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.part_functions import (
     Frame,
     State,
     make_notes,
@@ -21,7 +21,7 @@ from consistency.bench.filters.kernel.slam import (
     place,
     predict,
 )
-from consistency.bench.filters.kernel.work import NoNotes, Work
+from consistency.bench.filters.kernel.work_arrays import NoNotes, Work
 from consistency.bench.filters.landmark.inverse_range import InverseRange, carried, curvature
 from consistency.bench.filters.motion.unicycle import Unicycle
 from consistency.bench.filters.sensor.conversion import Pixels, conversion_jacobian, convert, subtract_bias
@@ -59,7 +59,7 @@ class Converted(NamedTuple):
 
 
 class CentredSlam(NamedTuple):
-    """The parts of such a filter, a :class:`consistency.filters.kernel.slam.Slam` of these types."""
+    """The parts of such a filter, a :class:`consistency.bench.filters.kernel.part_functions.Slam` of these types."""
 
     motion: Unicycle
     sensor: Uvd

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.bench.filters.compiler.dispatch import implement
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.covariance_update.parking import Clones, is_in_doubt, is_new, recentre, unpark
 from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
 from consistency.bench.filters.kernel.covariance import gather_rows, replace_rows, state_index, subtract_gram
-from consistency.bench.filters.kernel.dispatch import implement
 from consistency.bench.filters.kernel.gain import apply_beyond, divide_by_root
-from consistency.bench.filters.kernel.jit import inner
-from consistency.bench.filters.kernel.slam import Data, Frame, State, correct, predict_innovation, robot_frame
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.part_functions import Data, Frame, State, correct, predict_innovation, robot_frame
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.landmark.inverse_range import carried
 from consistency.bench.filters.sensor.conversion import observe_range
 from consistency.bench.filters.update.converting import CentredSlam, Converting, ConvertingRoom

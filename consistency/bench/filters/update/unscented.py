@@ -17,16 +17,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import copy, fill, matrix, vector
 from consistency.bench.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
 from consistency.bench.filters.kernel.covariance import definite_root, state_index
-from consistency.bench.filters.kernel.dispatch import implement, part
 from consistency.bench.filters.kernel.gain import POSE, add_noise, correct_at_once, gather, innovate
-from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.linalg import semidefinite_cholesky
 from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.measuring import observe
-from consistency.bench.filters.kernel.slam import (
+from consistency.bench.filters.kernel.observation_model import observe
+from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
@@ -43,7 +43,7 @@ from consistency.bench.filters.kernel.slam import (
     robot_width,
     wrap_residual,
 )
-from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.referee.types import Array
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.model import Study, Track
+from consistency.bench.pages.report_input import Study, Track
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.questions import STEP
+from consistency.referee.diagnostics.verdict.answers import STEP
+from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Rule, Sheet, xy
-from consistency.referee.document.looks import EXPECTED, LIMIT, SHADE
 from consistency.referee.document.wording import listed
 from consistency.referee.pages.judged import wide
 from consistency.referee.pages.section import STUDY, Section

@@ -6,8 +6,8 @@ from typing import Any
 
 import pandas as pd
 
-from consistency.bench.pages.model import Report
-from consistency.bench.pages.tables import extra_table
+from consistency.bench.pages.experiment_tables import extra_table
+from consistency.bench.pages.report_input import Report
 from consistency.referee.document.blocks import Block, Cell, Column, Small, Stack, Status, table
 from consistency.referee.document.wording import brief
 from consistency.referee.pages.section import Part, Section

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from consistency.bench.pages.exhibits import findings_table
-from consistency.bench.pages.model import Report
+from consistency.bench.pages.report_input import Report
 from consistency.referee.document.blocks import Table
 from consistency.referee.pages.section import Part, Section
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.model import Report
-from consistency.bench.pages.tables import extra_table
+from consistency.bench.pages.experiment_tables import extra_table
+from consistency.bench.pages.report_input import Report
+from consistency.referee.document.colours import ACCEPTED, EXPECTED, LIMIT, REJECTED
 from consistency.referee.document.drawing import Axis, Figure, Key, Panel, Points, Rule, Sheet
-from consistency.referee.document.looks import ACCEPTED, EXPECTED, LIMIT, REJECTED
 from consistency.referee.errors import InputError
 from consistency.referee.pages.section import FRONT_END, Section
 from consistency.referee.types import Array

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from consistency.bench.pages.model import Study
+from consistency.bench.pages.report_input import Study
 from consistency.referee.document.blocks import Block, Heading, Name, table
 from consistency.referee.document.verdict import FILTER, FURTHER, cells, columns
 from consistency.referee.pages.section import STUDY, Section

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.model import Study, Track
+from consistency.bench.pages.report_input import Study, Track
+from consistency.referee.document.colours import EXPECTED, SHADE, Look
 from consistency.referee.document.drawing import (
     Axis,
     Band,
@@ -22,7 +23,6 @@ from consistency.referee.document.drawing import (
     Stems,
     dodge,
 )
-from consistency.referee.document.looks import EXPECTED, SHADE, Look
 from consistency.referee.document.wording import listed
 from consistency.referee.pages.judged import wide
 from consistency.referee.pages.section import STUDY, Section

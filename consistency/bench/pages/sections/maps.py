@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from consistency.bench.pages.model import Study, Track
+from consistency.bench.pages.report_input import Study, Track
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.document.blocks import Block, Heading, Name, Text, table
 from consistency.referee.document.map import COLUMNS, map_cells

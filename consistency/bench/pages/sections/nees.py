@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from consistency.referee.document.colours import EXPECTED, SHADE, solid
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Sheet
-from consistency.referee.document.looks import EXPECTED, SHADE, solid
 from consistency.referee.pages.judged import Estimator, Judged
 from consistency.referee.pages.section import STUDY, Section
 from consistency.referee.types import Array

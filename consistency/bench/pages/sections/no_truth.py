@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from consistency.bench.pages.model import Study
+from consistency.bench.pages.report_input import Study
 from consistency.referee.document.blocks import Text
 from consistency.referee.pages.section import STUDY, Section
 

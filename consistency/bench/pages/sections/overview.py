@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.model import Report, Track
+from consistency.bench.pages.report_input import Report, Track
 from consistency.referee.diagnostics import Interval
 from consistency.referee.document.blocks import Block, Column, Name, Table, table
+from consistency.referee.document.colours import EXPECTED, SHADE, solid
 from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span, dodge
-from consistency.referee.document.looks import EXPECTED, SHADE, solid
 from consistency.referee.document.verdict import BRIEF, cells, columns, factor
 from consistency.referee.document.wording import written
 from consistency.referee.pages.section import OPENING, Section

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from consistency.bench.pages.model import Study, Track
+from consistency.bench.pages.report_input import Study, Track
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, table
 from consistency.referee.document.verdict import BRIEF, FILTER, cells, columns
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR

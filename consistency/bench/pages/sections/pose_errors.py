@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.model import Study, Track
+from consistency.bench.pages.report_input import Study, Track
+from consistency.referee.document.colours import SIGMAS, ZERO, Look, solid
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Panel, Rule, Sheet
-from consistency.referee.document.looks import SIGMAS, ZERO, Look, solid
 from consistency.referee.pages.section import STUDY, Section
 from consistency.referee.types import Array
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from consistency.bench.pages.model import Report, Study
+from consistency.bench.pages.report_input import Report, Study
 from consistency.referee.document.blocks import Block, Details, Facts, Settings
 from consistency.referee.pages.provenance import facts
 from consistency.referee.pages.section import Part, Section

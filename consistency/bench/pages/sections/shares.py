@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from consistency.bench.pages.model import Report
-from consistency.bench.pages.tables import extra_table
+from consistency.bench.pages.experiment_tables import extra_table
+from consistency.bench.pages.report_input import Report
+from consistency.referee.document.colours import EXPECTED, SHADE, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Panel, Points, Rule, Sheet, Span
-from consistency.referee.document.looks import EXPECTED, SHADE, style
 from consistency.referee.pages.section import FRONT_END, Section
 from consistency.referee.types import Array
 

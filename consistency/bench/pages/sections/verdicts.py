@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from consistency.bench.pages.model import Report
+from consistency.bench.pages.report_input import Report
 from consistency.referee.document.blocks import Block, Text
 from consistency.referee.pages.section import Part, Section
 from consistency.referee.pages.verdicts import judgement, method

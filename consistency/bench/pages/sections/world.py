@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.pages.model import Study, Track
+from consistency.bench.pages.report_input import Study, Track
 from consistency.bench.simulation import simulate
+from consistency.referee.document.colours import ODOMETRY, TRUTH, Look
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet, xy
-from consistency.referee.document.looks import ODOMETRY, TRUTH, Look
 from consistency.referee.pages.section import STUDY, Section
 from consistency.referee.types import Array, Indices
 

@@ -7,14 +7,14 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from consistency.bench.filters.record import RunRecord
+from consistency.bench.filters.recorder import RunRecord
 from consistency.bench.filters.stepping import error_of, name_of, rejects
 from consistency.bench.runs.backends.remote import Part, require_same_versions
-from consistency.bench.runs.work import Outcomes, TrialWork
+from consistency.bench.runs.trial_work import Outcomes, TrialWork
 from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.referee.errors import InputError
 from consistency.referee.system.machine import in_words
-from consistency.referee.terminal.progress import say
+from consistency.referee.system.progress import say
 
 
 @dataclass(eq=False)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.work import Backend
+from consistency.bench.runs.trial_work import Backend
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 

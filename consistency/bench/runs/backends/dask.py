@@ -27,8 +27,8 @@ from consistency.bench.filters.stepping import reason_of
 from consistency.bench.runs.backends.batches import Batch, Batches, Event, WorkerLost, in_batches
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
-from consistency.bench.runs.isolating import ONE_THREAD
-from consistency.bench.runs.work import Outcomes, TrialWork
+from consistency.bench.runs.isolation.isolating import ONE_THREAD
+from consistency.bench.runs.trial_work import Outcomes, TrialWork
 from consistency.referee.errors import InputError
 
 TARGET = 1.5  # s of work in a batch
@@ -80,12 +80,12 @@ class Dask:
             )
 
     def prepare(self, work: TrialWork, run: int, /) -> None:
-        """See :class:`consistency.runs.work.Backend`."""
+        """See :class:`consistency.bench.runs.trial_work.Backend`."""
         if self.scheduler is None:
             work.compile(run)
 
     def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
-        """See :class:`consistency.runs.work.Backend`.
+        """See :class:`consistency.bench.runs.trial_work.Backend`.
 
         Raises
         ------

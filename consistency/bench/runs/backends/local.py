@@ -11,7 +11,7 @@ from itertools import islice
 from queue import Empty, SimpleQueue
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.runs.work import Outcomes, TrialWork
+from consistency.bench.runs.trial_work import Outcomes, TrialWork
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.errors import InputError
 
@@ -41,7 +41,7 @@ class LocalThreads:
         worker_count(self.jobs)
 
     def prepare(self, work: TrialWork, run: int, /) -> None:
-        """See :class:`consistency.runs.work.Backend`.
+        """See :class:`consistency.bench.runs.trial_work.Backend`.
 
         Raises
         ------
@@ -54,7 +54,7 @@ class LocalThreads:
         work.compile(run, workers)
 
     def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
-        """See :class:`consistency.runs.work.Backend`."""
+        """See :class:`consistency.bench.runs.trial_work.Backend`."""
         workers = min(worker_count(self.jobs), len(runs), self._room)
         with one_blas_thread():
             if workers > 1:

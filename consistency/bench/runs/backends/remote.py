@@ -19,8 +19,8 @@ from pathlib import Path
 from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.runs.isolating import dismiss
-from consistency.bench.runs.work import TrialWork
+from consistency.bench.runs.isolation.isolating import dismiss
+from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.errors import InputError
 from consistency.referee.system.machine import this_machine

@@ -24,9 +24,9 @@ from consistency.bench.filters.stepping import reason_of
 from consistency.bench.runs.backends.batches import Batch, Batches, Event, WorkerLost, in_batches
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
-from consistency.bench.runs.work import Outcomes, TrialWork
+from consistency.bench.runs.trial_work import Outcomes, TrialWork
 from consistency.referee.errors import InputError
-from consistency.referee.terminal.progress import say
+from consistency.referee.system.progress import say
 
 EVERY = 5.0  # s of work between parts
 GLANCE = 1.0  # s between looks at the folder
@@ -60,10 +60,10 @@ class Slurm:
         worker_count(self.jobs)
 
     def prepare(self, work: TrialWork, run: int, /) -> None:
-        """See :class:`consistency.runs.work.Backend`: the jobs compile."""
+        """See :class:`consistency.bench.runs.trial_work.Backend`: the jobs compile."""
 
     def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
-        """See :class:`consistency.runs.work.Backend`.
+        """See :class:`consistency.bench.runs.trial_work.Backend`.
 
         Raises
         ------

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field, model_validator
 
-from consistency.bench.scenario.effects.nodes import require_increasing
-from consistency.bench.scenario.tables import Finite, Table
+from consistency.bench.scenario.effects.node_tables import require_increasing
+from consistency.bench.scenario.toml_tables import Finite, Table
 from consistency.referee.types import Array
 
 Nodes = Annotated[tuple[Finite, ...], Field(min_length=1)]

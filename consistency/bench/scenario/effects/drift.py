@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.bench.scenario.effects.effect import ListedEffect, register
 from consistency.bench.scenario.effects.observations import NO_LANDMARK, Context, Observations
-from consistency.bench.scenario.tables import Positive, Rate
+from consistency.bench.scenario.toml_tables import Positive, Rate
 from consistency.referee.types import Array, Indices
 
 

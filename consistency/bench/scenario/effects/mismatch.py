@@ -9,7 +9,7 @@ from pydantic import model_validator
 
 from consistency.bench.scenario.effects.effect import ListedEffect, register
 from consistency.bench.scenario.effects.observations import NO_LANDMARK, Context, Observations
-from consistency.bench.scenario.tables import Positive, Rate
+from consistency.bench.scenario.toml_tables import Positive, Rate
 
 
 @register

@@ -1,0 +1,1 @@
+"""How kernels are compiled by Numba, and where compiled code is kept."""

@@ -1,0 +1,159 @@
+"""How kernels are compiled: nogil, IEEE division, as one program, and kept by content."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba.core import serialize
+from numba.core.compiler import CompileResult
+from numba.core.compiler_lock import global_compiler_lock
+from numba.extending import register_jitable
+
+from consistency.bench.filters.compiler import compile_time, disk_cache
+from consistency.bench.filters.compiler.content_key import Content
+from consistency.bench.filters.compiler.dispatch import INNER, OPTIONS, Function
+from consistency.bench.filters.compiler.uninterrupted import apart
+from consistency.bench.filters.compiler.whole_program import one_program
+from consistency.bench.models import jitable
+
+_result: Any = CompileResult  # untyped
+_typeof: Callable[[Any], Any] = numba.typeof
+_signatures: dict[Any, tuple[Any, ...]] = {}
+
+
+def inner(function: Function) -> Function:
+    """Decorator of a function that kernels call; Python calls it as the plain function that it is.
+
+    Raises
+    ------
+    TypeError
+        The function is a closure.
+    """
+    if "<locals>" in function.__qualname__:
+        raise TypeError(f"kernel function '{function.__qualname__}' must stand at module level")
+    register_jitable(**INNER)(function)
+    return function
+
+
+class Outlook(NamedTuple):
+    """What a call of a kernel begins with."""
+
+    key: str  # of what the kernel is made of
+    is_ready: bool  # compiled in this process, or on disk
+    is_shared: bool  # whether other processes can read what one has compiled
+    seconds: float  # that compiling takes, or would take
+
+
+class Kernel:
+    """A whole-trial entry: compiled on first use for each combination of parts, kept on disk for later processes.
+
+    What was compiled of the same content is loaded, whoever compiled it and wherever its sources lay. One process
+    compiles a content; those that waited for it read what it has kept. Nothing of this is done in the main thread, see
+    :mod:`consistency.bench.filters.compiler.uninterrupted`; where that is told to end, ``stop`` is called.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function: Any = function
+        self.loaded = 0  # signatures that this process has read from disk
+        self._entries: dict[Any, Any] = {}
+        self._contents: dict[Any, Content] = {}  # by signature, as far as somebody has asked
+        self._functions: set[str] = set()  # that this process has compiled
+
+    def __call__(self, *args: Any, stop: Callable[[], None] = lambda: None) -> Any:
+        return apart(lambda: self._entry(*args)(*args), stop=stop)
+
+    def compile(self, *args: Any) -> Callable[..., Any]:
+        """The entry, compiled for these arguments or loaded from disk."""
+        return apart(self._entry, *args)
+
+    def _entry(self, *args: Any) -> Callable[..., Any]:
+        signature = _signature(args)
+        if signature not in self._entries:
+            self._entries[signature] = self._made(signature)
+        entry: Callable[..., Any] = self._entries[signature]
+        return entry
+
+    def is_ready(self, *args: Any) -> bool:
+        """Whether a call with these arguments starts at once, or spends seconds on compiling first."""
+        return _signature(args) in self._entries or self.outlook(*args).is_ready
+
+    def outlook(self, *args: Any) -> Outlook:
+        """What a call with these arguments begins with."""
+        signature = _signature(args)
+        if signature not in self._entries or signature not in self._contents:
+            self._contents[signature] = self._content(signature)
+        content = self._contents[signature]
+        is_shared = content.unknown is None
+        is_kept = is_shared and disk_cache.read(disk_cache.place(content.key)) is not None
+        is_ready = signature in self._entries or is_kept
+        return Outlook(content.key, is_ready, is_shared, compile_time.seconds_for(self._size(content)))
+
+    def _content(self, signature: tuple[Any, ...]) -> Content:
+        jitable.register()
+        return Content(self.function, signature)
+
+    def _size(self, content: Content) -> float:
+        """Bytes of bytecode to be compiled; functions that this process has compiled before count less."""
+        return sum(
+            size * (compile_time.AGAIN if name in self._functions else 1.0) for name, size in content.functions.items()
+        )
+
+    def _made(self, signature: tuple[Any, ...]) -> Any:
+        content = self._contents.get(signature) or self._content(signature)
+        entry = numba.njit(**OPTIONS)(self.function)
+        if content.unknown is not None:
+            return self._compiled(entry, signature, content)
+        path = disk_cache.place(content.key)
+        if not self._load(entry, disk_cache.read(path, tell=True)):
+            with disk_cache.one_at_a_time(path):
+                if not self._load(entry, disk_cache.read(path)):
+                    self._compiled(entry, signature, content)
+                    _keep(path, entry.overloads[signature])
+        return entry
+
+    def _compiled(self, entry: Any, signature: tuple[Any, ...], content: Content) -> Any:
+        names = {self.function.__qualname__, *content.dispatchers}
+        with compile_time.measured(self._size(content)), one_program(names):
+            entry.compile(signature)
+        self._functions |= content.functions.keys()
+        return entry
+
+    def _load(self, entry: Any, payload: bytes | None) -> bool:
+        """Give the entry the code that was kept, as Numba does with its own cache."""
+        if payload is None:
+            return False
+        with global_compiler_lock:
+            entry.targetctx.refresh()
+            result = _result._rebuild(entry.targetctx, *pickle.loads(payload))
+            entry.targetctx.insert_user_function(result.entry_point, result.fndesc, [result.library])
+            entry.add_overload(result)
+        self.loaded += 1
+        return True
+
+
+def _keep(path: Path, result: Any) -> None:
+    """Keep what holds no address of this process."""
+    if not result.library.has_dynamic_globals and not result.lifted:
+        disk_cache.write(path, serialize.dumps(result._reduce()))  # type: ignore[no-untyped-call]
+
+
+def _signature(args: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Types of the arguments; those of one kind are found once, which takes Numba as long as a short trial."""
+    kind = _kind(args)
+    if kind not in _signatures:
+        _signatures[kind] = tuple(_typeof(arg) for arg in args)
+    return _signatures[kind]
+
+
+def _kind(value: Any) -> Any:
+    """What the type of an argument depends on."""
+    if isinstance(value, np.ndarray):
+        return value.dtype, value.ndim, value.flags.c_contiguous, value.flags.f_contiguous, value.flags.writeable
+    if isinstance(value, tuple):
+        return type(value), *map(_kind, value)
+    return type(value) if isinstance(value, bool | int | float | np.generic) else _typeof(value)

@@ -1,0 +1,1 @@
+"""Filters that are not compiled, in processes that can be killed."""

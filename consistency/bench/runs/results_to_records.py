@@ -1,0 +1,342 @@
+"""Results of the bench as records: the way from their tables to the referee.
+
+Beside the error of its own, which a filter states the covariance of, a record has the additive one of the pose in the
+world. Maps are read when they are asked for.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.bench.store.parquet import Columns
+from consistency.bench.store.results import JOINT, Tables, open_results
+from consistency.referee.column_names import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
+from consistency.referee.diagnostics import Design, JointNees, MapRecord, Record, Rejections, sequential_design
+from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.conventions import ADDITIVE, planar_error
+from consistency.referee.parsing import LARGEST_NUMBER, one_line
+from consistency.referee.readers.formats.innovation_files import NisLog, checked_dof, choose
+from consistency.referee.types import Array, Failure, Indices
+from consistency.referee.verdicts.sources import Source
+
+INNOVATIONS = ["run", "step", "t", "nis", "nis_dof"]
+POINT = ("x", "y", "z")
+
+
+def records_of(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
+    """A record for every filter of the results, or for those named, each read when it is asked for.
+
+    Raises
+    ------
+    InputError
+        As :func:`record_of`.
+    """
+    steps = steps_of(results)
+    return (record_of(results, name, steps) for name in filters or results.filters)
+
+
+def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Record:
+    """One filter; of results in a folder nothing else is read but, unless ``steps`` is known, the steps.
+
+    Raises
+    ------
+    InputError
+        The results hold no such filter, or lack the covariance of its own error.
+    """
+    if filter_name not in results.filters:
+        raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
+    broken = results.failures[results.failures["filter"] == filter_name]
+    convention, runs = results.error_of(filter_name), results.runs_of(filter_name)
+    steps = steps_of(results) if steps is None else steps
+    shape = len(runs), steps
+    pose, covariance = np.full((*shape, 3), np.nan), Symmetric.filled(shape, 3)
+    own = None if convention == ADDITIVE else Symmetric.filled(shape, 3)
+    nis, nis_dof = np.full(shape, np.nan), np.zeros(shape, np.int64)
+    nees = np.full(shape, np.nan) if results.has_truth else None
+    own_nees = None if own is None or nees is None else nees.copy()
+    t = np.full(steps, np.nan)
+    for batch in results.batches("estimates", results.numbers_of(filter_name), filter_name):
+        if (batch["step"] < 1).any():
+            raise InputError(f"estimates of '{filter_name}': column 'step' must be at least 1")
+        at = _places_of(runs, steps, batch)
+        for i, axis in enumerate(POSE):
+            pose.reshape(-1, 3)[at, i] = batch[axis]
+        _fill(covariance, at, batch, COVARIANCE)
+        nis.reshape(-1)[at], nis_dof.reshape(-1)[at], t[batch["step"] - 1] = batch["nis"], batch["nis_dof"], batch["t"]
+        if nees is not None:
+            nees.reshape(-1)[at] = batch["nees"]
+        if own is not None:
+            _require_own(batch, filter_name)
+            _fill(own, at, batch, OWN_COVARIANCE)
+        if own_nees is not None:
+            own_nees.reshape(-1)[at] = batch["own_nees"]
+    failures = tuple(
+        Failure(filter_name, int(r), int(s), one_line(why, 2000)) for _, r, s, why in broken.itertuples(index=False)
+    )
+    dof = len(POSE) if results.has_truth else 0
+    parts = partial(Record, filter_name, dof=dof, axes=POSE, runs=runs, align="")
+    own_error = _errors(results, runs, pose.copy(), t, convention) if own_nees is not None else None
+    world = parts(_errors(results, runs, pose, t) if results.has_truth else None, covariance, nees)
+    _require_agreement(world)
+    _require_all(world, "nees", covariance if own is None else own)
+    record = world
+    if own is not None:
+        record = parts(own_error, own, own_nees, convention=convention, world=world)
+        _require_agreement(record)
+        _require_all(record, "own_nees", own)
+    _require_nis(filter_name, runs, nis, nis_dof)
+    return replace(
+        record, nis=nis, nis_dof=nis_dof, failures=failures, t=t,
+        optimal_gain=filter_name in results.manifest.get("optimal_gain", []),
+        map=partial(map_of, results, filter_name, runs, failures),
+        rejections=_rejections(results, filter_name),
+    )  # fmt: skip
+
+
+def _places_of(runs: Indices, steps: int, batch: Columns) -> Any:
+    """Where rows stand among the values of ``runs`` with ``steps`` each: a slice if one comes after the other."""
+    at = np.searchsorted(runs, batch["run"]) * steps + batch["step"] - 1
+    return slice(int(at[0]), int(at[-1]) + 1) if len(at) and (np.diff(at) == 1).all() else at
+
+
+def _fill(covariance: Symmetric, at: Any, batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
+    for name, (i, j) in columns.items():
+        covariance.entry(i, j).reshape(-1)[at] = batch[name]
+
+
+def _require_own(batch: Columns, filter_name: str) -> None:
+    for column in OWN_COVARIANCE:
+        if np.isnan(batch[column]).any():
+            raise InputError(
+                f"estimates of '{filter_name}': column '{column}' is null, but manifest.json says that it has an "
+                "error of its own; run it again"
+            )
+
+
+def _require_agreement(r: Record) -> None:
+    """Refuse an error of so many standard deviations that no NEES can go with it: its square would overflow."""
+    if r.error is None or r.covariance is None or r.nees is None:
+        return
+
+    def beyond(error: Array, covariance: Array, nees: Array) -> Array:
+        variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+        too_large = np.abs(error) > np.sqrt(LARGEST_NUMBER * np.maximum(variance, 0.0))
+        return np.asarray(np.isfinite(nees) & (too_large & (variance > 0)).any(axis=-1))
+
+    bad = by_runs(beyond, r.error, r.covariance, r.nees)
+    if bad.any():
+        row, step = np.argwhere(bad)[0]
+        raise InputError(
+            f"estimates of '{r.name}', run {r.run_numbers[row]}, step {step + 1}: the NEES is not that of the error "
+            "and its covariance; the tables were changed or damaged; write them again"
+        )
+
+
+def _require_all(r: Record, column: str, covariance: Symmetric) -> None:
+    """Refuse a missing NEES from the first step on whose covariance, of the filter's own error, has full rank."""
+    if r.nees is None:
+        return
+    from consistency.bench.filters.kernel.linalg import definiteness  # loads Numba
+
+    steps = np.isfinite(covariance.entry(0, 0)).sum(axis=1)  # with an estimate, of each run
+    first = by_runs(_first_number, r.nees)
+    missing = np.isfinite(r.nees).sum(axis=1) < steps - np.minimum(first, steps)
+    for row in np.flatnonzero((first > 0) & (steps > 0)):  # the last step without a NEES before those with one
+        last = min(int(first[row]), int(steps[row])) - 1
+        missing[row] |= definiteness(np.asarray(covariance[row, last])) == 1
+    if missing.any():
+        run = r.run_numbers[int(np.argmax(missing))]
+        raise InputError(
+            f"estimates of '{r.name}', run {run}: column '{column}' is null or NaN in a step whose covariance has "
+            "full rank; the tables were changed or damaged; write them again"
+        )
+
+
+def _first_number(values: Array) -> Array:
+    """Column of the first number in each row, the number of columns where none is."""
+    there = np.isfinite(values)
+    return np.where(there.any(axis=1), there.argmax(axis=1), values.shape[1]) if values.size else np.zeros(len(values))
+
+
+def _require_nis(filter_name: str, runs: Indices, nis: Array, nis_dof: Indices) -> None:
+    """Refuse a missing NIS in a step with degrees of freedom."""
+    missing = by_runs(_lacks_nis, nis, nis_dof)
+    if missing.any():
+        raise InputError(
+            f"estimates of '{filter_name}', run {runs[int(np.argmax(missing))]}: column 'nis' is null or NaN in a step "
+            "whose nis_dof is not 0; the tables were changed or damaged; write them again"
+        )
+
+
+def _lacks_nis(nis: Array, nis_dof: Indices) -> Array:
+    return np.asarray((np.isnan(nis) & (nis_dof > 0)).any(axis=1))
+
+
+def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: str = ADDITIVE) -> Array:
+    """Errors in the place of ``pose``; NaN without truth. Fills ``t`` where every run had failed."""
+    known = np.zeros(pose.shape[:2], bool)
+    for batch in results.batches("truth", list(COLUMNS["truth"])):
+        rows = (batch["step"] > 0) & np.isin(batch["run"], runs)
+        row, column = np.searchsorted(runs, batch["run"][rows]), batch["step"][rows] - 1
+        t[column] = np.where(np.isnan(t[column]), batch["t"][rows], t[column])
+        true = np.stack([batch[axis][rows] for axis in POSE], axis=-1)
+        pose[row, column] = planar_error(true, pose[row, column], convention)
+        known[row, column] = True
+    pose[~known] = np.nan
+    return pose
+
+
+def map_of(
+    results: Tables, filter_name: str, of_poses: Indices, failures: tuple[Failure, ...] = ()
+) -> MapRecord | None:
+    """Landmarks in the maps of one filter; None where no run has a map.
+
+    Parameters
+    ----------
+    of_poses : (runs,), numbers of the runs of its poses
+
+    Raises
+    ------
+    InputError
+        The file is damaged.
+    """
+    batches = list(results.batches("map", results.map_numbers, filter_name))
+    if not sum(len(batch["run"]) for batch in batches):
+        return None
+    rows = {column: np.concatenate([batch.pop(column) for batch in batches]) for column in results.map_numbers}
+    entries = {place: rows.pop(name) for name, place in POINT_COVARIANCE.items()}
+    covariance = Symmetric([[entries[min(i, j), max(i, j)] for j in range(3)] for i in range(3)])
+    error = _places(results, rows["landmark"])
+    for i, axis in enumerate("xyz"):
+        error[:, i] -= rows.pop(axis)
+    joint = rows.get(JOINT)  # not kept in older folders
+    dof = 3 if any(covariance.entry(2, j).any() for j in range(3)) else 2
+
+    def record(last: Array | None) -> Record | None:
+        """The landmarks that are judged, in the place of steps; None where none is.
+
+        Landmarks that every map holds stand with their errors. Which runs saw the others depends on where the robot
+        was, and so on the error: those count in the joint NEES only, unless there are no others.
+        """
+        judged = np.isfinite(rows["nees"])
+        if not judged.any():
+            return None
+        some: Any = slice(None) if judged.all() else judged  # a slice is no copy
+        runs, row = np.unique(rows["run"][some], return_inverse=True)
+        labels, column = np.unique(rows["landmark"][some], return_inverse=True)
+        nees = np.full((len(runs), len(labels)), np.nan)
+        nees[row, column] = rows["nees"][some]
+        errors, covariances = np.full((*nees.shape, dof), np.nan), Symmetric.filled(nees.shape, dof)
+        errors[row, column] = error[some, :dof]
+        for i, j in itertools.combinations_with_replacement(range(dof), 2):
+            covariances.entry(i, j)[row, column] = covariance.entry(i, j)[some]
+        common = np.isfinite(nees).all(axis=0)
+        kept = common if common.any() else np.full(len(labels), True)
+        at: Any = slice(None) if kept.all() else kept
+        known = common.any() and bool(np.isfinite(errors[:, at]).all())
+        pose = None if last is None else last[np.searchsorted(of_poses, runs)]
+        return Record(
+            filter_name, errors[:, at] if known else None, covariances[:, at] if known else None, nees[:, at], dof,
+            failures=failures, axes=POINT[:dof], runs=runs, landmarks=labels[kept],
+            joint=None if pose is None or joint is None else _joint(pose, joint[some], dof, row, column, kept),
+        )  # fmt: skip
+
+    return MapRecord(rows["run"], rows["nees"], dof, record)
+
+
+def _joint(pose: Array, joint: Array, width: int, row: Indices, column: Indices, kept: Array) -> JointNees | None:
+    """NEES of pose and map together, of landmarks that stand in these rows and columns; None where it was not kept."""
+    if np.isnan(joint).all():
+        return None
+    parts = np.full((len(pose), len(kept)), np.nan)
+    parts[row, column] = joint
+    return JointNees(pose, np.bincount(row, joint), width * np.bincount(row), parts[:, kept], width)
+
+
+def _rejections(results: Tables, filter_name: str) -> Rejections | None:
+    if results.rejections is None:
+        return None
+    rows = results.rejections[results.rejections["filter"] == filter_name].drop(columns="filter")
+    return Rejections(*(rows[column].to_numpy() for column in rows)) if len(rows) else None
+
+
+def _places(results: Tables, labels: Indices) -> Array:
+    """True positions (M, 3) of landmarks (M,), m; NaN where they are not known."""
+    places = np.full((len(labels), 3), np.nan)
+    if results.landmarks is not None and len(results.landmarks):
+        table = results.landmarks.sort_values("landmark")
+        known = table["landmark"].to_numpy()
+        at = np.minimum(np.searchsorted(known, labels), len(known) - 1)
+        here = known[at] == labels
+        places[here] = table[list("xyz")].to_numpy()[at[here]]
+    return places
+
+
+def steps_of(results: Tables) -> int:
+    """Steps of the longest run, failed steps counted."""
+    last = int(results.failures["step"].max()) if len(results.failures) else 0
+    for table in ("estimates", "truth"):
+        for batch in results.batches(table, ["step"]):
+            last = max(last, int(batch["step"].max(initial=0)))
+    return last
+
+
+def design_of(results: Tables) -> Design | None:
+    """The plan of looks that the results were run by, if they were."""
+    plan = results.manifest.get("until_decided")
+    try:
+        return sequential_design(**plan) if plan else None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"manifest.json: key 'until_decided': {error}") from None
+
+
+def source_of(results: Tables | str | Path) -> Source:
+    """Results of a run, in memory or in a folder, as a source of records.
+
+    Raises
+    ------
+    InputError
+        The folder is damaged; the records raise as :func:`record_of`.
+    """
+    tables = results if isinstance(results, Tables) else open_results(results)
+    m, steps = tables.manifest, cache(partial(steps_of, tables))
+    unfinished = "" if m.get("complete", True) else f"only {m['finished_runs']} of {m['runs']} runs are there"
+    return Source(
+        tables.filters, lambda name: record_of(tables, name, steps()), partial(design_of, tables), tables.has_truth,
+        (m.get("scenario") or {}).get("name"), (m.get("scenario_hash") or m.get("log_sha256"), m.get("seed")),
+        unfinished,
+    )  # fmt: skip
+
+
+def innovations_of(folder: Path, filter_name: str | None, run: int | None) -> NisLog:
+    """Innovations of one run in a folder of results.
+
+    Raises
+    ------
+    InputError
+        There are several filters or runs and none is named, or a value is missing.
+    """
+    results = open_results(folder)
+    name = choose(folder, "filter", results.filters, filter_name)
+    run_number = choose(folder, "run", results.runs_of(name).tolist(), run)
+    parts = []
+    for batch in results.batches("estimates", INNOVATIONS, name):
+        rows = batch["run"] == run_number
+        parts.append(np.stack([batch[column][rows].astype(float) for column in INNOVATIONS[1:]]))
+    step, t, nis, dof = np.concatenate(parts, axis=1) if parts else np.empty((4, 0))
+    if not len(step):
+        raise InputError(f"{folder}: run {run_number} of '{name}' failed before its first estimate")
+    order = np.argsort(step, kind="stable")
+    step, t, nis, dof = step[order], t[order], nis[order], dof[order]
+    return NisLog(
+        name, step, t, nis, checked_dof(nis, dof, lambda row: f"{folder}, run {run_number}, step {step[row]:g}")
+    )

@@ -1,0 +1,115 @@
+"""What is done for each run, as a value that can be sent to where it is done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Protocol
+
+from consistency.bench.protocols import Filter
+from consistency.bench.runs.compiling import compile_for
+from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.memory_needed import workers_that_fit
+from consistency.bench.scenario import Scenario
+from consistency.bench.simulation import require_landmarks_in_view
+from consistency.bench.simulation.world import World
+from consistency.bench.store.trial_rows import RunOutcome, outcome_of
+from consistency.bench.types import Trial
+
+Outcomes = Generator[RunOutcome, None, None]
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Trials of a scenario.
+
+    Raises
+    ------
+    InputError
+        No landmark can ever be seen.
+    """
+
+    scenario: Scenario
+    seed: int
+    _ahead: dict[int, Trial] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        _ = self._world
+
+    def __call__(self, run: int) -> Trial:
+        trial = self._ahead.pop(run, None)
+        return self._world.trial(run, self.seed) if trial is None else trial
+
+    def ahead(self, run: int) -> Trial:
+        """The trial that is about to be run, kept until then."""
+        if run not in self._ahead:
+            self._ahead.clear()
+            self._ahead[run] = self._world.trial(run, self.seed)
+        return self._ahead[run]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Simulated, (self.scenario, self.seed)
+
+    @cached_property
+    def _world(self) -> World:
+        return require_landmarks_in_view(self.scenario)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Trials that are there, by number of their runs."""
+
+    trials: Mapping[int, Trial]
+
+    def __call__(self, run: int) -> Trial:
+        return self.trials[run]
+
+
+@dataclass(frozen=True)
+class TrialWork:
+    """Trials, and the filters through which each is put; it can be pickled.
+
+    Runs are done in a ``with`` on ``isolation``.
+    """
+
+    trials: Callable[[int], Trial]
+    isolation: Isolation
+
+    def __call__(self, run: int) -> RunOutcome:
+        trial = self.trials(run)
+        return outcome_of(trial, self.isolation.run(trial))
+
+    @property
+    def filters(self) -> list[Filter]:
+        return self.isolation.filters
+
+    def _ahead(self, run: int) -> Trial:
+        ahead: Callable[[int], Trial] = getattr(self.trials, "ahead", self.trials)
+        return ahead(run)
+
+    def room_for(self, run: int, workers: int) -> int:
+        """As many of ``workers`` as have memory for a run; raises InputError where not even one has.
+
+        The runs of a scenario are alike, so that ``run`` speaks for all; of a log all are looked at.
+        """
+        trials = list(self.trials.trials.values()) if isinstance(self.trials, Recorded) else [self._ahead(run)]
+        return workers_that_fit(self.isolation.compiled, trials, self.isolation.belief, workers)
+
+    def compile(self, run: int, jobs: int = 1) -> None:
+        """Compile what a run needs and is not yet compiled, in ``jobs`` processes at most, and say so."""
+        if self.isolation.compiled:
+            compile_for(self.isolation.compiled, self._ahead(run), self.isolation.belief, jobs)
+
+
+class Backend(Protocol):
+    """Where runs are done."""
+
+    def prepare(self, work: TrialWork, run: int, /) -> None:
+        """Compile what ``run`` needs, where that is done on this machine."""
+
+    def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
+        """What each run left, in the order in which they end; to be closed, which stops what is not done.
+
+        The bits do not depend on who does a run: BLAS has one thread.
+        """

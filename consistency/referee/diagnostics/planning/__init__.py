@@ -1,0 +1,1 @@
+"""How many runs a verdict needs, and when runs may stop."""

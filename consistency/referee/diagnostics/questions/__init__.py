@@ -1,0 +1,1 @@
+"""The questions of a verdict, each a test in a file."""

@@ -1,0 +1,119 @@
+"""Tests that show the scale to be right; the absence of a fault does not show it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import special
+
+from consistency.referee.diagnostics.planning.e_process import e_process, ever
+from consistency.referee.diagnostics.planning.number_of_runs import LARGEST
+from consistency.referee.diagnostics.questions.scale import FEW, MeanTest, scale_test
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
+from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Settings
+from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.questions.innovations import NisTest
+
+
+def equivalence(
+    means: Array,
+    dof: int,
+    steps: int,
+    settings: Settings,
+    factor: float | None = None,
+    low_is_fault: bool = True,
+    unseen: float = 0.0,
+    share: float = 0.0,
+) -> Equivalence:
+    """Two one-sided tests that the ratio of true to stated covariance lies in [1 / factor, factor].
+
+    The ratio is below ``factor`` if the test of run means Y / factor finds them too small, and above its inverse if
+    that of Y factor finds them too large; both at ``1 - power`` (Schuirmann 1987). A ratio at either end, or beyond,
+    is called equivalent with that probability at most.
+
+    Parameters
+    ----------
+    means : (runs,), mean NEES of each run over ``dof``
+    steps : of the longest run
+    factor : ``settings.factor`` where it is not given
+    low_is_fault : whether a ratio below 1 is a fault, which more runs may find
+    unseen : share of the NEES that ``means`` may lack; the ratio is then as much larger on its upper side
+    share : of errors of the truth in the covariances of ``means``; the ratio is of the others
+    """
+    factor = settings.factor if factor is None else factor
+    top, bottom = (share + (1.0 - share) * factor) * (1.0 - unseen), share + (1.0 - share) / factor
+    below = scale_test(means / top, dof, steps).below if top > 0 else 1.0
+    above = scale_test(means / bottom, dof, steps).above
+    runs = None
+    if top > 1.0:
+        nearer = min(top, 1.0 / bottom) if share and not settings.one_sided else top
+        runs = deciding_runs(scale_test(means, dof, steps), nearer, settings, low_is_fault)
+    return equivalent(below, above, factor, settings, runs)
+
+
+def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equivalence:
+    """Equivalence of the scale from the inverted e-process: valid at any look, and under any dependence.
+
+    Parameters
+    ----------
+    means : (runs,), mean over its steps of each run's NEES over ``dof``
+    dof : components of the error
+    """
+    factor = settings.factor
+    below = ever(e_process(means / factor, dof).down)
+    above = ever(e_process(means * factor, dof).up)
+    return equivalent(below, above, factor, settings, None)
+
+
+def equivalence_of_innovations(
+    test: NisTest | Innovations, settings: Settings, factor: float | None = None
+) -> Equivalence:
+    """Equivalence of the scale of the innovations, from the total NIS; innovations are independent over steps too."""
+    factor, total = settings.factor if factor is None else factor, test.ratio * test.dof
+    if not test.dof:
+        return Equivalence(factor, float("nan"), 1.0 - settings.power, None)
+    below, above = (
+        float(distributions.chi2.cdf(total / factor, test.dof)),
+        float(distributions.chi2.sf(total * factor, test.dof)),
+    )
+    return equivalent(below, above, factor, settings, None)
+
+
+def equivalent(below: float, above: float, factor: float, settings: Settings, runs: int | None) -> Equivalence:
+    """Equivalence by the p values of the ratio being ``factor`` or more, and its inverse or less."""
+    p_value = below if settings.one_sided else max(below, above)
+    return Equivalence(factor, float(p_value), 1.0 - settings.power, runs, settings.one_sided)
+
+
+def worst(parts: Sequence[Equivalence]) -> Equivalence:
+    """Equivalence of all parts: shown where each of them is, by the runs that decide for each."""
+    last = max(parts, key=lambda e: np.nan_to_num(e.p_value, nan=np.inf))
+    runs = [e.runs for e in parts if not e.shown]
+    return replace(last, runs=None if None in runs else max((r for r in runs if r is not None), default=last.runs))
+
+
+def deciding_runs(test: MeanTest, factor: float, settings: Settings, low_is_fault: bool = True) -> int | None:
+    """Number of runs that would probably show the ratio inside, or find it at fault, at its present estimate.
+
+    From fewer than 20 runs the ratio is not known and is assumed to be right. Chi-square of k degrees of freedom
+    is judged by its logarithm, of variance 2 / k; each with probability ``power``.
+    """
+    if not test.runs or not test.ratio > 0:
+        return None
+    off = float(np.log(test.ratio)) if test.runs >= FEW else 0.0
+    gap = off if settings.one_sided else abs(off)  # one-sided, a ratio below 1 is no fault and farther from the end
+    tail = SHARES[MAIN] * settings.false_alarm / (1 if settings.one_sided else 2)
+    power, room = float(special.ndtri(settings.power)), float(np.log(factor)) - gap
+    fault = gap if low_is_fault or off > 0 else 0.0
+
+    def runs(quantile: float, distance: float) -> float:
+        return 2.0 / test.effective_dof * ((quantile + power) / distance) ** 2 if distance > 0 else float("inf")
+
+    least = min(runs(power, room), runs(float(special.ndtri(1.0 - tail)), fault))
+    return None if least > LARGEST else max(int(np.ceil(least)), FEW)

@@ -1,0 +1,137 @@
+"""Tests that innovations are white and have the stated covariance, as those of a right filter."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.whitening import all_finite, whiten
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.types import Array
+
+LAGS = 10
+FEWEST = 400  # values; below, the chi-square of the portmanteau is not to be trusted
+
+
+@dataclass(frozen=True)
+class NisTest:
+    """Total NIS against its degrees of freedom."""
+
+    ratio: float  # total NIS over total degrees of freedom
+    dof: int
+    above: float  # one-sided p values
+    below: float
+
+    @property
+    def p_value(self) -> float:
+        return float(np.minimum(1.0, 2.0 * np.minimum(self.above, self.below)))
+
+
+def nis_of(innovations: Array, covariances: Array) -> tuple[Array, Array]:
+    """NIS and its degrees of freedom, (runs, steps, m), (runs, steps, m, m) -> (runs, steps), (runs, steps).
+
+    NaN and 0 where there is no innovation.
+    """
+    u = whiten(innovations, covariances)
+    return np.square(u).sum(axis=-1), np.where(np.isfinite(u[..., 0]), u.shape[-1], 0)
+
+
+def nis_test(nis: Array, dof: Array) -> NisTest:
+    """Chi-square test of the total NIS, Bar-Shalom, Li & Kirubarajan (2001) sec. 5.4.
+
+    Innovations of a right filter are independent over steps too, so all runs and steps add up, whatever
+    number of degrees of freedom each step has. Shapes (runs, steps); NaN does not count.
+    """
+    counted = np.isfinite(nis) & (dof > 0)
+    k, total = int(dof[counted].sum()), float(nis[counted].sum())
+    if k == 0:
+        return NisTest(float("nan"), 0, float("nan"), float("nan"))
+    return NisTest(total / k, k, float(distributions.chi2.sf(total, k)), float(distributions.chi2.cdf(total, k)))
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Autocorrelation over steps, and the test that it is zero."""
+
+    correlation: Array  # (lags,), of lag 1, 2, ...; mean over components
+    bound: float  # that 95 % of each stay within, if white
+    statistic: float  # portmanteau
+    dof: int
+    p_value: float
+
+
+def whiteness(innovations: Array, covariances: Array, lags: int = LAGS) -> Whiteness:
+    """Portmanteau test that innovations are independent over steps, from their autocorrelation matrices.
+
+    With u the innovations in units of their stated covariance and C_l the mean of u_k u_{k+l}' over the M
+    pairs of all runs, sum M ``|C_l|^2`` / s^4 is chi-square with lags m^2 degrees of freedom (Box & Pierce 1970;
+    Hosking 1980 for vectors), s^2 the mean square of u: a wrong scale alone does not fire it.
+
+    Parameters
+    ----------
+    innovations, covariances : (runs, steps, m), (runs, steps, m, m); NaN where there is none
+    """
+    return _portmanteau(whiten(innovations, covariances), lags)
+
+
+def nis_whiteness(nis: Array, dof: Array, lags: int = LAGS) -> Whiteness:
+    """Whiteness of the NIS alone, where no innovations are kept, shapes (runs, steps).
+
+    The cube root of the NIS is nearly Gaussian (Wilson & Hilferty 1931). It is standardised by its exact mean and
+    standard deviation, because autocorrelations are about a mean of 0; the mean of Wilson and Hilferty is 5 % of a
+    standard deviation off with one degree of freedom, which over many steps looks like correlation. The remaining mean
+    is removed, so that white innovations that are not Gaussian do not count as correlated.
+
+    Correlated innovations show in their squares, with the correlation squared.
+    """
+    counted = np.isfinite(nis) & (dof > 0)
+    if not counted.any():
+        return _portmanteau(np.full((*np.shape(nis), 1), np.nan), lags)
+    overall = float(nis[counted].sum() / dof[counted].sum())
+    standard = functools.partial(_cube_root, overall, *cube_root_moments(np.arange(int(dof[counted].max()) + 1)))
+    u = by_runs(standard, nis, dof)
+    u -= np.nanmean(u) if overall > 0 else np.nan
+    return _portmanteau(u[..., None], lags)
+
+
+def cube_root_moments(dof: Array) -> tuple[Array, Array]:
+    """Mean and standard deviation of the cube root of chi-square(dof) / dof, (...) each; NaN where ``dof`` is 0.
+
+    E (chi-square(n) / n)^r = (2 / n)^r Gamma(n / 2 + r) / Gamma(n / 2), with r = 1/3 and 2/3.
+    """
+    half = np.where(dof > 0, 0.5 * dof, np.nan)
+    mean, square = (half**-r * special.poch(half, r) for r in (1 / 3, 2 / 3))
+    return mean, np.sqrt(square - mean**2)
+
+
+def _cube_root(overall: float, mean: Array, deviation: Array, nis: Array, dof: Array) -> Array:
+    """Cube root of NIS / ``overall`` (runs, steps), standardised by the moments (dof + 1,) of each dof."""
+    counted = np.isfinite(nis) & (dof > 0)
+    n = np.where(counted, dof, 0).astype(int)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((np.cbrt(nis / (n * overall)) - mean[n]) / deviation[n])
+
+
+def _portmanteau(u: Array, lags: int) -> Whiteness:
+    _, steps, m = u.shape
+    lags = min(lags, max(steps // 4, 1), max(steps - 1, 0))
+    present = all_finite(u)
+    if lags == 0 or present.sum() < FEWEST:
+        return Whiteness(np.full(0, np.nan), float("nan"), float("nan"), 0, float("nan"))
+    u = np.where(present[..., None], u, 0.0)
+    power = float(np.square(u).sum() / (present.sum() * m))
+    statistic, correlation, pairs = 0.0, np.zeros(lags), 0
+    for lag in range(1, lags + 1):
+        pairs = int((present[:, lag:] & present[:, :-lag]).sum())
+        if pairs == 0 or power == 0:
+            return Whiteness(np.full(0, np.nan), float("nan"), float("nan"), 0, float("nan"))
+        C = np.tensordot(u[:, :-lag], u[:, lag:], axes=((0, 1), (0, 1))) / (pairs * power)
+        correlation[lag - 1] = np.trace(C) / m
+        statistic += pairs * float(np.square(C).sum())
+    dof = lags * m * m
+    bound = 1.96 / np.sqrt(pairs * m)
+    return Whiteness(correlation, float(bound), statistic, dof, float(distributions.chi2.sf(statistic, dof)))

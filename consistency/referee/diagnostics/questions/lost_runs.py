@@ -1,0 +1,86 @@
+"""Lost runs: those that failed or have a NEES beyond chance, and the share of them that is not excluded."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special
+
+from consistency.referee.diagnostics.planning.e_process import ever
+from consistency.referee.diagnostics.planning.number_of_runs import lost_runs, share_limit
+from consistency.referee.diagnostics.questions.scale import run_means
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.parts import Lost, Settings
+from consistency.referee.types import Array
+
+PARTS = np.array([0.0, 0.125, 0.25, 0.5])  # of the share in question: what the bet takes the true share to be
+HALVINGS = 40  # of the interval in which a limit is sought
+FURTHEST = 100_000  # runs; more are no advice
+
+
+def lost_bound(dof: int, rate: float | Array) -> Array:
+    """Mean NEES that a right run exceeds with probability ``rate`` at most, however its steps depend on each other.
+
+    E[X | X > q] of X = chi-square(n) with P(X > q) = rate: n P(chi-square(n + 2) > q) / rate. For any b > a,
+    P(Y > b) <= E(Y - a)+ / (b - a); E(Y - a)+ is at most E(X - a)+ because (y - a)+ is convex and the mean NEES Y an
+    average of such X (Jensen); with a = q and that b the right side is ``rate``. A chi-square quantile, the bound of
+    steps that are all one and the same, is lower, and some kinds of dependence exceed it more often than stated.
+    """
+    q = special.chdtri(dof, rate)
+    return np.asarray(dof * special.chdtrc(dof + 2, q) / rate)
+
+
+def lost_evidence(is_lost: Array, share: float) -> Array:
+    """E-values against 'a share of ``share`` or more is lost' after each run, (runs,) of bool -> (runs,).
+
+    The mean over q in {0, 1/8, 1/4, 1/2} ``share`` of the likelihood ratio of q to ``share``. It falls with every lost
+    run, so its mean is at most 1 for larger shares too, and it ever reaches 1 / alpha with probability alpha at most
+    (Ville 1939).
+    """
+    q = PARTS * share
+    with np.errstate(divide="ignore"):
+        gains = np.where(np.asarray(is_lost)[:, None], np.log(q / share), np.log1p(-q) - np.log1p(-share))
+    return np.asarray(np.exp(np.minimum(special.logsumexp(np.cumsum(gains, axis=0), axis=1) - np.log(len(q)), 700.0)))
+
+
+def lost_of(evidence: Record, nees: Array, dof: int, settings: Settings, any_time: bool = False) -> Lost | None:
+    """Lost runs among those that failed or have a NEES, and the share not excluded; None without such a run.
+
+    Parameters
+    ----------
+    nees : (runs, steps), NaN where nothing counts
+    any_time : the limit holds at any stopping time, and a run is lost or not regardless of that time: run i is judged
+        at the rate / (i (i + 1))
+    """
+    means, counts = run_means(nees)
+    numbers = np.asarray(evidence.run_numbers)
+    failed = np.isin(numbers, [f.run for f in evidence.failures])
+    there = failed | (counts > 0)
+    runs = int(there.sum())
+    if not runs:
+        return None
+    i = np.arange(1.0, runs + 1.0)
+    rates = settings.false_alarm / (i * (i + 1.0)) if any_time else np.full(runs, settings.false_alarm / runs)
+    is_lost = failed[there] | (np.nan_to_num(means[there]) > lost_bound(dof, rates))
+    lost, level = int(is_lost.sum()), settings.power
+    upper = _limit_at_any_time(is_lost, level) if any_time else share_limit(lost, runs, level)
+    needed = None
+    if settings.lost is not None:
+        needed = _next(is_lost, settings.lost, level) if any_time else lost_runs(settings.lost, level, lost)
+    return Lost(lost, runs, float(lost_bound(dof, rates[-1])), upper, level, needed)
+
+
+def _limit_at_any_time(is_lost: Array, level: float) -> float:
+    """Smallest share that the bet excludes: shares above it are excluded as well."""
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if ever(lost_evidence(is_lost, middle)) <= 1.0 - level else (middle, high)
+    return high
+
+
+def _next(is_lost: Array, share: float, level: float) -> int | None:
+    """Runs with which the bet excludes ``share``, if none of the further ones is lost; None beyond 100,000."""
+    further = np.zeros(FURTHEST, bool)
+    further[: len(is_lost)] = is_lost[:FURTHEST]
+    reached = np.flatnonzero(lost_evidence(further, share) >= 1.0 / (1.0 - level))
+    return int(reached[0]) + 1 if len(reached) else None

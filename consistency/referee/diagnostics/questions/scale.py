@@ -1,0 +1,240 @@
+"""Test of the scale of the covariance. Trials are the unit: they are independent, steps are not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics.records.array_blocks import by_runs, by_steps
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.statistics.intervals import anees_interval
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.types import Array, Indices
+
+FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete
+LARGE = 1e6  # shape of a Gamma distribution beyond which its information is 1/2 and rounding would rule
+LEAST = 4.0  # degrees of freedom of Student's t in an interval: with fewer it says nothing at all
+REACH = 4.0  # standard errors that chance may carry the mean, where nu is moved to a mean of 1
+UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
+NOTHING = (float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class MeanTest:
+    """Test that the mean NEES of whole trajectories is the degrees of freedom."""
+
+    runs: int
+    ratio: float  # mean NEES over dof
+    effective_dof: float  # nu of one run: its mean NEES spreads as chi-square(nu) / nu
+    spread: float  # degrees of freedom with which nu is known
+    above: float  # one-sided p value against a covariance too small
+    below: float  # one-sided p value against a covariance too large
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided; NaN where there is nothing to judge."""
+        return float(np.minimum(1.0, 2.0 * np.minimum(self.above, self.below)))
+
+
+def mean_test(nees: Array, dof: int) -> MeanTest:
+    """Test of the mean NEES over whole trajectories, with each run one observation; see :func:`scale_test`.
+
+    Parameters
+    ----------
+    nees : (runs, steps), NaN where a run has no value
+    dof : dimension of the error
+    """
+    means, counts = run_means(nees)
+    return scale_test(means[counts > 0] / dof, dof, int(counts.max(initial=0)))
+
+
+def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> MeanTest:
+    """Test that run means of the NEES over its degrees of freedom, Y_i (runs,), have the mean 1.
+
+    A run's mean NEES is a sum of dependent chi-squares. It is approximated by chi-square(nu) / nu with
+    the same mean and variance (Satterthwaite 1946; Box 1954, Theorem 3.1). No assumption is made about the dependence
+    between the steps of a run, which may differ from run to run: nu comes from the run means alone, which are
+    independent. Two estimates are taken, each one standard error to the safe side, and the smaller counts:
+
+    - from the coefficient of variation, nu = 2 / CV^2 less its first-order bias. The jackknife over runs gives its
+      variance and its change with the mean; where that lowers nu, its value at a mean of 1 is used;
+    - from the likelihood of a Gamma distribution of shape a = nu / 2, log a - digamma(a) = log mean Y - mean log Y
+      (Fisher 1922), which small values enter as strongly as large ones.
+
+    Student's t in place of the normal allows for the remaining uncertainty. nu lies between ``dof``, its value where
+    all steps of a run are one and the same, and that times ``steps``. With fewer than 20 runs nu is ``dof``: the test
+    is the chi-square of one step.
+
+    Parameters
+    ----------
+    means : (runs,), mean NEES of each run over ``dof``
+    dof : dimension of the error
+    steps : of the longest run
+    gaussian : False lets nu fall below ``dof``, where only errors with heavy tails can have it
+    """
+    runs = len(means)
+    if runs == 0:
+        return MeanTest(0, float("nan"), float("nan"), float("inf"), float("nan"), float("nan"))
+    ratio = float(means.mean())
+    nu, spread = float(dof), float("inf")
+    if runs >= FEW and (steps > 1 or not gaussian) and means.min() > 0:
+        log_nu, variance = _log_nu(means)
+        log_nu = min(log_nu, float(np.log(dof * steps)))
+        if log_nu > np.log(dof) or not gaussian:
+            nu, spread = float(np.exp(log_nu)), 2.0 / variance
+    above, below = _tails(ratio, runs * nu, spread)
+    return MeanTest(runs, ratio, nu, spread, above, below)
+
+
+def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
+    """Whether run means (runs,) differ more than those of Gaussian errors can, for which nu is ``dof`` at least.
+
+    Either estimate of nu (:func:`scale_test`) lies more than ``errors`` standard errors below; not asked of fewer than
+    20 runs.
+    """
+    if len(means) < FEW or not means.min() > 0:
+        return False
+    by_spread, left_out = _log_nu_of_means(means)
+    _, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
+    by_likelihood, error = _log_nu_of_gamma(means)
+    return bool(min(by_spread + errors * np.sqrt(variance), by_likelihood + errors * error) < np.log(dof))
+
+
+def spreads_more_in_steps(nees: Array, dof: int) -> bool:
+    """Whether the NEES (runs, steps) differs more between runs, step by step, than that of Gaussian errors can.
+
+    The mean of log nu over the steps is compared, with the standard error of one step. Steps need not be independent.
+    Those in which a run has no value, or none of the runs an error, do not count.
+    """
+    whole = by_steps(lambda part: (np.isfinite(part) & (part > 0)).all(axis=0), nees)
+    if len(nees) < FEW or not whole.any():
+        return False
+    nees = nees if whole.all() else nees[:, whole]
+    return bool(by_steps(lambda part: np.add(*_log_nu_of_gamma(part)), nees).mean() < np.log(dof))
+
+
+def run_means(nees: Array) -> tuple[Array, Array]:
+    """Mean NEES of each run over the steps it has, and how many those are: (runs, steps) -> (runs,), (runs,)."""
+    means, count = by_runs(means_and_counts, nees).T
+    return np.ascontiguousarray(means), count.astype(np.int64)
+
+
+def means_and_counts(nees: Array) -> Array:
+    """Means and counts of :func:`run_means` as one array, (runs, steps) -> (runs, 2)."""
+    present = np.isfinite(nees)
+    count = present.sum(axis=1)
+    total = np.where(present, nees, 0.0).sum(axis=1)
+    return np.stack([np.where(count > 0, total / np.maximum(count, 1), np.nan), count], axis=-1)
+
+
+def acceptance(test: MeanTest, dof: int, false_alarm: float, allow: str | None = None) -> tuple[float, float]:
+    """Interval of the mean NEES that :func:`mean_test` accepts at ``false_alarm``."""
+    if not test.runs:
+        return float("nan"), float("nan")
+    z = float(distributions.t.isf(false_alarm if allow else false_alarm / 2, test.spread))
+    k = test.runs * test.effective_dof
+    low = 0.0 if allow == "conservative" else float(distributions.chi2.ppf(special.ndtr(-z), k)) * dof / k
+    return low, float(distributions.chi2.isf(special.ndtr(-z), k)) * dof / k
+
+
+def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -> Interval:
+    """Ratio of true to stated covariance (1 is right) and its interval, from the runs' mean NEES over dof (runs,).
+
+    From 20 runs on the spread between the runs is taken as it is, so that neither dependence between steps nor heavy
+    tails make the interval too short. Fewer runs do not determine their spread well: then the spread of runs whose
+    steps are all the same is used, or the observed one if it is larger. Without a run the interval is NaN.
+    """
+    means = np.asarray(means, float)
+    if not len(means):
+        return UNKNOWN
+    ratio, tail = float(means.mean()), 0.5 * (1.0 - confidence)
+    if not means.max() > 0:
+        return Interval(ratio, ratio, ratio)
+    nu, spread = float(dof), float("inf")
+    if len(means) > 1 and means.max() > means.min():
+        log_nu, left_out = _log_nu_of_means(means)
+        if len(means) >= FEW:
+            variance = max(_jackknife(left_out, left_out), 2.0 / len(means))
+            nu, spread = float(np.exp(log_nu)), max(2.0 / variance, LEAST)
+        else:
+            nu = min(nu, float(np.exp(log_nu)))
+    elif len(means) >= FEW:
+        return Interval(ratio, ratio, ratio)
+    z, k = float(distributions.t.isf(tail, spread)), len(means) * nu
+    low, high = (float(distributions.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
+    return Interval(ratio, ratio * k / low, ratio * k / max(high, 1e-300))
+
+
+def _log_nu(means: Array) -> tuple[float, float]:
+    """The smaller of both estimates of log nu on the safe side, and the variance of the first."""
+    by_spread, left_out = _log_nu_of_means(means)
+    by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
+    by_likelihood, error = _log_nu_of_gamma(means)
+    return min(by_spread - float(np.sqrt(variance)), float(by_likelihood - error)), variance
+
+
+def _log_nu_of_means(means: Array) -> tuple[float, Array]:
+    """log(2 / CV^2) of the runs' means (runs,), less its first-order bias, and the same with each run left out."""
+    means = np.ldexp(means, -np.frexp(means.max())[1])  # exact, and no square leaves the range of numbers
+    runs, mean, left = len(means), means.mean(), _left_out_mean(means)
+    squares = np.square(means).sum()
+    cv = max(means.var(ddof=1) / mean**2, 1e-12)
+    variance = (squares - np.square(means) - (runs - 1) * left**2) / max(runs - 2, 1)
+    smallest = 1e-12 * mean**2
+    return float(np.log(2.0 / cv) - np.log1p(cv / runs)), np.log(2.0 * left**2 / np.maximum(variance, smallest))
+
+
+def _log_nu_of_gamma(means: Array) -> tuple[Array, Array]:
+    """log(2 a) of the Gamma distribution of shape a most likely to have made ``means`` (runs, ...), and its error.
+
+    The error is the standard error by the expected information, 1 / (N (a^2 trigamma(a) - a)); (...) both.
+    """
+    gap = np.maximum(np.log(means.mean(axis=0)) - np.log(means).mean(axis=0), 1e-12)
+    log_a = np.log((3.0 - gap + np.sqrt((gap - 3.0) ** 2 + 24.0 * gap)) / (12.0 * gap))  # Minka (2002), to 1.5 %
+    for _ in range(5):  # Newton in log a
+        a = np.exp(log_a)
+        log_a = log_a - np.clip((log_a - special.psi(a) - gap) / (1.0 - a * special.polygamma(1, a)), -2.0, 2.0)
+    a = np.exp(np.minimum(log_a, np.log(LARGE)))
+    information = np.where(a < LARGE, a * a * special.polygamma(1, a) - a, 0.5)
+    return np.log(2.0) + log_a, 1.0 / np.sqrt(len(means) * information)
+
+
+def _left_out_mean(means: Array) -> Array:
+    """Mean without each run; what is left beside a run that diverged is no smaller than its rounding."""
+    total = means.sum()
+    return np.asarray(np.maximum(total - means, np.finfo(float).eps * total) / (len(means) - 1))
+
+
+def _jackknife(a: Array, b: Array) -> float:
+    """Covariance of two estimates from their values with each run left out (Efron & Stein 1981)."""
+    return float((len(a) - 1) / len(a) * ((a - a.mean()) * (b - b.mean())).sum())
+
+
+def _at_mean_one(log_nu: float, left_out: Array, means: Array, floor: float) -> tuple[float, float]:
+    """log nu moved down to where it would be at a mean of 1, never up, and the variance that is left."""
+    log_mean = np.log(_left_out_mean(means))
+    of_mean, both = _jackknife(log_mean, log_mean), _jackknife(left_out, log_mean)
+    slope = both / of_mean if of_mean > 0 else 0.0
+    reach = REACH * np.sqrt(of_mean)  # no farther than chance carries the mean
+    variance = max(_jackknife(left_out, left_out) - slope * both, floor)
+    return log_nu + min(-slope * float(np.clip(np.log(means.mean()), -reach, reach)), 0.0), variance
+
+
+def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:
+    """Upper and lower p value of ``ratio`` = chi-square(k) / k, widened from normal to Student's t."""
+    if not np.isfinite(k):
+        return float(ratio <= 1.0), float(ratio >= 1.0)
+    upper, lower = special.chdtrc(k, k * ratio), special.chdtr(k, k * ratio)
+    if not np.isfinite(spread):
+        return float(upper), float(lower)
+    above, below = (special.stdtr(spread, float(special.ndtri(p))) for p in (upper, lower))
+    return float(above), float(below)
+
+
+def pointwise_band(alive: Indices, dof: int) -> Array:
+    """95 % interval of the ANEES of each single step, (steps,) -> (steps, 2); NaN without a run."""
+    intervals = {int(m): anees_interval(dof, int(m), CONFIDENCE) for m in set(alive[alive > 0])}
+    return np.array([intervals.get(int(m), NOTHING) for m in alive]).reshape(-1, 2)

@@ -1,0 +1,140 @@
+"""Tests of the shape of the covariance: relative sizes of the components and their correlations."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import optimize, special
+
+from consistency.referee.diagnostics.questions.bias import Moments, moments, t_squared
+from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.whitening import all_finite
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.types import Array
+
+ALL_AT_ONCE = 3  # numbers, of which the test of Hotelling keeps its rate with heavy tails
+
+
+def identity_statistic(whitened: Array) -> tuple[float, float]:
+    """Likelihood ratio that whitened errors (N, n) have covariance I, mean zero: statistic and p value.
+
+    N (tr S - ln det S - n) with S the mean of w w', chi-square with n (n + 1) / 2 degrees of freedom after
+    Bartlett's correction (Anderson 2003, sec. 10.8). It tests scale and shape together; :func:`sphericity` tests the
+    shape alone.
+    """
+    w = np.asarray(whitened, float)
+    N, n = w.shape
+    S = w.T @ w / N
+    sign, logdet = np.linalg.slogdet(S)
+    if sign <= 0:
+        return float("inf"), 0.0
+    statistic = N * (float(np.trace(S)) - float(logdet) - n)
+    statistic *= 1.0 - (2 * n + 1 - 2 / (n + 1)) / (6 * N)
+    return statistic, float(distributions.chi2.sf(statistic, n * (n + 1) / 2))
+
+
+def sphericity(whitened: Array, known: Moments | None = None) -> tuple[Array, Array]:
+    """Mauchly's (1940) test of every step: covariance of the whitened errors proportional to I.
+
+    (runs, steps, n) -> statistic and p value, (steps,) each; the mean and the scale may be anything. Box's
+    second-order expansion of the null distribution (Anderson 2003, sec. 10.7.4). NaN where fewer than 4 n runs are
+    left, or n is 1. ``known`` are the moments, if already computed.
+    """
+    N, _, S = moments(whitened) if known is None else known
+    n = whitened.shape[-1]
+    statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
+    good = (4 * n <= N) & (np.trace(S, axis1=-2, axis2=-1) > 0)
+    if n == 1 or not good.any():
+        return statistic, p_value
+    m = N[good] - 1.0
+    sign, logdet = np.linalg.slogdet(S[good])
+    trace = np.trace(S[good], axis1=-2, axis2=-1) / n
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_w = np.where(sign > 0, logdet - n * np.log(trace), -np.inf)
+    rho = 1.0 - (2 * n * n + n + 2) / (6 * n * m)
+    omega = (n + 2) * (n - 1) * (n - 2) * (2 * n**3 + 6 * n**2 + 3 * n + 2) / (288 * n**2 * m**2 * rho**2)
+    f = n * (n + 1) / 2 - 1
+    statistic[good] = value = -m * rho * log_w
+    tail = distributions.chi2.sf(value, f)
+    p_value[good] = np.clip(tail + omega * (distributions.chi2.sf(value, f + 4) - tail), 0.0, 1.0)
+    return statistic, p_value
+
+
+def mean_shape(whitened: Array) -> tuple[Array, float]:
+    """Mean of w w' over whole trajectories, scaled to trace n, and the p value of its being diagonal.
+
+    (runs, steps, n) -> (n, n), p. Each run is one observation of the mean products of different components,
+    n (n - 1) / 2 numbers with mean zero under any scale of each component; :func:`products_test`. (Scales
+    that differ are seen by the test of each axis.) p is NaN where there are fewer than 6 (n - 1) runs: with
+    fewer, only gross faults would be found.
+    """
+    present = all_finite(whitened)
+    n = whitened.shape[-1]
+    count = present.sum(axis=1)
+    M = by_runs(second_moments, whitened, present)[count > 0] / count[count > 0, None, None]
+    mean = M.mean(axis=0) if len(M) else np.full((n, n), np.nan)
+    trace = float(np.trace(mean))
+    scaled = mean * n / trace if trace > 0 else mean
+    if n == 1 or len(M) < 6 * (n - 1) or not trace > 0:
+        return scaled, float("nan")
+    i, j = np.triu_indices(n, 1)
+    return scaled, products_test(M[:, i, j])
+
+
+def products_test(products: Array) -> float:
+    """p value of the mean of run means of products (runs, numbers) being zero.
+
+    Products of Gaussian errors have heavy tails. Hotelling's T-squared is robust to them with up to three numbers. With
+    more numbers it is not, because of its inverse of a sample covariance: with 15 numbers and 50 runs it errs at 2.5
+    times a rate of 1/400. Then two tests at half the rate each find a fault in a few numbers and one in many:
+
+    - the largest Student's t, Bonferroni over the numbers. Given one factor a product is Gaussian, with a variance of
+      its own for each run. For such products t errs at most as often as for equal variances (Bakirov & Szekely 2006,
+      Theorem 1), however the steps of a run depend on each other;
+    - the sum of the squares of the normal scores of these t, against sum l_j chi-square(1), with l the eigenvalues of
+      the correlations between the numbers over the runs. Chance makes these eigenvalues differ more than they do,
+      which errs on the safe side.
+
+    NaN where a number is 0 in all runs, as with a component that has no error.
+    """
+    runs, size = products.shape
+    if size <= ALL_AT_ONCE:
+        return float(t_squared(products[:, None])[1][0])
+    gap = products - products.mean(axis=0)
+    length = np.sqrt(np.square(gap).sum(axis=0))
+    if not length.all():
+        return float("nan")
+    t = products.mean(axis=0) * np.sqrt(runs * (runs - 1)) / length
+    tail = special.stdtr(runs - 1, -np.abs(t))
+    u = gap / length
+    weights = np.linalg.eigvalsh(u @ u.T if runs < size else u.T @ u)
+    scores = float(np.square(special.ndtri(tail)).sum())
+    return float(min(1.0, 2.0 * min(2.0 * size * float(tail.min()), weighted_chi_square_tail(scores, weights))))
+
+
+def weighted_chi_square_tail(value: float, weights: Array) -> float:
+    """P(sum of weights times independent chi-square(1) > value) by saddlepoint, ``weights`` (k,) not negative.
+
+    Lugannani & Rice (1980) in Barndorff-Nielsen's form, as in Kuonen (1999): relative errors of a few per cent far out
+    in the tail too. Up to the mean, and so near to it that differences would be lost in rounding, 1.
+    """
+    weights = weights[weights > 0]
+    if not np.isfinite(value):
+        return 0.0
+    if value <= weights.sum() + 0.01 * np.sqrt(2.0 * np.square(weights).sum()):
+        return 1.0
+
+    def slope(s: float) -> float:
+        return float((weights / (1.0 - 2.0 * s * weights)).sum()) - value
+
+    end = 0.5 / weights.max() - 0.25 / value  # where the term of the largest weight alone is twice the value
+    s = float(optimize.brentq(slope, 0.0, end, xtol=1e-14 * end))
+    left = 1.0 - 2.0 * s * weights
+    w = np.sqrt(2.0 * s * value + np.log(left).sum())
+    v = s * np.sqrt(2.0 * np.square(weights / left).sum())
+    return float(special.ndtr(-w - np.log(v / w) / w))
+
+
+def second_moments(whitened: Array, present: Array) -> Array:
+    """Sum of w w' over the steps of each run, (runs, steps, n) -> (runs, n, n)."""
+    w = np.where(present[..., None], whitened, 0.0)
+    return np.asarray(np.swapaxes(w, -1, -2) @ w)

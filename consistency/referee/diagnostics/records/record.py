@@ -1,0 +1,274 @@
+"""The record: the runs of one estimator, as every source gives them and every verdict takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.skipping import Skip, Skipped, without_first
+from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array, Failure, Indices
+
+
+@dataclass(frozen=True)
+class JointNees:
+    """NEES of pose and map together, in two independent parts of which it is the sum; N runs.
+
+    NaN where a run has none, infinite where its joint covariance is not positive definite.
+    """
+
+    pose: Array  # (N,), chi-square with 3 degrees of freedom if the covariance is right
+    map: Array  # (N,), of all landmarks given the pose, chi-square with ``dof``
+    dof: Indices  # (N,), ``width`` a landmark
+    landmarks: Array | None = None  # (N, L), ``map`` by landmark, each given the pose and the landmarks before it
+    width: int = 3  # degrees of freedom of a landmark, 2 in the plane
+
+
+class MapRecord(NamedTuple):
+    """Landmarks in the maps after the last step; M of all runs."""
+
+    run: Indices  # (M,)
+    nees: Array  # (M,), NaN where the landmark is not judged
+    dof: int  # of a landmark: 3, or 2 in the plane
+    record: Callable[[Array | None], Record | None]  # what is judged, of the last NEES of the pose of each run, (runs,)
+
+    def of_runs(self, runs: int | None) -> MapRecord:
+        """Those of runs 0 to ``runs`` - 1, or of all."""
+        some = self.run < (np.inf if runs is None else runs)
+        return self._replace(run=self.run[some], nees=self.nees[some])
+
+
+class Rejections(NamedTuple):
+    """What a guard did in each of N runs: counts of observations, (N,) each."""
+
+    run: Indices
+    offered: Indices
+    spurious: Indices
+    rejected: Indices
+    hits: Indices  # rejected and spurious
+
+    def of_runs(self, runs: int | None) -> Rejections:
+        """Those of runs 0 to ``runs`` - 1, or of all."""
+        some = self.run < (np.inf if runs is None else runs)
+        return Rejections(*(column[some] for column in self))
+
+
+@dataclass(frozen=True, repr=False)
+class Record:
+    """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them.
+
+    Every source of data gives records, and everything that judges, compares, draws or describes an estimator takes
+    them: arrays of a gate, files of another estimator, and results of the bench take the same way. From the step of a
+    failure on all values are NaN. If the start is known exactly, its covariance is singular: in those steps the NEES
+    and, for files, the covariance are NaN, and the error is not.
+
+    What is large and not always needed, as a map, is a function that reads it when it is called.
+    """
+
+    name: str
+    error: Array | None = None  # (runs, steps, n), truth minus estimate; NaN where a run has no estimate
+    covariance: Array | Symmetric | None = None  # (runs, steps, n, n)
+    nees: Array | None = None  # (runs, steps), NaN where it does not count; worked out from the errors if not given
+    dof: int = 0  # dimension of the error, where NEES stands alone; 0 where there is none
+    nis: Array | None = None  # (runs, steps), NaN where there was no innovation
+    nis_dof: Array | None = None  # (runs, steps)
+    innovations: Array | None = None  # (runs, steps, m), for their whiteness; without them the NIS has to do
+    innovation_covariances: Array | None = None  # (runs, steps, m, m)
+    optimal_gain: bool = False  # declared: innovations are white if the filter is right, and none was gated away
+    failures: tuple[Failure, ...] = ()  # Failure.step counts the columns from 1, as the verdict does
+    axes: Sequence[str] = ()  # names of the n components, if they have any
+    # indices of components whose covariance is stated, without cross terms to the other parts, which are 0 and not
+    # used: each part is judged by itself. Of standard deviations alone each component is one. () where all is stated
+    parts: tuple[tuple[int, ...], ...] = ()
+    runs: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
+    landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
+    joint: JointNees | None = None  # of a map
+    unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
+    skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
+
+    # what a fit to the truth leaves of the errors
+    align: str = "none"  # how the estimates were moved into the world of the truth; "" if they are known to be in it
+    caption: str = ""  # note of the verdict on that
+    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
+    unavailable: Collection[str] = ()  # questions that cannot be answered after the fit, which are not asked
+    unseen: float = 0.0  # share of the NEES that the fit may have absorbed: consistent is shown with it added
+
+    # origin
+    t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
+    times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
+    convention: str = ""  # of the error
+    notes: tuple[str, ...] = ()  # notes for the reader: the convention, left-out steps
+    window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
+    independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
+    unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
+    path: Array | None = None  # (runs, steps, 2, 2 or 3), m, true and estimated positions, to be drawn
+    guesses: Mapping[str, Record] = field(default_factory=dict)  # by convention, where none is declared
+    truth_covariance: Array | None = None  # (runs, steps, n, n), of the truth itself; NaN where it has none
+    truth_errors: str | None = None  # declared: its errors are "independent", "per-run" or "common" to all runs
+    truth_shared: bool = False  # declared: the estimator has fused the truth
+
+    # beside the errors
+    world: Record | None = None  # errors of the same runs as differences in the world, where ``error`` is another
+    map: Callable[[], MapRecord | None] | None = None  # reads the maps; None where there are none
+    rejections: Rejections | None = None  # of a filter with a guard
+
+    @property
+    def run_numbers(self) -> Indices:
+        """Labels of the runs, (runs,)."""
+        if self.runs is not None:
+            return self.runs
+        there = (self.error, self.nees, self.nis, self.innovations)
+        return np.arange(next((len(array) for array in there if array is not None), 0))
+
+    @property
+    def in_world(self) -> Record:
+        """The same runs with their errors as differences in the world: this record where it has no others."""
+        if self.world is None:
+            return self
+        w = self.world
+        return replace(self, error=w.error, covariance=w.covariance, nees=w.nees, convention=w.convention, world=None)
+
+    @property
+    def errors_alone(self) -> Record:
+        """Without what is judged beside the errors and innovations."""
+        return replace(self, world=None, map=None, rejections=None, convention="")
+
+    @property
+    def ends(self) -> Record:
+        """Each run by the last NEES that it has, (runs, 1): what a verdict on the maps needs of the poses."""
+        nees = None if self.nees is None else by_runs(_last_value, self.nees)[:, None]
+        return Record(self.name, nees=nees, failures=self.failures, runs=self.run_numbers, map=self.map)
+
+    def of_runs(self, rows: slice | Indices) -> Record:
+        """Some of the runs, by their rows, with maps and rejections of all."""
+        names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times",
+                 "truth_covariance", "path")  # fmt: skip
+        arrays = {name: array[rows] for name in names if (array := getattr(self, name)) is not None}
+        numbers = self.run_numbers[rows]
+        failures = tuple(failure for failure in self.failures if failure.run in numbers)
+        world = None if self.world is None else self.world.of_runs(rows)
+        guesses = {kind: one.of_runs(rows) for kind, one in self.guesses.items()}
+        return replace(self, **arrays, runs=numbers, failures=failures, world=world, guesses=guesses)
+
+    def first_runs(self, runs: int) -> Record:
+        """Runs 0 to ``runs`` - 1."""
+        return self.of_runs(slice(int(np.searchsorted(self.run_numbers, runs))))
+
+    def without_first(self, skip: Skip | None) -> Record:
+        """The first steps of each run left out of the statistics: all but the errors is NaN there; maps stay.
+
+        Raises
+        ------
+        InputError
+            Nothing is left, or seconds are asked for and there are no times.
+        """
+        names = ("covariance", "nees", "nis", "nis_dof", "innovations")
+        arrays = {name: getattr(self, name) for name in names}
+        if self.world is not None:
+            arrays |= {"world covariance": self.world.covariance, "world nees": self.world.nees}
+        t = self.times if self.times is not None else self.t if len(self.t) else None
+        try:
+            rest, skipped = without_first(skip, arrays, self.name, t)
+        except ValueError as error:
+            raise InputError(f"--{error}") from None
+        world = self.world
+        if world is not None:
+            world = replace(world, covariance=rest.pop("world covariance"), nees=rest.pop("world nees"))
+        guesses = {kind: one.without_first(skip) for kind, one in self.guesses.items()}
+        return replace(self, **rest, world=world, skipped=skipped, guesses=guesses)
+
+    @property
+    def as_runs(self) -> Record:
+        """Independent windows as runs of a single step, numbered from 1; those without an error are none."""
+        if not self.independent:
+            return self
+        assert self.error is not None
+        assert self.covariance is not None
+        assert self.nees is not None
+        runs, steps = self.error.shape[:2]
+        there = np.isfinite(self.nees)
+        number = np.arange(1, runs * steps + 1).reshape(runs, steps)
+        failures = [(int(np.flatnonzero(self.run_numbers == f.run)[0]), f) for f in self.failures]
+        for row, f in failures:
+            there[row, f.step - 1] = True
+        return Record(
+            self.name, self.error[there][:, None], self.covariance[there][:, None], self.nees[there][:, None],
+            self.dof, failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures),
+            axes=self.axes, parts=self.parts, runs=number[there], unit="window", skipped=self.skipped,
+        )  # fmt: skip
+
+    @property
+    def left_out_steps(self) -> list[int]:
+        """Steps, counted from 1, in which the covariance of some run is not of full rank yet."""
+        if self.error is None or self.nees is None:
+            return []
+        deficient = np.isfinite(self.error).all(axis=-1) & np.isnan(self.nees)
+        if self.skipped is not None:
+            deficient[:, : self.skipped.steps] = False
+        return [int(k) + 1 for k in np.flatnonzero(deficient.any(axis=0))]
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Error of each component in one run with the stated 2-sigma bounds, and the coverage.
+
+        Parameters
+        ----------
+        path : .png, .pdf or .svg to write as well; one that is there is replaced
+
+        Returns
+        -------
+        A figure of Matplotlib, which notebooks show
+
+        Raises
+        ------
+        InputError
+            There is no error to draw, or the file cannot be written.
+        """
+        return shown_by("plot", self, None, path)
+
+    def __repr__(self) -> str:
+        return str(shown_by("record_text", self))
+
+    def _repr_html_(self) -> str:
+        return str(shown_by("record_html", self))
+
+
+Evidence = Record  # name of the record as input of :func:`consistency.diagnostics.judge`
+
+
+def numbered_axes(n: int) -> tuple[str, ...]:
+    """Names of components that have none: axis 0, axis 1, ..."""
+    return tuple(f"axis {i}" for i in range(n))
+
+
+def shown_by(function: str, *arguments: Any) -> Any:
+    """Result of a function that draws or describes; its module is loaded here, as nothing else needs it."""
+    return getattr(import_module("consistency.referee.notebook.showing"), function)(*arguments)
+
+
+def _last_value(nees: Array) -> Array:
+    """The last value of each run that is a number, (runs, steps) -> (runs,); NaN where none is."""
+    if not nees.size:
+        return np.full(len(nees), np.nan)
+    last = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
+    return np.asarray(nees[np.arange(len(nees)), last])
+
+
+def each_alone(record: Record) -> Record:
+    """The record with each of its components as a part, so that no cross term of its covariances is used.
+
+    Raises
+    ------
+    ValueError
+        The record has no errors.
+    """
+    if record.error is None:
+        raise ValueError(f"{record.name}: has no errors")
+    n = record.error.shape[-1]
+    return replace(record, parts=tuple((i,) for i in range(n)) if n > 1 else ())

@@ -1,0 +1,240 @@
+"""Record prepared for the tests: whitened errors, the NEES that counts, run means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
+from consistency.referee.diagnostics.records.array_blocks import by_runs, by_steps, of_runs
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
+from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.diagnostics.records.validity import negative
+from consistency.referee.diagnostics.records.whitening import all_finite, entries, squared_length, subset, whiten
+from consistency.referee.diagnostics.verdict.parts import Settings
+from consistency.referee.types import Array
+
+POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Whitened errors of a record and the names of their components; N runs, T steps, n components."""
+
+    record: Record  # with errors and covariances
+    whitened: Array  # (N, T, n), NaN where nothing counts
+    names: tuple[str, ...]
+    groups: Mapping[str, list[int]]  # components, named groups and subsets
+    centre: Centre | None = None  # where ``whitened`` is of the errors about it
+
+    @property
+    def error(self) -> Array:
+        """(N, T, n)."""
+        assert self.record.error is not None
+        return self.record.error
+
+    @property
+    def covariance(self) -> Symmetric:
+        """(N, T, n, n)."""
+        assert self.record.covariance is not None
+        return entries(self.record.covariance)
+
+
+class Centre(NamedTuple):
+    """Mean of the errors of N runs in each step, and the factor that restores their variance about it."""
+
+    mean: Array  # (T, n)
+    factor: Array  # (T, 1), NaN in a step of a single run
+
+    def about(self, error: Array, counted: Array) -> Array:
+        """Errors (runs, T, n) about the mean; NaN where they are not ``counted`` (runs, T)."""
+        return np.where(counted[..., None], (error - self.mean) * self.factor, np.nan)
+
+    def of_steps(self, steps: slice) -> Centre:
+        return Centre(self.mean[steps], self.factor[steps])
+
+
+@dataclass(frozen=True)
+class Sample:
+    """NEES of N runs in T steps; with errors where they are known.
+
+    The arrays may be large: they are processed in blocks of runs or steps, and no other array of their size is kept.
+    """
+
+    nees: Array  # (N, T), NaN where nothing counts
+    dof: int
+    errors: Errors | None = None
+
+    @cached_property
+    def counted(self) -> Array:
+        """(N, T) of bool."""
+        return np.asarray(np.isfinite(self.nees))
+
+    def means(self, steps: slice = slice(None)) -> Array:
+        """Mean NEES over dof of each run that has any of ``steps``, (runs,)."""
+        means, counts = run_means(self.nees[:, steps])
+        return np.asarray(means[counts > 0] / self.dof)
+
+    @property
+    def longest(self) -> int:
+        """Steps of the longest run."""
+        return int(self.counted.sum(axis=1).max(initial=0))
+
+    def group_means(self, index: Sequence[int], steps: slice = slice(None)) -> Array:
+        """Mean NEES of a group of components alone, over its number of components."""
+        assert self.errors is not None
+        e, index = self.errors, list(index)
+        centre = None if e.centre is None else e.centre.of_steps(steps)
+
+        def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
+            error = error if centre is None else centre.about(error, counted)
+            return means_and_counts(np.where(counted, squared_length(subset(error, P, index)), np.nan))
+
+        means, counts = by_runs(of_block, e.error[:, steps], e.covariance[:, steps], self.counted[:, steps]).T
+        return np.asarray(means[counts > 0] / len(index))
+
+    def centre(self) -> Centre:
+        """Mean error over runs in each step."""
+        assert self.errors is not None
+        N = self.counted.sum(axis=0)[:, None]
+        total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), self.errors.error, self.counted)
+        factor = np.sqrt(N / np.maximum(N - 1, 1))
+        return Centre(total / np.maximum(N, 1), np.where(N > 1, factor, np.nan))
+
+    def centred_means(self, steps: slice) -> Array:
+        """:meth:`means` of errors less their mean over runs in each step."""
+        assert self.errors is not None
+        centre = self.centre().of_steps(steps)
+
+        def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
+            return means_and_counts(squared_length(whiten(centre.about(error, counted), P)))
+
+        e = self.errors
+        means, counts = by_runs(of_block, e.error[:, steps], e.covariance[:, steps], self.counted[:, steps]).T
+        return np.asarray(means[counts > 0] / self.dof)
+
+    def centred(self) -> Sample:
+        """Errors less their mean over runs in each step, with the variance that they would have without a bias.
+
+        Overwrites this sample's NEES and whitened errors in place; do not use it afterwards.
+        """
+        assert self.errors is not None
+        e, centre = self.errors, self.centre()
+        counted = self.counted
+        for here in of_runs(counted):
+            w = whiten(centre.about(e.error[here], counted[here]), e.covariance[here])
+            e.whitened[here], self.nees[here] = w, squared_length(w)
+        return Sample(self.nees, self.dof, replace(e, centre=centre))
+
+
+def sample_of(evidence: Record, settings: Settings) -> Sample | None:
+    """Sample of the errors, or of the NEES alone; None without either.
+
+    Raises
+    ------
+    ValueError
+        Names or subsets that do not fit, or NEES without dof.
+    """
+    e = evidence
+    if e.error is None or e.covariance is None:
+        if e.nees is None:
+            return None
+        if not e.dof:
+            raise ValueError("nees needs dof, the dimension of the error")
+        return Sample(e.nees, e.dof)
+    n, P = e.error.shape[-1], entries(e.covariance)
+    names = names_of(e)
+    groups = groups_of(names, settings.subsets)
+    whitened, nees = np.empty(e.error.shape), np.empty(e.error.shape[:2])
+    for here in of_runs(nees):
+        w = whiten(e.error[here], P[here])
+        counted = all_finite(w) if e.nees is None else np.isfinite(e.nees[here])
+        nees[here] = np.where(counted, squared_length(w), np.nan)
+        w[~np.isfinite(nees[here])] = np.nan
+        whitened[here] = w
+    return Sample(nees, n, Errors(e, whitened, names, groups))
+
+
+def names_of(e: Record) -> tuple[str, ...]:
+    """Names of the components of the error; axis 0, axis 1, ... where they have none.
+
+    Raises
+    ------
+    ValueError
+        Other than one name for each component.
+    """
+    assert e.error is not None
+    n = e.error.shape[-1]
+    names = tuple(() if e.axes is None else e.axes) or numbered_axes(n)
+    if len(names) != n:
+        raise ValueError(f"{len(names)} names of axes for {n} components")
+    return names
+
+
+def groups_of(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:
+    """Each component, position and attitude where they are more than one and not all, and the subsets."""
+    groups = {axis: [i] for i, axis in enumerate(names)}
+    for label, members in (("position", POSITION), ("attitude", ATTITUDE)):
+        index = [i for i, axis in enumerate(names) if axis in members]
+        if 1 < len(index) < len(names):
+            groups[label] = index
+    for label, chosen in (subsets or {}).items():
+        index = [int(i) for i in chosen]
+        if not index or not all(0 <= i < len(names) for i in index) or len(set(index)) < len(index):
+            raise ValueError(f"subset '{label}': indices must be different and between 0 and {len(names) - 1}")
+        groups[label] = index
+    return groups
+
+
+def innovations_of(evidence: Record) -> tuple[Array, Array] | None:
+    """NIS and its degrees of freedom, (runs, steps) each; None without any."""
+    if evidence.nis is not None and evidence.nis_dof is not None:
+        return evidence.nis, evidence.nis_dof
+    if evidence.innovations is not None and evidence.innovation_covariances is not None:
+        from consistency.referee.diagnostics.questions.innovations import nis_of
+
+        return nis_of(evidence.innovations, evidence.innovation_covariances)
+    return None
+
+
+def shape_of(e: Record) -> tuple[int, int]:
+    """Runs and steps that all arrays agree on.
+
+    Raises
+    ------
+    ValueError
+        They do not agree, or nothing is there.
+    """
+    arrays = {"error": e.error, "covariance": e.covariance, "nees": e.nees, "nis": e.nis, "nis_dof": e.nis_dof,
+              "innovations": e.innovations}  # fmt: skip
+    if all(array is None for name, array in arrays.items() if name not in ("covariance", "nis_dof")):
+        raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
+    dimensions = {"error": 3, "covariance": 4, "nees": 2, "nis": 2, "nis_dof": 2, "innovations": 3}
+    shapes = {name: np.shape(array) for name, array in arrays.items() if array is not None}
+    for name, shape in shapes.items():
+        if len(shape) != dimensions[name]:
+            raise ValueError(f"{name} must be (runs, steps{', n' * (dimensions[name] - 2)}), got shape {shape}")
+    if len({shape[:2] for shape in shapes.values()}) > 1:
+        raise ValueError(f"runs and steps differ: {', '.join(f'{n} {shape}' for n, shape in shapes.items())}")
+    if "error" in shapes and "covariance" in shapes and shapes["covariance"][2:] != shapes["error"][2:] * 2:
+        raise ValueError(f"error {shapes['error']} and covariance {shapes['covariance']} do not fit")
+    runs, steps = next(iter(shapes.values()))[:2]
+    return int(runs), int(steps)
+
+
+def impossible(e: Record, counted: Array) -> Array:
+    """(runs, steps) of bool: impossible values, an infinite error or a covariance with a negative variance."""
+    assert e.error is not None
+    assert e.covariance is not None
+
+    def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
+        odd = np.isinf(error).any(axis=-1) | ~P.where_all(lambda entry: ~np.isinf(entry))
+        suspect = ~counted & ~odd & P.where_all(np.isfinite)
+        odd[suspect] = negative(np.asarray(P[suspect]))
+        return odd
+
+    return by_runs(of_block, e.error, entries(e.covariance), counted)

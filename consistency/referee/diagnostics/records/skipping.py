@@ -1,0 +1,141 @@
+"""The first steps of each run left out of the statistics: a start that is not meant to be judged.
+
+Values of skipped steps are NaN, so that every other step keeps its number. Alignment and time offsets use them before.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.types import Array
+
+FORMS = "a whole number of steps (20) or seconds (2s)"
+ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
+
+
+@dataclass(frozen=True)
+class Skip:
+    """Length of the beginning of each run that is left out."""
+
+    size: float
+    unit: str = "step"  # or "s"
+
+    @property
+    def option(self) -> str:
+        """Value of the option: 20, 2s."""
+        return f"{self.size:g}{'s' * (self.unit == 's')}"
+
+    @property
+    def text(self) -> str:
+        """The first 20 steps, the first 2 s."""
+        if self.unit == "s":
+            return f"the first {self.size:g} s"
+        return "the first step" if self.size == 1 else f"the first {self.size:g} steps"
+
+    def mask(self, shape: tuple[int, int], t: Array | None = None) -> Array:
+        """Which of (runs, steps) are left out, of bool.
+
+        Steps are counted from 1 as in sentences. Seconds are counted from the first time of each run; the step at their
+        end is kept.
+
+        Parameters
+        ----------
+        t : (steps,) or (runs, steps), s, NaN where a run has no step
+
+        Raises
+        ------
+        ValueError
+            Seconds are asked for, and a run has no times.
+        """
+        if self.unit == "step":
+            return np.broadcast_to(np.arange(1, shape[1] + 1) <= self.size, shape)
+        times = np.broadcast_to(np.nan if t is None else t, shape)
+        known = np.isfinite(times)
+        if not known.any(axis=1).all():
+            raise ValueError(f"skip {self.option}: there are no times; give a number of steps, as --skip 20")
+        start = times[np.arange(shape[0]), np.argmax(known, axis=1)]
+        with np.errstate(invalid="ignore"):
+            return np.asarray(times - start[:, None] < self.size - ROUNDING)
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """The steps that were left out."""
+
+    skip: Skip
+    steps: int  # of the run that lost most
+    empty: int = 0  # runs of which nothing is left
+
+
+def skip_of(given: str | float | Skip | None) -> Skip | None:
+    """Parse the value of ``--skip``, such as 20 or "2s"; None for nothing.
+
+    Raises
+    ------
+    ValueError
+        It is neither a number of steps nor of seconds.
+    """
+    if given is None or isinstance(given, Skip):
+        return given
+    match = re.fullmatch(r"\s*(\d+|\d*\.\d+|\d+\.\d*)\s*(s?)\s*", str(given))
+    whole = match is not None and (match[2] == "s" or match[1].isdigit())
+    if match is None or not whole or isinstance(given, bool):
+        raise ValueError(f"skip {given}: must be {FORMS}")
+    size = float(match[1])
+    return Skip(size, "s" if match[2] else "step") if size > 0 else None
+
+
+def without_first(
+    skip: Skip | None, arrays: Mapping[str, Any], name: str, t: Array | None = None
+) -> tuple[dict[str, Any], Skipped | None]:
+    """Arrays over (runs, steps, ...) of one estimator without the first steps, and the record of those steps.
+
+    Errors need not be among them: where covariance and NEES are NaN they do not count.
+
+    Parameters
+    ----------
+    arrays : covariances as arrays or :class:`Symmetric`, NEES, NIS, innovations, by any name; those that end in "dof"
+        become 0, the others NaN. None is passed over.
+    t : as in :meth:`Skip.mask`
+
+    Raises
+    ------
+    ValueError
+        Nothing is left, or seconds are asked for and there are no times.
+    """
+    there = [value for value in arrays.values() if value is not None]
+    if skip is None or not there:
+        return dict(arrays), None
+    shape = there[0].shape[:2]
+    mask = skip.mask((int(shape[0]), int(shape[1])), t)
+    counted = np.zeros(shape, bool)
+    for key, value in arrays.items():
+        if value is not None and not key.endswith("dof"):
+            counted |= _finite(value)
+    left = (counted & ~mask).any(axis=1)
+    if not left.any():
+        last = int(np.flatnonzero(counted.any(axis=0)).max(initial=-1)) + 1
+        raise ValueError(f"skip {skip.option}: nothing of {name} is left, whose last step is {last}; leave out less")
+    lost = Skipped(skip, int(mask.sum(axis=1).max()), int((counted.any(axis=1) & ~left).sum()))
+    return {key: _blank(value, mask, 0 if key.endswith("dof") else np.nan) for key, value in arrays.items()}, lost
+
+
+def _finite(value: Array | Symmetric) -> Array:
+    """Where all of a step is finite, (runs, steps) of bool."""
+    if isinstance(value, Symmetric):
+        return value.where_all(np.isfinite)
+    return np.asarray(np.isfinite(value).all(axis=tuple(range(2, value.ndim))))
+
+
+def _blank(value: Array | Symmetric | None, mask: Array, fill: float) -> Array | Symmetric | None:
+    if value is None:
+        return None
+    if isinstance(value, Symmetric):
+        return value.without(mask)
+    return np.where(mask.reshape(*mask.shape, *[1] * (value.ndim - 2)), np.asarray(fill, value.dtype), value)

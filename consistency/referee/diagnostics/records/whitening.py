@@ -1,0 +1,126 @@
+"""Errors in units of their stated covariance."""
+
+from __future__ import annotations
+
+import functools
+import operator
+
+import numpy as np
+
+from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.types import Array
+
+FEW = 7  # components that NumPy adds one after the other; sums over so short an axis are slow
+
+
+def whiten(error: Array, covariance: Array | Symmetric) -> Array:
+    """L^-1 error with L L' = covariance: standard normal, independent components, if the covariance is right.
+
+    Shapes (..., n) and (..., n, n) -> (..., n). Rows that hold a NaN, or whose covariance is not positive
+    definite, come back as NaN.
+    """
+    e, P = np.asarray(error, float), entries(covariance)
+    P = P if P.shape[:-1] == e.shape else P.broadcast(e.shape[:-1])
+    return by_runs(_whiten, e, P) if e.ndim > 1 else _whiten(e, P)
+
+
+def entries(covariance: Array | Symmetric) -> Symmetric:
+    """Covariances (..., n, n) by entries; those of an array are not copied."""
+    return covariance if isinstance(covariance, Symmetric) else Symmetric.of(np.asarray(covariance, float))
+
+
+def _whiten(e: Array, P: Symmetric) -> Array:
+    out = np.empty(e.shape)
+    L: list[list[Array]] = []  # rows of arrays over the batch: n is small, the batch is not
+    w: list[Array] = []
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        for i in range(e.shape[-1]):
+            row: list[Array] = []
+            for j in range(i):
+                row.append(_less(P.entry(i, j), row, L[j]) / L[j][j])
+            row.append(np.sqrt(_less(P.entry(i, i), row, row)))  # NaN or 0 where P is not definite, and so what follows
+            w.append(_less(e[..., i], row, w) / row[i])
+            L.append(row)
+            out[..., i] = w[i]
+    out[~all_finite(out)] = np.nan
+    return out
+
+
+def _less(value: Array, a: list[Array], b: list[Array]) -> Array:
+    """``value`` less the sum of the products, as many as the shorter list has."""
+    products = [x * y for x, y in zip(a, b, strict=False)]
+    return value - functools.reduce(operator.add, products) if products else value
+
+
+def standardise(error: Array, covariance: Array | Symmetric) -> Array:
+    """Each component over its own standard deviation, (..., n) and (..., n, n) -> (..., n); NaN where that is 0."""
+
+    def of_block(e: Array, P: Symmetric) -> Array:
+        out = np.empty(e.shape)
+        for i in range(e.shape[-1]):
+            variance = P.entry(i, i)
+            out[..., i] = e[..., i] / np.sqrt(np.where(variance > 0, variance, np.nan))
+        return out
+
+    e = np.asarray(error, float)
+    return by_runs(of_block, e, entries(covariance)) if e.ndim > 1 else of_block(e, entries(covariance))
+
+
+def subset(error: Array, covariance: Array | Symmetric, index: list[int]) -> Array:
+    """Whitened errors of a group, (runs, steps, n) and (runs, steps, n, n) -> (runs, steps, len(index))."""
+
+    def of_block(e: Array, P: Symmetric) -> Array:
+        e, P = e[..., index], P.part(index)
+        return standardise(e, P) if len(index) == 1 else whiten(e, P)
+
+    return by_runs(of_block, error, entries(covariance))
+
+
+def squared_length(whitened: Array) -> Array:
+    """(runs, steps, n) -> (runs, steps): the NEES, if nothing is missing."""
+    return by_runs(_squared_length, whitened)
+
+
+def _squared_length(w: Array) -> Array:
+    if w.shape[-1] > FEW:
+        return np.asarray(np.square(w).sum(axis=-1))
+    return functools.reduce(operator.add, (np.square(w[..., i]) for i in range(w.shape[-1])))
+
+
+def all_finite(values: Array) -> Array:
+    """Rows without a missing component, (..., n) -> (...) of bool."""
+    return functools.reduce(operator.and_, (np.isfinite(values[..., i]) for i in range(values.shape[-1])))
+
+
+def mean_of_runs(values: Array) -> Array:
+    """Mean over the steps that a run has, (runs, steps, n) -> (runs, n); NaN where it has none."""
+
+    def mean(block: Array) -> Array:
+        present = ~np.isnan(block)
+        total, count = np.where(present, block, 0.0).sum(axis=1), present.sum(axis=1)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    return by_runs(mean, values)
+
+
+def spread_steps(present: Array) -> Array:
+    """One step of each run, spread over the trajectory: (runs, steps) of bool -> (runs,), -1 where none.
+
+    Runs are independent and steps are not, so one value of each run is an independent sample. Run i takes
+    the step at the i-th point of the golden-ratio sequence, which fills the trajectory evenly for any
+    number of runs and does not depend on the data.
+    """
+    present = np.asarray(present, bool)
+    place = np.mod(0.5 + np.arange(len(present)) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0)
+    return by_runs(_at_place, present, place)
+
+
+def _at_place(present: Array, place: Array) -> Array:
+    """The step of each run that has a share ``place`` (runs,) of its present ones before it; -1 where none."""
+    runs, steps = present.shape
+    count = present.sum(axis=1)
+    rank = np.minimum((place * count).astype(int), np.maximum(count - 1, 0))
+    nth = np.cumsum(present, axis=1) - 1
+    step = np.argmax(present & (nth == rank[:, None]), axis=1) if steps else np.zeros(runs, int)
+    return np.where(count > 0, step, -1)

@@ -1,0 +1,1 @@
+"""NEES, intervals, distributions and figures of merit."""

@@ -1,0 +1,78 @@
+"""The questions of a verdict, the share of the false-alarm rate of each, and the correction for multiple tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from consistency.referee.diagnostics.verdict.parts import Answer
+
+MAIN, STEP, AXIS, DIRECTION = "scale", "scale in some step", "scale of an axis", "scale in some direction"
+SCALE = (MAIN, STEP, AXIS, DIRECTION)
+BIAS = ("bias", "bias in some step")
+SHAPE = ("shape", "shape in some step")
+INNOVATIONS = ("innovation scale", "innovation whiteness")
+JOINT, JOINT_DISTRIBUTION = "scale of pose and map", "distribution of pose and map"
+# Share of the false-alarm rate of each question; those that are asked share what the main one leaves. Half goes to
+# the mean over the trajectory, so that the number of runs planned for a covariance ratio does not depend on what
+# else is asked.
+SHARES = {
+    MAIN: 0.5,
+    STEP: 0.1,
+    AXIS: 0.1,
+    DIRECTION: 0.1,
+    "bias": 0.05,
+    "bias in some step": 0.05,
+    "shape": 0.05,
+    "shape in some step": 0.05,
+    "outliers": 0.025,
+    "distribution": 0.025,
+    "innovation scale": 0.025,
+    "innovation whiteness": 0.025,
+    JOINT: 0.1,
+    JOINT_DISTRIBUTION: 0.025,
+}
+ABOUT = {
+    MAIN: "mean NEES of whole trajectories against its degrees of freedom",
+    STEP: "ANEES of every step against its simultaneous band",
+    AXIS: "the same mean for each axis and subset by itself",
+    DIRECTION: "largest eigenvalue of the mean whitened second moment, where only too small a covariance is a fault",
+    "bias": "Hotelling's T-squared of the mean whitened error of a trajectory",
+    "bias in some step": "Hotelling's T-squared of every step",
+    "shape": "mean products of different whitened components over a trajectory",
+    "shape in some step": "Mauchly's sphericity of the whitened errors of every step",
+    "outliers": "Wilks' largest distance of one run from the others in any step",
+    "distribution": "Kolmogorov's distance of the NEES from chi-square, one step a run",
+    "innovation scale": "total NIS against its degrees of freedom",
+    "innovation whiteness": "portmanteau test of the autocorrelation over steps",
+    JOINT: "NEES of pose and all landmarks together against its degrees of freedom",
+    JOINT_DISTRIBUTION: "Kolmogorov's distance of that NEES from chi-square, one value a run",
+}
+# what is wrong, where the answer to one of these questions is the only fault
+ALONE = {
+    JOINT_DISTRIBUTION: "the NEES of pose and map together does not follow the chi-square distribution",
+    "distribution": "the NEES does not follow the chi-square distribution",
+}
+
+
+def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answer]:
+    """Answers corrected for the number of questions: weighted Holm (1979), valid under any dependence.
+
+    The chance that a right filter is found at fault in any question is at most ``false_alarm``. The main question
+    keeps its share; the shares of questions that cannot be asked (p is NaN) go to the other ones. The
+    adjusted p value of a question is the false-alarm rate at which it would just be found.
+    """
+    by_question = {q: p for q, p in p_values.items() if np.isfinite(p)}
+    total = sum(SHARES[q] for q in by_question if q != MAIN)
+    kept = SHARES[MAIN] if MAIN in by_question else 0.0
+    share = {q: kept if q == MAIN else SHARES[q] * (1.0 - kept) / total for q in by_question}
+    if set(by_question) == {MAIN}:
+        share = {MAIN: 1.0}
+    result: dict[str, Answer] = {}
+    left, least = 1.0, 0.0
+    for question in sorted(by_question, key=lambda q: by_question[q] / share[q]):
+        least = max(least, min(1.0, by_question[question] * left / share[question]))
+        result[question] = Answer(question, by_question[question], share[question], least, least <= false_alarm)
+        left -= share[question]
+    return {q: result[q] for q in by_question}

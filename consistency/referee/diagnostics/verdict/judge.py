@@ -1,0 +1,145 @@
+"""The verdict on a record: on its errors and innovations, and on what it has beside them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.answers import SHARES
+from consistency.referee.diagnostics.verdict.parts import Settings, Verdict
+from consistency.referee.diagnostics.verdict.verdict import DEFAULT, judge_alone
+from consistency.referee.diagnostics.words.sentences import plain
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.planning.early_stopping import Design
+
+POSES = {"heading", "yaw", "pitch", "roll"}  # components that a pose has beside its position
+
+
+def judge(record: Record, settings: Settings = DEFAULT) -> Verdict:
+    """Judge one filter: a status of ``records.STATUSES``, with reasons.
+
+    Runs are independent, steps are not: every test takes a run as one observation, or holds under any
+    dependence between steps. A filter whose errors are Gaussian with the stated covariance is found at fault in
+    any of the questions (``consistency.referee.diagnostics.verdict.answers``) with probability ``false_alarm`` at most;
+    half of that belongs to the mean NEES, for which :func:`gate_runs` plans. A filter is *consistent* if no question
+    found a fault, and two one-sided tests put the ratio of true to stated covariance inside [1 / detect, detect]; with
+    ``lost``, the share of lost runs is shown to be at most that, too. Without a fault and without this evidence, the
+    filter is undecided. A filter with failed runs is never consistent.
+
+    Innovations are judged where an optimal gain is declared, otherwise they are reported: only those of an optimal gain
+    are white. Without truth they are judged alone.
+
+    If a fit to the truth absorbed an unknown part of the errors (``Record.reduced``), a covariance that is too large
+    is no fault, as with ``allow="conservative"``. *Consistent* is still shown on both sides, after adding the largest
+    share of the NEES that the fit may have absorbed (``Record.unseen``). Questions that cannot be answered after the
+    fit (``Record.unavailable``) are not asked.
+
+    A map is judged likewise, with its landmarks in the place of steps (``Record.landmarks``) and with the NEES of
+    pose and map together, where it is given.
+
+    Raises
+    ------
+    ValueError
+        Nothing to judge is given, or shapes or options do not fit.
+    """
+    return with_map(judge_runs(record, settings), record.ends, settings)
+
+
+def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | None = None) -> Verdict:
+    """:func:`judge` without the maps; with a ``design``, the verdict of the look that decides, or of the last one."""
+    if design is not None:
+        from consistency.referee.diagnostics.planning.early_stopping import follow
+
+        return of_look(*follow(design, record.first_runs, len(record.run_numbers)), record, design)
+    if record.guesses:
+        from consistency.referee.diagnostics.verdict.guessed_convention import judge_guesses
+
+        return replace(judge_guesses(record, settings, judge_runs), notes=tuple(record.notes))
+    runs, truth = record.as_runs, None
+    if record.truth_covariance is not None:
+        from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import uncertain_truth
+
+        truth = uncertain_truth(record)
+    if truth is not None:
+        runs, record = truth.evidence, replace(record, unshown=record.unshown or truth.unjudged)
+    if record.unshown:
+        runs = replace(runs, unavailable=tuple(SHARES))
+    world = None if record.world is None else judge_alone(record.in_world, settings)
+    if not runs.parts:
+        return _beside(judge_alone(runs, settings, truth=truth), record, world)
+    from consistency.referee.diagnostics.verdict.separate_components import judge_parts
+
+    return _beside(judge_parts(runs, settings), record, world)
+
+
+def of_look(verdict: Verdict, runs: int, record: Record, design: Design) -> Verdict:
+    """The verdict of a look at the first ``runs``, with what is known beside them."""
+    from consistency.referee.diagnostics.planning.early_stopping import follow
+
+    world = None if record.world is None else follow(design, record.in_world.first_runs, runs)[0]
+    return _beside(verdict, record, world, runs)
+
+
+def with_map(verdict: Verdict, ends: Record, settings: Settings, design: Design | None = None) -> Verdict:
+    """The verdict with that on the maps, which are read for it; a look has their scores alone.
+
+    Parameters
+    ----------
+    ends : :attr:`Record.ends`, so that the arrays of the runs can be free before the maps are read
+    """
+    landmarks = None if ends.map is None else ends.map()
+    if landmarks is None:
+        return verdict
+    from consistency.referee.diagnostics.maps.map_score import map_score
+
+    runs = None if design is None else 1 + int(ends.run_numbers[: verdict.runs].max(initial=-1))
+    record = None if runs is not None else landmarks.record(None if ends.nees is None else ends.nees[:, 0])
+    some = landmarks.of_runs(runs)
+    score = map_score(some.run, some.nees, landmarks.dof)
+    return replace(verdict, map=replace(score, verdict=None if record is None else judge_alone(record, settings)))
+
+
+def _beside(verdict: Verdict, r: Record, world: Verdict | None, runs: int | None = None) -> Verdict:
+    """The verdict with what the record says beside its arrays; ``runs`` of it were judged, or all."""
+    verdict = _unshown(verdict, r.unshown)
+    rejection = None
+    if r.rejections is not None:
+        from consistency.referee.diagnostics.maps.rejected_observations import rejection_score
+
+        rejection = rejection_score(*r.rejections.of_runs(runs)[1:])
+    first, *rest = verdict.reasons
+    left_out = verdict.left_out_steps
+    return replace(
+        verdict,
+        reasons=(f"{first}; {r.caption}" if r.caption else first, *rest, *_other_ways(verdict, r)),
+        convention=r.convention or None,
+        align=(r.align or None) if r.convention else None,
+        notes=tuple(r.notes),
+        left_out_steps=tuple(sorted({*left_out, *r.left_out_steps})) if r.align else left_out,
+        world=world,
+        rejection=rejection,
+    )
+
+
+def _unshown(verdict: Verdict, why: str) -> Verdict:
+    """Undecided, for that reason; as it was without one, or where a window failed."""
+    if not why or verdict.scale is None or verdict.status == "failed":
+        return verdict
+    scale = replace(verdict.scale, equivalence=replace(verdict.scale.equivalence, p_value=float("nan"), runs=None))
+    provided = "" if verdict.truth is not None else " if they are"
+    ratio = f"the covariance ratio would be {plain(scale.inflation)}{provided}, reported and not judged"
+    reasons = (f"undecided: {why}; {ratio}", *verdict.reasons[1:])
+    return replace(verdict, status="undecided", scale=scale, reasons=reasons)
+
+
+def _other_ways(verdict: Verdict, r: Record) -> list[str]:
+    """What else would decide on a single log of poses."""
+    is_log = len(r.run_numbers) == 1 and r.window is None and r.align and r.convention
+    if verdict.status != "undecided" or not is_log or not POSES & set(r.axes):
+        return []
+    return [
+        "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances, "
+        "or poses with cross-covariances (docs/files.md)"
+    ]

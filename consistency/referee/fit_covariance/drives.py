@@ -1,0 +1,150 @@
+"""Drives of an odometry beside their truth, from every file that verdicts are given on; no covariance is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.groups import composed, matrices
+from consistency.referee.outside import function_at
+from consistency.referee.readers.file_kinds import (
+    TABLES,
+    TRAJECTORIES,
+    is_bag,
+    is_drive,
+    is_plane,
+    is_solution,
+    kind_of,
+    trajectory_files,
+)
+from consistency.referee.readers.formats.table import table_poses
+from consistency.referee.readers.matching import truth_at
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.poses import NamedPoses
+from consistency.referee.types import Array, Indices
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One drive, at the N times at which both poses are known; d is 2 in the plane and 3 in space."""
+
+    name: str
+    t: Array  # (N,), s; NaN where it is not known
+    row: Indices  # (N,), of the estimates: neighbours differ by 1 where none is left out
+    estimate: Array  # (N, d + 1, d + 1), poses in any world
+    truth: Array  # (N, d + 1, d + 1)
+
+    @property
+    def d(self) -> int:
+        """2 in the plane, 3 in space."""
+        return int(self.truth.shape[-1]) - 1
+
+
+def read_drives(
+    estimates: str | Path, truth: str | Path | None = None, *, reading: Reading | None = None
+) -> list[Drive]:
+    """Poses of an odometry and of the truth, from files of any kind that ``consistency analyse`` reads.
+
+    Covariances in the files are not looked at. A file or a value of the column ``run`` is a drive.
+
+    Parameters
+    ----------
+    estimates : .csv, .parquet, .npz, .bag, a TUM trajectory, or a folder of these with one for each drive
+    truth : of the same kind, or the folder of a KITTI drive; in any world frame
+    reading : further options of files, in place of ``truth``
+
+    Raises
+    ------
+    InputError
+        Something cannot be used: names file, line, column or option, and what is allowed.
+    """
+    r = reading or Reading(truth=None if truth is None else Path(truth))
+    path = Path(estimates)
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    if r.time_offset == "estimate":
+        raise InputError("--time-offset estimate: needs poses in one world; give seconds")
+    return [_drive(each, r) for each in _poses(path, r)]
+
+
+def drive_of(
+    name: str, estimate: Array, truth: Array, t: Array | None = None, row: Indices | None = None, motions: bool = False
+) -> Drive:
+    """A drive of arrays.
+
+    Parameters
+    ----------
+    estimate, truth : (N, 3), x, y, heading in m and rad, or (N, 7), x, y, z and a quaternion x, y, z, w
+    t : (N,), s, increasing
+    motions : estimates are motions since the row before, not poses
+
+    Raises
+    ------
+    InputError
+        Shapes do not fit, or a value is not finite.
+    """
+    estimate, truth = np.asarray(estimate, float), np.asarray(truth, float)
+    if estimate.ndim != 2 or estimate.shape != truth.shape or estimate.shape[1] not in (3, 7):
+        raise InputError(f"{name}: estimates {estimate.shape} and truth {truth.shape} must both be (N, 3) or (N, 7)")
+    if not (np.isfinite(estimate).all() and np.isfinite(truth).all()):
+        raise InputError(f"{name}: a pose is not finite; leave such rows out")
+    T = matrices(estimate)
+    rows = np.arange(len(T)) if row is None else row
+    return Drive(
+        name, np.full(len(T), np.nan) if t is None else np.asarray(t, float), rows,
+        composed(T) if motions else T, matrices(truth),
+    )  # fmt: skip
+
+
+def _poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
+    """Name and poses of each drive."""
+    kind = kind_of(path, r)
+    if not is_bag(path) and path.is_dir() and not trajectory_files(path):
+        yield from _of_folder(path, r)
+    elif kind is None or not kind.poses or is_solution(path):
+        known = ", ".join((*TABLES, ".npz", ".bag", *TRAJECTORIES))
+        raise InputError(f"{path}: unknown kind of file; known are {known}")
+    else:
+        yield from function_at(kind.poses)(path, r)
+
+
+def _of_folder(folder: Path, r: Reading) -> Iterator[NamedPoses]:
+    """Tables of a folder, one for each drive, with truths of the same names in another."""
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in TABLES or is_plane(path))
+    if not files:
+        raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
+    for path in files:
+        truth = r.truth / path.name if r.truth is not None and r.truth.is_dir() and not is_drive(r.truth) else r.truth
+        if truth is not None and not truth.exists():
+            raise InputError(f"--truth {r.truth}: holds no file '{path.name}' for {path}")
+        for name, poses, clock in table_poses(path, replace(r, truth=truth)):
+            stem = path.name.split(".")[0]
+            yield NamedPoses(stem if name == path.stem else f"{stem}, {name}", poses, clock)
+
+
+def _drive(read: NamedPoses, r: Reading) -> Drive:
+    """The rows of a drive whose truth is known."""
+    name, poses, clock = read
+    finite = np.isfinite(poses.estimate).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise InputError(f"{poses.place[row]}: the pose is not finite; end the drive before it, or leave the row out")
+    t = poses.t + r.shift
+    known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
+    if len(known.rows) < 2:
+        raise InputError(
+            f"{name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t is "
+            f"{t[0]:.10g} to {t[-1]:.10g}, but {poses.true_t[0]:.10g} to {poses.true_t[-1]:.10g} in the truth"
+        )
+    T = matrices(poses.estimate)
+    T = composed(T) if r.motions else T
+    return Drive(name, clock[known.rows] + r.shift, known.rows, T[known.rows], matrices(known.truth))
+
+
+def names_of(drives: Sequence[Drive]) -> str:
+    """The first names, for messages."""
+    return ", ".join(drive.name for drive in drives[:5]) + ", …" * (len(drives) > 5)

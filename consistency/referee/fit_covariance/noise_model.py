@@ -1,0 +1,281 @@
+"""The noise model of an odometry at one span: fitted, judged, and told in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Fold, Judged, Ratio, folds_of, judged_by
+from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.motions import record_of, stretches_of
+from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
+from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_sound
+from consistency.referee.fit_covariance.variances import ENOUGH
+from consistency.referee.fit_covariance.white_noise import Noise, intervals, with_jitter
+from consistency.referee.fit_covariance.windows import PIECES, Windows, span_of, windows_of
+from consistency.referee.geometry.groups import matrices
+from consistency.referee.readers.relative_motions import Stretch
+from consistency.referee.types import Array
+from consistency.referee.verdicts.sources import analyse
+
+SPANS = (1, 2, 5, 10, 20)  # multiples of the span that the fit is judged at
+FEWEST = 3  # windows at a span that is shown
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """White noise of an odometry, fitted at one span, with the verdict on motions that chose nothing."""
+
+    name: str
+    span: str  # 1m, 2s, 100
+    noise: Noise
+    per_m: tuple[Interval, ...]  # (n,), variances a metre
+    per_rad: tuple[Interval, ...]  # (n,)
+    spans: tuple[Judged, ...]  # the first is that of the fit
+    record: Record = field(repr=False)  # judged motions, each a run
+    verdict: Verdict = field(repr=False)  # of the referee on these motions
+    fitted_drives: tuple[str, ...]
+    judged_drives: tuple[str, ...]
+    held_out: str  # "in turn", "half" or names
+    counts: Mapping[str, int]  # windows, and those left out: long, still, jumps
+    growth: Growth  # of the squared rotation error over the span
+    warnings: tuple[str, ...]
+    lasting: tuple[Lasting, ...] = ()  # errors that differ between drives
+    second: Second | None = None  # errors of the second estimator
+    drives: tuple[Drive, ...] = field(default=(), repr=False)
+    windows: Windows | None = field(default=None, repr=False)
+    folds: tuple[Fold, ...] = field(default=(), repr=False)
+    is_planar: bool = False
+
+    @property
+    def ratio(self) -> Ratio:
+        """Ratio of true to stated covariance at the span."""
+        return self.spans[0].whole
+
+    @property
+    def status(self) -> str:
+        """consistent, overconfident, conservative, inconsistent or undecided."""
+        is_of_truth = self.second is not None and bool(self.second.is_shared.any())
+        return decided(self.spans[0].status, is_of_truth or any(each.decides for each in self.lasting))
+
+    @property
+    def stretches(self) -> list[tuple[str, Stretch]]:
+        """Judged motions as files have them."""
+        assert self.windows is not None
+        return stretches_of(self.drives, self.windows, self.folds)
+
+    def correct(self, motions: ArrayLike) -> Array:
+        """Estimated motions (K, 3) or (K, 7) with the mean error taken out, as matrices (K, d + 1, d + 1)."""
+        return np.asarray(self.noise.mean.corrected(_matrices(motions, self.noise)[None])[0])
+
+    def covariance(self, motion: ArrayLike) -> Array:
+        """Covariance (n, n) of Log(D^-1 M) of a corrected motion D: the error in the body's frame at its end.
+
+        Parameters
+        ----------
+        motion : x, y, heading (3,) or x, y, z and a quaternion (7,), taken as even; or (K, 3) or (K, 7), its steps
+
+        Raises
+        ------
+        InputError
+            The motion is not of the model's space, or not finite.
+        """
+        steps = _matrices(motion, self.noise)
+        if len(steps) == 1:
+            steps = evenly(steps[0], PIECES)
+        return np.asarray(self.noise.covariance(steps[None])[0])
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Errors with ellipses, growth of the squared error over spans, and ratios by drive; needs ``[plot]``.
+
+        Parameters
+        ----------
+        path : .png, .pdf or .svg to write as well; one that is there is replaced
+        """
+        return _shown("page", "plot", self, path)
+
+    def __repr__(self) -> str:
+        return f"<NoiseModel {self.name}: {_shown('wording', 'sentence', self)}>"
+
+
+def decided(status: str, doubted: bool) -> str:
+    """A status at the span: nothing is consistent whose errors are the truth's, or last for a whole drive.
+
+    Such an error has one value a drive, so that a fit to few drives, and its judgement, rest on as few values.
+    """
+    return "undecided" if doubted and status == "consistent" else status
+
+
+def _shown(module: str, function: str, *arguments: Any) -> Any:
+    """Result of a function that draws or describes, whose module is loaded here."""
+    return getattr(import_module(f"consistency.referee.fit_covariance.{module}"), function)(*arguments)
+
+
+def fit_covariance(
+    records: Sequence[Drive],
+    span: str | float,
+    *,
+    held_out: str | None = None,
+    axes: int | None = None,
+    correct: bool = True,
+    cautious: float | None = None,
+    second: Sequence[Drive] | None = None,
+    name: str = "odometry",
+) -> NoiseModel:
+    """Fit a covariance to an odometry that states none, at one span, and judge it on drives that chose nothing.
+
+    Parameters
+    ----------
+    records : drives with their truth, of :func:`consistency.read_drives` or :func:`consistency.drive_of`
+    span : length of the motions: "1m" along the true path, "2s", or 100 steps
+    held_out : names of drives that are judged and not fitted, with commas; "half": the second half of every drive is
+        judged by a fit to the first halves; None: each drive is judged by a fit to all others, or halves of one
+    axes : 3 (x, y, yaw) or 6; None is that of the poses
+    correct : take the mean of scale and heading out first
+    cautious : probability, such as 0.9, that a new drive has no larger covariance than the one stated: raises all
+    second : another estimator's poses on the same drives, to tell errors of the truth
+    name : of the odometry, in sentences
+
+    Raises
+    ------
+    InputError
+        An option is out of its range, or the errors are none that white noise describes: says which, and what to do.
+    """
+    drives, over = list(records), span_of(span)
+    planar = _is_planar(drives, axes)
+    if cautious is not None and not 0.5 < cautious < 1.0:
+        raise InputError(f"--cautious {cautious:g}: must be a probability between 0.5 and 1, such as 0.9")
+    windows = windows_of(drives, over, planar)
+    require_sound(drives, windows, planar, correct)
+    noise, folds = folds_of(drives, windows, held_out, correct)
+    noise = with_jitter(noise, drives, windows, planar)
+    growth, lasting = growth_of(drives, windows, planar, noise.mean), persistent(noise, windows)
+    folds = [replace(fold, noise=replace(fold.noise, floor=noise.floor)) for fold in folds]
+    is_half = held_out == HALF or (held_out is None and len(drives) == 1)
+    if cautious is not None:
+        factor = caution(judged_by(folds, windows, len(drives), not is_half).whole, cautious)
+        noise, folds = _raised(noise, factor), [replace(fold, noise=_raised(fold.noise, factor)) for fold in folds]
+    spans = _spans(folds, drives, windows, planar, not is_half)
+    record = record_of(stretches_of(drives, windows, folds), windows.axes)
+    fitted = windows.of(~np.isin(windows.drive, folds[0].judged)) if held_out not in (None, HALF) else windows
+    per_m, per_rad = intervals(noise, fitted)
+    judged = sorted({int(i) for fold in folds for i in fold.judged})
+    return NoiseModel(
+        name=name, span=over.option, noise=noise, per_m=per_m, per_rad=per_rad, spans=spans, record=record,
+        verdict=replace(analyse([record])[record.name], record=record),
+        fitted_drives=tuple(drives[i].name for i in np.unique(fitted.drive)),
+        judged_drives=tuple(drives[i].name for i in judged),
+        held_out=HALF if is_half else held_out or "in turn",
+        counts={
+            "windows": len(windows.drive), "long": windows.long, "still": windows.still, "jumps": windows.jumps,
+        },
+        growth=growth, warnings=tuple(doubts(noise, windows, growth, lasting)), lasting=lasting,
+        second=None if second is None else errors_of_second(noise, windows, drives, second),
+        drives=tuple(drives), windows=windows, folds=tuple(folds), is_planar=planar,
+    )  # fmt: skip
+
+
+def caution(ratio: Ratio, probability: float) -> float:
+    """Factor on a covariance above which the ratio of a new drive is no larger than 1, with that probability.
+
+    The upper prediction limit of a log-normal ratio of drives.
+
+    Raises
+    ------
+    InputError
+        Fewer than ``ENOUGH`` drives are judged, which do not tell their spread.
+    """
+    if ratio.drives < ENOUGH:
+        raise InputError(
+            f"--cautious: {ratio.drives} judged drives do not tell how drives differ; it takes {ENOUGH} or more"
+        )
+    reach = float(stats.t.ppf(probability, ratio.drives - 1)) * ratio.spread * np.sqrt(1.0 + 1.0 / ratio.drives)
+    return float(max(1.0, ratio.value * np.exp(reach)))
+
+
+def evenly(motion: Array, pieces: int) -> Array:
+    """A motion (d + 1, d + 1) as equal pieces of one screw, (pieces, d + 1, d + 1)."""
+    root = np.array(motion)[None]
+    d = motion.shape[-1] - 1
+    if d == 2:
+        angle = np.arctan2(motion[1, 0], motion[0, 0]) / pieces
+        root = matrices(np.array([[0.0, 0.0, angle]]))
+    else:
+        from scipy.spatial.transform import Rotation
+
+        vector = Rotation.from_matrix(motion[:3, :3]).as_rotvec() / pieces
+        root[0] = np.eye(4)
+        root[0, :3, :3] = Rotation.from_rotvec(vector).as_matrix()
+    # T = r^p with translation sum r^k t: solve for t
+    total, power = np.zeros((d, d)), np.eye(d)
+    for _ in range(pieces):
+        total += power
+        power = power @ root[0, :d, :d]
+    root[0, :d, d] = np.linalg.solve(total, motion[:d, d])
+    return np.repeat(root, pieces, axis=0)
+
+
+def _matrices(motion: ArrayLike, noise: Noise) -> Array:
+    values = np.atleast_2d(np.asarray(motion, float))
+    width = 3 if len(noise.axes) == 3 else 7
+    if values.ndim != 2 or values.shape[1] != width or not np.isfinite(values).all():
+        raise InputError(f"motion: needs {width} finite numbers a step, got an array of {np.shape(motion)}")
+    return matrices(values)
+
+
+def _raised(noise: Noise, factor: float) -> Noise:
+    return replace(noise, factor=factor)
+
+
+def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
+    """Whether x, y and yaw are modelled."""
+    if not drives or not all(isinstance(drive, Drive) for drive in drives):
+        raise InputError("records: needs at least one drive, of cs.read_drives or cs.drive_of")
+    if axes not in (None, 3, 6):
+        raise InputError(f"--axes {axes}: must be 3 (x, y, yaw) or 6; a number here, names in 'analyse'")
+    spaces = {drive.d for drive in drives}
+    if len(spaces) > 1:
+        raise InputError("drives in the plane and in space do not go together; give --axes 3 poses in the plane")
+    if spaces == {2} and axes == 6:
+        raise InputError("--axes 6: the poses are x, y, heading, which have 3")
+    return spaces == {2} or axes == 3
+
+
+def _spans(
+    folds: Sequence[Fold], drives: Sequence[Drive], windows: Windows, planar: bool, general: bool
+) -> tuple[Judged, ...]:
+    """The span of the fit and its multiples, as long as there are windows."""
+    found = []
+    for times in SPANS:
+        try:
+            some = (
+                windows
+                if times == 1
+                else windows_of(drives, replace(windows.span, size=windows.span.size * times), planar)
+            )
+        except InputError:
+            break
+        if sum(int(fold.judges(some).sum()) for fold in folds) < FEWEST:
+            break
+        found.append(judged_by(folds, some, len(drives), general))
+    if not found:
+        raise InputError(
+            f"--span {windows.span.option}: fewer than {FEWEST} windows are left to judge; take a shorter span or "
+            f"longer drives: {DECIDE} windows, or {ENOUGH} drives, make a verdict possible"
+        )
+    return tuple(found)
+
+
+def error_windows(model: NoiseModel, judged: Judged) -> Windows:
+    """Corrected windows of one of the spans."""
+    return model.noise.mean.applied(windows_of(model.drives, span_of(judged.span), model.is_planar))

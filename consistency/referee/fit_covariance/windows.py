@@ -1,0 +1,191 @@
+"""Windows of one span, which do not overlap, each in a few pieces; jumps and windows without motion are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.geometry.groups import inverse, log
+from consistency.referee.readers.windows import Relative, relative_of, windows
+from consistency.referee.types import Array, Indices
+
+PIECES = 20  # of a window: sums over them are independent of the rate of the file, and as good as integrals
+STILL = 0.1  # of the span: a window with less motion says nothing about the span
+JUMP = (12.0, 3.0)  # medians of the errors of its drive's pieces, and windows, that a piece exceeds in a jump
+PLANE, SPACE = ("x", "y", "yaw"), ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class Windows:
+    """W windows of some drives, in P pieces of estimated motion each; a piece that is the identity is none."""
+
+    span: Relative
+    drive: Indices  # (W,), index of the drive
+    first: Indices  # (W,), rows of the drive
+    last: Indices  # (W,)
+    pieces: Array  # (W, P, d + 1, d + 1), motions
+    true: Array  # (W, d + 1, d + 1), of the whole window
+    long: int = 0  # windows left out because rows or truth are missing
+    still: int = 0  # left out, with hardly any motion
+    jumps: int = 0  # left out, with a jump
+
+    @property
+    def d(self) -> int:
+        """2 in the plane, 3 in space."""
+        return int(self.true.shape[-1]) - 1
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the components of the error."""
+        return PLANE if self.d == 2 else SPACE
+
+    @property
+    def motions(self) -> Array:
+        """Estimated motion of each window, (W, d + 1, d + 1)."""
+        return rests(self.pieces)[:, 0]
+
+    @property
+    def errors(self) -> Array:
+        """Log(D^-1 M) of the estimated and the true motion, (W, n)."""
+        return log(inverse(self.motions) @ self.true)
+
+    @property
+    def cut(self) -> float:
+        """Share of windows that have a jump."""
+        return self.jumps / max(len(self.drive) + self.jumps, 1)
+
+    def of(self, keep: Indices | Array) -> Windows:
+        """Some of the windows."""
+        names = ("drive", "first", "last", "pieces", "true")
+        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+
+
+def span_of(text: str | float) -> Relative:
+    """Parse a span: 1m, 2s, 100 steps.
+
+    Raises
+    ------
+    InputError
+        It is not a positive number with its unit.
+    """
+    try:
+        span = relative_of(text)
+    except InputError:
+        span = None
+    if span is None:
+        raise InputError(f"--span {text}: must be metres along the true path (1m), seconds (2s) or a number of steps")
+    return replace(span, flag="--span")
+
+
+def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) -> Windows:
+    """The windows of all drives; drives in which none fits have none.
+
+    Parameters
+    ----------
+    planar : x, y and yaw alone of motions in space
+
+    Raises
+    ------
+    InputError
+        No window fits in any drive.
+    """
+    parts, long, refused = [], 0, None
+    for number, drive in enumerate(drives):
+        try:
+            position = drive.truth[:, : drive.d, drive.d]
+            rows = drive.row if span.unit == "step" else np.arange(len(position))
+            first, last, skipped = windows(drive.t, position, rows, span, drive.name)
+        except InputError as error:
+            refused = error
+            continue
+        long += skipped
+        first, last = np.searchsorted(rows, first), np.searchsorted(rows, last)
+        parts.append(_pieces(number, drive, first, last, planar))
+    if not parts:
+        assert refused is not None
+        raise refused
+    index, first, last, pieces, true, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    found = Windows(span, index, first, last, pieces, true, long)
+    moved, jumped = _moves(found), _jumps(errors, found)
+    found = replace(found, still=int((~moved).sum()), jumps=int((moved & jumped).sum()))
+    if not (moved & ~jumped).any():
+        raise InputError(f"--span {span.option}: no window of {drives[0].name} has motion without a jump; take another")
+    return found.of(moved & ~jumped)
+
+
+def _pieces(
+    number: int, drive: Drive, first: Indices, last: Indices, planar: bool
+) -> tuple[Indices, Indices, Indices, Array, Array, Array]:
+    """Windows of one drive: index, rows, pieces (W, P, ...), true motions, and the errors of pieces (W, P, n)."""
+    share = np.linspace(0.0, 1.0, PIECES + 1)
+    ends = np.rint(first[:, None] + share * (last - first)[:, None]).astype(np.int64)
+    T, true = drive.estimate, drive.truth
+    D, M = (inverse(each[ends[:, :-1]]) @ each[ends[:, 1:]] for each in (T, true))
+    whole = inverse(true[first]) @ true[last]
+    if planar and drive.d == 3:
+        D, M, whole = (in_plane(each) for each in (D, M, whole))
+    error = log((inverse(D) @ M).reshape(-1, *D.shape[-2:])).reshape(*D.shape[:2], -1)
+    error[ends[:, 1:] == ends[:, :-1]] = np.nan
+    return np.full(len(first), number), first, last, D, whole, error
+
+
+def in_plane(T: Array) -> Array:
+    """Motions in space (..., 4, 4) as x, y and yaw, (..., 3, 3); yaw is the direction of the x axis."""
+    out = np.zeros((*T.shape[:-2], 3, 3))
+    yaw = np.arctan2(T[..., 1, 0], T[..., 0, 0])
+    out[..., 0, 0] = out[..., 1, 1] = np.cos(yaw)
+    out[..., 1, 0] = np.sin(yaw)
+    out[..., 0, 1] = -out[..., 1, 0]
+    out[..., :2, 2], out[..., 2, 2] = T[..., :2, 3], 1.0
+    return out
+
+
+def rests(pieces: Array) -> Array:
+    """Motion from the beginning of each piece to the end of its window, (W, P, ...) -> (W, P + 1, ...)."""
+    W, P, m, _ = pieces.shape
+    out = np.empty((W, P + 1, m, m))
+    out[:, P] = np.eye(m)
+    for k in reversed(range(P)):
+        out[:, k] = pieces[:, k] @ out[:, k + 1]
+    return out
+
+
+def ways(pieces: Array) -> Array:
+    """Length of each piece, (W, P), m."""
+    d = pieces.shape[-1] - 1
+    return np.asarray(np.linalg.norm(pieces[..., :d, d], axis=-1))
+
+
+def turns(pieces: Array) -> Array:
+    """Rotation vectors (W, P, 3), or (W, P, 1) in the plane, rad."""
+    if pieces.shape[-1] == 3:
+        return np.arctan2(pieces[..., 1, 0], pieces[..., 0, 0])[..., None]
+    flat = pieces[..., :3, :3].reshape(-1, 3, 3)
+    vectors = Rotation.from_matrix(flat).as_rotvec() if len(flat) else np.empty((0, 3))
+    return np.asarray(vectors.reshape(*pieces.shape[:2], 3))
+
+
+def _moves(of: Windows) -> Array:
+    """Which windows have motion, (W,): on the way, for a span in m; in way or turn, compared with others, otherwise."""
+    way = ways(of.pieces).sum(axis=1)
+    if of.span.unit == "m":
+        return np.asarray(way >= STILL * of.span.size)
+    turn = np.linalg.norm(turns(of.pieces), axis=-1).sum(axis=1)
+    return np.asarray((way > STILL * np.median(way)) | (turn > STILL * np.median(turn)))
+
+
+def _jumps(errors: Array, of: Windows) -> Array:
+    """Which windows have a piece whose error (W, P, n), of position or rotation, is a jump in its drive, (W,)."""
+    out, whole = np.zeros(len(errors), bool), of.errors
+    for part in (slice(0, of.d), slice(of.d, None)):
+        pieces, windows = (np.linalg.norm(each[..., part], axis=-1) for each in (errors, whole))
+        for drive in np.unique(of.drive):
+            rows = of.drive == drive
+            limit = max(JUMP[0] * float(np.nanmedian(pieces[rows])), JUMP[1] * float(np.median(windows[rows])))
+            out[rows] |= (np.nan_to_num(pieces[rows]) > limit).any(axis=1) & (limit > 0)
+    return out

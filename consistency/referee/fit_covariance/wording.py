@@ -1,0 +1,199 @@
+"""A fitted noise model in sentences, a table and numbers for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.defaults import DETECT
+from consistency.referee.diagnostics.verdict.as_dictionary import flat
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.words.sentences import plural, short
+from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
+from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Ratio
+from consistency.referee.fit_covariance.noise_model import NoiseModel
+from consistency.referee.fit_covariance.persistence import SHARED, Second
+from consistency.referee.fit_covariance.variances import ENOUGH
+from consistency.referee.fit_covariance.windows import span_of
+
+MARK = {"consistent": "", "undecided": " ?", "overconfident": " overconfident", "conservative": " conservative"}
+
+
+def sentence(model: NoiseModel) -> str:
+    """Span, status, ratio with its interval, and on how many drives it rests."""
+    r = model.ratio
+    word = f"consistent within x{DETECT:g}" if model.status == "consistent" else model.status
+    shown = f"{short(r.value)} [{short(r.low)}, {short(r.high)}]" if np.isfinite(r.low) else short(r.value)
+    return f"at {_text(model.span)} {word}: held-out ratio {shown}; {_basis(model)}{_why(model)}"
+
+
+def _text(span: str) -> str:
+    """1 m, 10 steps."""
+    return span_of(span).text
+
+
+def _basis(model: NoiseModel) -> str:
+    r, windows = model.ratio, plural(model.ratio.windows, "window")
+    if model.held_out == HALF:
+        of = plural(r.drives, "drive")
+        return f"fitted on the first {'half' if r.drives == 1 else 'halves'} of {of}, judged on the second ({windows})"
+    if model.held_out == "in turn":
+        return f"{plural(r.drives, 'drive')}, each judged by the fit of the others ({windows})"
+    return f"fitted on {plural(len(model.fitted_drives), 'drive')}, judged on {r.drives} ({windows})"
+
+
+def _why(model: NoiseModel) -> str:
+    """Reasons for a status that the ratio does not tell."""
+    r, parts = model.ratio, []
+    if model.held_out == HALF and model.status == "undecided":
+        parts.append("halves of a drive show nothing about a new one; give drives that are not fitted")
+    elif r.drives < ENOUGH and r.windows < DECIDE:
+        parts.append(f"too few to decide, which takes {ENOUGH} drives or {DECIDE} windows")
+    if model.second is not None and model.second.is_shared.any():
+        worst = int(np.argmax(model.second.correlation))
+        parts.append(
+            f"errors in {model.noise.axes[worst]} correlate {model.second.correlation[worst]:.2f} with those of the "
+            "second estimator: they are the truth's, or the calibration's"
+        )
+    if model.spans[0].status == "consistent":
+        parts += [
+            f"{each.term} differs between drives and makes up {each.share:.0%} of the variance of an axis, so that new "
+            "drives may have another covariance"
+            for each in model.lasting if each.decides
+        ]  # fmt: skip
+    open_axes = [a for a, axis in zip(model.noise.axes, model.spans[0].axes, strict=True) if axis.status == "undecided"]
+    found = [
+        f"{a} {axis.status}" for a, axis in zip(model.noise.axes, model.spans[0].axes, strict=True)
+        if axis.status in ("overconfident", "conservative")
+    ]  # fmt: skip
+    if found:
+        parts.append(", ".join(found))
+    if open_axes and model.status == "consistent":
+        parts.append(f"undecided: {', '.join(open_axes)}")
+    return "".join(f"; {part}" for part in parts)
+
+
+def document(model: NoiseModel) -> Document:
+    """Sentence, corrections, table over axes and spans, and limits; numbers as data."""
+    return Document(
+        f"{model.name}: noise of motions over {_text(model.span)}",
+        "",
+        (),
+        (
+            Text(f"{model.name}: {sentence(model)}"), *([Text(correction(model))] if correction(model) else []),
+            _table(model), *(Text(line) for line in lines(model)),
+        ),
+        data(model),
+    )  # fmt: skip
+
+
+def correction(model: NoiseModel) -> str:
+    """What is corrected before the covariance holds; empty where nothing is."""
+    m = model.noise.mean
+    if m.way == m.turn == 1.0 and not any(m.drift):
+        return ""
+    drift = ", ".join(f"{each:+.3g}" for each in m.drift)
+    of = "heading" if len(m.drift) == 1 else "roll, pitch, yaw"
+    return f"correct first: way x{m.way:.4g}, turn x{m.turn:.4g}, {of} {drift} rad/m"
+
+
+def _table(model: NoiseModel) -> Table:
+    heads = [
+        Column("axis"),
+        Column("per m^.5", number=True),
+        Column("per rad^.5", number=True),
+        Column("at least", number=True),
+    ]
+    heads += [
+        Column(f"held-out {_text(each.span)}" if i == 0 else _text(each.span)) for i, each in enumerate(model.spans)
+    ]
+    rows: list[tuple[Cell, ...]] = []
+    for i, axis in enumerate(model.noise.axes):
+        unit = "m" if axis in "xyz" else "rad"
+        sizes = [f"{np.sqrt(each[i].value):.2g} {unit}" for each in (model.per_m, model.per_rad)]
+        sizes.append(f"{np.sqrt(model.noise.floor[i]):.2g} {unit}")
+        rows.append((axis, *sizes, *(_cell(each.axes[i]) for each in model.spans)))
+    rows.append(("all", "", "", "", *(_cell(each.whole) for each in model.spans)))
+    label = "Noise of each axis, and ratios of true to stated covariance over spans"
+    return table(tuple(heads), rows, label, style="plain")
+
+
+def _cell(ratio: Ratio) -> Cell:
+    if not np.isfinite(ratio.low):
+        return Quantity(ratio.value)
+    return f"{short(ratio.value)} [{short(ratio.low)}, {short(ratio.high)}]{MARK[ratio.status]}"
+
+
+def lines(model: NoiseModel) -> list[str]:
+    """Limits of the model, what was left out, and what the referee says of the judged motions."""
+    out, r = [], model.ratio
+    limit = next((each.span for each in model.spans[1:] if each.whole.status != "consistent"), None)
+    parts = [f"not shown for {_text(limit)} and more"] if limit else [f"shown for {_text(model.span)} alone"]
+    if np.isfinite(r.spread):
+        low, high = r.reach
+        parts.append(f"a new drive: {low:.2g} to {high:.2g}")
+    else:
+        parts.append("a new drive: not known from one")
+    counts = model.counts
+    parts.append(f"jumps cut: {counts['jumps']}")
+    for key, why in (("still", "without motion"), ("long", "with rows or truth missing")):
+        if counts[key]:
+            parts.append(f"left out {why}: {counts[key]}")
+    out.append("; ".join(parts))
+    if model.noise.factor != 1.0:
+        out.append(
+            f"cautious: all covariances are raised x{model.noise.factor:.3g}, so that a new drive seldom has more"
+        )
+    if model.second is not None:
+        out.append(_of_second(model.second, model.noise.axes))
+    out += model.warnings
+    out.append(
+        f"analyse counts each judged motion as a run, though those of a drive depend: {model.verdict.reasons[0]}"
+    )
+    return out
+
+
+def _of_second(second: Second, axes: Sequence[str]) -> str:
+    """How errors of both correlate, and where the second errs too much to tell."""
+    shown = ", ".join(f"{axis} {each:.2f}" for axis, each in zip(axes, second.correlation, strict=True))
+    rough = ", ".join(np.array(axes)[second.is_rough])
+    text = f"correlation with errors of the second estimator: {shown}; above {SHARED:g} they are the truth's"
+    return text + (f"; it errs too much to tell in {rough}" if rough else "")
+
+
+def _interval(value: Interval) -> list[float | None]:
+    return [float(each) if np.isfinite(each) else None for each in value]
+
+
+def _ratio(ratio: Ratio) -> dict[str, Any]:
+    numbers = {key: getattr(ratio, key) for key in ("value", "low", "high", "spread")}
+    clean = {key: float(each) if np.isfinite(each) else None for key, each in numbers.items()}
+    return {**clean, "drives": ratio.drives, "windows": ratio.windows, "status": ratio.status}
+
+
+def data(model: NoiseModel) -> dict[str, Any]:
+    """Everything as plain data, as noise.toml and --json have it."""
+    n, m = model.noise, model.noise.mean
+    return {
+        "name": model.name, "status": model.status, "sentence": sentence(model), "span": model.span,
+        "axes": list(n.axes), "fitted_drives": list(model.fitted_drives), "judged_drives": list(model.judged_drives),
+        "held_out": model.held_out, "counts": dict(model.counts),
+        "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": list(m.drift)},
+        "noise": {
+            "variance_per_m": n.per_m.tolist(), "variance_per_rad": n.per_rad.tolist(), "floor": n.floor.tolist(),
+            "factor": n.factor, "per_m_interval": [_interval(each) for each in model.per_m],
+            "per_rad_interval": [_interval(each) for each in model.per_rad],
+        },
+        "growth": None if np.isnan(model.growth.power) else model.growth.power, "warnings": list(model.warnings),
+        "second_correlation": None if model.second is None else model.second.correlation.tolist(),
+        "second_size": None if model.second is None else model.second.size.tolist(),
+        "spans": [
+            {"span": each.span, "whole": _ratio(each.whole),
+             **{axis: _ratio(of) for axis, of in zip(n.axes, each.axes, strict=True)},
+             "by_drive": [None if np.isnan(v) else float(v) for v in each.by_drive[:, 0]]}
+            for each in model.spans
+        ],
+        "referee": flat(model.verdict),
+    }  # fmt: skip

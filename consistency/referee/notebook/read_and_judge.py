@@ -1,0 +1,169 @@
+"""Files of another estimator to a record, and the verdict on it; both draw themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+from numpy.typing import ArrayLike
+
+from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.numpy_archive import record_of_arrays
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.read_files import read_frames, read_recordings
+from consistency.referee.readers.truth_covariance import declared, require_truth_options
+from consistency.referee.verdicts.options import settings_of, skip_asked
+from consistency.referee.verdicts.sources import analyse
+
+
+def read(
+    estimates: str | Path | Any,
+    truth: str | Path | Any | None = None,
+    covariance: str | Path | None = None,
+    error: str | None = None,
+    *,
+    state: Sequence[str] | None = None,
+    covariance_order: str | None = None,
+    max_dt: float | None = None,
+    time_offset: float | str | None = None,
+    axes: Sequence[str] | None = None,
+    topic: str | None = None,
+    truth_topic: str | None = None,
+    body: str | None = None,
+    relative: str | float | None = None,
+    motions: bool = False,
+    windows: str | None = None,
+    align: str | None = None,
+    lever_arm: Sequence[float] | None = None,
+    split: str | int | None = None,
+    truth_covariance: str | Path | None = None,
+    truth_errors: str | None = None,
+    truth_shared: bool = False,
+    shared: str | None = None,
+    shared_from: str | Path | None = None,
+    shared_truth: str | Path | None = None,
+    filter: str | None = None,
+) -> Record:
+    """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
+
+    Parameters
+    ----------
+    estimates : .csv, .parquet, .npz, a TUM trajectory, or a folder of these with one for each run; or a table in
+        memory, as a DataFrame, with the columns of a .csv
+    truth : of the same kind, or the folder of a KITTI drive; not with .npz
+    covariance : of a TUM trajectory: t and 36 or 21 numbers
+    error : error that the covariance describes: so2, vector, left, right, so3 or so3-body; None is the default,
+        and "guess" judges all that poses have
+    state : names of the columns that make up the state, in .csv and .parquet; None is x, y, heading
+    covariance_order : translation-rotation or rotation-translation, of a trajectory
+    max_dt : s, between an estimate and its truth; None is 0.01
+    time_offset : s to add to the timestamps of the estimates, or "estimate"
+    axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw
+    topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
+    body : whose poses a KITTI drive gives as truth: imu (default), velodyne or camera
+    relative : judge motions over windows of so many steps (100), seconds ("10s") or metres ("50m")
+    motions : with ``relative``: each row is a motion with a covariance of its own, not a pose
+    windows : "independent" declares errors of different windows independent, so that each is a run
+    align : none, origin, posyaw, posyaw-all, se3 or se3-all: how estimates are moved into the world of the truth
+    lever_arm : of a truth of positions alone: its point in the axes of the estimated body, x, y, z, m
+    split : cut one long log into so many pieces, which stand as runs; "auto" takes the advised number
+    truth_covariance : of the truth itself, in the convention of the error: "columns" of its file, or a file of t and 36
+        or 21 numbers
+    truth_errors : how errors of the truth depend on each other: "independent", "per-run", or "common" to all runs; with
+        None only what holds under any dependence is said
+    truth_shared : the estimator has fused the truth
+    shared : take off errors that all estimates share: a vector ("by-vector"), one that grows by the second ("by-time"),
+        or by the metre of the true path ("by-distance")
+    shared_from, shared_truth : drives that these are fitted to, and their truth, ``truth`` by default; without them the
+        first half, and halves of one log are at most undecided
+    filter : which estimator, where the files hold several
+
+    Raises
+    ------
+    InputError
+        Something cannot be used: names file, line, column or option, and what is allowed.
+    """
+    in_memory = any(hasattr(table, "columns") for table in (estimates, truth))
+    true = None if truth is None or in_memory else Path(truth)
+    stated = None if covariance is None else Path(covariance)
+    of_truth = None if truth_covariance is None else str(truth_covariance)
+    reading = Reading(
+        true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
+        motions or None, windows, align, lever_arm, split, of_truth, truth_errors,
+        truth_shared or None, shared, *(None if each is None else Path(each) for each in (shared_from, shared_truth)),
+    )  # fmt: skip
+    found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
+    where = "estimates" if in_memory else estimates
+    named = {recording.name: recording for recording in found}
+    if filter is None and len(named) > 1:
+        raise InputError(f"{where}: holds several estimators ({', '.join(named)}); choose one with filter=")
+    name = next(iter(named)) if filter is None else filter
+    if name not in named:
+        raise InputError(f"filter '{name}' is not in {where}; there are: {', '.join(named)}")
+    return named[name]
+
+
+def judge(
+    record: Record | str | Path | ArrayLike,
+    covariances: ArrayLike | None = None,
+    *,
+    deviations: ArrayLike | None = None,
+    axes: Sequence[str] | None = None,
+    independent: bool = False,
+    name: str = "estimator",
+    optimal_gain: bool = False,
+    skip: str | float | None = None,
+    truth_covariances: ArrayLike | None = None,
+    truth_errors: str | None = None,
+    truth_shared: bool = False,
+    **settings: Any,
+) -> Verdict:
+    """Judge a record, a file, or arrays: consistent, overconfident, conservative, undecided, ..., with reasons.
+
+    Parameters
+    ----------
+    record : of :func:`read`; or a path, which is read without options; or errors (runs, steps, n), truth minus
+        estimate. A run whose error is not finite, or whose covariance is not positive definite, has failed in that
+        step: it is counted, and the others are judged. Where every run begins with singular covariances, as at a
+        start that is known exactly, its steps are left out up to the first of full rank. Steps without a truth are
+        masked (``numpy.ma``) and do not count.
+    covariances : (runs, steps, n, n), beside errors
+    deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
+        judged by itself, at a false-alarm rate that all share (Holm)
+    axes : (n,) names of the components of errors
+    independent : errors are (N, n) and covariances (N, n, n), or deviations (N, n), and each row is an independent run
+        of one step
+    name : of the estimator, in messages; arrays alone
+    optimal_gain : True if the filter has an optimal gain and gates nothing away: its innovations are then judged
+    skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
+    truth_covariances : (runs, steps, n, n), of the truth itself, beside errors
+    truth_errors, truth_shared : of arrays, as for :func:`read`
+    settings : ``false_alarm``, ``detect``, ``power``, ``tolerance``, ``allow``, ``lost`` of
+        :class:`consistency.diagnostics.Settings`
+
+    Raises
+    ------
+    InputError
+        A setting out of its range, or nothing is left; shapes that do not fit, a covariance that is not symmetric, a
+        step that is not finite in any run.
+    """
+    given = {"covariances": covariances, "deviations": deviations}
+    stated = {key: value for key, value in given.items() if value is not None}
+    if len(stated) > 1:
+        raise InputError("covariances, deviations: give one of them beside errors")
+    if stated:
+        stated |= {} if truth_covariances is None else {"truth_covariances": truth_covariances}
+        record = record_of_arrays({"errors": cast(ArrayLike, record), **stated}, axes, name, independent)
+        options = Reading(truth_errors=truth_errors, truth_shared=truth_shared or None)
+        require_truth_options(options)
+        (record,) = declared([record], options)
+    elif isinstance(record, (str, Path)):
+        record = read(record)
+    elif not isinstance(record, Record):
+        raise InputError("covariances: needed beside errors, (runs, steps, n, n); or deviations, (runs, steps, n)")
+    record = record.without_first(skip_asked(skip))
+    verdict = analyse([record], settings=settings_of(**settings), optimal_gain=optimal_gain)[record.name]
+    return replace(verdict, record=record)

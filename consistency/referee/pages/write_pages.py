@@ -1,0 +1,181 @@
+"""Pages on the verdicts and records of any estimator: what a document of them holds, and documents as files.
+
+Renderers of ``show`` write them. No statistic is computed here that the diagnostics do not already have.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from consistency.referee.errors import InputError
+from consistency.referee.extras import missing, require
+from consistency.referee.show import rendered
+from consistency.referee.system.atomic import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from consistency.referee.diagnostics import Evidence, Verdict
+    from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
+    from consistency.referee.document.blocks import Document
+    from consistency.referee.system.progress import Advance
+    from consistency.referee.verdicts.monitor_sources import Watched
+
+KINDS = (".png", ".pdf", ".svg")  # of a plot
+
+
+def require_pages(html: Path | None, pdf: Path | None, overwrite: bool) -> None:
+    """Refuse, before any work, files of a report that cannot be written; None leaves one out.
+
+    Raises
+    ------
+    InputError
+        Both are the same, or one exists or cannot be written.
+    """
+    if html is not None and pdf is not None and html.absolute() == pdf.absolute():
+        raise InputError(f"{html}: is named for both HTML and PDF; name two files")
+    for path in (html, pdf):
+        if path is not None:
+            require_writable(path, overwrite)
+
+
+def write_file_pages(
+    records: Sequence[Evidence], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
+) -> None:
+    """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
+    from consistency.referee.pages.files_report import compose_files
+    from consistency.referee.system.provenance import manifest_of
+
+    write_document(compose_files(records, judged, title, manifest_of(kind="verdict", source=title)), html, pdf)
+
+
+def write_file_reports(
+    records: Sequence[Evidence],
+    judged: Mapping[str, Verdict],
+    folder: Path,
+    title: str,
+    data: str,
+    overwrite: bool = False,
+) -> list[Path]:
+    """``report.html``, ``report.pdf`` and ``verdict.json`` in a folder that appears whole or not at all.
+
+    Without the packages of [report] the page is a static one, and there is no PDF.
+
+    Parameters
+    ----------
+    judged : verdicts by name of the records that are shown
+    data : text of the JSON file
+
+    Raises
+    ------
+    InputError
+        The folder exists or cannot be written.
+    """
+    from consistency.referee.system.folders import write_folder
+    from consistency.referee.system.provenance import manifest_of
+
+    manifest = manifest_of(kind="verdict", source=title)
+    write = _static_page(records, judged, title) if missing("report") else _pages(records, judged, title, manifest)
+
+    def contents(at: Path) -> None:
+        write(at)
+        write_file(at / "verdict.json", data.encode("utf-8"))
+
+    write_folder(folder, manifest, contents, overwrite)
+    names = ("report.html", "report.pdf", "verdict.json")
+    return [path for path in (folder / name for name in names) if path.exists()]
+
+
+def _pages(
+    records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str, manifest: dict[str, Any]
+) -> Callable[[Path], None]:
+    from consistency.referee.pages.files_report import compose_files
+
+    document = compose_files(records, judged, title, manifest)
+    return lambda at: write_document(document, at / "report.html", at / "report.pdf")
+
+
+def _static_page(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
+    from consistency.referee.pages.core_page import compose_plain
+    from consistency.referee.show.as_html import render
+
+    text = render(compose_plain(records, judged, title))
+    return lambda at: write_file(at / "report.html", text.encode("utf-8"))
+
+
+def write_text_file(document: Document, path: Path, overwrite: bool) -> Path:
+    """One file, in the format of its suffix.
+
+    Raises
+    ------
+    InputError
+        The file exists or cannot be written.
+    """
+    require_writable(path, overwrite)
+    write_file(path, rendered(document, path).encode("utf-8"))
+    return path
+
+
+def write_document(
+    document: Document, html: Path | None, pdf: Path | None, *, advance: Advance = lambda _: None
+) -> None:
+    """The document in both formats, each file whole or not at all; None leaves one out."""
+    from consistency.referee.show.html import render_html
+    from consistency.referee.show.pdf import pdf_beside
+
+    contents: list[tuple[Path, bytes]] = []
+    with pdf_beside(document) if pdf is not None else nullcontext(bytes) as finished:
+        if html is not None:
+            contents.append((html, render_html(document).encode("utf-8")))
+            advance(1)
+        if pdf is not None:
+            contents.append((pdf, finished()))
+            advance(1)
+    for path, content in contents:
+        write_file(path, content)
+
+
+def require_plot(path: Path, overwrite: bool) -> None:
+    """Refuse, before any work, a plot that cannot be written.
+
+    Raises
+    ------
+    InputError
+        The kind of file is unknown, the file exists, or it cannot be written.
+    """
+    if path.suffix.lower() not in KINDS:
+        raise InputError(f"--plot {path}: must end in {', '.join(KINDS)}")
+    require("a plot", "plot")
+    require_writable(path, overwrite)
+
+
+def write_monitor_plot(path: Path, shown: Watched | Sequence[GateRatios]) -> None:
+    """NIS and evidence of a run over its steps, or test ratios, as PNG, PDF or SVG by the suffix of ``path``."""
+    from consistency.referee.pages.monitor import monitor_plot
+
+    write_file(path, monitor_plot(shown, path.suffix.lower().removeprefix(".")))
+
+
+def require_writable(path: Path, overwrite: bool) -> None:
+    """Refuse, before any work, what cannot be written or must not be replaced."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file")
+    if (path.exists() or path.is_symlink()) and not overwrite:
+        raise InputError(f"{path}: exists already; name another file or add --overwrite")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """A file, whole or not at all; raises :class:`InputError` where the system refuses."""
+    try:
+        write_whole(path, content, 0o644)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

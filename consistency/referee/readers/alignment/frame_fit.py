@@ -1,0 +1,130 @@
+"""Frames of least NEES, and how whitened errors change with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.whitening import whiten
+from consistency.referee.errors import InputError
+from consistency.referee.readers.alignment.world_frames import (
+    IDENTITY,
+    WorldTransform,
+    fitted_frame,
+    moved,
+    turned_frame,
+)
+from consistency.referee.readers.matching import Known
+from consistency.referee.readers.poses import Poses
+from consistency.referee.types import Array, Indices
+
+STEP = 1e-6  # m or rad, over which the change of an error is taken
+ROUNDS, DONE = 20, 1e-3  # steps of a fit at most; the last one, in stated standard deviations: the next is its square
+RANK = 1e-10  # of the largest singular value: directions that no error shows
+
+
+@dataclass(frozen=True)
+class Sound:
+    """Estimates of one run that have truth and a covariance of full rank, k of them."""
+
+    rows: Indices  # (k,)
+    truth: Array  # (k, m)
+    whitened: Array  # (k, n), errors, of the components that are judged
+
+
+def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sound:
+    """Estimates usable for an alignment; ``known`` is the truth at all timestamps, if already computed."""
+    known = p.known() if known is None else known
+    w = _whitened(p, known.rows, p.error_of(known.rows, known.truth), judged)
+    fine = np.isfinite(w).all(axis=1) & p.stated[known.rows]
+    return Sound(known.rows[fine], known.truth[fine], w[fine])
+
+
+def _whitened(p: Poses, rows: Indices, error: Array, judged: Sequence[int]) -> Array:
+    index = list(judged)
+    return by_runs(lambda e, at: whiten(e[:, index], p.covariance[at][:, index][:, :, index]), error, rows)
+
+
+def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array:
+    """Change of the whitened errors with a small motion of the world of the estimates, (k, n, d).
+
+    The truth is moved the other way instead: errors and covariances are carried alike, so that the whitened errors
+    are the same but for a turn of their axes.
+
+    Parameters
+    ----------
+    free : (d, 6), directions in which the world moves: shift, then rotation vector
+    """
+
+    def of_block(truth: Array, rows: Indices) -> Array:
+        k, d = len(rows), len(free)
+        there = [_small(side * motion).placed(truth, p.manifold) for side in (-STEP, STEP) for motion in free]
+        errors = p.error_of(np.tile(rows, 2 * d), np.concatenate(there))
+        after, before = errors.reshape(2, d * k, errors.shape[-1])
+        change = _whitened(p, np.tile(rows, d), (after - before) / (2.0 * STEP), judged)
+        return np.moveaxis(change.reshape(d, k, len(judged)), 0, -1)
+
+    return by_runs(of_block, sound.truth, sound.rows)
+
+
+def _small(motion: Array) -> WorldTransform:
+    return WorldTransform(Rotation.from_rotvec(motion[3:]), motion[:3])
+
+
+def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: Sequence[int]) -> WorldTransform:
+    """The frame in which the sum of the NEES of all ``runs`` is least, by Gauss-Newton iteration.
+
+    Raises
+    ------
+    InputError
+        No estimate has a truth and a covariance of full rank.
+    """
+    known = [p.known() for p in runs]
+
+    def at(frame: WorldTransform) -> tuple[float, list[Poses], list[Sound]]:
+        there = [moved(p, frame) for p in runs]
+        found = [sound_of(p, judged, k) for p, k in zip(there, known, strict=True)]
+        return float(sum(np.square(sound.whitened).sum() for sound in found)), there, found
+
+    frame = turned_frame(runs) if free[:, 3:5].any() else fitted_frame(runs) or IDENTITY
+    nees, there, found = at(frame)
+    if not any(len(sound.rows) for sound in found):
+        raise InputError(f"--align: no estimate of {name} has a truth and a covariance of full rank to be aligned by")
+    for _ in range(ROUNDS):
+        step, size = _step(there, found, free, judged)
+        further = _small(step @ free).after(frame)
+        while size > DONE and (tried := at(further))[0] > nees:
+            step, size = 0.5 * step, 0.5 * size
+            further = _small(step @ free).after(frame)
+        frame = further
+        if size <= DONE:
+            break
+        nees, there, found = tried
+    return frame
+
+
+def _step(runs: Sequence[Poses], found: Sequence[Sound], free: Array, judged: Sequence[int]) -> tuple[Array, float]:
+    """Gauss-Newton step (d,), and its length in stated standard deviations."""
+    tangents = [tangent(p, sound, free, judged).reshape(-1, len(free)) for p, sound in zip(runs, found, strict=True)]
+    A, w = np.concatenate(tangents), np.concatenate([sound.whitened.ravel() for sound in found])
+    scale = _sizes(A)
+    step = -np.linalg.lstsq(A / scale, w, rcond=RANK)[0] / scale
+    return step, float(np.linalg.norm(A @ step))
+
+
+def _sizes(A: Array) -> Array:
+    size = np.sqrt(np.square(A).sum(axis=0))
+    return np.where(size > 0, size, 1.0)
+
+
+def orthonormal(tangents: Sequence[Array]) -> list[Array]:
+    """Columns Q, (k, n, d) of each run, that span the tangents of one frame of all runs; fewer where some are 0."""
+    A = np.concatenate([each.reshape(-1, each.shape[-1]) for each in tangents])
+    U, s, _ = np.linalg.svd(A / _sizes(A), full_matrices=False)
+    U = U[:, s > RANK * s[0]]
+    ends = np.cumsum([each.shape[0] * each.shape[1] for each in tangents])[:-1]
+    return [part.reshape(*each.shape[:2], -1) for part, each in zip(np.split(U, ends), tangents, strict=True)]

@@ -1,0 +1,155 @@
+"""Estimates moved from their own world frame into that of the truth, and the covariances of the residual errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import ENOUGH, inflation_of_mean, left_covariances
+from consistency.referee.diagnostics.verdict.answers import BIAS, INNOVATIONS, MAIN, SHARES, STEP
+from consistency.referee.errors import InputError
+from consistency.referee.readers.alignment.align import Aligned
+from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
+from consistency.referee.readers.alignment.origin import frame_of_first_pose, from_first_pose
+from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
+from consistency.referee.readers.poses import Poses
+
+FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
+    ("posyaw", "spatial"): np.eye(6)[[0, 1, 2, 5]],
+    ("posyaw", "planar"): np.eye(6)[[0, 1, 5]],
+    ("posyaw", "vector"): np.eye(6)[[0, 1, 2, 5]],  # of positions alone
+    ("se3", "spatial"): np.eye(6),
+}
+LEAST = 0.05  # least share of its NEES that a run keeps; a run of a step or two might keep none
+COMMON = 0.25  # largest variance of the frame, over that of the mean error of all runs, to judge single steps
+ALL_BUT_SCALE = tuple(q for q in SHARES if q != MAIN and q not in INNOVATIONS)
+OF_RUNS = "what is constant over a run, a covariance that is too large, and single steps and axes are not judged"
+OF_ALL = "an error that is the same in all runs and steps is not judged"
+OSCILLATING = "the errors alternate or oscillate, so that it is not known what the frame takes of them"
+NO_MEAN = "the errors cancel over each run, so that the frame's own error outweighs their mean"
+SLIGHT = 0.01  # of a covariance: what an uncertain first pose adds to the others, and counts as nothing below
+
+
+def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) -> list[WorldTransform]:
+    """The frame of each run.
+
+    Raises
+    ------
+    InputError
+        The errors are not those of a pose that such a frame has, or no estimate can be aligned.
+    """
+    if mode == "origin":
+        return [frame_of_first_pose(name, p) for p in runs]
+    base, _, shared = mode.partition("-")
+    kind = runs[0].manifold
+    if (base, kind) not in FREE:
+        raise InputError(f"--align {mode}: turns about x and y are for poses in space; for x, y, heading it is posyaw")
+    if shared:
+        return [frame_of_least_nees(name, runs, FREE[base, kind], judged)] * len(runs)
+    return [frame_of_least_nees(name, [p], FREE[base, kind], judged) for p in runs]
+
+
+def aligned(
+    name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int], frames: Sequence[WorldTransform] | None = None
+) -> Aligned:
+    """Runs moved into the world of the truth by frames of least NEES, or by their first poses (``origin``).
+
+    The covariance is multiplied by the share of the NEES that a run keeps, which
+    ``diagnostics.imperfect_truth.residuals_of_fit.left_covariances`` finds. Only the sum of the NEES of a run is
+    known: a frame may make errors larger in some steps or axes. Fewer than ``ENOUGH`` runs do not show the share; their
+    covariance is unchanged, and too large. After ``origin`` it is a bound, as files lack the correlation with the
+    first pose.
+
+    Parameters
+    ----------
+    frames : frame of each run, if known
+
+    Raises
+    ------
+    InputError
+        The errors have no such frame, or no estimate can be aligned, as in :func:`frames_of`.
+    """
+    frames = frames_of(name, runs, mode, judged) if frames is None else frames
+    there = [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
+    found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
+    return replace(found, mode=mode, notes=(_sizes(name, mode, frames), *found.notes))
+
+
+# --- residual errors -------------------------------------------------------------------------------------------
+
+
+def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) -> Aligned:
+    """Covariances of the residuals of a fit; unchanged where these are not known."""
+    base, _, for_all = mode.partition("-")
+    found = [sound_of(p, judged) for p in runs]
+    some = [i for i, sound in enumerate(found) if len(sound.rows)]
+    tangents = [tangent(runs[i], found[i], FREE[base, runs[i].manifold], judged) for i in some]
+    bases = orthonormal(tangents) if for_all else [orthonormal([A])[0] for A in tangents]
+    dof = max(Q.shape[-1] for Q in bases)
+    what = f"aligned by {mode}, a frame of {dof} degrees of freedom for {'all runs' if for_all else 'each run'}"
+    if len(some) < ENOUGH:
+        note = (
+            f"{name}: fewer than {ENOUGH} runs do not show what the frame takes of the errors; nothing makes up for it"
+        )
+        return Aligned(runs, notes=(note,), caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
+    residuals = [found[i].whitened for i in some]
+    left = left_covariances(residuals, bases, bool(for_all))
+    if left.oscillating:
+        most = f"at most about {100.0 * left.unseen:.2g} % of the NEES"
+        note = f"{name}: the errors alternate or oscillate; nothing makes up for what the frame takes of them, {most}"
+        caption = f"{what}: {OF_RUNS}, and {OSCILLATING} ({most})"
+        return Aligned(
+            runs, notes=(note,), caption=caption, reduced=True, unavailable=ALL_BUT_SCALE, unseen=left.unseen
+        )
+    kept = [max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST) for M in left.covariances]
+    factors = dict(zip(some, kept, strict=True))
+    out = [replace(p, covariance=p.covariance * factors.get(i, 1.0)) for i, p in enumerate(runs)]
+    note = (
+        f"{name}: the frame takes {100.0 * (1.0 - np.mean(kept)):.2g} % of the NEES of a right covariance, made up for"
+    )
+    if not for_all:
+        return Aligned(out, notes=(note,), caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
+    added = len(some) * (max(float(np.linalg.eigvalsh(M)[:, -1].max()) for M in left.covariances) - 1.0)
+    if added > COMMON:
+        return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}, nor are single steps", unavailable=(STEP, *BIAS))
+    if inflation_of_mean(residuals, bases) > 1.0 + COMMON:
+        return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}, nor is a bias: {NO_MEAN}", unavailable=BIAS)
+    return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}")
+
+
+def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
+    """Covariances of the errors relative to the first poses, or bounds of them."""
+    out, factors = zip(*(from_first_pose(name, p, judged) for p in runs), strict=True)
+    every = np.concatenate(factors)
+    larger = float(np.median(every)) if len(every) else 1.0
+    if larger < 1.0 + SLIGHT:
+        return Aligned(out, caption="aligned by origin: the error of the first pose of each run is not judged")
+    note = (
+        f"{name}: the first pose is not exact, and files do not say how its error is correlated with the others; "
+        f"covariances are made {larger:.3g} times as large in the median, which holds whatever that is"
+    )
+    caption = "aligned by origin, whose first poses are not exact: a covariance that is too large is not judged"
+    return Aligned(out, notes=(note,), caption=caption, reduced=True, unavailable=(*BIAS, "outliers"))
+
+
+# --- words --------------------------------------------------------------------------------------------------
+
+
+def _sizes(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
+    """How far the worlds are turned and shifted."""
+    if len(frames) == 1 or mode.endswith("-all"):
+        axis, where = (
+            ", ".join(f"{value:.4g}" for value in values)
+            for values in (np.rad2deg(frames[0].turn.as_rotvec()), frames[0].shift)
+        )
+        return f"{name}: aligned by {mode}: turned by ({axis}) degrees about x, y, z and shifted by ({where}) m"
+    turns = _span([float(np.rad2deg(frame.turn.magnitude())) for frame in frames])
+    shifts = _span([float(np.linalg.norm(frame.shift)) for frame in frames])
+    each = f"each of {len(frames)} runs by itself"
+    return f"{name}: aligned by {mode}, {each}: turned by {turns} degrees and shifted by {shifts} m"
+
+
+def _span(values: Sequence[float]) -> str:
+    return f"{min(values):.3g} to {max(values):.3g} (median {np.median(values):.3g})"

@@ -1,0 +1,161 @@
+"""Clocks that differ: the time by which the truth of some runs is early or late, from their errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import optimize
+
+from consistency.referee.diagnostics.records.whitening import whiten
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.errors import InputError
+from consistency.referee.readers.alignment.align import Aligned
+from consistency.referee.readers.poses import Poses
+from consistency.referee.types import Array
+
+REACH = 1.0  # s, the largest offset that is looked for
+STEP = 1e-3  # s, over which the motion of the truth is taken
+MOST = 4000  # estimates that are looked at, of all runs together
+PARTS = 12  # that a single run is cut into
+CAP = 100.0  # NEES over its degrees of freedom, beyond which an estimate counts no more: a broken one decides nothing
+GROSS = 4.0  # mean NEES over its degrees of freedom that a right single run hardly has
+ROUNDS, SETTLED = 5, 1e-4  # of clocks and frames in turn, and the change of the offset, s, that ends them
+RATE = 1e-4  # chance that an offset is named where there is none
+LEAST = 0.01  # share of the NEES that it makes, at least
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Time to add to the timestamps of the estimates, with its 95 % interval."""
+
+    value: float  # s
+    low: float
+    high: float
+    p_value: float  # of no offset, by the spread between runs, or between parts of a single run
+    explained: float  # share of the sum of the NEES that goes with it
+    alone: bool = False  # of a single run, whose own error along the path may look the same
+
+    @property
+    def found(self) -> bool:
+        return self.p_value <= RATE and self.explained >= LEAST and not self.alone
+
+    def __str__(self) -> str:
+        return f"{self.value:.4g} s [{self.low:.4g}, {self.high:.4g}]"
+
+
+def clocks_and_frames(
+    name: str, runs: Sequence[Poses], time_offset: float | str | None, align: str | None, judged: Sequence[int]
+) -> tuple[float, list[str], Aligned]:
+    """Time to add to the timestamps, s, notes on it, and the runs in the world of the truth.
+
+    Parameters
+    ----------
+    align : one of ``ALIGNMENTS``, or None
+    judged : components of the error that are judged, and by which frames are fitted
+
+    Raises
+    ------
+    InputError
+        The offset cannot be estimated, or nothing can be aligned.
+    """
+    if align is None:
+        return *clock_shift(name, runs, time_offset), Aligned(runs)
+    from consistency.referee.readers.alignment.residuals import aligned, frames_of
+    from consistency.referee.readers.alignment.world_frames import moved
+
+    shift = time_offset if isinstance(time_offset, float) else 0.0
+    for _ in range(ROUNDS):
+        before, frames = shift, frames_of(name, [p.later(shift) for p in runs], align, judged)
+        there = [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
+        shift, notes = clock_shift(name, there, time_offset)
+        if abs(shift - before) <= SETTLED:
+            break
+    found = aligned(name, [p.later(shift) for p in runs], align, judged, frames if shift == before else None)
+    return shift, notes, replace(found, runs=[replace(p, t=own.t) for p, own in zip(found.runs, runs, strict=True)])
+
+
+def clock_shift(name: str, runs: Sequence[Poses], wanted: float | str | None) -> tuple[float, list[str]]:
+    """Time to add to the timestamps of the estimates, s, and notes on it.
+
+    Parameters
+    ----------
+    wanted : seconds to add; "estimate"; or None, which adds nothing but reports an offset if one is found
+
+    Raises
+    ------
+    InputError
+        The offset cannot be estimated.
+    """
+    if isinstance(wanted, float):
+        return wanted, [f"{name}: {wanted:g} s are added to the timestamps of the estimates"] if wanted else []
+    found = offset_of(runs)
+    if wanted is None:
+        return 0.0, [_named(name, found)] if found is not None and found.found else []
+    if found is None:
+        raise InputError(f"--time-offset estimate: nothing moves in {name}, so that the clocks cannot be compared")
+    return found.value, [
+        f"{name}: the clocks differ by {found}; so much is added to the timestamps of the estimates, which takes "
+        f"{100.0 * found.explained:.0f} % of the NEES away"
+    ]
+
+
+def _named(name: str, found: Offset) -> str:
+    return (
+        f"{name}: the clocks of estimates and truth seem to differ by {found}, which makes "
+        f"{100.0 * found.explained:.0f} % of the NEES; if so, add --time-offset {found.value:.4g}"
+    )
+
+
+def offset_of(runs: Sequence[Poses]) -> Offset | None:
+    """The offset of the clocks that fits best; None where nothing moves, or the data are too few.
+
+    The offset minimises the NEES (capped) within a second; one Gauss-Newton step in each run, or in each of
+    ``PARTS`` parts of a single one, tells how far runs agree on it (Student's t).
+    """
+    some = [sound for poses in runs if len((sound := poses.some(max(MOST // len(runs), 50)).sound()).t)]
+    if not some:
+        return None
+
+    judged = [np.isfinite(np.square(whiten(poses.errors(), poses.covariance)).sum(axis=1)) for poses in some]
+
+    def size(shift: float) -> float:
+        return float(np.mean([_size(poses, shift, those) for poses, those in zip(some, judged, strict=True)]))
+
+    steps = np.geomspace(0.004, REACH, 12)
+    grid = np.concatenate([-steps[::-1], [0.0], steps])
+    sizes = np.array([size(shift) for shift in grid])
+    if not np.isfinite(sizes).any() or np.nanmax(sizes) - np.nanmin(sizes) <= 1e-9 or not size(0.0) > 0.0:
+        return None  # nothing moves, or no error is there to explain
+    best = int(np.nanargmin(sizes))
+    low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    found = optimize.minimize_scalar(size, bounds=(low, high), method="bounded", options={"xatol": 1e-5})
+    value = float(found.x) if found.fun < sizes[best] else float(grid[best])
+    each = np.concatenate([steps_of(poses, value, 1 if len(some) > 1 else PARTS) for poses in some])
+    each = value + each[np.isfinite(each)]
+    if len(each) < 3:
+        return None
+    spread = each.std(ddof=1) / np.sqrt(len(each))
+    reach = float(distributions.t.ppf(0.975, len(each) - 1) * spread)
+    p = 2.0 * float(distributions.t.sf(abs(each.mean()) / spread, len(each) - 1)) if spread > 0 else float(value == 0.0)
+    alone = len(some) == 1 and not (size(0.0) > GROSS and size(value) < 0.5 * size(0.0))
+    return Offset(value, value - reach, value + reach, p, 1.0 - size(value) / size(0.0), alone)
+
+
+def _size(poses: Poses, shift: float, judged: Array) -> float:
+    """Mean NEES of ``judged`` over its degrees of freedom, capped, as it is where there is no truth then."""
+    w = whiten(poses.errors(shift), poses.covariance)
+    nees = np.square(w).sum(axis=1) / w.shape[1]
+    return float(np.minimum(np.where(np.isfinite(nees), nees, CAP), CAP)[judged].mean()) if judged.any() else np.nan
+
+
+def steps_of(poses: Poses, shift: float, parts: int) -> Array:
+    """Gauss-Newton step from ``shift`` in each part, s; NaN where nothing moves."""
+    e = whiten(poses.errors(shift), poses.covariance)
+    moved = (poses.errors(shift + STEP) - poses.errors(shift - STEP)) / (2.0 * STEP)
+    v = whiten(moved, poses.covariance)
+    top, bottom = (v * e).sum(axis=1), np.square(v).sum(axis=1)
+    fine = np.isfinite(top) & np.isfinite(bottom) & (np.square(e).mean(axis=1) < CAP)
+    groups = np.array_split(np.flatnonzero(fine), parts)
+    return np.array([-top[g].sum() / bottom[g].sum() if bottom[g].sum() > 0 else np.nan for g in groups])

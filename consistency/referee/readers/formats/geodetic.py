@@ -1,0 +1,248 @@
+"""Positions on the ellipsoid in a plane that touches it, and the solutions that RTKLIB writes."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.sheet import Lines, increasing
+from consistency.referee.readers.formats.text_blocks import blocks
+from consistency.referee.types import Array
+
+A, F = 6378137.0, 1.0 / 298.257223563  # m and 1: semi-major axis and flattening of WGS 84 (NIMA TR8350.2, table 3.1)
+E2 = F * (2.0 - F)
+GPS = dt.datetime(1980, 1, 6)  # begin of its weeks
+UNIX = dt.datetime(1970, 1, 1)
+LEAPS = (  # days from which GPS time is one second more ahead of UTC (IERS, Bulletin C)
+    "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01", "1992-07-01",
+    "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01",
+    "2015-07-01", "2017-01-01",
+)  # fmt: skip
+AHEAD = {"GPST": 0.0, "UTC": 0.0, "JST": 9 * 3600.0}  # s of the clocks of RTKLIB before UTC, leap seconds aside
+GEODETIC = ("latitude(deg)", "longitude(deg)", "height(m)")
+SEXAGESIMAL = ("latitude(d'\")", "longitude(d'\")", "height(m)")  # degrees, minutes and seconds apart
+CENTRED = ("x-ecef(m)", "y-ecef(m)", "z-ecef(m)")
+BASELINE = ("e-baseline(m)", "n-baseline(m)", "u-baseline(m)")
+STATED = {
+    GEODETIC: ("sdn", "sde", "sdu", "sdne", "sdeu", "sdun"),
+    SEXAGESIMAL: ("sdn", "sde", "sdu", "sdne", "sdeu", "sdun"),
+    CENTRED: ("sdx", "sdy", "sdz", "sdxy", "sdyz", "sdzx"),
+    BASELINE: ("sde", "sdn", "sdu", "sden", "sdnu", "sdue"),
+}
+AXES = {"e": 0, "n": 1, "u": 2, "x": 0, "y": 1, "z": 2}
+QUALITY: dict[float, str] = {1: "fixed", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
+
+
+@dataclass(frozen=True)
+class Fixes(Lines):
+    """Positions with covariances: t, s since 1970 in UTC, three numbers of the place, and 9 of the covariance.
+
+    The place is latitude and longitude, degrees, and height, m, with ``geodetic``; else east, north, up, m. The
+    covariance is that of east, north and up there, m^2.
+    """
+
+    geodetic: bool = True
+    alone: bool = False  # deviations are stated without cross terms
+
+    @property
+    def origin(self) -> Array:
+        """The first place, (3,)."""
+        return self.values[0, 1:4]
+
+    def local(self, origin: Array | None = None) -> tuple[Array, Array]:
+        """Positions (N, 3) and covariances (N, 3, 3) in the plane that touches the ellipsoid in ``origin``."""
+        place, P = self.values[:, 1:4], self.values[:, 4:].reshape(-1, 3, 3)
+        if not self.geodetic:
+            return place, P
+        start = self.origin if origin is None else origin
+        turn = axes_at(start)
+        between = turn @ np.swapaxes(axes_at(place), -1, -2)
+        return (centred(place) - centred(start)) @ turn.T, between @ P @ np.swapaxes(between, -1, -2)
+
+
+def centred(place: Array) -> Array:
+    """Latitude, longitude, degrees, and height, m, (..., 3), to x, y, z from the centre of the earth, m."""
+    latitude, longitude, height = np.moveaxis(np.asarray(place, float), -1, 0)
+    phi, lam = np.deg2rad(latitude), np.deg2rad(longitude)
+    N = A / np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
+    out = [(N + height) * np.cos(phi) * np.cos(lam), (N + height) * np.cos(phi) * np.sin(lam)]
+    return np.stack([*out, (N * (1.0 - E2) + height) * np.sin(phi)], axis=-1)
+
+
+def geodetic(point: Array) -> Array:
+    """Latitude, longitude, degrees, and height, m, (..., 3), of x, y, z from the centre of the earth, m.
+
+    The latitude is the fixed point of tan phi = (z + e^2 N sin phi) / p, which each round brings e^2 nearer.
+    """
+    x, y, z = np.moveaxis(np.asarray(point, float), -1, 0)
+    p, phi = np.hypot(x, y), np.arctan2(z, (1.0 - E2) * np.hypot(x, y))
+    for _ in range(8):
+        phi = np.arctan2(z + E2 * A * np.sin(phi) / np.sqrt(1.0 - E2 * np.sin(phi) ** 2), p)
+    height = p * np.cos(phi) + z * np.sin(phi) - A * np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
+    return np.stack([np.rad2deg(phi), np.rad2deg(np.arctan2(y, x)), height], axis=-1)
+
+
+def axes_at(place: Array) -> Array:
+    """Rows east, north, up (..., 3, 3) of a place, as directions from the centre of the earth."""
+    phi, lam = np.deg2rad(np.asarray(place, float)[..., 0]), np.deg2rad(np.asarray(place, float)[..., 1])
+    s, c, sl, cl, zero = np.sin(phi), np.cos(phi), np.sin(lam), np.cos(lam), np.zeros_like(phi)
+    rows = [[-sl, cl, zero], [-s * cl, -s * sl, c], [c * cl, c * sl, s]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def localised(own: Lines, true: Lines) -> tuple[Lines, Lines, str]:
+    """Fixes among estimates and truth as positions in one plane, and a note on it; all else as it is.
+
+    The plane touches the ellipsoid in the first place of the truth, or of the estimates where the truth has none.
+    """
+    geodetic = [each for each in (true, own) if isinstance(each, Fixes) and each.geodetic]
+    if not geodetic:
+        return _plain(own, None), _plain(true, None), ""
+    origin = geodetic[0].origin
+    at = f"{origin[0]:.7f}, {origin[1]:.7f} degrees, {origin[2]:.2f} m"
+    note = f"{geodetic[0].path}: x is east, y north, z up from its first place, {at} above the ellipsoid"
+    if len(geodetic) == 1:
+        other = own if geodetic[0] is true else true
+        note += f"; add --align posyaw-all where {other.path} is in another world, turned about z or of another height"
+    return _plain(own, origin), _plain(true, origin), note
+
+
+def _plain(lines: Lines, origin: Array | None) -> Lines:
+    if not isinstance(lines, Fixes):
+        return lines
+    place, P = lines.local(origin)
+    return replace(lines, values=np.column_stack([lines.t, place, P.reshape(-1, 9)]), geodetic=False)
+
+
+# --- RTKLIB ------------------------------------------------------------------------------------------
+
+
+def read_solution(path: Path) -> Fixes:
+    """A solution of RTKLIB: latitude, longitude, height; x, y, z from the earth's centre; or east, north, up.
+
+    Its deviations are in m. ``sdne`` and the like are the roots of cross terms with the sign of the cross term (RTKLIB
+    manual 2.4.2, appendix B.1).
+
+    Raises
+    ------
+    InputError
+        The file has no header that names these columns, a row is broken, or times do not increase.
+    """
+    clock, names, rows, numbers = "", list[str](), list[list[str]](), list[int]()
+    for block in blocks(path):
+        for number, line in block.lines():
+            if line.startswith("%"):
+                words = line[1:].split()
+                clock, names = (words[0], words[1:]) if words and words[0] in AHEAD else (clock, names)
+                continue
+            if not names:
+                raise InputError(f"{path}, line {number}: stands under no header '%  GPST  latitude(deg) ...'")
+            rows.append(line.replace(",", " ").split())
+            numbers.append(number)
+            width = len(names) + 2 * (1 + sum(name in SEXAGESIMAL[:2] for name in names))
+            if len(rows[-1]) != width:
+                what = f"has {len(rows[-1])} fields; its header names a time of two and {width - 2} more"
+                raise InputError(f"{path}, line {number}: {what}")
+    if not rows:
+        raise InputError(f"{path}: holds no solution")
+    kind = next((each for each in STATED if set(each) <= set(names)), None)
+    if kind is None:
+        raise InputError(
+            f"{path}: holds none of {', '.join(GEODETIC)}; {', '.join(CENTRED)}; {', '.join(BASELINE)}; have RTKLIB "
+            "write it with out-solformat =llh, =xyz or =enu"
+        )
+    t = np.array([_time(path, number, row, clock) for number, row in zip(numbers, rows, strict=True)])
+    values = _numbers(path, numbers, [row[2:] for row in rows])
+    if kind is SEXAGESIMAL:
+        values, names = _in_degrees(path, numbers, values, names, rows)
+    place = values[:, [names.index(name) for name in kind]]
+    P = _covariance(path, names, values, STATED[kind])
+    if kind is CENTRED:
+        place = geodetic(place)
+        P = axes_at(place) @ P @ np.swapaxes(axes_at(place), 1, 2)
+    quality = Counter(int(each) for each in values[:, names.index("Q")]) if "Q" in names else Counter[int]()
+    shares = ", ".join(f"{count} {QUALITY.get(q, f'Q={q}')}" for q, count in sorted(quality.items()))
+    note = (
+        f"{path}: read as a solution of RTKLIB, {len(names) + 2} columns, {_clock_note(clock, t)}; {shares or 'no Q'}"
+    )
+    values = np.column_stack([t, place, P.reshape(-1, 9)])
+    lines = Fixes(path, values, np.array(numbers), note, geodetic=kind is not BASELINE)
+    increasing(lines)
+    return lines
+
+
+def _numbers(path: Path, numbers: Sequence[int], rows: Sequence[Sequence[str]]) -> Array:
+    out = []
+    for number, row in zip(numbers, rows, strict=True):
+        try:
+            out.append([float(field) for field in row])
+        except ValueError:
+            raise InputError(f"{path}, line {number}: a field is not a number ({' '.join(row)[:60]})") from None
+    return np.array(out)
+
+
+def _in_degrees(
+    path: Path, numbers: Sequence[int], values: Array, names: Sequence[str], rows: Sequence[Sequence[str]]
+) -> tuple[Array, list[str]]:
+    """Values with degrees, minutes and seconds in one column, and their names; -0 degrees are negative."""
+    columns, at = [], 0
+    for name in names:
+        if name not in SEXAGESIMAL[:2]:
+            columns.append(values[:, at])
+            at += 1
+            continue
+        whole, minutes, seconds = values[:, at : at + 3].T
+        bad = np.flatnonzero((minutes < 0) | (minutes >= 60) | (seconds < 0) | (seconds > 60) | (whole % 1 != 0))
+        if len(bad):
+            row = rows[bad[0]]
+            what = f"'{' '.join(row[2 + at : 5 + at])}' is no angle of degrees, minutes and seconds"
+            raise InputError(f"{path}, line {numbers[bad[0]]}: {what}")
+        columns.append(np.copysign(np.abs(whole) + minutes / 60.0 + seconds / 3600.0, whole))
+        at += 3
+    return np.column_stack(columns), list(names)
+
+
+def _time(path: Path, number: int, row: Sequence[str], clock: str) -> float:
+    """Seconds since 1970 in UTC of a date and a time of day, or of a week and its second."""
+    try:
+        if "/" in row[0]:
+            (year, month, day), (hour, minute, seconds) = map(int, row[0].split("/")), row[1].split(":")
+            second = float(seconds)
+            at = dt.datetime(year, month, day, int(hour), int(minute))
+        else:
+            at, second = GPS + dt.timedelta(weeks=int(row[0])), float(row[1])
+    except (ValueError, IndexError, TypeError, OverflowError):
+        raise InputError(f"{path}, line {number}: '{' '.join(row[:2])}' is no date and time, and no GPS week") from None
+    whole = (at - UNIX).total_seconds() - AHEAD[clock]
+    return whole + second - (leap_seconds(whole + second) if clock == "GPST" else 0)
+
+
+def leap_seconds(t: float) -> int:
+    """Seconds that GPS time is ahead of UTC at a time in GPS time, s since 1970."""
+    days = [(dt.datetime.fromisoformat(day) - UNIX).total_seconds() for day in LEAPS]
+    return sum(t - k >= day for k, day in enumerate(days, 1))
+
+
+def _clock_note(clock: str, t: Array) -> str:
+    if clock != "GPST":
+        return f"times of {clock} as UTC"
+    first = next(k for k in range(len(LEAPS) + 1) if leap_seconds(t[0] + k) == k)
+    return f"times of GPS as UTC, {first} leap seconds less"
+
+
+def _covariance(path: Path, names: Sequence[str], values: Array, stated: Sequence[str]) -> Array:
+    """Covariances (N, 3, 3) of east, north, up, or of x, y, z, of deviations and signed roots of cross terms."""
+    P = np.zeros((len(values), 3, 3))
+    for name in stated:
+        if f"{name}(m)" not in names:
+            raise InputError(f"{path}: column '{name}(m)' is missing, of the deviations of the position")
+        root = values[:, names.index(f"{name}(m)")]
+        i, j = (AXES[letter] for letter in (name[2:] * 2)[:2])
+        P[:, i, j] = P[:, j, i] = root * np.abs(root)
+    return P

@@ -1,0 +1,303 @@
+"""Poses in space by the names of their columns, as EuRoC, exports of bags and tables of pandas have them."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import re
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.parsing import is_file
+from consistency.referee.readers.formats.text_blocks import opened
+from consistency.referee.types import Array
+
+PEEKED = 2**16  # bytes of a file that hold its header and its first row
+POSITIONS = ("p_rs_r_{}", "p_{}", "p{}", "t_{}", "t{}", "pos_{}", "position_{}", "translation_{}", "{}")
+QUATERNIONS = ("q_rs_{}", "q_{}", "q{}", "quat_{}", "orientation_{}", "rotation_{}")
+MOVING = (
+    ("v_rs_r_{}", "v_{}", "v{}", "vel_{}", "velocity_{}"),
+    ("b_w_rs_s_{}", "bg_{}", "bg{}", "bw_{}", "bw{}", "b_g_{}", "gyro_bias_{}"),
+    ("b_a_rs_s_{}", "ba_{}", "ba{}", "b_a_{}", "accel_bias_{}"),
+)  # velocity, biases of gyroscope and accelerometer
+INNER = ("position_{}", "translation_{}", "orientation_{}", "rotation_{}")  # which a longer name may end in
+CLOCKS = ("header_stamp", "stamp", "timestamp", "timestamps", "t", "time", "")  # pandas leaves its index without a name
+HALVES = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"))
+UNITS = {"s": 1, "sec": 1, "ms": 10**3, "us": 10**6, "ns": 10**9, "nsec": 10**9}  # in a second
+UNIT_NAMES = {1: "seconds", 10**3: "milliseconds", 10**6: "microseconds", 10**9: "nanoseconds"}
+EPOCHS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3))  # times since 1970 are larger than this in ns, us and ms
+RECORDED = ("field_header_stamp",)  # names whose times are in ns: rostopic echo -p
+LABELS = (("x", "y", "z", "roll", "pitch", "yaw"), ("x", "y", "z", "rx", "ry", "rz"), ("x", "y", "z", "a", "b", "c"))
+MOVING_LABELS = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # behind those of a pose
+PREFIXES = ("p_", "p", "cov_", "cov", "t")  # before two labels
+DEVIATIONS = ("sigma_{}", "std_{}", "s{}", "s_{}", "sd_{}", "sigma{}", "std{}", "stddev_{}")  # standard, not squared
+APART = {"p": ("x", "y", "z"), "q": ("r", "p", "y")}  # two triangles of cnspy: position, rotation
+_OTHER = r"deg(?:rees?)?|°|mm|cm|km(?:/?h)?|mph|kph|ft|feet|rpm"
+OTHER_UNITS = re.compile(rf"[\[(]\s*((?:{_OTHER})(?![a-z_])[^\])]*)[\])]", re.IGNORECASE)  # than SI and rad
+NUMBERED = re.compile(r"(.*?)(?:covariance|cov)_?(\d+)(?:_(\d+))?")
+
+
+class Head(NamedTuple):
+    """Names of the columns of a text file, as they stand in it."""
+
+    names: list[str]
+    line: int  # of the names, from 1
+    comment: bool  # it begins with #
+    spaced: bool  # by white space
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Which columns are what, by their places."""
+
+    time: tuple[int, ...]  # one, or seconds and nanoseconds
+    unit: int | None  # in a second; None where the name says none
+    position: tuple[int, ...]  # (3,)
+    quaternion: tuple[int, ...]  # (4,), x, y, z, w; none of positions alone
+    covariance: tuple[int, ...] = ()  # n^2, its upper triangle, or 12: rotation, then position; or n deviations
+    kind: str = "poses by the names of their columns"
+    rest: tuple[int, ...] = ()  # (3,), a velocity, or (9,), biases of gyroscope and accelerometer, too
+
+    @property
+    def is_tum(self) -> bool:
+        """Whether they are the first columns of a TUM trajectory."""
+        return self.time + self.position + self.quaternion == tuple(range(8)) and self.unit in (None, 1)
+
+    @property
+    def w_first(self) -> bool:
+        return self.quaternion[3] < self.quaternion[0]
+
+
+def head_of(path: Path) -> Head | None:
+    """The names of columns above the first row of numbers; None where the file has none."""
+    lines, row = _beginning(path)
+    if row is None or not lines:
+        return None
+    number, line = lines[-1]
+    comment = line.lstrip().startswith("#")
+    if not comment and len([text for _, text in lines if not text.lstrip().startswith("#")]) > 1:
+        return None
+    text, width = line.strip().lstrip("#") if comment else line, len(fields_of(row))
+    names = fields_of(text)
+    if len(names) != width and comment:
+        names = re.split(r"\s{2,}", text.strip())
+    if len(names) != width:
+        return None
+    return Head(names, number, comment, not any(mark in line for mark in ",;\t"))
+
+
+def begins_with_numbers(path: Path) -> bool:
+    """Whether the first line that is no comment is of numbers alone."""
+    lines, row = _beginning(path)
+    return (
+        row is not None and all(map(_is_number, fields_of(row))) and all(text.lstrip()[0] == "#" for _, text in lines)
+    )
+
+
+def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
+    """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none."""
+    if not is_file(path):  # a pipe would be waited for
+        return [], None
+    try:
+        with opened(path) as file:
+            text = file.read(PEEKED).decode("utf-8-sig", "ignore")
+    except (OSError, EOFError, zlib.error):
+        return [], None
+    lines: list[tuple[int, str]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.strip() and _is_row(line):
+            return lines, line
+        if line.strip():
+            lines.append((number, line))
+    return lines, None
+
+
+def _is_row(line: str) -> bool:
+    """Whether at least half of the fields of a line are numbers or empty, and one is a number."""
+    fields = fields_of(line)
+    numbers = sum(map(_is_number, fields))
+    return not line.lstrip().startswith("#") and numbers > 0 and 2 * (numbers + fields.count("")) >= len(fields)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+# --- names -------------------------------------------------------------------------------------------
+
+
+def roles_of(names: Sequence[str], where: Path) -> Roles | None:
+    """Which columns make up a pose, or a position without a quaternion; None without a position or a time.
+
+    Raises
+    ------
+    InputError
+        Several columns would do.
+    """
+    plain = [_plain(name) for name in names]
+    quaternion = _family(plain, QUATERNIONS, "xyzw", where)
+    position = _family(plain, POSITIONS, "xyz", where)
+    clock = _clock(plain, names)
+    if position is None or clock is None:
+        return None
+    asl = plain[position[0]] == "p_rs_r_x" or (len(plain) == 17 and plain[-3:] == ["bax", "bay", "baz"])
+    kind = "EuRoC truth" if asl else "poses by the names of their columns"
+    rest = _rest(plain) if quaternion else ()
+    kind = kind if quaternion else kind.replace("poses", "positions")
+    return Roles(*clock, position, quaternion or (), _covariance(plain, len(rest)), kind, rest)
+
+
+def _plain(name: str) -> str:
+    """A name in lower case without its unit, words joined by one underscore."""
+    name = re.sub(r"[\[(]([^\]\d)][^\])]*)?[\])]", "", name.lower())
+    return re.sub(r"[^a-z0-9]+", "_", name).strip("_")
+
+
+def _family(plain: list[str], spellings: Sequence[str], parts: str, where: Path) -> tuple[int, ...] | None:
+    """Places of the columns that are spelled alike, one for each part; None without them."""
+    for spelling in spellings:
+        found: list[list[int]] = []
+        for part in parts:
+            name = spelling.format(part)
+            exact = [i for i, other in enumerate(plain) if other == name]
+            longer = [i for i, other in enumerate(plain) if spelling in INNER and other.endswith(f"_{name}")]
+            found.append(exact or longer)
+        if not all(found):
+            continue
+        if many := next((places for places in found if len(places) > 1), []):
+            name = spelling.format(parts[found.index(many)])
+            raise InputError(
+                f"{where}: {len(many)} columns are '{name}'; leave one pose in the file, or rename the others"
+            )
+        return tuple(places[0] for places in found)
+    return None
+
+
+def clock_of(names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
+    """Places of the time, and how many of its units are a second, where its name says it; None without a time."""
+    return _clock([_plain(name) for name in names], names)
+
+
+def places_of(names: Sequence[str], spellings: Sequence[Sequence[str]]) -> tuple[int, ...] | None:
+    """Places of columns, the first one there of the spellings of each; a longer name may end in one of two words."""
+    plain = [_plain(name) for name in names]
+    found = []
+    for each in spellings:
+        there = [plain.index(name) for name in each if name in plain]
+        there += [i for i, name in enumerate(plain) for end in each if "_" in end and name.endswith(f"_{end}")]
+        if not there:
+            return None
+        found.append(there[0])
+    return tuple(found)
+
+
+def _clock(plain: list[str], names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
+    """Places of the time, and its unit where the name says it."""
+    bare = [re.sub(rf"_({'|'.join(UNITS)})$", "", name) for name in plain]
+    for seconds, rest in HALVES:
+        for i, j in itertools.permutations(range(len(plain)), 2):
+            if plain[i].endswith(seconds) and plain[j] == plain[i][: -len(seconds)] + rest:
+                return (i, j), 1
+    for clock in CLOCKS:
+        for i, name in enumerate(bare):
+            if name == clock or (clock == "header_stamp" and name.endswith(clock)):
+                return (i,), _unit(names[i], plain[i])
+    return None
+
+
+def _unit(name: str, plain: str) -> int | None:
+    said = re.search(r"[\[(_ ]\s*(s|sec|ms|us|ns|nsec)\s*[\])]?$", name.lower())
+    if said:
+        return UNITS[said[1]]
+    return 10**9 if plain in RECORDED else None
+
+
+def _rest(plain: list[str]) -> tuple[int, ...]:
+    """Places of a velocity, and of both biases where they are there."""
+    found = []
+    for spellings in MOVING:
+        there = ([spelling.format(axis) for axis in "xyz"] for spelling in spellings)
+        places = [tuple(map(plain.index, names)) for names in there if all(plain.count(name) == 1 for name in names)]
+        found.append(places[0] if places else ())
+    return (*found[0], *found[1], *found[2]) if all(found) else found[0]
+
+
+def _covariance(plain: list[str], rest: int) -> tuple[int, ...]:
+    """Places of the columns of a covariance of a pose and ``rest`` more, or of the pose alone; none without one."""
+    sizes = sorted({6, 6 + min(rest, 3), 6 + rest}, reverse=True)
+    every = [(*labels, *MOVING_LABELS[: n - 6]) for n in sizes for labels in LABELS]
+    for labels, prefix in itertools.product(every, PREFIXES):
+        if found := _places(plain, _pairs(prefix, labels, len(labels))):
+            return found
+    blocks = [_places(plain, _pairs(prefix, APART[prefix], 3)) for prefix in ("q", "p")]
+    if all(blocks):
+        return (*blocks[0], *blocks[1])
+    stated: dict[str, dict[tuple[int, int], int]] = {}
+    for i, name in enumerate(plain):
+        if (number := NUMBERED.fullmatch(name)) and "twist" not in number[1]:
+            place = (int(number[2]), -1) if number[3] is None else (int(number[2]), int(number[3]))
+            stated.setdefault(number[1], {})[place] = i
+    for places in stated.values():
+        if len(places) in [size for n in sizes for size in (n * n, n * (n + 1) // 2)]:
+            return tuple(places[key] for key in sorted(places))
+    for labels, spelling in itertools.product(every, DEVIATIONS):
+        if set(names := [spelling.format(label) for label in labels]) <= set(plain):
+            return tuple(plain.index(name) for name in names)
+    return ()
+
+
+def _pairs(prefix: str, labels: Sequence[str], n: int = 6) -> Iterator[tuple[str, str]]:
+    """Names of the entries of an upper triangle, each with that of its mirror image."""
+    join = "_" if prefix.endswith("_") else ""
+    for i, j in itertools.combinations_with_replacement(range(n), 2):
+        yield f"{prefix}{labels[i]}{join}{labels[j]}", f"{prefix}{labels[j]}{join}{labels[i]}"
+
+
+def _places(plain: list[str], pairs: Iterator[tuple[str, str]]) -> tuple[int, ...]:
+    found = []
+    for names in pairs:
+        there = [plain.index(name) for name in names if name in plain]
+        if not there:
+            return ()
+        found.append(there[0])
+    return tuple(found)
+
+
+# --- numbers -----------------------------------------------------------------------------------------
+
+
+def unit_of(t: Array, unit: int | None = None) -> int:
+    """How many units of times are a second: what their name says, or what times since 1970 are large enough for."""
+    if unit is not None:
+        return unit
+    middle = float(np.median(np.abs(t))) if len(t) else 0.0
+    return next((each for least, each in EPOCHS if middle > least), 1)
+
+
+def require_units(names: Sequence[str], path: Path) -> None:
+    """Refuse columns whose names state a unit that is not of the SI, such as ``heading [deg]``."""
+    for name in names:
+        if found := OTHER_UNITS.search(name):
+            raise InputError(
+                f"{path}: column '{name}' is in {found[1].strip()}; units are SI and radians: convert and rename it"
+            )
+
+
+def fields_of(line: str) -> list[str]:
+    """Fields of a line, apart by commas, semicolons or tabs, or by white space where it has none of them."""
+    separator = max(",;\t", key=line.count)
+    if '"' in line and separator in line:
+        with suppress(csv.Error):  # of a line with a null character
+            return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+    return [field.strip().strip('"') for field in (line.split(separator) if separator in line else line.split())]

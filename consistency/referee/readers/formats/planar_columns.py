@@ -1,0 +1,88 @@
+"""Planar poses from files that do not hold them as columns t, x, y, heading: speeds and turn rates, poses in space."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.column_names import COVARIANCE, POSE
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import wrap
+from consistency.referee.readers.file_kinds import PLACES, SPEEDS, TURNS, is_poses
+from consistency.referee.readers.formats.named_columns import UNIT_NAMES, clock_of, head_of, places_of
+from consistency.referee.readers.formats.pose_rows import POSE as WIDTH
+from consistency.referee.readers.formats.pose_rows import read_named, read_poses, times_of
+from consistency.referee.readers.formats.sheet import Lines, TableRows, increasing
+from consistency.referee.readers.formats.table_columns import LOWER_NAMES
+from consistency.referee.types import Array
+
+
+def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
+    """Planar poses t, x, y, heading of a file, and what it was read as.
+
+    Speeds and turn rates are integrated, each held from its row to the next: to the motion since the row before, in
+    the frame of the body there, with ``motions``; else to poses from (0, 0, 0) on. Of poses in space it is the
+    position and the heading of the x axis. Columns of a covariance, ``P_xx`` and so on, are kept.
+
+    Raises
+    ------
+    InputError
+        The file holds none of these, or its timestamps do not increase.
+    """
+    if is_poses(path):
+        return _of_space(read_poses(path, true=True))
+    head = head_of(path)
+    clock = None if head is None else clock_of(head.names)
+    if head is None or clock is None:
+        raise InputError(f"{path}: needs names of columns, t with x, y, heading, or t with v, omega")
+    places, rates = places_of(head.names, PLACES), False
+    if places is None:
+        places, rates = places_of(head.names, (SPEEDS, TURNS)), True
+    if places is None:
+        raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(head.names[:12])}")
+    stated = [name for name in dict.fromkeys([*COVARIANCE, *LOWER_NAMES.values()]) if name in head.names]
+    lines, columns = read_named(path, head, (*clock[0], *places, *(head.names.index(name) for name in stated)))
+    first = len(clock[0])
+    t, unit = times_of(lines, clock[0], columns[:first], clock[1])
+    pose = np.column_stack(columns[first : first + len(places)])
+    of = "planar poses"
+    if rates:
+        of = f"speed and turn rate, each held until the next, integrated to {'motions' if motions else 'poses'}"
+        pose = motions_of(t, pose[:, 0], pose[:, 1])
+        pose = pose if motions else poses_of(pose)
+    increasing(Lines(path, t[:, None], lines.line))
+    note = f"{path}: read as {of}, {len(head.names)} columns, {UNIT_NAMES[unit]}"
+    data = dict(zip(["t", *POSE, *stated], [t, *pose.T, *columns[first + len(places) :]], strict=True))
+    return TableRows(path, data, lines.line, "line"), note
+
+
+def motions_of(t: Array, v: Array, omega: Array) -> Array:
+    """Motions (N, 3) since the row before: forward, left and turn, in the frame of the body there, m and rad.
+
+    Arcs of circles: ``v`` and ``omega`` (N,), m/s and rad/s, hold from their time ``t``, s, to the next one. The first
+    row is 0.
+    """
+    dt = np.diff(t)
+    turn, way = omega[:-1] * dt, v[:-1] * dt
+    half = 0.5 * turn
+    chord = way * np.sinc(half / np.pi)
+    rows = np.column_stack([chord * np.cos(half), chord * np.sin(half), turn])
+    return np.concatenate([np.zeros((1, 3)), rows])
+
+
+def poses_of(motions: Array) -> Array:
+    """Poses (N, 3) from (0, 0, 0) on, of motions as :func:`motions_of` gives them; headings within half a turn."""
+    heading = np.cumsum(motions[:, 2])
+    before = np.concatenate([[0.0], heading[:-1]])
+    c, s = np.cos(before), np.sin(before)
+    steps = np.column_stack([c * motions[:, 0] - s * motions[:, 1], s * motions[:, 0] + c * motions[:, 1]])
+    return np.column_stack([np.cumsum(steps, axis=0), wrap(heading)])
+
+
+def _of_space(lines: Lines) -> tuple[TableRows, str]:
+    ahead = Rotation.from_quat(lines.values[:, 4:WIDTH]).apply([1.0, 0.0, 0.0])
+    columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
+    of = lines.note or f"{lines.path}: read as poses in space"
+    return TableRows(lines.path, columns, lines.line, "line"), f"{of}, of which the heading is that of the x axis"

@@ -1,0 +1,208 @@
+"""Poses in space as rows ``t x y z qx qy qz qw`` with a covariance, from every layout of text that they come in.
+
+The layout is told by the names of the columns, or by their number and what they hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.errors import InputError
+from consistency.referee.readers.file_kinds import is_solution
+from consistency.referee.readers.formats.geodetic import read_solution
+from consistency.referee.readers.formats.named_columns import (  # fmt: skip
+    UNIT_NAMES,
+    Head,
+    Roles,
+    fields_of,
+    head_of,
+    require_units,
+    roles_of,
+    unit_of,
+)
+from consistency.referee.readers.formats.openvins import FULL as STATES
+from consistency.referee.readers.formats.openvins import as_states
+from consistency.referee.readers.formats.sheet import Lines, increasing, read_rows, read_sheet
+from consistency.referee.readers.formats.text_blocks import blocks
+from consistency.referee.types import Array, Indices
+
+POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
+FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
+POINT = 4  # columns of a truth of positions alone: t, x, y, z
+DEVIATIONS = (6, 9, 15)  # of a pose, with a velocity, with two biases
+DEVIATED = POSE + 6  # columns of a pose and six standard deviations
+TUM = (POSE, SPLIT, POSE + TRIANGLE, POSE + FULL)
+ASL = 17  # columns of the truth of EuRoC: t in ns, position, quaternion w first, velocity, two biases
+MATRICES = {12: (), 13: (0,), 16: (), 17: (0,)}  # numbers of a matrix, 3 x 4 or 4 x 4, behind its time or number
+STATED = (0, TRIANGLE, FULL)  # columns of a covariance behind a matrix
+ROTATION = 1e-3  # largest entry of R R' - I
+LAYOUT = f"t tx ty tz qx qy qz qw ({', '.join(map(str, TUM))} columns)"
+
+
+def read_poses(path: Path, true: bool = False) -> Lines:
+    """Lines (N, 8, or more with a covariance) as in a TUM trajectory, whatever layout they have in the file.
+
+    Raises
+    ------
+    InputError
+        The layout is none of those known, a row is broken, or timestamps do not increase.
+    """
+    if is_solution(path):
+        return read_solution(path)
+    head = head_of(path)
+    roles = None if head is None else roles_of(head.names, path)
+    if head is not None and roles is not None and not (head.comment and roles.is_tum and len(head.names) in TUM):
+        if not (roles.quaternion or true):
+            raise InputError(f"{path}: holds no quaternion; a table of a state is read with --state x,y,z")
+        return _named(path, head, roles, true)
+    widths = [matrix + stated for matrix in MATRICES for stated in STATED]
+    lines = read_rows(path, (*(POINT,) * true, *TUM, DEVIATED, *widths, *STATES), LAYOUT)
+    width = lines.values.shape[1]
+    if width == POINT:
+        return increasing(replace(lines, note=f"{path}: read as positions without orientations, {width} columns"))
+    if width == DEVIATED:
+        of = "poses with the standard deviations of x, y, z and of the rotation about x, y, z, in m and rad"
+        return increasing(replace(lines, note=f"{path}: read as {of}, {width} columns"))
+    if width in TUM:
+        unnamed = f"{path}: read as t x y z qx qy qz qw, as its columns have no names"
+        return increasing(replace(lines, note=unnamed if path.suffix.lower() == ".csv" else ""))
+    if width == ASL and not _is_rigid(lines.values[:, 1:]).all():
+        return _asl(lines, true)
+    if width in widths and (_is_rigid(_matrix(lines)[0]).all() or width not in STATES):
+        return _matrices(lines)
+    states = as_states(increasing(lines))
+    if states is None:
+        raise InputError(f"{lines.place(0)}: has {width} columns; should be {LAYOUT}")
+    return states
+
+
+def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
+    """Rows under the names of their columns."""
+    pose = (*roles.time, *roles.position, *roles.quaternion, *roles.covariance)
+    lines, columns = read_named(path, head, (*pose, *roles.rest))
+    t, unit = times_of(lines, roles.time, columns[: len(roles.time)], roles.unit)
+    of = roles.kind if true else roles.kind.replace(" truth", " poses")
+    clock = UNIT_NAMES[unit] if len(roles.time) == 1 else "seconds and nanoseconds"
+    order = f"quaternion {'w first' if roles.w_first else 'w last'}" if roles.quaternion else "no orientation"
+    note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
+    if roles.covariance:
+        stated = "standard deviations" if len(roles.covariance) in DEVIATIONS else "covariance"
+        note += f", {stated} in {len(roles.covariance)} columns"
+    values = np.column_stack([t, *columns[len(roles.time) : len(pose)]])
+    rest = np.column_stack(columns[len(pose) :]) if roles.rest else None
+    return increasing(replace(lines, values=values, note=note, rest=rest))
+
+
+def read_named(path: Path, head: Head, places: Sequence[int]) -> tuple[Lines, list[Array]]:
+    """Some columns of a file with names, and lines that hold none of them yet."""
+    require_units([head.names[i] for i in places], path)
+    if head.comment or head.spaced:
+        layout = f"{len(head.names)} columns as named"
+        lines = read_rows(path, [len(head.names)], layout, 0 if head.comment else head.line)
+        return replace(lines, values=lines.values[:, :0]), [lines.values[:, i] for i in places]
+    sheet = read_sheet(path)
+    names = list(sheet.data)
+    if "run" in names or "filter" in names:
+        raise InputError(f"{path}: column 'run' or 'filter': write such poses to a file for each run and estimator")
+    return Lines(path, np.empty((len(sheet), 0)), sheet.line), [sheet.numbers(names[i]) for i in places]
+
+
+def _asl(lines: Lines, true: bool) -> Lines:
+    """The 17 columns of EuRoC without their names."""
+    t, unit = times_of(lines, (0,), [lines.t])
+    of = f"EuRoC {'truth' if true else 'poses'}, {ASL} columns, {UNIT_NAMES[unit]}, quaternion w first"
+    note = f"{lines.path}: read as {of}"
+    values = np.column_stack([t, lines.values[:, [1, 2, 3, 5, 6, 7, 4]]])
+    return increasing(replace(lines, values=values, note=note, rest=lines.values[:, POSE:]))
+
+
+def times_of(
+    lines: Lines, places: Sequence[int], columns: Sequence[Array], unit: int | None = None
+) -> tuple[Array, int]:
+    """Times in s, each the number nearest to what the file says, and how many of its units are a second.
+
+    A double does not hold the nanoseconds since 1970, so that they are read again as whole numbers.
+    """
+    unit = 10**9 if len(places) == 2 else unit_of(columns[0], unit)
+    if unit < 10**9:
+        return columns[0] / unit, unit
+    rows = iter(lines.line)
+    row, t = next(rows, None), []
+    for block in blocks(lines.path):
+        for number, line in block.lines():
+            if number == row:
+                cells = fields_of(line)
+                try:
+                    t.append(
+                        sum(int(cells[i]) * each for i, each in zip(places, (unit, 1)[-len(places) :], strict=True))
+                        / unit
+                    )
+                except (ValueError, IndexError, OverflowError):
+                    return (columns[0] / unit if len(places) == 1 else columns[0] + columns[1] / unit), unit
+                row = next(rows, None)
+    return np.array(t), unit
+
+
+# --- matrices ----------------------------------------------------------------------------------------
+
+
+def _matrix(lines: Lines) -> tuple[Array, Array, Array]:
+    """Numbers of the matrices (N, 12 or 16), what stands before them, and their covariances."""
+    width = lines.values.shape[1]
+    for stated in STATED:
+        if width - stated in MATRICES:
+            start, end = len(MATRICES[width - stated]), width - stated
+            return lines.values[:, start:end], lines.values[:, :start], lines.values[:, end:]
+    raise InputError(f"{lines.place(0)}: has {width} columns; should be {LAYOUT}")
+
+
+def _is_rigid(numbers: Array) -> Indices:
+    """Whether rows (N, 12) or (N, 16) are the matrix of a rotation and a translation, or not finite."""
+    M = numbers.reshape(len(numbers), -1, 4)
+    R, finite = M[:, :3, :3], np.asarray(np.isfinite(numbers).all(axis=1))
+    with np.errstate(invalid="ignore", over="ignore"):
+        right: Indices = (np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2)) < ROTATION) & (
+            np.linalg.det(np.where(finite[:, None, None], R, 0.0)) > 0
+        )
+    if M.shape[1] == 4:
+        right &= np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ROTATION
+    return np.asarray(right | ~finite)
+
+
+def _matrices(lines: Lines) -> Lines:
+    """Matrices that turn body into world coordinates, row by row, behind a time or a number or neither."""
+    numbers, before, covariance = _matrix(lines)
+    wrong = np.flatnonzero(~_is_rigid(numbers))
+    if len(wrong):
+        raise InputError(
+            f"{lines.place(int(wrong[0]))}: the {numbers.shape[1]} numbers are no rotation and translation, row by "
+            f"row; should be these, or {LAYOUT}"
+        )
+    t, clock = _clock(lines, before)
+    M = numbers.reshape(len(numbers), -1, 4)
+    quaternion = np.full((len(M), 4), np.nan)
+    finite = np.isfinite(numbers).all(axis=1)
+    if finite.any():
+        quaternion[finite] = Rotation.from_matrix(M[finite, :3, :3]).as_quat()
+    note = f"{lines.path}: read as matrices of {M.shape[1]} x 4, {lines.values.shape[1]} columns, {clock}"
+    return increasing(replace(lines, values=np.column_stack([t, M[:, :3, 3], quaternion, covariance]), note=note))
+
+
+def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
+    """Times of matrices: those before them, those of times.txt in the same folder, or their numbers from 0 on."""
+    if before.shape[1]:
+        t, unit = times_of(lines, (0,), [before[:, 0]])
+        of = "the number of the step" if (t == np.round(t)).all() else f"the time in {UNIT_NAMES[unit]}"
+        return t, f"the first one {of}"
+    times = lines.path.parent / "times.txt"
+    if not times.is_file():
+        return np.arange(float(len(lines.line))), "numbered from 0 on, as there is no times.txt beside them"
+    t = read_rows(times, (1,), "a time").t
+    if len(t) != len(lines.line):
+        raise InputError(f"{times}: has {len(t)} times, but {lines.path} {len(lines.line)} poses")
+    return t, f"times from {times.name} beside them"

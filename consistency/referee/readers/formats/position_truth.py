@@ -1,0 +1,125 @@
+"""A truth of positions alone, as GNSS receivers and total stations give it: the position of a point of the body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.geodetic import Fixes
+from consistency.referee.readers.formats.sheet import Lines, Places
+from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.runs_to_record import symmetric
+from consistency.referee.readers.space_trajectories import AXES, TrajectorySource
+from consistency.referee.readers.windows import Relative
+from consistency.referee.types import Array
+
+
+def position_source(
+    source: TrajectorySource, poses: Sequence[Poses], convention: str, r: Reading, relative: Relative | None
+) -> TrajectorySource:
+    """Origin of estimates whose truth is positions alone, with what is judged of them; ``convention`` "" of fixes.
+
+    Raises
+    ------
+    InputError
+        Some runs have a truth with orientations, or an option needs one.
+    """
+    truth = source.files[0][1]
+    if any(one.manifold != "vector" for one in poses):
+        raise InputError(f"{source.path}: the truth of some runs has orientations, of others none; judge them apart")
+    if relative is not None or r.align not in (None, "posyaw", "posyaw-all"):
+        option = "--relative" if relative is not None else f"--align {r.align}"
+        raise InputError(f"{option}: needs a truth with orientations; {truth} holds positions alone")
+    if rotations := [axis for axis in r.axes or () if axis not in AXES[:3]]:
+        raise InputError(
+            f"--axes {','.join(r.axes or ())}: '{rotations[0]}' has no truth; {truth} holds positions alone"
+        )
+    if not convention:
+        return source
+    at = "the origin of the body; --lever-arm x,y,z names another point"
+    if r.lever_arm is not None:
+        at = f"the point ({', '.join(f'{each:g}' for each in r.lever_arm)}) m of the body"
+    note = f"{truth}: the truth has no orientation, so that the position alone is judged, of {at}"
+    why = f"; of the position, whose covariance follows from that of the error {convention}"
+    return replace(source, notes=(*source.notes, note), why=why)
+
+
+def positions(poses: Poses, lever: Sequence[float], blocks: bool) -> Poses:
+    """Estimated positions p + R l of a point of the body beside its true ones, with their covariances to first order.
+
+    Parameters
+    ----------
+    poses : estimates in space; their truth (M, 3 or more) begins with the position
+    lever : (3,), m, from the origin of the body to the point, in the axes of the body
+    blocks : position and rotation are stated apart, or as deviations, so that their cross-covariance is not known
+
+    Raises
+    ------
+    InputError
+        The covariance of the point depends on cross terms that are not stated.
+    """
+    arm = np.asarray(lever, float)
+    if blocks and (arm.any() or poses.convention == "right"):
+        of = "--lever-arm" if arm.any() else "--error right"
+        raise InputError(
+            f"{poses.place[0]}: {of} moves errors of the rotation into that of the position, whose cross terms are "
+            "not stated; give covariances of whole poses"
+        )
+    R = np.full((len(poses.t), 3, 3), np.nan)
+    finite = np.isfinite(poses.estimate).all(axis=1)
+    if finite.any():
+        R[finite] = Rotation.from_quat(poses.estimate[finite, 3:]).as_matrix()
+    point = poses.estimate[:, :3] + R @ arm
+    J = _jacobian(poses.convention, R, arm, point)
+    P = J @ poses.covariance @ np.swapaxes(J, 1, 2)
+    return replace(
+        poses, estimate=point, covariance=0.5 * (P + np.swapaxes(P, 1, 2)), truth=poses.truth[:, :3],
+        manifold="vector", convention="vector", cross=None,
+        true_covariance=None if poses.true_covariance is None else poses.true_covariance[:, :3, :3],
+    )  # fmt: skip
+
+
+def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) -> Poses:
+    """Estimated positions without orientations beside the true ones, in one plane.
+
+    Parameters
+    ----------
+    of_truth : (M, 3 or more, 3 or more), covariance of the truth, which begins with the position
+
+    Raises
+    ------
+    InputError
+        An option needs orientations, or the covariance from elsewhere.
+    """
+    names = ("covariance", "covariance_order", "error", "lever_arm")
+    if given := r.given(names):
+        raise InputError(f"{flag_of(given[0])}: does not go with {own.path}, of positions with their own covariances")
+    P = symmetric(own.values[:, 4:].reshape(-1, 3, 3), own.place)
+    return Poses(
+        Places(own.place, np.arange(len(own.t))), own.t, own.values[:, 1:4], P, np.ones(len(own.t), bool),
+        true.t, true.values[:, 1:4], "vector", "vector", r.tolerance,
+        true_covariance=None if of_truth is None else of_truth[:, :3, :3],
+    )  # fmt: skip
+
+
+def _jacobian(convention: str, R: Array, arm: Array, point: Array) -> Array:
+    """Error of the point by the error of the pose, (N, 3, 6): derivatives of each convention at 0."""
+    J = np.empty((len(R), 3, 6))
+    J[:, :, :3] = R if convention == "left" else np.eye(3)
+    if convention == "right":
+        J[:, :, 3:] = -_skew(point)
+    elif convention == "so3":
+        J[:, :, 3:] = -_skew(R @ arm)
+    else:
+        J[:, :, 3:] = -R @ _skew(arm)
+    return J
+
+
+def _skew(v: Array) -> Array:
+    """Matrices (..., 3, 3) of the cross product with v (..., 3)."""
+    return np.cross(np.eye(3), v[..., None, :])

@@ -1,0 +1,393 @@
+"""Text files and Parquet tables, with the place of every row for messages."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.extras import require
+from consistency.referee.outside import outside
+from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
+from consistency.referee.readers.formats.text_blocks import Block, blocks
+from consistency.referee.types import Array, Indices
+
+Column = Array  # (N,), floats with NaN where a cell is empty; or objects, text for one, with None there
+EMPTY = frozenset(
+    [
+        "#N/A",
+        "#N/A N/A",
+        "#NA",
+        "-1.#IND",
+        "-1.#QNAN",
+        "-NaN",
+        "-nan",
+        "1.#IND",
+        "1.#QNAN",
+        "<NA>",
+        "N/A",
+        "NA",
+        "NULL",
+        "NaN",
+        "None",
+        "n/a",
+        "nan",
+        "null",
+        "",
+    ]
+)  # what pandas and R write for no value
+TRUTHS = {text: value for value in (True, False) for text in (str(value), str(value).lower(), str(value).upper())}
+
+
+@dataclass(frozen=True)
+class TableRows:
+    """A table of N rows, with the place of each row in the file."""
+
+    path: Path
+    data: dict[str, Column]
+    line: Indices  # (N,), line of a text file, row of a Parquet file
+    unit: str  # line | row
+
+    def __contains__(self, column: str) -> bool:
+        return column in self.data
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    @property
+    def columns(self) -> str:
+        """The names of the first columns, for messages."""
+        names = list(self.data)
+        return ", ".join(names[:12]) + ", …" * (len(names) > 12)
+
+    def place(self, row: int) -> str:
+        return f"{self.path}, {self.unit} {self.line[row]}"
+
+    def numbers(self, column: str, finite: bool = False, whole: bool = False) -> Array:
+        """A column as floats, NaN where empty; refused where it is text, or not finite or whole as asked for."""
+        cells = self.data[column]
+        values = bounded(cells if cells.dtype.kind == "f" else np.array([_number(cell) for cell in cells], float))
+        bad = np.isnan(values) & ~self.empty(column)
+        other = not all(isinstance(cell, str) for cell in cells[bad])
+        what = "a truth value or a date, which is to be written as a number" if other else "not a number"
+        if any(hasattr(cell, "__len__") for cell in cells[bad]) and other:
+            what = "a list, of which each number needs a column of its own"
+        if not bad.any() and (finite or whole):
+            bad, what = ~np.isfinite(values), "not a finite number"
+        if not bad.any() and whole:
+            bad, what = values != np.round(values), "not a whole number"
+        if not bad.any() and whole:
+            bad, what = np.abs(values) > WHOLE, "a number too large to be counted exactly"
+        if bad.any():
+            row = int(np.flatnonzero(bad)[0])
+            if re.fullmatch(r"[-+]?\d+,\d+", str(cells[row])):
+                what += " with a decimal point"
+            raise InputError(f"{self.place(row)}: column '{column}': {what} ({one_line(cells[row], 60)})")
+        return values
+
+    def rows(self, keep: Array) -> TableRows:
+        """The rows of a mask or of indices."""
+        return TableRows(
+            self.path, {name: cells[keep] for name, cells in self.data.items()}, self.line[keep], self.unit
+        )
+
+    def texts(self, column: str) -> Array:
+        """A column as text, (N,)."""
+        return np.array([str(cell) for cell in self.data[column]], object)
+
+    def empty(self, column: str) -> Array:
+        """Which cells of a column are empty, (N,)."""
+        cells = self.data[column]
+        return np.isnan(cells) if cells.dtype.kind == "f" else np.array([cell is None for cell in cells], bool)
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The numbers of a text file."""
+
+    path: Path
+    values: Array  # (N, columns), the first of which is t
+    line: Indices  # (N,)
+    note: str = ""  # what they were read as
+    unit: str = "line"  # line | message
+    rest: Array | None = None  # (N, 3) velocity in the world, m/s, or (N, 9) biases of gyroscope and accelerometer, too
+
+    @property
+    def t(self) -> Array:
+        """First column, (N,), s."""
+        return self.values[:, 0]
+
+    def place(self, row: int) -> str:
+        return f"{self.path}, {self.unit} {self.line[row]}"
+
+    def of(self, columns: slice) -> Lines:
+        """Some of the columns, without holding the others in memory."""
+        return replace(self, values=self.values[:, columns].copy())
+
+
+class Places(Sequence[str]):
+    """Places of some rows of a file, put into words when asked for."""
+
+    def __init__(self, of: Callable[[int], str], rows: Indices) -> None:
+        self._of, self._rows = of, rows
+
+    @overload
+    def __getitem__(self, which: int) -> str: ...
+    @overload
+    def __getitem__(self, which: slice) -> Places: ...
+    def __getitem__(self, which: int | slice) -> str | Places:
+        if isinstance(which, slice):
+            return Places(self._of, self._rows[which])
+        return self._of(int(self._rows[which]))
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def at(self, rows: Indices) -> Places:
+        """Places of some of the rows."""
+        return Places(self._of, self._rows[rows])
+
+
+def bounded(values: Array) -> Array:
+    """Numbers, with infinity for those too large for any measurement, as a filter that broke down writes."""
+    return np.where(np.abs(values) > HUGE, np.copysign(np.inf, values), values)
+
+
+def are_dof(values: Array) -> Array:
+    """Whether numbers are degrees of freedom: whole, from 0 to below 2^31."""
+    return np.asarray((values >= 0) & (values < MOST_DOF) & (values == np.round(values)))
+
+
+def read_sheet(path: Path) -> TableRows:
+    """A CSV file (comma, semicolon or tab; # comments) or a Parquet file."""
+    sheet = _read_parquet(path) if path.suffix.lower() in (".parquet", ".pq") else _read_csv(path)
+    if not len(sheet):
+        raise InputError(f"{path}: holds no row")
+    if "filter" in sheet:
+        empty = np.flatnonzero(sheet.empty("filter"))
+        if len(empty):
+            raise InputError(f"{sheet.place(int(empty[0]))}: column 'filter' is empty")
+        for name in dict.fromkeys(sheet.texts("filter")):
+            require_name(name, f"{path}: column 'filter'")
+    return sheet
+
+
+def frame_rows(frame: Any, name: str) -> TableRows:
+    """Rows of a table in memory with columns by name, as a DataFrame of pandas or polars, called ``name`` in messages.
+
+    Raises
+    ------
+    InputError
+        It holds no row, or a column is there twice.
+    """
+    names = [str(column) for column in frame.columns]
+    if twice := {column for column in names if names.count(column) > 1}:
+        raise InputError(f"{name}: column '{sorted(twice)[0]}' is there twice")
+    data = {str(column): _cells(np.asarray(frame[column])) for column in frame.columns}
+    rows = len(next(iter(data.values()), ()))
+    if not rows:
+        raise InputError(f"{name}: holds no row")
+    return TableRows(Path(name), data, np.arange(1, rows + 1), "row")
+
+
+def _cells(values: Array) -> Column:
+    """A column in memory: floats, or objects with None where a cell is empty."""
+    if values.dtype.kind in "fiu":
+        return np.asarray(values, float)
+    return np.array([None if str(cell) in EMPTY else cell for cell in values.tolist()], object)
+
+
+def _read_parquet(path: Path) -> TableRows:
+    if not is_file(path):
+        raise InputError(f"{path}: no such file")
+    require(f"{path}: Parquet", "parquet")
+    columns, rows = outside("columns")(path, "cannot be read as Parquet")
+    return TableRows(path, columns, np.arange(rows), "row")
+
+
+def _read_csv(path: Path) -> TableRows:
+    names: list[str] = []
+    separator, tables, line = ",", list[dict[str, Column]](), list[Indices]()
+    for block in blocks(path):
+        if not names:
+            lines = block.lines()
+            if not lines:
+                continue
+            names, separator = _header(path, lines[0][1])
+            found = _rows(path, lines[1:], names, separator)
+        else:
+            found = _plain_rows(block, names, separator) or _rows(path, block.lines(), names, separator)
+        if found is not None:
+            tables.append(found[0])
+            line.append(found[1])
+    if not names:
+        raise InputError(f"{path}: is empty")
+    if not tables:
+        raise InputError(f"{path}: holds no row under its header")
+    return TableRows(
+        path, {name: _joined([table[name] for table in tables]) for name in names}, np.concatenate(line), "line"
+    )
+
+
+def _header(path: Path, line: str) -> tuple[list[str], str]:
+    """Names of the columns, and the character between them."""
+    separator = max(",;\t", key=line.count)
+    names = [name.strip().strip('"') for name in line.split(separator)]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise InputError(f"{path}: column '{sorted(twice)[0]}' is there twice")
+    return names, separator
+
+
+def _rows(
+    path: Path, lines: list[tuple[int, str]], names: list[str], separator: str
+) -> tuple[dict[str, Column], Indices] | None:
+    """Rows of a table from its lines, and their numbers; None without any."""
+    for number, line in lines:
+        fields = line.count(separator) + 1
+        if fields != len(names) and '"' not in line:
+            raise InputError(f"{path}, line {number}: has {fields} columns, the header has {len(names)}")
+    if not lines:
+        return None
+    numbers = [number for number, _ in lines]
+    return _columns(_fields(path, lines, separator, len(names)), names), np.array(numbers)
+
+
+def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[str, Column], Indices] | None:
+    """Rows of a block in which every line is a row; None where the block must be parsed line by line."""
+    if len(names) == 1 or not block.plain or b"\n\t" in block.data or block.data[:1] == b"\t":
+        return None
+    if (block.count_of(separator.encode()) != len(names) - 1).any():
+        return None
+    numbers = block.first + np.arange(block.count)
+    found = None if "filter" in names else block.numbers(separator.encode())
+    if found is not None and found[0].shape == (block.count, len(names)):
+        return dict(zip(names, found[0].T, strict=True)), numbers
+    return _columns([line.split(separator) for line in block.text.splitlines()], names), numbers
+
+
+def _fields(path: Path, lines: list[tuple[int, str]], separator: str, width: int) -> list[list[str]]:
+    """The fields of lines, out of their quotes where they are in some."""
+    rows = []
+    for number, line in lines:
+        fields = line.split(separator)
+        if '"' in line:
+            if line.count('"') % 2:
+                raise InputError(
+                    f"{path}: cannot be read as CSV (line {number}: a quoted field goes over several lines)"
+                )
+            with reading(path, f"line {number} cannot be read as CSV"):
+                (fields,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+        if len(fields) != width:
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the header has {width}")
+        rows.append(fields)
+    return rows
+
+
+def _columns(rows: list[list[str]], names: list[str]) -> dict[str, Column]:
+    """Columns of floats where all cells are numbers or empty; of text or truth values else."""
+    columns = (map(str.lstrip, cells) for cells in zip(*rows, strict=True))
+    return {name: _column(list(cells), name == "filter") for name, cells in zip(names, columns, strict=True)}
+
+
+def _column(cells: list[str], is_text: bool) -> Column:
+    filled: list[Any] = [None if cell in EMPTY else cell for cell in cells]
+    if not is_text:
+        values = np.array([_number(cell) for cell in filled], float)
+        if all(cell is None for cell in itertools.compress(filled, np.isnan(values))):
+            return values
+        if all(cell is None or cell in TRUTHS for cell in filled):
+            filled = [TRUTHS.get(cell) for cell in cells]
+    return np.array(filled, object)
+
+
+def _number(cell: object) -> float:
+    """A cell as a number; NaN where it is empty or none."""
+    if isinstance(cell, str):
+        if "_" in cell or not cell.isascii():  # numbers to Python alone
+            return math.nan
+        try:
+            return float(cell)
+        except ValueError:
+            return math.nan
+    return float(cell) if isinstance(cell, int | float | np.number) and not isinstance(cell, bool) else math.nan
+
+
+def _joined(parts: list[Column]) -> Column:
+    """Parts of a column below each other, as objects where one of them is."""
+    if any(part.dtype.kind == "O" for part in parts):
+        parts = [part if part.dtype.kind == "O" else _objects(part) for part in parts]
+    return np.concatenate(parts)
+
+
+def _objects(values: Array) -> Column:
+    cells = values.astype(object)
+    cells[np.isnan(values)] = None
+    return cells
+
+
+def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
+    """A text file of numbers, every line of the same one of the ``widths``, the first column increasing."""
+    return increasing(read_rows(path, widths, layout))
+
+
+def read_rows(path: Path, widths: Sequence[int], layout: str, header: int = 0) -> Lines:
+    """A text file of numbers, every line but ``header``, counted from 1, of the same one of the ``widths``."""
+    values, line, width = list[Array](), list[Indices](), 0
+    for block in blocks(path):
+        found = block.numbers()
+        if found is None or found[0].shape[1] not in widths or width not in (0, found[0].shape[1]):
+            rows = [(number, text) for number, text in block.lines() if number != header]
+            found = _number_rows(path, rows, widths, width, layout)
+        if len(found[1]):
+            width = found[0].shape[1]
+            values.append(bounded(found[0]))
+            line.append(found[1])
+    if not values:
+        raise InputError(f"{path}: is empty; each line should be {layout}")
+    return Lines(path, np.concatenate(values), np.concatenate(line))
+
+
+def increasing(lines: Lines) -> Lines:
+    """Lines whose first column is finite and increases; others are refused."""
+    wrong = np.flatnonzero(~np.isfinite(lines.t))
+    if len(wrong):
+        raise InputError(f"{lines.place(int(wrong[0]))}: the timestamp is not finite")
+    wrong = np.flatnonzero(np.diff(lines.t) <= 0)
+    if len(wrong):
+        row = int(wrong[0]) + 1
+        what = "is there twice" if lines.t[row] == lines.t[row - 1] else "is less than the one before"
+        raise InputError(
+            f"{lines.place(row)}: timestamp {lines.t[row]:.10g} {what}; they must increase, so leave the row out"
+        )
+    return lines
+
+
+def _number_rows(
+    path: Path, lines: list[tuple[int, str]], widths: Sequence[int], width: int, layout: str
+) -> tuple[Array, Indices]:
+    """Numbers of some lines, after lines of ``width`` columns if it is not 0; refused with the number of the line."""
+    rows: list[list[float]] = []
+    for number, line in lines:
+        fields = line.replace(",", " ").split()
+        if len(fields) not in widths:
+            hint = "; columns apart by semicolons need names, and numbers decimal points" * (";" in line)
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns; should be {layout}{hint}")
+        width = width or len(fields)
+        if len(fields) != width:
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the lines before {width}")
+        try:
+            rows.append([float(field) for field in fields])
+        except ValueError:
+            raise InputError(
+                f"{path}, line {number}: not a number in '{line.strip()[:60]}'; should be {layout}"
+            ) from None
+    return np.array(rows).reshape(len(rows), -1 if rows else 0), np.array([number for number, _ in lines], int)

@@ -1,0 +1,1 @@
+"""Hints on mix-ups in files whose errors are impossible."""

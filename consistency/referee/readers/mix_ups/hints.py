@@ -1,0 +1,163 @@
+"""Hints on mix-ups in files with impossible errors: a unit, order, side or frame that makes the covariance fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from consistency.referee.diagnostics.records.whitening import whiten
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.geometry import wrap
+from consistency.referee.readers.mix_ups.likelihoods import ReadingFit, fit_of
+from consistency.referee.readers.poses import Poses
+from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from consistency.referee.readers.mix_ups.known import Guess
+
+MOST = 4000  # estimates that are looked at, of all runs together
+MOST_RUNS = 200  # that are looked at, evenly over all
+MOST_FITTED = 1000  # of which so many are, where less than a decade is wrong
+WRONG = 1.0  # decades that the NEES is off, from which a mix-up is looked for
+APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
+RIGHT = 0.4  # decades that it may be off with the mix-up undone
+LEAST_GAIN = float(np.log(1e4))  # log likelihood that a reading gains over simple faults, and as much as it has rivals
+ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
+ALIKE = 0.01  # decades between guesses of which the likelier is named
+NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
+
+
+def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 0.0) -> list[str]:
+    """Hints on a probable mix-up, where the covariance does not fit and one other reading of the files does; or none.
+
+    Where the NEES of a median estimate is off by a decade or more, the guess that brings it nearest to a right one is
+    named. Where it is off by less, a guess is named if all errors then agree with the covariance, and no simple fault
+    of a filter explains as much (:mod:`consistency.referee.readers.mix_ups.likelihoods`).
+    """
+    if not runs:
+        return []
+    runs = runs[:: -(-len(runs) // MOST_RUNS)]
+    some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs]
+    if _same(some):
+        return [
+            f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies of "
+            "one; give the true poses as the truth"
+        ]
+    off = decades(some)
+    limit = np.append(WRONG, np.full(len(off) - 1, APART))
+    worst = int(np.argmax(np.abs(off) / limit))
+    gross = bool(abs(off[worst]) > limit[worst])
+    if gross and (best := _gross(_guesses(some, axes), some)) is not None:
+        return [f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, but about right if {best.text}"]
+    some = [poses.some(max(MOST_FITTED // len(runs), 20)) for poses in some]
+    declared = fit_of(some)
+    if declared is None:
+        return []
+    if not gross and declared.size * declared.fault() < LEAST_GAIN:
+        return []
+    guesses = _guesses(some, axes)
+    best = _fine(guesses, some, declared)
+    if best is None:
+        return []
+    worst = int(np.argmax(np.abs(off)))
+    return [
+        f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, and no single factor explains the errors, but "
+        f"all would be consistent if {best.text}"
+    ]
+
+
+def _guesses(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
+    from consistency.referee.readers.mix_ups.known import guesses_of  # few files need them
+
+    return guesses_of(runs, axes)
+
+
+def _of(axes: Sequence[str], worst: int) -> str:
+    return "" if worst == 0 else f" of {axes[worst - 1]} by itself"
+
+
+def _times(off: float) -> str:
+    return f"{10.0 ** abs(off):.2g} times too {'large' if off > 0 else 'small'}"
+
+
+def _same(runs: Sequence[Poses]) -> bool:
+    """Whether the errors are rounding in nearly all estimates, in values and beside their standard deviations."""
+    same = total = 0
+    for p in runs:
+        error, known = np.abs(p.errors()), p.known().rows
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))[known]
+            rounding = ROUNDING * max(1.0, float(np.abs(p.truth).max(initial=0.0)))
+            same += int(((error[known] <= rounding) & (error[known] <= NEGLIGIBLE * sigma)).all(axis=1).sum())
+        total += len(known)
+    return total >= LEAST and same >= NEARLY_ALL * total
+
+
+def _gross(guesses: Sequence[Guess], some: Sequence[Poses]) -> Guess | None:
+    """The guess with which the NEES of a median estimate is nearest to a right one, if it is near."""
+    left = np.array([np.abs(decades([guess.change(poses) for poses in some])).max() for guess in guesses])
+    first = np.where([guess.last for guess in guesses], np.nan, left)
+    left = first if np.nanmin(first) < RIGHT else left
+    if not np.nanmin(left) < RIGHT:
+        return None
+    return guesses[int(np.flatnonzero(left <= np.nanmin(left) + ALIKE)[0])]
+
+
+def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: ReadingFit) -> Guess | None:
+    """The likeliest guess with which everything is right, where no simple fault is nearly as likely."""
+    guesses = [guess for guess in guesses if guess.fine]
+    bar, simple, found = LEAST_GAIN + np.log(max(len(guesses), 1)), declared.simple(), []
+    errors = np.concatenate([poses.errors() for poses in some])
+    for guess in guesses:
+        read = [guess.change(poses) for poses in some]
+        if any(new.truth is not old.truth for new, old in zip(read, some, strict=True)):
+            continue  # a density of the truth in another unit is no likelier
+        same = all(
+            new.estimate is old.estimate and new.convention == old.convention
+            for new, old in zip(read, some, strict=True)
+        )
+        fit = fit_of(read, errors if same else None)
+        if fit is None or len(fit.w) < len(declared.w) or declared.size * (fit.likelihood - simple) < bar:
+            continue
+        gain = min(fit.size, declared.size) * (fit.likelihood - simple)
+        if gain >= bar and fit.right():
+            found.append((gain, guess))
+    most = max((gain for gain, _ in found), default=0.0)
+    return next((guess for gain, guess in found if gain >= most - 1.0), None)  # nearly as likely: the first
+
+
+def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
+    """Components of errors (runs, steps, n) that look like angles: their large errors are whole turns."""
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        far = (np.abs(error) > np.pi) & (np.abs(error) > 2.0 * NEAR * sigma) & (NEAR * sigma < SHARP)
+        home = np.abs(wrap(error)) <= NEAR * sigma
+    found = []
+    for k, axis in enumerate(axes):
+        jumps = int(far[..., k].sum())
+        if jumps >= LEAST and home[..., k][far[..., k]].all():
+            steps = f"{jumps} of {int(np.isfinite(error[..., k]).sum())} steps"
+            found.append(f"{name}: the error of {axis} is off by 2 pi in {steps}, as that of an angle; {remedy}")
+    return found
+
+
+def decades(runs: Sequence[Poses]) -> Array:
+    """log10 of the median NEES over that of chi-square, of all n components and of each alone, (1 + n,).
+
+    NaN without any.
+    """
+    n = runs[0].covariance.shape[-1]
+    found = []
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for poses in runs:
+            error, P = poses.errors(), poses.covariance
+            own = np.square(error) / np.diagonal(P, axis1=1, axis2=2)
+            found.append(np.column_stack([np.square(whiten(error, P)).sum(axis=1), own]))
+    nees = np.concatenate(found)
+    nees = nees[np.isfinite(nees).all(axis=1)]
+    if not len(nees):
+        return np.full(1 + n, np.nan)
+    right = distributions.chi2.ppf(0.5, np.append(n, np.ones(n)))
+    return np.asarray(np.log10(np.maximum(np.median(nees, axis=0), 1e-300) / right))

@@ -1,0 +1,288 @@
+"""The mix-ups in files that are looked for: a unit, order, side, convention, world or body of one file or of both."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.geometry import wrap
+from consistency.referee.geometry.conventions import PLANAR, SPATIAL
+from consistency.referee.readers.alignment.bodies import fitted_body, on_body
+from consistency.referee.readers.alignment.world_frames import WorldTransform, fitted_frame, moved, spread
+from consistency.referee.readers.poses import Poses
+from consistency.referee.types import Array
+
+ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
+DEGREE = np.pi / 180.0
+MILLI = 1e-3
+ARM = 1e-3  # of the size of the path: shorter lever arms are not named
+TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
+
+Change = Callable[[Poses], Poses]
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A possible mix-up in words, and the files read without it."""
+
+    text: str
+    change: Change
+    last: bool = False  # named only where nothing else fits: it has a fit of its own for each run
+    fine: bool = True  # named where less than a decade is wrong too: no bias and no drift looks like it
+
+
+def guesses_of(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
+    """Possible mix-ups, the likelier first."""
+    kind, convention = runs[0].manifold, runs[0].convention
+    guesses = [*_covariances()]
+    if kind == "spatial":
+        own = [*_orders(convention), *_quaternions(), *guesses, *_permuted(axes, 3)]
+        return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_positions(3), *_frames(runs), *_bodies(runs)]
+    if kind == "planar":
+        own = [*_sides(convention), *_headings(), *guesses, *_permuted(axes, 3)]
+        return [*own, *_units(2, slice(2, 3)), _mirrored(convention), *_positions(2), *_frames(runs), *_bodies(runs)]
+    return [*guesses, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
+
+
+def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator[Guess]:
+    """Components of the covariance, or of estimates and covariance, in another order; of six in both blocks alike."""
+    n = width if len(axes) != 2 * width else 2 * width
+    if width > SWAPS:
+        return
+    orders: Iterable[tuple[int, ...]] = itertools.permutations(range(width))
+    if width > ALL_ORDERS:
+        orders = (_swap(width, *pair) for pair in itertools.combinations(range(width), 2))
+    for order in orders:
+        if order == tuple(range(width)):
+            continue
+        there = [axes[order.index(slot)] for slot in range(width)]
+        words = f"in the order {', '.join(there)}{' (rotations alike)' * (n > width)}"
+        whole = [*order, *(width + i for i in order)][:n]
+        if states:
+            what = f"the components of the estimates and of their covariance are {words}, beside those of the truth"
+        else:
+            what = f"the components of the covariance are {words}"
+        change = _reordered_states(whole, whole) if states else _reordered(whole)
+        yield Guess(f"{what}; write them as {', '.join(axes[:width])}", change)
+
+
+def _positions(width: int) -> Iterator[Guess]:
+    """Coordinates of the estimates of poses in another order, with the blocks of their covariance or without."""
+    axes = "xyz"[:width]
+    for order in itertools.permutations(range(width)):
+        if order == tuple(range(width)):
+            continue
+        there = ", ".join(axes[order.index(slot)] for slot in range(width))
+        words = f"of the estimates are in the order {there}; write them as {', '.join(axes)}"
+        turned, rest = ([3, 4, 5, 6], [3, 4, 5]) if width == 3 else ([2], [2])
+        place, both = [*order, *turned], [*order, *rest]
+        yield Guess(f"the positions {words}", _reordered_estimates(place), fine=False)
+        yield Guess(f"positions and covariance {words}", _reordered_states(place, both), fine=False)
+
+
+def _swap(width: int, i: int, j: int) -> tuple[int, ...]:
+    order = list(range(width))
+    order[i], order[j] = j, i
+    return tuple(order)
+
+
+def _reordered(order: list[int]) -> Change:
+    return lambda p: replace(p, covariance=p.covariance[:, order][:, :, order])
+
+
+def _reordered_estimates(order: list[int]) -> Change:
+    return lambda p: replace(p, estimate=p.estimate[:, order])
+
+
+def _reordered_states(estimate: list[int], covariance: list[int]) -> Change:
+    return lambda p: _reordered(covariance)(_reordered_estimates(estimate)(p))
+
+
+def _ned(convention: str) -> Iterator[Guess]:
+    """A world whose z points down, with a body whose z does so too or not."""
+    north = WorldTransform(Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))
+    down = np.diag([1.0, -1.0, -1.0])
+    turned = {"so3-body": slice(3, 6), "left": slice(0, 6)}.get(convention, slice(0, 0))
+    T = np.eye(6)
+    T[turned, turned] = np.kron(np.eye(2), down)[turned, turned]
+
+    def with_body(p: Poses) -> Poses:
+        p = moved(p, north)
+        finite = np.isfinite(p.estimate).all(axis=1)
+        if finite.any():
+            p.estimate[finite, 3:] = (Rotation.from_quat(p.estimate[finite, 3:]) * Rotation.from_matrix(down)).as_quat()
+        return replace(p, covariance=T @ p.covariance @ T)
+
+    worlds = "one file is in a world of x north, y east, z down, the other in one of x east, y north, z up"
+    remedy = "write both in one (swap x and y, turn z over)"
+    yield Guess(f"{worlds}; {remedy}", lambda p: moved(p, north), fine=False)
+    yield Guess(f"{worlds}, and their bodies have z down and z up; {remedy}", with_body, fine=False)
+
+
+def _mirrored(convention: str) -> Guess:
+    """A plane of x north and y east."""
+    A = np.diag([1.0, -1.0, -1.0])
+    if convention != "left":
+        A[:2, :2] = [[0.0, 1.0], [1.0, 0.0]]
+
+    def change(p: Poses) -> Poses:
+        x, y, heading = p.estimate.T
+        own = np.column_stack([y, x, wrap(0.5 * np.pi - heading)])
+        return replace(p, estimate=own, covariance=A @ p.covariance @ A.T)
+
+    words = "one file is in a plane of x north, y east, the other in one of x east, y north"
+    return Guess(f"{words}; write both in one (swap x and y, heading = pi/2 - heading)", change, fine=False)
+
+
+def _orders(convention: str) -> Iterator[Guess]:
+    swap = [3, 4, 5, 0, 1, 2]
+    for other in SPATIAL:
+        for turned in (False, True):
+            if (other, turned) != (convention, False):
+                words = [] if other == convention else [f"the error is '{other}' (--error {other})"]
+                words += ["the covariance has its two blocks in the other order (--covariance-order)"] if turned else []
+                yield Guess(" and ".join(words), _read_as(other, swap if turned else [0, 1, 2, 3, 4, 5]))
+
+
+def _read_as(convention: str, order: list[int]) -> Change:
+    return lambda p: replace(p, convention=convention, covariance=p.covariance[:, order][:, :, order])
+
+
+def _sides(convention: str) -> Iterator[Guess]:
+    for other in PLANAR:
+        if other not in (convention, "vector"):
+            yield Guess(f"the error is '{other}' (--error {other})", _read_as(other, [0, 1, 2]))
+
+
+def _quaternions() -> Iterator[Guess]:
+    first = [0, 1, 2, 4, 5, 6, 3]
+    yield Guess(
+        "the quaternions of both files are w x y z; write them x y z w",
+        lambda p: replace(p, estimate=p.estimate[:, first], truth=p.truth[:, first]),
+    )
+    yield Guess(
+        "the quaternions of the estimates are w x y z; write them x y z w",
+        lambda p: replace(p, estimate=p.estimate[:, first]),
+    )
+    yield Guess(
+        "the quaternions of the truth are w x y z; write them x y z w", lambda p: replace(p, truth=p.truth[:, first])
+    )
+    back = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
+    yield Guess(
+        "the quaternions of the estimates turn world into body; invert them",
+        lambda p: replace(p, estimate=p.estimate * back),
+    )
+
+
+def _headings() -> Iterator[Guess]:
+    degrees = np.array([1.0, 1.0, DEGREE])
+    remedy = "; multiply them by pi / 180"
+    yield Guess(f"the headings of both files are in degrees{remedy}", lambda p: _scaled(p, degrees, degrees))
+    yield Guess(f"the headings of the estimates are in degrees{remedy}", lambda p: _scaled(p, degrees, None))
+    yield Guess(f"the headings of the truth are in degrees{remedy}", lambda p: _scaled(p, None, degrees))
+    both = "the headings of both files and their variances are in degrees"
+    yield Guess(f"{both}{remedy}", lambda p: _weighed(_scaled(p, degrees, degrees), slice(2, 3), DEGREE))
+
+
+def _scaled(p: Poses, estimate: Array | None, truth: Array | None) -> Poses:
+    ones = np.ones(p.estimate.shape[1])
+    p = replace(p, estimate=p.estimate * (ones if estimate is None else estimate))
+    p = replace(p, truth=p.truth * (ones if truth is None else truth))
+    for values in (p.estimate, p.truth):
+        values[:, 2] = wrap(values[:, 2])
+    return p
+
+
+def _units(width: int, angles: slice) -> Iterator[Guess]:
+    """Millimetres and degrees; the first ``width`` components are metres."""
+    part = slice(0, width)
+
+    def shrunk(values: Array) -> Array:
+        out: Array = values.copy()
+        out[:, part] *= MILLI
+        return out
+
+    yield Guess(
+        "its angles are in degrees (deg^2 for rad^2); multiply them by pi / 180", lambda p: _weighed(p, angles, DEGREE)
+    )
+    yield Guess(
+        "its positions are in millimetres (mm^2 for m^2); divide them by 1000", lambda p: _weighed(p, part, MILLI)
+    )
+    yield Guess(
+        "the positions of the estimates and their covariance are in millimetres; divide them by 1000",
+        lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),
+    )
+    for of, change in (
+        ("truth", lambda p: replace(p, truth=shrunk(p.truth))),
+        ("estimates", lambda p: replace(p, estimate=shrunk(p.estimate))),
+    ):
+        yield Guess(f"the positions of the {of} are in millimetres; divide them by 1000", change)
+
+
+def _weighed(p: Poses, part: slice, factor: float) -> Poses:
+    scale = np.ones(p.covariance.shape[-1])
+    scale[part] = factor
+    return replace(p, covariance=p.covariance * scale[:, None] * scale)
+
+
+def _covariances() -> Iterator[Guess]:
+    yield Guess("its diagonal holds standard deviations; square them", _squared)
+    yield Guess("it is an information matrix; invert it", _inverted)
+
+
+def _squared(p: Poses) -> Poses:
+    n = p.covariance.shape[-1]
+    return replace(p, covariance=np.square(np.diagonal(p.covariance, axis1=1, axis2=2))[:, :, None] * np.eye(n))
+
+
+def _inverted(p: Poses) -> Poses:
+    P = np.full_like(p.covariance, np.nan)
+    regular = np.abs(np.linalg.det(p.covariance)) > 0
+    P[regular] = np.linalg.inv(p.covariance[regular])
+    return replace(p, covariance=P)
+
+
+# --- frames -----------------------------------------------------------------------------------------
+
+
+def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
+    """The worlds of the files differ by a turn about z and a shift, the same in all runs, or another in each."""
+    frame = fitted_frame(runs)
+    if frame is None or not (size := spread(runs)) > 0:
+        return
+    angle = np.rad2deg(frame.heading)
+    if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
+        turn = f"turned by {angle:.1f} degrees about z and " if abs(angle) > TURN else ""
+        where = ", ".join(f"{value:.3g}" for value in frame.shift[: 3 if runs[0].manifold == "spatial" else 2])
+        words = (
+            f"the world of the estimates is {turn}shifted by ({where}) m to meet that of the truth; "
+            f"write both in one world, or add --align posyaw{'-all' * (len(runs) > 1)}"
+        )
+        yield Guess(words, lambda p: moved(p, frame), fine=False)
+    if len(runs) > 1:
+        words = "each run is turned about z and shifted by itself to meet the truth; add --align posyaw"
+        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame), last=True, fine=False)
+
+
+def _bodies(runs: Sequence[Poses]) -> Iterator[Guess]:
+    """The bodies of the files differ by a constant turn or lever arm."""
+    body = fitted_body(runs)
+    if body is None:
+        return
+    angle, size = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0, spread(runs)
+    parts = []
+    if np.linalg.norm(angle) >= TURN:
+        planar = runs[0].manifold == "planar"
+        about = "z" if planar else "x, y, z"
+        turned = f"{angle[2]:.1f}" if planar else f"({', '.join(f'{value:.1f}' for value in angle)})"
+        parts.append(f"turned by {turned} degrees about {about}")
+    if np.linalg.norm(body.arm) >= ARM * size:
+        arm = ", ".join(f"{value:.3g}" for value in body.arm[: 2 if runs[0].manifold == "planar" else 3])
+        parts.append(f"shifted by a lever arm of ({arm}) m")
+    if parts:
+        words = f"the body of the truth is {' and '.join(parts)} against that of the estimates; write poses of one body"
+        yield Guess(words, lambda p: on_body(p, body), fine=False)

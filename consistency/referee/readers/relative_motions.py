@@ -1,0 +1,260 @@
+"""Motions over windows of a log, beside the true ones; estimate and truth need no common world frame.
+
+The error of a window is Log(D^-1 M) of its estimated motion D = est_i^-1 est_j and its true one M = truth_i^-1 truth_j.
+A change of either world frame changes neither. Log(M D^-1) is the adjoint of it and has the same NEES.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.questions.independence import ENOUGH, Independence, independence
+from consistency.referee.diagnostics.records.whitening import whiten
+from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.words.sentences import p_text
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
+from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.matching import common_times
+from consistency.referee.readers.runs_to_record import Track, assemble
+from consistency.referee.readers.windows import Relative, windows
+from consistency.referee.types import Array, Indices
+
+KIND = "left"
+MARGINAL = (
+    "covariances of two poses do not tell that of the motion between them; give their cross-covariances, or motions "
+    "with --motions (docs/files.md, Relative poses)"
+)
+BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One run before its windows are taken; N rows, k of which have a truth."""
+
+    run: int
+    file: str
+    place: Places  # (N,)
+    t: Array  # (N,), s, or NaN
+    estimate: Array  # (N, m), poses, or motions since the row before
+    covariance: Array  # (N, n, n), NaN where the file has none
+    cross: Array | None  # (N, n, n), E e_before e', of the errors of the row before and of this row
+    rows: Indices  # (k,), with truth
+    truth: Array  # (k, m)
+    convention: str  # of the error that the covariances are of
+
+    @property
+    def d(self) -> int:
+        """2 in the plane, 3 in space."""
+        return 2 if self.covariance.shape[-1] == 3 else 3
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The windows of one run, W of them."""
+
+    track: Track  # with the times of their beginnings
+    t: Array  # (W,), s, at the end of each
+    left_out: int
+
+    @property
+    def error(self) -> Array:
+        """(W, n), NaN where the estimate is."""
+        assert self.track.error is not None
+        return self.track.error
+
+    @property
+    def covariance(self) -> Array:
+        """(W, n, n)."""
+        assert self.track.covariance is not None
+        return self.track.covariance
+
+
+def windows_of(stretch: Stretch, relative: Relative) -> Windows:
+    """Errors of the motions over windows, with their covariances to first order.
+
+    Independent motions M_k = D_k Exp(e_k) make up the window's motion D Exp(sum Ad(D_k+1 ... D_j)^-1 e_k): poses are
+    compounded as in Barfoot (2017), State Estimation for Robotics, sec. 7.3.3. Errors e_i and e_j of two poses with a
+    joint covariance make up D Exp(e_j - Ad(D)^-1 e_i).
+
+    Raises
+    ------
+    InputError
+        No window fits, a covariance is missing, or cross-covariances do not reach over a window.
+    """
+    s = stretch
+    if not relative.motions and s.cross is None:
+        raise InputError(f"{s.file}: --relative: {MARGINAL}")
+    first, last, left_out = windows(s.t, s.truth[:, : s.d], s.rows, relative, s.file)
+    sound = _sound(s, relative)
+    first, last = first[last < sound], last[last < sound]
+    T, true = _poses(s, sound, relative), matrices(s.truth)
+    start, end = np.searchsorted(s.rows, first), np.searchsorted(s.rows, last)
+    D, M = inverse(T[first]) @ T[last], inverse(true[start]) @ true[end]
+    error = log(inverse(D) @ M)
+    covariance = _of_motions(s, T, first, last) if relative.motions else _of_poses(s, T, D, first, last, relative)
+    if sound < len(s.t):  # a broken row ends the run, in a window of its own
+        finite = np.isfinite(s.estimate[sound]).all()
+        first, last = np.append(first, max(sound - 1, 0)), np.append(last, sound)
+        error = np.concatenate([error, np.full((1, error.shape[1]), 0.0 if finite else np.nan)])
+        covariance = np.concatenate([covariance, np.full((1, *s.covariance.shape[1:]), np.nan)])
+    track = Track(s.run, np.arange(len(last)), s.place.at(last), error, covariance, t=s.t[first])
+    return Windows(track, s.t[last], left_out)
+
+
+def _sound(s: Stretch, relative: Relative) -> int:
+    """The first row that is broken; the first row of motions is only where they start."""
+    ok: Array = np.asarray(np.isfinite(s.estimate).all(axis=1) & np.isfinite(s.covariance).all(axis=(1, 2)))
+    if s.cross is not None:
+        ok[1:] &= np.isfinite(s.cross[1:]).all(axis=(1, 2))
+    if relative.motions:
+        ok[0] = True
+    return len(ok) if ok.all() else int(np.argmin(ok))
+
+
+def _poses(s: Stretch, sound: int, relative: Relative) -> Array:
+    """Estimated poses (sound, d + 1, d + 1); of motions from the origin on."""
+    if not relative.motions:
+        return matrices(s.estimate[:sound])
+    D = matrices(s.estimate[1:sound])
+    return composed(np.concatenate([np.eye(s.d + 1)[None], D]))
+
+
+def _of_motions(s: Stretch, T: Array, first: Indices, last: Indices) -> Array:
+    """Covariances of the windows' left errors from independent motions, (W, n, n)."""
+    if not len(first):
+        return np.empty((0, *s.covariance.shape[1:]))
+    sizes = last - first
+    window = np.repeat(np.arange(len(first)), sizes)
+    rows = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes) + first[window] + 1
+    own = to_left(inverse(T[rows - 1]) @ T[rows], s.convention)
+    J = adjoint(inverse(T[last[window]]) @ T[rows]) @ own
+    return np.asarray(np.add.reduceat(carried(J, s.covariance[rows]), np.cumsum(sizes) - sizes))
+
+
+def _of_poses(s: Stretch, T: Array, D: Array, first: Indices, last: Indices, relative: Relative) -> Array:
+    """Covariances of the windows' left errors from the joint ones of their two ends, (W, n, n)."""
+    assert s.cross is not None
+    if (wide := np.flatnonzero(last - first != 1)).size:
+        raise InputError(
+            f"{s.place[int(last[wide[0]])]}: --relative {relative.option}: the window spans "
+            f"{(last - first)[wide[0]]} rows, but a cross-covariance reaches one row back; keep only the rows at the "
+            "ends of windows, or take --relative 1"
+        )
+    start, end = to_left(T[first], s.convention), to_left(T[last], s.convention)
+    J = np.concatenate([-adjoint(inverse(D)) @ start, end], axis=-1)
+    cross = s.cross[last]
+    joint = np.block([[s.covariance[first], cross], [np.swapaxes(cross, -1, -2), s.covariance[last]]])
+    return carried(J, joint)
+
+
+def relative_recording(
+    name: str, file: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
+) -> Evidence:
+    """The windows of some runs of one estimator as a recording, whose steps are windows.
+
+    Parameters
+    ----------
+    axes : names of the components of the error; ``judged`` are the indices of those that count
+
+    Raises
+    ------
+    InputError
+        Input that :func:`windows_of` refuses, or a covariance that is singular in every window.
+    """
+    found = [windows_of(stretch, relative) for stretch in stretches]
+    times = [one.t for one in found]
+    part = list(judged)
+    tracks, t = [one.track.part(part) for one in found], np.full(max(map(len, times)), np.nan)
+    if np.isfinite(np.concatenate(times)).all():
+        columns, t = common_times(times)
+        tracks = [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
+    notes = _notes(name, found, axes, stretches[0].convention, relative)
+    of = _independence(found)
+    notes += _doubt(name, of, relative) if relative.independent else []
+    record = assemble(name, tracks, t, tuple(axes[i] for i in part), file, KIND, notes)
+    if not relative.independent:
+        return replace(record, window=relative.text)
+    caption = f"the {_whose(relative)} do not seem to be independent, on which this rests" if of.doubtful else ""
+    unshown = _too_few(of, relative)
+    return replace(record, window=relative.text, independent=True, caption=caption, unshown=unshown)
+
+
+def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention: str, relative: Relative) -> list[str]:
+    total, left_out = sum(len(one.t) for one in found), sum(one.left_out for one in found)
+    of = "motions" if relative.motions else "poses, with cross-covariances,"
+    group = "SE(2)" if len(axes) == 3 else "SE(3)"
+    notes = [
+        f"{name}: relative poses over {plural(total, 'window')} of {relative.text}; the error is Log(estimated^-1 true "
+        f"motion) of {group}, in the frame of the body at the end of a window; covariances of {of} are of the error "
+        f"{convention}",
+        f"{name}: what is constant over a window, or drifts more slowly than it, is not seen; longer windows see more",
+    ]
+    if relative.independent:
+        notes.append(
+            f"{name}: errors of different {_whose(relative)} are declared to be independent: each window is a run"
+        )
+    else:
+        notes.append(
+            f"{name}: windows are steps of their run, as their errors may depend on each other; where they do not, "
+            "--windows independent makes each a run"
+        )
+    if left_out:
+        notes.append(f"{name}: {plural(left_out, 'window')} left out, too long because rows or truth are missing")
+    wide = _widest(found)
+    if wide > BENT:
+        notes.append(
+            f"{name}: the stated rotation over a window has a sigma of {wide:.2g} rad in the median; beyond {BENT:g} "
+            "a covariance to first order is doubtful, so take shorter windows"
+        )
+    return notes
+
+
+def _whose(relative: Relative) -> str:
+    return "motions" if relative.motions else "windows"
+
+
+def _widest(found: Sequence[Windows]) -> float:
+    """Largest standard deviation of a rotation about an axis, rad, in the median window."""
+    P = np.concatenate([one.covariance for one in found])
+    angles = P[:, 2:, 2:] if P.shape[-1] == 3 else P[:, 3:, 3:]
+    angles = angles[np.isfinite(angles).all(axis=(1, 2))]
+    return float(np.median(np.sqrt(np.maximum(np.linalg.eigvalsh(angles)[:, -1], 0.0)))) if len(angles) else 0.0
+
+
+def _independence(found: Sequence[Windows]) -> Independence:
+    return independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
+
+
+def _doubt(name: str, of: Independence, relative: Relative) -> list[str]:
+    """Note that windows are correlated, positively or negatively, though they are declared to be independent."""
+    if not of.doubtful:
+        return []
+    if of.of_sizes:
+        way = "are of like size" if of.alike else "are of unlike size"
+        cause = "conditions that last longer than a window" if of.alike else "what takes turns from window to window"
+    else:
+        way = "go the same way" if of.alike else "go opposite ways"
+        cause = "a bias, or noise that lasts longer than a window" if of.alike else "noise of the pose that they share"
+    return [
+        f"{name}: errors of neighbouring windows {way} (p {p_text(of.p_value)}), so that they do not seem to be "
+        f"independent: {cause} may be behind it, and the verdict holds for independent {_whose(relative)} only"
+    ]
+
+
+def _too_few(of: Independence, relative: Relative) -> str:
+    """Why windows that are only declared to be independent are too few to decide; "" where they are enough.
+
+    Independent motions are never too few: their covariance over a window assumes independence, and is judged with it.
+    """
+    if relative.motions or of.pieces >= ENOUGH:
+        return ""
+    return (
+        f"{plural(of.pieces, 'window')} {'is' if of.pieces == 1 else 'are'} too few windows to show independence, "
+        f"which takes {ENOUGH}; without --windows independent they are steps of their run, however they depend on "
+        "each other"
+    )

@@ -1,0 +1,223 @@
+"""Runs of an estimator as arrays over (runs, steps), with failures and left-out steps."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.records.array_blocks import of_runs
+from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, asymmetric, classify
+from consistency.referee.diagnostics.statistics.nees import nees
+from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array, Failure, Indices
+
+
+@dataclass(frozen=True)
+class Track:
+    """One run as it stands in a file: its rows in order, each with the step it belongs to."""
+
+    run: int
+    column: Indices  # (k,), increasing, 0..T-1
+    place: Sequence[str]  # (k,), "est.csv, line 7"
+    error: Array | None = None  # (k, n), NaN where the estimate is
+    covariance: Array | None = None  # (k, n, n)
+    nis: Array | None = None  # (k,)
+    nis_dof: Array | None = None  # (k,)
+    nees: Array | None = None  # (k,)
+    t: Array | None = None  # (k,), s; of windows, of their beginnings
+    truth_covariance: Array | None = None  # (k, n, n), of the truth itself; NaN where it has none
+    path: Array | None = None  # (k, 2, 2 or 3), m, true and estimated positions
+
+    def part(self, index: Sequence[int]) -> Track:
+        """Track of some components of the error."""
+        assert self.error is not None
+        assert self.covariance is not None
+        if len(index) == self.error.shape[1]:
+            return self
+        of_truth = self.truth_covariance
+        return replace(
+            self, error=self.error[:, index], covariance=self.covariance[:, index][:, :, index],
+            truth_covariance=None if of_truth is None else of_truth[:, index][:, :, index],
+        )  # fmt: skip
+
+
+def assemble(
+    name: str,
+    tracks: Sequence[Track],
+    t: Array,
+    axes: tuple[str, ...],
+    file: str,
+    convention: str = "",
+    notes: Sequence[str] = (),
+) -> Evidence:
+    """Assemble tracks on the common steps, find failures, and leave out exactly known starts.
+
+    Parameters
+    ----------
+    t : (steps,), s, NaN where a step has no time
+    axes : names of the components of the error
+    file : where the estimates are from, for messages
+
+    Raises
+    ------
+    InputError
+        No covariance of any run has full rank, or two runs are the same.
+    """
+    tracks = sorted(tracks, key=lambda track: track.run)
+    _require_different(file, tracks)
+    notes = list(notes)
+    failures, parts, skipped = [], [], 0
+    longest = longest_start(tracks)
+    for track in tracks:
+        start, end, reason = judged_rows(track, longest)
+        if reason:
+            failures.append(Failure(name, track.run, int(track.column[end]) + 1, f"{reason} ({track.place[end]})"))
+        skipped += start
+        parts.append(_cut(track, start, end))
+    if not failures and all(part.nees is not None and np.isnan(part.nees).all() for part in parts):
+        raise InputError(_singular(file, tracks, axes))
+    if skipped:
+        notes.append(f"{name}: {skipped} estimates before the covariance has full rank are left out")
+    short = [part.run for part in parts if len(part.column) and part.column[-1] < len(t) - 1]
+    short = [run for run in short if run not in {failure.run for failure in failures}]
+    if short:
+        notes.append(
+            f"{name}: {plural(len(short), 'run')} of {len(parts)} ({listed(short)}) end before step {len(t)}; "
+            "if the filter broke down there, write a row of NaN, so that the failure counts"
+        )
+
+    def grid(pick: Callable[[Track], Array | None]) -> Array | None:
+        values = [value for part in parts if (value := pick(part)) is not None]
+        if not values:
+            return None
+        out = np.full((len(parts), len(t), *values[0].shape[1:]), np.nan)
+        for row, (part, value) in enumerate(zip(parts, values, strict=True)):
+            out[row, part.column] = value
+        return out
+
+    error = grid(lambda part: part.error)
+    return Evidence(
+        name=name,
+        runs=np.array([part.run for part in parts], dtype=np.int64),
+        t=t,
+        error=error,
+        covariance=grid(lambda part: part.covariance),
+        nees=grid(lambda part: part.nees),
+        dof=len(axes) if error is not None else 0,
+        nis=grid(lambda part: part.nis),
+        nis_dof=grid(lambda part: part.nis_dof),
+        axes=axes,
+        failures=tuple(failures),
+        convention=convention,
+        notes=tuple(notes),
+        times=grid(lambda part: part.t),
+        truth_covariance=grid(lambda part: part.truth_covariance),
+        path=grid(lambda part: part.path),
+    )
+
+
+def _require_different(file: str, tracks: Sequence[Track]) -> None:
+    """Refuse a run that is there twice: the verdict counts runs that share no noise."""
+    seen: dict[bytes, Track] = {}
+    for track in tracks:
+        if track.error is None or len(track.error) < 2 or not np.nan_to_num(track.error).any():
+            continue
+        other = seen.setdefault(hashlib.sha256(np.ascontiguousarray(track.error).tobytes()).digest(), track)
+        if other is not track:
+            raise InputError(
+                f"{file}: the errors from {track.place[0]} on are those from {other.place[0]} on to the last digit: a "
+                "run that is there twice; leave one of them out"
+            )
+
+
+def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
+    """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so already."""
+    out = np.empty(covariance.shape)
+    with np.errstate(invalid="ignore"):  # of infinite ones
+        for piece in of_runs(out):
+            P = covariance[piece]
+            bad = np.flatnonzero(asymmetric(P, ROUNDED))
+            if len(bad):
+                row = piece.start + int(bad[0])
+                raise InputError(f"{place(row)}: the covariance is not symmetric; write P = (P + P') / 2")
+            out[piece] = 0.5 * (P + np.swapaxes(P, -1, -2))
+    return out
+
+
+def longest_start(tracks: Sequence[Track]) -> int:
+    """Rows that a start known exactly may take, in which a covariance is singular; 0 where a run begins otherwise."""
+    starts = [(_first_full(track), len(track.column)) for track in tracks]
+    ended = [start for start, rows in starts if start < rows]
+    if not ended:
+        return max((rows for _, rows in starts), default=0)
+    return max(ended) if min(start for start, _ in starts) > 0 else 0
+
+
+def _first_full(track: Track) -> int:
+    """First row with a covariance of full rank; the number of rows without any."""
+    if track.covariance is None or not len(track.column):
+        return 0
+    if classify(track.covariance[:1], ROUNDED)[0] == Validity.VALID:
+        return 0
+    full = classify(track.covariance, ROUNDED) == Validity.VALID
+    return int(np.argmax(full)) if full.any() else len(full)
+
+
+def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int, int, str]:
+    """First row that is judged, first broken row, and why it is broken: ``what`` is not finite, ..."""
+    rows = len(track.column)
+    error_ok: Array = np.all(np.isfinite(np.zeros((rows, 1)) if track.error is None else track.error), axis=1)
+    kind = np.zeros(rows, int) if track.covariance is None else classify(track.covariance, ROUNDED)
+    full: Array = np.asarray(kind == Validity.VALID)
+    start = min(int(np.argmax(full)) if full.any() else rows, longest)
+    bad: Array = ~error_ok | ~full
+    bad[:start] = ~error_ok[:start] | (kind[:start] != Validity.DEFICIENT)
+    if not bad.any():
+        return start, rows, ""
+    end = int(np.argmax(bad))
+    if not error_ok[end]:
+        reason = f"{what} is not finite"
+    elif kind[end] == Validity.NOT_FINITE:
+        reason = "covariance is not finite"
+    else:
+        reason = "covariance is not positive definite"
+    return min(start, end), end, reason
+
+
+def _cut(track: Track, start: int, end: int) -> Track:
+    """Rows before ``end``, with their NEES from ``start`` on."""
+    given = (track.error, track.covariance, track.nis, track.nis_dof, track.t, track.truth_covariance, track.path)
+    error, P, nis, dof, t, of_truth, path = (None if v is None else v[:end] for v in given)
+    values = None
+    if error is not None and P is not None:
+        values = np.full(end, np.nan)
+        values[start:] = nees(error[start:], P[start:])
+        if start:
+            P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
+    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values, t, of_truth, path)
+
+
+def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
+    variances = [np.diagonal(t.covariance, axis1=-2, axis2=-1) for t in tracks if t.covariance is not None]
+    none = (np.abs(np.concatenate(variances)) <= ROUNDED.zero).all(axis=0)
+    if none.all():
+        return f"{file}: the covariance is zero in every step; nothing to judge"
+    of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})" * bool(none.any())
+    return f"{file}: the covariance is singular in every step{of}; " + (
+        _without(axes, none) if none.any() else "write only the states that the filter estimates by themselves"
+    )
+
+
+def _without(axes: tuple[str, ...], none: Array) -> str:
+    """Advice on the option that leaves out components whose variance is zero."""
+    left = ",".join(axis for axis, zero in zip(axes, none, strict=True) if not zero)
+    return f"judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
+
+
+def listed(numbers: Sequence[object]) -> str:
+    return ", ".join(map(str, numbers[:5])) + ", …" * (len(numbers) > 5)

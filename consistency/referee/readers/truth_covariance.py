@@ -1,0 +1,77 @@
+"""Truth with a covariance of its own: what the options declare of it, and what they do not go with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import DECLARED
+from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
+from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.errors import InputError
+from consistency.referee.readers.options import Reading, flag_of
+
+REFUSED = {
+    "relative": "neighbouring windows share the truth at their common end, so that its errors are in both",
+    "motions": "a motion has the errors of the truth at both ends, whose cross-covariance no file states",
+    "split": "pieces of one log share the truth's errors, in a way that no log shows",
+    "align": "a frame that is fitted to an uncertain truth takes an unknown share of the truth's errors",
+}
+
+
+def require_truth_options(r: Reading) -> None:
+    """Refuse declarations that are unknown, or an uncertain truth where its errors enter otherwise than once a step.
+
+    Raises
+    ------
+    InputError
+        Names the option, and the reason.
+    """
+    if r.truth_errors not in (None, *DECLARED):
+        raise InputError(f"--truth-errors {r.truth_errors}: must be {', '.join(DECLARED[:-1])} or {DECLARED[-1]}")
+    asked = r.given(["truth_covariance", "truth_errors", "truth_shared"])
+    for option, why in REFUSED.items():
+        if asked and getattr(r, option):
+            raise InputError(f"{flag_of(asked[0])}: does not go with {flag_of(option)}: {why}")
+
+
+def declared(records: Sequence[Evidence], r: Reading) -> list[Evidence]:
+    """Records with what is declared of the errors of the truth.
+
+    Raises
+    ------
+    InputError
+        The truth has no covariance, or one that is none.
+    """
+    asked = r.given(["truth_errors", "truth_shared"])
+    found = []
+    for record in records:
+        P = record.truth_covariance
+        if P is None:
+            if asked:
+                raise InputError(
+                    f"{flag_of(asked[0])}: the truth of {record.name} has no covariance of its own; name it by "
+                    "--truth-covariance"
+                )
+            found.append(record)
+            continue
+        if record.parts:
+            raise InputError(f"{record.name}: --truth-covariance needs covariances; here deviations alone are stated")
+        kind = classify(P, ROUNDED)
+        wrong = np.argwhere((kind == Validity.INDEFINITE) | (kind == Validity.ASYMMETRIC))
+        if len(wrong):
+            run, step = wrong[0]
+            raise InputError(
+                f"{record.name}: the covariance of the truth in run {record.run_numbers[run]}, step {step + 1} is no "
+                "covariance: it is not symmetric, or negative in some direction"
+            )
+        missing = int((np.isnan(P).any(axis=(2, 3)) & np.isfinite(record.nees)).sum()) if record.nees is not None else 0
+        if missing and not np.isfinite(P).any():
+            raise InputError(f"{record.name}: the truth has a covariance in none of the steps that are judged")
+        note = f"{record.name}: {plural(missing, 'estimate')} whose truth has no covariance are left out"
+        notes = (*record.notes, note) if missing else record.notes
+        found.append(replace(record, truth_errors=r.truth_errors, truth_shared=bool(r.truth_shared), notes=notes))
+    return found

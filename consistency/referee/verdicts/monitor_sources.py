@@ -1,0 +1,119 @@
+"""The monitor over recorded innovations: files and folders to what it said of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.diagnostics import Alarm, Monitor
+from consistency.referee.errors import InputError
+from consistency.referee.outside import outside
+from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash, read_stated
+from consistency.referee.readers.formats.innovation_files import NisLog, choose, read_nis, stream_nis
+from consistency.referee.readers.formats.px4_log import SUFFIX, read_ulog
+from consistency.referee.types import Array
+
+OPTIMAL = "optimal"
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What a monitor said of the innovations of one run."""
+
+    name: str
+    monitor: Monitor  # after the last step
+    alarm: Alarm | None  # its steps as the file numbers them
+    alarm_t: float  # s; NaN where unknown
+    since_t: float
+    step: Array  # (N,); all four are empty for lines as they came
+    t: Array  # (N,)
+    nis_over_dof: Array  # (N,), NaN where there is no innovation
+    evidence: Array  # (N,), e-value after each step
+
+
+def make_monitor(innovations: str | None, **options: Any) -> Monitor:
+    """A monitor by the options of the command; ``innovations`` must declare them to be those of an optimal gain.
+
+    Raises
+    ------
+    InputError
+        The declaration is missing, or an option is out of its range.
+    """
+    if innovations != OPTIMAL:
+        value = "" if innovations is None else f", got '{innovations}'"
+        raise InputError(
+            f"--innovations must be '{OPTIMAL}'{value}: declare that the filter has the optimal (Kalman) gain for its "
+            "model. Of any other filter the innovations are not white, and no false-alarm rate holds"
+        )
+    try:
+        return Monitor(**options)
+    except ValueError as error:
+        name, rest = str(error).split(" ", 1)
+        raise InputError(f"--{name.replace('_', '-')} {rest}") from None
+
+
+def read_innovations(path: Path, filter_name: str | None = None, run: int | None = None) -> NisLog:
+    """The innovations of one run from a file, or from a folder of ``consistency run``.
+
+    Of a flight log (.ulg of PX4, .bin of ArduPilot), ``filter_name`` is the sensor, and ``run`` the EKF's instance.
+
+    Raises
+    ------
+    InputError
+        Something cannot be used, or there are several filters or runs and none is named.
+    """
+    if path.suffix.lower() == SUFFIX:
+        return read_ulog(path, filter_name, run)
+    if is_dataflash(path):
+        return read_stated(path, choose(path, "filter", list(STATED), filter_name), run)
+    read: Callable[..., NisLog] = outside("innovations") if path.is_dir() else read_nis
+    return read(path, filter_name, run)
+
+
+def watch(log: NisLog, monitor: Monitor) -> Watched:
+    """Put the innovations of a run through a new monitor."""
+    evidence = np.empty(len(log.nis))
+    for row, (nis, dof) in enumerate(zip(log.nis.tolist(), log.dof.tolist(), strict=True)):
+        monitor.update(nis, int(dof))
+        evidence[row] = monitor.evidence
+    alarm, times = monitor.alarm, (math.nan, math.nan)
+    if alarm is not None:
+        row, since = alarm.step - 1, alarm.since - 1
+        times = float(log.t[row]), float(log.t[since])
+        alarm = replace(alarm, step=int(log.step[row]), since=int(log.step[since]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(log.dof > 0, log.nis / log.dof, np.nan)
+    return Watched(log.name, monitor, alarm, *times, log.step, log.t, ratio, evidence)
+
+
+def watch_lines(lines: Iterable[str], name: str, monitor: Monitor, on_alarm: Callable[[Alarm], None]) -> Watched:
+    """Put lines of a CSV file through a new monitor as they come; step k is the k-th row.
+
+    ``on_alarm`` is called in the row in which the alarm is raised.
+
+    Raises
+    ------
+    InputError
+        A line that cannot be used.
+    """
+    try:
+        for place, nis, dof in stream_nis(lines, name):
+            alarm = _updated(monitor, place, nis, dof)
+            if alarm is not None:
+                on_alarm(alarm)
+    except UnicodeDecodeError:
+        raise InputError(f"{name}: not text; lines of a CSV file are needed") from None
+    empty = np.empty(0)
+    return Watched(name, monitor, monitor.alarm, math.nan, math.nan, empty, empty, empty, empty)
+
+
+def _updated(monitor: Monitor, place: str, nis: float, dof: float) -> Alarm | None:
+    try:
+        return monitor.update(nis, dof)  # type: ignore[arg-type]  # refuses what is not whole
+    except ValueError as error:
+        raise InputError(f"{place}: {error}") from None

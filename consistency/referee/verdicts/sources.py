@@ -1,0 +1,104 @@
+"""Sources of records, whatever they are, and the way from there to verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from consistency.referee.diagnostics import Record, Settings, Verdict
+from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
+from consistency.referee.errors import InputError
+from consistency.referee.outside import outside
+from consistency.referee.verdicts.options import settings_of, skip_asked
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics import Design
+
+
+class Results(Protocol):
+    """Results of filters of the bench, in memory or in a folder, as ``consistency.run_trials`` returns them."""
+
+    @property
+    def filters(self) -> list[str]:
+        """Names."""
+
+    @property
+    def batches(self) -> Callable[..., Any]:
+        """Reads the rows of a table, some at a time."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Records of several estimators on the same trials, each read when it is asked for."""
+
+    filters: Sequence[str]
+    record: Callable[[str], Record]  # by name; raises InputError of a name that is not there
+    design: Callable[[], Design | None] = lambda: None  # looks at growing numbers of runs, if they were run by one
+    has_truth: bool = True  # False: no record has a NEES
+    scenario: str | None = None
+    trials: tuple[Any, Any] = (None, None)  # scenario hash and seed, or what a log holds: equal for the same trials
+    unfinished: str = ""  # number of runs, where some are missing
+
+
+def source_of(of: Source | Sequence[Record] | Results | str | Path) -> Source:
+    """Records, or results of the bench, in memory or in a folder, as a source."""
+    if isinstance(of, Source):
+        return of
+    if not isinstance(of, list | tuple):
+        source: Source = outside("results")(of)
+        return source
+    named: dict[str, Record] = {record.name: record for record in of}
+
+    def record(name: str) -> Record:
+        if name not in named:
+            raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
+        return named[name]
+
+    return Source(list(named), record)
+
+
+def analyse(
+    results: Source | Sequence[Record] | Results | str | Path,
+    filters: Sequence[str] | None = None,
+    confidence: float | None = None,
+    settings: Settings | None = None,
+    skip: str | float | Skip | None = None,
+    optimal_gain: bool = False,
+) -> dict[str, Verdict]:
+    """A verdict for every filter of the results, or for those named.
+
+    Parameters
+    ----------
+    results : of ``consistency.run_trials``, a folder of them, or a sequence of records
+    confidence : 1 less the false-alarm rate of a verdict, in place of ``settings``
+    settings : what to ask; the defaults of :class:`Settings` where None. Results of a run until decided are then
+        judged as that run was.
+    skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
+    optimal_gain : the filters declare one, so that their innovations are judged; results say it themselves
+
+    Raises
+    ------
+    InputError
+        Unknown filter, a confidence outside (0, 1), or nothing is left.
+    """
+    source = source_of(results)
+    design = source.design() if settings is None and confidence is None else None
+    settings = settings_of(confidence) if settings is None else settings
+    first, verdicts = skip_asked(skip), {}
+    for name in filters or source.filters:
+        verdict, ends = _of_poses(_record(source.record(name), first, optimal_gain), settings, design)
+        verdicts[name] = with_map(verdict, ends, settings, design)
+    return verdicts
+
+
+def _record(record: Record, first: Skip | None, optimal_gain: bool) -> Record:
+    record = record if first is None else record.without_first(first)
+    return replace(record, optimal_gain=True) if optimal_gain else record
+
+
+def _of_poses(record: Record, settings: Settings, design: Design | None) -> tuple[Verdict, Record]:
+    """A verdict without the maps; the arrays are free before those are read."""
+    return judge_runs(record, settings, design), record.ends

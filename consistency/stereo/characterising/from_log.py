@@ -1,0 +1,147 @@
+"""A log folder to a characterisation: what can be estimated depends on what of the truth is there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.bench.scenario import Mount, PicturedSensor, read_table
+from consistency.bench.store.log import Log, SensorFile, read_log
+from consistency.bench.store.log_tables import table_file
+from consistency.bench.types import Trial
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import rotation
+from consistency.referee.readers.formats.tum import read_trajectory
+from consistency.referee.types import Array
+from consistency.stereo.characterising.characterise import Characterisation, characterise
+from consistency.stereo.characterising.known_poses import characterise_posed
+from consistency.stereo.characterising.residuals import residuals_of
+from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
+from consistency.stereo.frontend.planar_log import CAMERA
+
+OTHERS = ("motion", "start", "sigma_points")  # tables that a measured sensor keeps from the log
+EXACT = "Poses are taken as exact: their errors are in sigma."
+FREE = "The pose of each step is fitted, six values each: what moves all points together is no noise."
+PLANE = "The truth is on a plane: what the sensor rolls, pitches and heaves is in sigma."
+SPACE = "truth.tum"  # of a log from images: true poses of the left camera in space
+REST = "Only the parts at rest are used: noise while moving may be larger."
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A characterisation and what of the source's file stays as it was."""
+
+    of: Characterisation
+    others: Mapping[str, Any]  # tables of sensor.toml beside the sensor itself
+
+
+def is_log(folder: Path) -> bool:
+    """Whether a folder is a recorded log, and not one of images."""
+    return any(table_file(folder, name).exists() for name in ("observations", "controls"))
+
+
+def characterise_log(folder: Path, grid: tuple[int, int], at_rest: bool = False, free_poses: bool = False) -> Measured:
+    """The sensor of a log folder.
+
+    With true poses and landmarks everything is estimated; with true poses alone no bias map and no offsets; without
+    truth only the noise of a sensor at rest. ``at_rest`` says that it stood still all the time.
+
+    Raises
+    ------
+    InputError
+        As :func:`consistency.store.log.read_log`; the sensor measures no disparity; too few data; no truth, and the
+        sensor moves all the time.
+    """
+    log = read_log(folder)
+    file = read_table(folder / "sensor.toml", SensorFile)
+    if file.model != "uvd":
+        raise InputError(f"{folder}/sensor.toml: key 'model' is '{file.model}'; only a sensor 'uvd' is characterised")
+    sensor = PicturedSensor.model_validate(file.model_dump(include=set(PicturedSensor.model_fields)))
+    dumped = file.model_dump(exclude_none=True)
+    others: dict[str, Any] = {key: value for key, value in dumped.items() if key in OTHERS}
+    return Measured(_of_log(log, sensor, str(folder), grid, at_rest, free_poses), others)
+
+
+def _of_log(
+    log: Log, sensor: PicturedSensor, source: str, grid: tuple[int, int], at_rest: bool, free_poses: bool
+) -> Characterisation:
+    poses = all(trial.truth is not None for trial in log.trials)
+    if poses and not at_rest and not free_poses and all(trial.landmarks is not None for trial in log.trials):
+        data, strange = residuals_of(log.trials, sensor)
+        return characterise(data, sensor, source, strange, grid)
+    space = Path(source) / SPACE
+    if not at_rest and len(log.trials) == 1 and space.is_file():
+        return characterise_posed(
+            _in_space(log.trials[0], space), sensor, source, (FREE if free_poses else EXACT,), free_poses
+        )
+    if free_poses:
+        raise InputError(f"{source}: --free-poses begins with poses in space, and there is no {SPACE} of one run")
+    if poses and not at_rest:
+        return characterise_posed(seen_of(log.trials, sensor.mount), sensor, source, (EXACT, PLANE))
+    rests = [np.zeros(trial.steps, np.int64) if at_rest else _at_rest(trial) for trial in log.trials]
+    seen = seen_of(log.trials, sensor.mount, rests)
+    if len(seen.long_enough().z) == 0:
+        raise InputError(
+            f"{source}: has no truth.parquet and no landmark seen {SHORTEST} times at rest: while the robot moves, "
+            "noise cannot be told from motion; add true poses (noise, growth, tails), true poses and landmarks.parquet "
+            "(bias map and offsets too), or record some time at rest (noise at rest; --at-rest if it never moved)"
+        )
+    return characterise_posed(seen, sensor, source, (REST,))
+
+
+def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None = None) -> Seen:
+    """What is seen from true poses, or with ``rests`` (T,) of numbers of rests, in each of these from one pose.
+
+    A landmark is a track of its own in each run, and in each rest; steps between rests have the number -1.
+    """
+    parts, tracks = [], 0
+    for number, trial in enumerate(trials):
+        step = trial.step
+        rest = np.zeros(trial.steps, np.int64) if rests is None else rests[number]
+        place = rest[step - 1]
+        track = trial.landmark + trial.n_landmarks * place
+        order = np.lexsort((step, track))
+        order = order[place[order] >= 0]
+        pose = np.zeros((trial.steps + 1, 3)) if trial.truth is None or rests is not None else trial.truth
+        R, t = _sensor_poses(pose, mount)
+        moved = np.append(False, np.abs(np.diff(pose, axis=0)).max(axis=1) > 0.0)
+        rows = step[order]
+        parts.append((trial.z[order], R[rows], t[rows], tracks + track[order], rows, moved[rows]))
+        tracks += trial.n_landmarks * (int(rest.max()) + 1)
+    return Seen(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def _in_space(trial: Trial, path: Path) -> Seen:
+    """What is seen from the true poses of the left camera in a file of TUM's form, a line for each of steps 0..T."""
+    lines = read_trajectory(path, true=True)
+    if len(lines.values) != trial.steps + 1:
+        raise InputError(f"{path}: {len(lines.values)} poses for steps 0 to {trial.steps}; must hold one for each")
+    turns, place = Rotation.from_quat(lines.values[:, 4:8]).as_matrix() @ CAMERA, lines.values[:, 1:4]
+    return seen_from(trial, turns, place)
+
+
+def seen_from(trial: Trial, R: Array, t: Array) -> Seen:
+    """What is seen from poses R (T + 1, 3, 3), world from sensor axes, and t (T + 1, 3), m."""
+    step = trial.step
+    order = np.lexsort((step, trial.landmark))
+    rows = step[order]
+    return Seen(trial.z[order], R[rows], t[rows], trial.landmark[order], rows, np.ones(len(rows), bool))
+
+
+def _sensor_poses(pose: Array, mount: Mount) -> tuple[Array, Array]:
+    """Rotation (T + 1, 3, 3) and place (T + 1, 3) of the sensor in the world from poses on the plane."""
+    turns = np.stack([rotation(0.0, 0.0, float(heading)) for heading in pose[:, 2]])
+    place = np.column_stack([pose[:, :2], np.zeros(len(pose))])
+    return turns @ rotation(*mount.rotation), place + turns @ np.array(mount.position)
+
+
+def _at_rest(trial: Trial) -> Array:
+    """Number of the rest of each step (T,), -1 while the controls say that the robot moves."""
+    still = (trial.controls[:, 1:] == 0.0).all(axis=1)
+    begins = still & ~np.append(False, still[:-1])
+    return np.where(still, np.cumsum(begins) - 1, -1)

@@ -1,0 +1,128 @@
+"""True poses of the left camera from the files of datasets: KITTI odometry and raw, EuRoC / ASL, TUM."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from consistency.referee.errors import InputError
+from consistency.referee.parsing import is_file, reading
+from consistency.referee.readers.file_kinds import is_drive
+from consistency.referee.readers.formats.kitti_files import NANO, place_of, read_times
+from consistency.referee.readers.formats.kitti_oxts import BODIES, drive_poses
+from consistency.referee.readers.formats.tum import UNIT, read_trajectory
+from consistency.referee.readers.matching import associate
+from consistency.referee.types import Array
+from consistency.stereo.visual_odometry.cameras.camera_pair import CAMERA_0, EUROC_BODY
+from consistency.stereo.visual_odometry.sequence import RAW_CALIBRATION, Sequence, read_table
+
+MAX_DT = 0.01  # s between an image and its truth, as in `consistency analyse`
+PACKET_DT = 0.11  # s between an image of KITTI raw and a packet: one period, of 9.6 Hz
+PLACES = ("poses.txt", "mav0/state_groundtruth_estimate0/data.csv")
+NO_TABLE = "not a table of finite numbers"
+ROTATION = 1e-3  # largest entry of R'R - I; KITTI writes seven digits
+
+
+def find_truth(sequence: Sequence) -> Path | None:
+    """Where the layout keeps the truth, or None; the folder itself of a drive of KITTI raw with its calibrations."""
+    if sequence.format == "kitti-raw" and is_drive(sequence.folder):
+        return None if missing_of_drive(sequence) else sequence.folder
+    return next((sequence.folder / place for place in PLACES if (sequence.folder / place).is_file()), None)
+
+
+def missing_of_drive(sequence: Sequence) -> list[str]:
+    """What oxts of a drive of KITTI raw lacks to be the truth of the camera; empty for other layouts."""
+    if sequence.format != "kitti-raw" or not is_drive(sequence.folder):
+        return []
+    names = [f"calib_{name}.txt" for name in BODIES["camera"]]
+    lacking = [name for name in names if place_of(sequence.folder, name) is None]
+    return lacking + ([] if sequence.calibration.body == CAMERA_0 else [RAW_CALIBRATION])
+
+
+def read_truth(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+    """Poses of the rectified left camera in the world at every frame, (n, 3, 3) and (n, 3) in m.
+
+    12 numbers a line are KITTI's (3 x 4 row by row, a line a frame); a .csv is EuRoC's (nanoseconds, position,
+    quaternion w x y z, of the body, which T_BS ties to the camera); else TUM lines (seconds, position, quaternion
+    x y z w) of the left camera. A folder is a drive of KITTI raw: the poses of its inertial unit, as its calibrations
+    tie them to the camera, interpolated to the times of the images.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged, of another length or form, or a frame has no truth within 10 ms.
+    """
+    if not is_file(path) and not is_drive(path):
+        raise InputError(f"--truth {path}: no such file, and no drive of KITTI raw")
+    with reading(path, "holds no poses"):
+        if path.is_dir():
+            R, t = _drive(path, sequence)
+        elif path.suffix.lower() == ".csv":
+            R, t = _euroc(path, sequence)
+        elif _columns(path) == 12:
+            R, t = _kitti(path, len(sequence))
+        else:
+            lines = read_trajectory(path, true=True)
+            own = _matched(path, sequence.t, lines.t)
+            R, t = Rotation.from_quat(lines.values[own, 4:8]).as_matrix(), lines.values[own, 1:4]
+    return R @ sequence.rectification.turn.T, t
+
+
+def _columns(path: Path) -> int:
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return next((len(line.split()) for line in file if line.strip() and not line.startswith("#")), 0)
+
+
+def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
+    rows = read_table(path, None, NO_TABLE)
+    if len(rows) != frames:
+        raise InputError(f"{path}: {len(rows)} poses for {frames} frames; must hold one a frame")
+    poses = rows.reshape(-1, 3, 4)
+    U, singular, Vt = np.linalg.svd(poses[:, :, :3])
+    if np.abs(singular - 1.0).max() > ROTATION or (np.linalg.det(U @ Vt) < 0).any():
+        raise InputError(f"{path}: holds a rotation that is none; a line must be the 3 x 4 matrix [R t] row by row")
+    return U @ Vt, poses[:, :, 3]
+
+
+def _drive(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+    body = sequence.calibration.body_from_left
+    images = sequence.left[0].parent.parent / "timestamps.txt"
+    if sequence.format != "kitti-raw" or body is None or sequence.calibration.body != CAMERA_0:
+        raise InputError(f"--truth {path}: is of a drive of KITTI raw with {RAW_CALIBRATION}; the images are not")
+    stamps, poses = drive_poses(path, "camera")
+    if len(poses) < 2:
+        raise InputError(f"{path}: has {len(poses)} packets; takes two or more")
+    ends = poses[0] @ np.linalg.inv(poses[1]) @ poses[0], poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
+    poses = np.concatenate([ends[:1], poses, ends[1:]])  # driven on evenly: images do not end with the packets
+    known = np.concatenate([[2 * stamps[0] - stamps[1]], stamps, [2 * stamps[-1] - stamps[-2]]]) - stamps[0]
+    t = read_times(images) - stamps[0]
+    far = np.abs(t[:, None] - (stamps - stamps[0])).min(axis=1) > PACKET_DT / NANO
+    far |= (t < known[0]) | (t > known[-1])
+    if far.any():
+        raise InputError(f"{path}: {far.sum()} of {len(t)} frames have no packet within {PACKET_DT:g} s")
+    turn = Slerp(known, Rotation.from_matrix(poses[:, :3, :3]))(t).as_matrix()
+    place = np.column_stack([np.interp(t, known, column) for column in poses[:, :3, 3].T])
+    return turn @ body[:3, :3], place + turn @ body[:3, 3]
+
+
+def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+    rows = read_table(path, ",", NO_TABLE)
+    if rows.shape[1] < 8 or not np.isfinite(rows[:, :8]).all() or (np.diff(rows[:, 0]) <= 0).any():
+        raise InputError(f"{path}: must hold increasing nanoseconds, position and quaternion w x y z, all finite")
+    if (np.abs(np.linalg.norm(rows[:, 4:8], axis=1) - 1.0) > UNIT).any():
+        raise InputError(f"{path}: columns 5 to 8 must be a quaternion w x y z of length 1")
+    body = sequence.calibration.body_from_left
+    if body is None or sequence.calibration.body != EUROC_BODY:
+        raise InputError(f"{path}: is the truth of a body, but {sequence.calibration.source} has no T_BS to the camera")
+    rows = rows[_matched(path, sequence.t, rows[:, 0] / 1e9)]
+    turn = Rotation.from_quat(rows[:, [5, 6, 7, 4]]).as_matrix()
+    return turn @ body[:3, :3], rows[:, 1:4] + turn @ body[:3, 3]
+
+
+def _matched(path: Path, t: Array, reference: Array) -> Array:
+    own, match = associate(t, reference, MAX_DT)
+    if len(own) != len(t):
+        raise InputError(f"{path}: {len(t) - len(own)} of {len(t)} frames have no truth within {MAX_DT:g} s")
+    return match

@@ -1,0 +1,224 @@
+"""A sequence of stereo pairs as a log folder: controls, observations of few landmarks, truth, trajectory."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from consistency.bench.store.folder_tables import write_folder
+from consistency.bench.store.log import View, write_log
+from consistency.referee.errors import InputError
+from consistency.referee.system.folders import require_free
+from consistency.referee.system.provenance import manifest_of
+from consistency.referee.types import Array
+from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
+from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of
+from consistency.stereo.frontend.tum_output import covariance_text, motions_text, trajectory_text
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig
+from consistency.stereo.visual_odometry.features import opencv
+from consistency.stereo.visual_odometry.matching import is_rectified
+from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion
+from consistency.stereo.visual_odometry.odometry import motion_covariances, trajectory, visual_odometry
+from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
+
+LANDMARKS = 200  # in a log; the filters' covariance is then 603 x 603
+FEWEST = MIN_LIFE + 1  # stereo pairs of a log: the first is no observation
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class FrontendOptions:
+    """Options for the part of a sequence that becomes a log."""
+
+    calibration: Path | None = None
+    truth: Path | None = None
+    format: str | None = None
+    left: str | None = None
+    right: str | None = None
+    rate: float | None = None  # Hz
+    max_landmarks: int = LANDMARKS
+    lever: float = 0.0  # m from the robot's point forward to the camera
+    planar: bool = False  # whether the log is written where the motions leave the plane, too
+    seed: int = 0  # of RANSAC
+    settings: MotionSettings = field(default_factory=MotionSettings)
+
+
+@dataclass(frozen=True)
+class Logged:
+    """The part of a sequence that is in a log."""
+
+    landmarks: int
+    observations: int
+    sigma_px: tuple[float, ...]  # u, v, d
+    sigma_v: float  # m/s
+    sigma_omega: float  # rad/s
+
+    def lines(self, out: Path) -> list[str]:
+        u, v, d = self.sigma_px
+        return [
+            f"log: {self.landmarks} landmarks, {self.observations} observations; "
+            f"sigma u {u:.2f} v {v:.2f} d {d:.2f} px, v {self.sigma_v:.3g} m/s, omega {self.sigma_omega:.3g} rad/s",
+            "controls come from these images too: a filter that takes both uses the images twice",
+            f"log in {out}; next: consistency run --log {out} --filter ekf-uvd --out RESULTS",
+        ]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Summary of a built log."""
+
+    frames: int
+    log: Logged | None  # None of fewer pairs than a log takes, and where the motions leave the plane
+    plane: Plane | None  # None of fewer pairs than a log takes
+    first: RelativeMotion
+    distance: float  # m along the path
+    inliers: float  # median of the motions
+    noise_ratio: float  # chi2/dof of all motions: measured variance of the pixels over the stated one
+    timed: bool  # whether images had timestamps
+    rate: float  # Hz
+    truth: Path | None
+    lacking: tuple[str, ...] = ()  # files without which oxts of a drive is no truth
+    faults: tuple[str, ...] = ()  # of motions that could not be measured
+    doubts: tuple[str, ...] = ()  # of motions whose estimator far points dominate
+
+    def lines(self, out: Path) -> list[str]:
+        """What a terminal shows, and what to do next."""
+        times = [] if self.timed else [f"the images have no times: {self.rate:g} Hz assumed, --rate says otherwise"]
+        judge = f"consistency analyse {out}/trajectory.tum --truth {out}/truth.tum --covariance {out}/covariance.txt"
+        windows = f"consistency analyse {out}/motions.tum --truth {out}/truth.tum --motions --relative 1"
+        oxts = f": that of oxts takes {' and '.join(self.lacking)} too" if self.lacking else ""
+        judged = (
+            [f"no truth found{oxts}; --truth FILE takes one"]
+            if self.truth is None
+            else [
+                f"truth from {self.truth}; next: {judge} --error so3",
+                f"or motion by motion, whatever the world: {windows}",
+            ]
+        )
+        bridges = f"{len(self.faults)} of {self.frames - 1} motions could not be measured and are bridged"
+        return [
+            f"{self.frames} stereo pairs, {self.distance:.2f} m, {self.inliers:.0f} inliers in the median",
+            *([f"{len(self.doubts)} of {self.frames - 1} motions: {self.doubts[0]}"] if self.doubts else []),
+            *([f"{bridges}, with the covariance of that; the first: {self.faults[0]}"] if self.faults else []),
+            f"residuals: chi2/dof {self.noise_ratio:.2f}; 1 where the stated noise of the features "
+            "(--sigma-per-scale) is right",
+            *([self.plane.line] if self.plane is not None and not self.plane.holds else []),
+            *self._log_lines(out),
+            *times,
+            *judged,
+        ]
+
+    def _log_lines(self, out: Path) -> list[str]:
+        if self.log is not None:
+            return self.log.lines(out)
+        if self.plane is None:
+            return _motion_lines(self.first, out)
+        return [
+            f"no planar log of a camera that is not on a robot in the plane: trajectory and motions are in {out}; "
+            "--planar writes the log nevertheless"
+        ]
+
+
+def _motion_lines(motion: RelativeMotion, out: Path) -> list[str]:
+    """A single motion with its standard deviations."""
+    scale = np.repeat([1e3, 180.0 / np.pi], 3)
+    values, sigmas = scale * motion.pose.vector, scale * np.sqrt(np.diagonal(motion.covariance))
+    said = [f"{name} {value:+.2f} +- {sigma:.2g}" for name, value, sigma in zip(AXES, values, sigmas, strict=True)]
+    shift, turn = ", ".join(said[:3]), ", ".join(said[3:])
+    return [f"motion of the left camera: {shift} mm; {turn} deg", f"no log of {FEWEST - 1} pairs; motion in {out}"]
+
+
+def write_frontend_log(images: Path, out: Path, options: FrontendOptions, overwrite: bool = False) -> Summary:
+    """Run the front-end on ``images`` and write the log folder ``out``, whole or not at all.
+
+    Two pairs make one motion and no log; nor do motions that leave the plane, unless ``options.planar``.
+
+    Beside the files of a log: trajectory.tum and covariance.txt (error convention so3), motions.tum with covariances of
+    the motions (likewise), truth.tum where known.
+
+    Raises
+    ------
+    InputError
+        As :func:`consistency.vision.sequence.read_sequence` and :func:`consistency.vision.relative_motion`; ``out``
+        exists; no landmark is left.
+    """
+    started = time.monotonic()
+    if options.max_landmarks < 1:
+        raise InputError(f"--max-landmarks {options.max_landmarks}: must be at least 1")
+    if not np.isfinite(options.lever):
+        raise InputError(f"--lever {options.lever}: must be a finite number of metres")
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: must not be negative")
+    sequence = read_sequence(
+        images, options.calibration, options.format, options.left, options.right, options.rate
+    )  # fmt: skip
+    kind = "log" if len(sequence) >= FEWEST else "motion"
+    require_free(out, overwrite, kind)
+    if not is_rectified(sequence.rectification.rig):
+        raise InputError(f"{sequence.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
+    path = options.truth or find_truth(sequence)
+    truth = None if path is None else read_truth(path, sequence)
+    motions = visual_odometry(sequence, rng=np.random.default_rng(options.seed), settings=options.settings)
+    files = trajectory_files(sequence, motions, truth)
+    manifest = manifest_of(
+        kind=kind, seed=options.seed, runs=1, complete=True, failures=0, wall=time.monotonic() - started,
+        opencv=opencv().__version__, images=str(images), calibration=sequence.calibration.source,
+        settings=asdict(options.settings), timestamps="read" if sequence.timed else "assumed",
+        bridged={str(k): m.fault for k, m in enumerate(motions) if m.fault},
+    )  # fmt: skip
+    logged = plane = None
+    if kind == "log":
+        trial, belief = log_of(sequence, motions, truth, options.max_landmarks, options.lever)
+        plane = plane_of(motions, trial, belief)
+        manifest["plane"] = plane.fields
+    if plane is not None and (plane.holds or options.planar):
+        view = _view(sequence.rectification.rig)
+        write_log(out, [trial], belief, None, manifest, overwrite, view, files)
+        noise = belief.sensor.sigma, belief.motion.sigma_v, belief.motion.sigma_omega
+        logged = Logged(trial.n_landmarks, len(trial.z), *noise)
+    else:
+        write_folder(out, {}, manifest, lambda at: _write_texts(at, files), overwrite)
+    chi2, dof = (sum(values) for values in zip(*((m.chi2, m.dof) for m in motions), strict=True))
+    return Summary(
+        len(sequence), logged, plane, motions[0],
+        distance=float(sum(np.linalg.norm(m.pose.t) for m in motions)),
+        inliers=float(np.median([m.inliers.sum() for m in motions])),
+        noise_ratio=chi2 / dof, timed=sequence.timed,
+        rate=(len(sequence) - 1) / float(sequence.t[-1] - sequence.t[0]), truth=path,
+        lacking=() if path else tuple(missing_of_drive(sequence)),
+        faults=tuple(m.fault for m in motions if m.fault), doubts=tuple(m.doubt for m in motions if m.doubt),
+    )  # fmt: skip
+
+
+def _view(rig: StereoRig) -> View:
+    """Image size and principal point of the left camera."""
+    return rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2]))
+
+
+def _write_texts(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def trajectory_files(
+    sequence: Sequence, motions: list[RelativeMotion], truth: tuple[Array, Array] | None
+) -> dict[str, str]:
+    """Texts of trajectory.tum, covariance.txt and truth.tum, all in the first camera's frame, and of motions.tum.
+
+    ``truth`` is R (frames, 3, 3) and t (frames, 3), m; without it there is no truth.tum.
+    """
+    R, t, P = trajectory(motions)
+    turns, steps = (np.array(part) for part in zip(*((m.pose.R, m.pose.t) for m in motions), strict=True))
+    files = {
+        "trajectory.tum": trajectory_text(sequence.t, R, t),
+        "covariance.txt": covariance_text(sequence.t, P),
+        "motions.tum": motions_text(sequence.t, turns, steps, motion_covariances(motions)),
+    }
+    if truth is not None:
+        true_R, true_t = truth
+        back = true_R[0].T
+        files["truth.tum"] = trajectory_text(sequence.t, back @ true_R, (true_t - true_t[0]) @ back.T)
+    return files

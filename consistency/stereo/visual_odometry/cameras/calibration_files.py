@@ -1,0 +1,147 @@
+"""Stereo calibrations from files: KITTI odometry and raw, EuRoC / ASL, OpenCV, BoofCV, as one record."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.parsing import read_text, reading
+from consistency.referee.types import Array
+from consistency.stereo.visual_odometry.cameras.boofcv import read_boofcv
+from consistency.stereo.visual_odometry.cameras.camera_pair import EUROC_BODY, Calibration, checked, distortion, sized
+from consistency.stereo.visual_odometry.cameras.kitti_calibration import read_kitti, read_kitti_raw
+from consistency.stereo.visual_odometry.cameras.yaml_file import matrix, read_yaml
+
+# names that tools give to the same thing; the first one is used in messages
+OPENCV_KEYS = {
+    "K1": ("K1", "camera_matrix_1", "cameraMatrix1", "K_left", "left_K", "M1", "LEFT.K"),
+    "D1": ("D1", "distortion_coefficients_1", "distCoeffs1", "D_left", "left_D", "LEFT.D"),
+    "K2": ("K2", "camera_matrix_2", "cameraMatrix2", "K_right", "right_K", "M2", "RIGHT.K"),
+    "D2": ("D2", "distortion_coefficients_2", "distCoeffs2", "D_right", "right_D", "RIGHT.D"),
+    "R": ("R", "rotation_matrix", "R_stereo"),
+    "T": ("T", "translation_coefficients", "translation_vector", "T_stereo"),
+}
+# matrices that the same tools write beside them and nobody needs here
+OTHERS = {"R1", "R2", "P1", "P2", "Q", "E", "F", "essential_matrix", "fundamental_matrix", "LEFT.R", "LEFT.P"}
+OTHERS |= {"RIGHT.R", "RIGHT.P", "projection_matrix_1", "projection_matrix_2", "rectification_matrix_1"}
+OTHERS |= {"rectification_matrix_2", "image_size", "imageSize"}
+EUROC_KEYS = ("T_BS", "intrinsics", "distortion_model", "distortion_coefficients", "resolution")
+NO_DISTORTION = ("none", "")
+RADIAL_TANGENTIAL = ("radial-tangential", "radtan", "plumb_bob", *NO_DISTORTION)
+
+
+def read_calibration(
+    path: Path, left: str = "", right: str = "", image_size: tuple[int, int] | None = None
+) -> Calibration:
+    """A calibration by the look of ``path``: a folder as EuRoC's, .yaml or .yml as OpenCV's or BoofCV's, else KITTI's.
+
+    ``left`` and ``right`` are the folders of the images: they choose the cameras in a KITTI file. ``image_size``,
+    (width, height), tells whether the images of KITTI raw are rectified.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged, a key is missing or unknown, a number is not finite, a rotation is none.
+    """
+    with reading(path, "holds no calibration of two cameras"):
+        if path.is_dir():
+            return read_euroc(path)
+        if not path.is_file():
+            raise InputError(f"--calibration {path}: no such file")
+        if path.suffix.lower() in (".yaml", ".yml"):
+            return read_boofcv(path) if "rightToLeft" in read_yaml(path) else read_opencv(path)
+        if "P_rect_00:" in read_text(path, "cannot be read"):
+            return read_kitti_raw(path, left, right, image_size)
+        return read_kitti(path, left, right)
+
+
+def read_opencv(path: Path) -> Calibration:
+    """A YAML file as OpenCV's FileStorage writes it: K1, D1, K2, D2, R, T in Bouguet's convention.
+
+    x_right = R x_left + T. D1 and D2 may be left out for images without distortion, R for rectified ones;
+    ``image_width`` and ``image_height`` are optional. Other usual names of the same keys are taken as well. Where one
+    of D1, D2 and R is left out, another list or matrix of an unknown name may be that one misspelt, and is refused.
+    """
+    data = read_yaml(path)
+    matrices: dict[str, Array] = {}
+    for key, names in OPENCV_KEYS.items():
+        name = next((name for name in names if name in data), None)
+        if name is not None:
+            matrices[key] = matrix(path, name, data[name])
+        elif "T_BS" in data:
+            raise InputError(f"{path}: is one of the two files of EuRoC; --calibration takes the folder with both")
+        elif key in ("K1", "K2", "T"):
+            known = "; ".join(" = ".join(names) for names in OPENCV_KEYS.values())
+            raise InputError(f"{path}: key '{key}' is missing; known keys: {known}, image_width, image_height")
+    _require_known(path, data, [key for key in ("D1", "D2", "R") if key not in matrices])
+    for key, shape in (("K1", (3, 3)), ("K2", (3, 3)), ("R", (3, 3)), ("T", (3,))):
+        if key in matrices:
+            if matrices[key].size != np.prod(shape):
+                raise InputError(f"{path}: key '{key}': has {matrices[key].size} numbers, not {np.prod(shape)}")
+            matrices[key] = matrices[key].reshape(shape)
+    size = tuple(int(_number(path, data, key)) for key in ("image_width", "image_height") if key in data)
+    D_left, D_right = (distortion(path, key, matrices.get(key, np.zeros(4))) for key in ("D1", "D2"))
+    R, image_size = matrices.get("R", np.eye(3)), (size[0], size[1]) if len(size) == 2 else None
+    return checked(
+        Calibration(str(path), matrices["K1"], matrices["K2"], D_left, D_right, R, matrices["T"], image_size)
+    )
+
+
+def read_euroc(folder: Path) -> Calibration:
+    """``sensor.yaml`` of both cameras of a EuRoC / ASL folder: mav0/cam0, cam0, or cam0_sensor.yaml beside cam0."""
+    left, right = (_euroc_camera(folder, camera) for camera in ("cam0", "cam1"))
+    if left.size != right.size:
+        raise InputError(f"{right.path}: key 'resolution': {right.size} is not that of {left.path}, {left.size}")
+    right_from_left = np.linalg.solve(right.pose, left.pose)
+    R, T = right_from_left[:3, :3], right_from_left[:3, 3]
+    source = f"{left.path} and {right.path}"
+    return checked(Calibration(source, left.K, right.K, left.D, right.D, R, T, left.size, left.pose, EUROC_BODY))
+
+
+class _Camera(NamedTuple):
+    path: Path
+    K: Array  # (3, 3), px
+    D: Array  # distortion
+    size: tuple[int, int]  # width, height, px
+    pose: Array  # (4, 4), T_BS: the camera in the body
+
+
+def _euroc_camera(folder: Path, camera: str) -> _Camera:
+    places = [folder / "mav0" / camera / "sensor.yaml", folder / camera / "sensor.yaml"]
+    places.append(folder / f"{camera}_sensor.yaml")
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        raise InputError(
+            f"{folder}: holds no calibration of {camera}; expected {' or '.join(map(str, places))}; a calibration "
+            "that is not EuRoC's is given as a file"
+        )
+    data = read_yaml(path)
+    for key in EUROC_KEYS:
+        if key not in data:
+            raise InputError(f"{path}: key '{key}' is missing; needed: {', '.join(EUROC_KEYS)}")
+    model = str(data["distortion_model"]).lower()
+    if model not in RADIAL_TANGENTIAL:
+        raise InputError(f"{path}: key 'distortion_model': '{model}' is not one of {', '.join(RADIAL_TANGENTIAL)}")
+    fu, fv, cu, cv = sized(path, "intrinsics", data["intrinsics"], 4)
+    width, height = sized(path, "resolution", data["resolution"], 2)
+    K = np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
+    D = distortion(path, "distortion_coefficients", matrix(path, "D", data["distortion_coefficients"]))
+    return _Camera(path, K, D, (int(width), int(height)), sized(path, "T_BS", data["T_BS"], 16).reshape(4, 4))
+
+
+def _require_known(path: Path, data: dict[str, Any], missing: list[str]) -> None:
+    known = OTHERS.union(*OPENCV_KEYS.values())
+    strange = [key for key, value in data.items() if isinstance(value, dict | list | np.ndarray) and key not in known]
+    if missing and strange:
+        names = " = ".join(OPENCV_KEYS[missing[0]])
+        raise InputError(f"{path}: key '{strange[0]}' is unknown while '{missing[0]}' is missing; known: {names}")
+    lonely = [key for key in ("image_width", "image_height") if key in data]
+    if len(lonely) == 1:
+        raise InputError(f"{path}: key '{lonely[0]}': image_width and image_height go together")
+
+
+def _number(path: Path, data: dict[str, Any], key: str) -> float:
+    return float(sized(path, key, data[key], 1)[0])

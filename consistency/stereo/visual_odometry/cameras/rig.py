@@ -1,0 +1,165 @@
+"""A calibrated pair of pin-hole cameras, Valencia & Andrade-Cetto (2018) sec. 2.1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+from consistency.stereo.visual_odometry import batch_inverses, input_checks
+from consistency.stereo.visual_odometry.input_errors import PointError
+
+NEAREST = 1e-3  # depth in baselines up to which a point is at the camera: a disparity of a thousand focal lengths
+FARTHEST = 1e6  # depth in baselines from which on a point is at infinity
+# What A'A leaves of a coordinate's own entry when the others are eliminated: some 3e-13 at FARTHEST, up to 6e-16 by
+# rounding alone. Parallel rays must not pass for a point that rounding made up.
+FIXED = 2e-14
+BLOCK = 2000  # matches triangulated at a time, whose matrices fit the cache
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig:
+    """Two cameras without distortion; x right, y down, z forward, pixels from the image's corner.
+
+    ``R, t`` are the pose of the right camera in the left camera's frame, p_left = R p_right + t, which is how the
+    chapter's text and its experiments state them. Its eq. 2.2 and 2.3 apply [R t] to a point in the left frame and so
+    mean the inverse, R' and -R' t: R and t put there literally are another rig.
+
+    Parameters
+    ----------
+    K_left, K_right : (3, 3), upper triangular with 1 at the end, px
+    R : (3, 3), rotation
+    t : (3,), m
+    image_size : (width, height), px
+
+    Raises
+    ------
+    InputError
+        A shape, a value that is not finite, a focal length that is not positive, R no rotation, no baseline.
+    """
+
+    K_left: Array  # (3, 3), px
+    K_right: Array  # (3, 3), px
+    R: Array  # (3, 3)
+    t: Array  # (3,), m
+    image_size: tuple[int, int]  # width, height, px
+
+    def __post_init__(self) -> None:
+        input_checks.freeze(self, K_left=(3, 3), K_right=(3, 3), R=(3, 3), t=(3,))
+        for name, K in (("K_left", self.K_left), ("K_right", self.K_right)):
+            if np.tril(K, -1).any() or K[2, 2] != 1.0 or min(K[0, 0], K[1, 1]) <= 0.0:
+                raise InputError(f"{name}: give [[fu, skew, u0], [0, fv, v0], [0, 0, 1]] with positive fu and fv")
+        if not self.t.any():
+            raise InputError("t: no baseline between the cameras; depth needs one")
+        if len(self.image_size) != 2 or min(self.image_size) < 1:
+            raise InputError(f"image_size: {self.image_size}, allowed is (width, height) in pixels")
+        object.__setattr__(self, "image_size", (int(self.image_size[0]), int(self.image_size[1])))
+
+    @property
+    def baseline(self) -> float:
+        """Distance of the two cameras, m."""
+        return float(np.linalg.norm(self.t))
+
+    @cached_property
+    def cameras(self) -> Array:
+        """(2, 3, 4): K [I 0] of eq. 2.1 and K' [R' -R't], which eq. 2.2 calls [R t]."""
+        left = np.column_stack([self.K_left, np.zeros(3)])
+        return np.stack([left, self.K_right @ np.column_stack([self.R.T, -self.R.T @ self.t])])
+
+    def project(self, points: Array) -> Array:
+        """Eq. 2.1 and 2.2: points in the left camera's frame to both images.
+
+        Parameters
+        ----------
+        points : (N, 3), m
+
+        Returns
+        -------
+        (N, 4): u, v, u', v', px; also outside ``image_size``
+
+        Raises
+        ------
+        PointError
+            A point at or behind a camera.
+        """
+        p = input_checks.rows("points", points, 3)
+        h = p @ np.swapaxes(self.cameras[:, :, :3], 1, 2) + self.cameras[:, None, :, 3]  # (2, N, 3)
+        depth = h[:, :, 2]
+        if (bad := (depth <= NEAREST * self.baseline).any(axis=0)).any():
+            k = int(np.argmax(bad))
+            raise PointError(f"points: number {k} is at or behind a camera; leave such points out", k)
+        return np.concatenate(list(h[:, :, :2] / depth[:, :, None]), axis=1)
+
+    def inside(self, uv: Array) -> Array:
+        """(N, 4) px to (N,) bool: seen in both images."""
+        return np.asarray(((uv >= 0.0) & (uv <= np.tile(self.image_size, 2) - 1.0)).all(axis=1))
+
+
+def triangulate(rig: StereoRig, uv: Array) -> Array:
+    """Least squares of eq. 2.3 by eq. 2.26.
+
+    Parameters
+    ----------
+    uv : (N, 4), u, v, u', v', px
+
+    Returns
+    -------
+    (N, 3), points in the left camera's frame, m
+
+    Raises
+    ------
+    PointError
+        Rays that meet at infinity, at a camera or behind one: zero or negative disparity. See :func:`triangulable`.
+    """
+    points, good = _points(rig, input_checks.rows("uv", uv, 4))
+    if not good.all():
+        k = int(np.argmin(good))
+        raise PointError(
+            f"uv: match {k} has zero or negative disparity, its point is at infinity or behind a camera; leave such "
+            "matches out (triangulable tells them)",
+            k,
+        )
+    return points
+
+
+def triangulable(rig: StereoRig, uv: Array) -> Array:
+    """(N, 4) px to (N,) bool: the matches that :func:`triangulate` gives a point in front of both cameras."""
+    return _points(rig, input_checks.rows("uv", uv, 4))[1]
+
+
+def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
+    """A (N, 4, 3) and b (N, 4) of eq. 2.3, rows in the order u, v, u', v', and the points (N, 3); or PointError."""
+    A, b = _system(rig, uv)
+    return np.moveaxis(A, -1, 0), b.T, triangulate(rig, uv)
+
+
+def _points(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
+    """Points (N, 3), and which of them are in front of both cameras (N,)."""
+    if len(uv) <= BLOCK:
+        return _in_front(rig, *_system(rig, uv))
+    points, good = zip(*(_points(rig, uv[i : i + BLOCK]) for i in range(0, len(uv), BLOCK)), strict=True)
+    return np.concatenate(points), np.concatenate(good)
+
+
+def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
+    """A (4, 3, N) and b (4, N): the points last, so that sums run along memory."""
+    P = rig.cameras
+    rows, last = P[:, :2].reshape(4, 4, 1), P[:, 2].repeat(2, axis=0)[:, :, None]
+    A = uv.T[:, None] * last[:, :3]
+    A -= rows[:, :3]
+    return A, rows[:, 3] - uv.T * last[:, 3]
+
+
+def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
+    AtA = np.einsum("kin,kjn->ijn", A, A)
+    inverse, definite = batch_inverses.inverse(np.moveaxis(AtA, -1, 0))
+    inverse = np.moveaxis(inverse, 0, -1)
+    alone = np.einsum("iin,iin->in", inverse, AtA)
+    definite &= (alone < 1.0 / FIXED).all(axis=0)
+    points = np.einsum("ijn,jn->in", inverse, np.einsum("kin,kn->in", A, b))
+    depth = rig.cameras[:, 2, :3] @ points + rig.cameras[:, 2, 3:]
+    near, far = NEAREST * rig.baseline, FARTHEST * rig.baseline
+    return np.ascontiguousarray(points.T), definite & ((depth > near) & (depth < far)).all(axis=0)

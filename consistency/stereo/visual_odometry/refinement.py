@@ -1,0 +1,218 @@
+"""Maximum-likelihood relative poses: of points with covariances, and of pixels.
+
+Both minimise half the sum of rho(s), with s the squared standardised residual of a point in both frames at its best
+position. Both covariances come from :func:`implicit_covariance` of that cost, with exact second derivatives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+from consistency.stereo.visual_odometry import batch_inverses, input_checks
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
+from consistency.stereo.visual_odometry.input_errors import ConvergenceError, DegenerateError
+from consistency.stereo.visual_odometry.pose import RelativePose
+from consistency.stereo.visual_odometry.propagation import implicit_covariance
+from consistency.stereo.visual_odometry.registration import matched, register_svd
+from consistency.stereo.visual_odometry.robust_loss import Robust, loss, threshold
+from consistency.stereo.visual_odometry.two_frame_cost import (
+    Derivatives,
+    PixelMatches,
+    PointMatches,
+    TwoFrames,
+    derivatives,
+)
+
+STEPS = 100  # of Levenberg and Marquardt, at most; ten do for honest matches
+DECREMENT = 1e-12  # twice the predicted decrease of the cost in the last step: 1e-6 standard deviations
+NEAR = 1.0  # the same from which on second derivatives are taken in: one standard deviation
+SLACK = 1e-12  # relative rounding of the cost
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A relative pose of highest likelihood.
+
+    With a robust loss ``covariance`` is that of the robust estimator under the stated noise: a far point enters with
+    its reduced influence, and that it may be an outlier, of which the stated noise knows nothing, is left out.
+    """
+
+    pose: RelativePose  # p1 = R p2 + t
+    covariance: Array  # (6, 6), of x, y, z (m), roll, pitch, yaw (rad)
+    weights: Array  # (N,), rho'(s): 1 is an inlier, 0 a point without influence
+    points: Array  # (N, 3), in frame 1, m
+    residuals: Array  # (N,), s: squared standardised residual of a point
+    dof: int  # of the sum of s for honest noise without robust loss
+
+    @property
+    def chi2(self) -> float:
+        """Sum of s, chi-square distributed with ``dof`` degrees of freedom where the noise is as stated."""
+        return float(self.residuals.sum())
+
+
+def register_weighted(
+    p1: Array, p2: Array, S1: Array, S2: Array, pose: RelativePose | None = None, *, robust: Robust | None = None
+) -> Refined:
+    """Minimum of the sum of e' (S1 + R S2 R')^-1 e with e = p1 - (R p2 + t).
+
+    That is the likelihood of points in both frames whose true positions are unknown, and the weighting of eq. 2.4 that
+    Valencia & Andrade-Cetto (2018) sec. 2.2 leave out as too complicated; Matthies & Shafer (1987) have it.
+
+    Covariances of triangulated points are worked out at the noisy points: those that err towards the camera seem surer,
+    and the pose is biased where the disparity's noise is some per cent of it. :func:`refine_reprojection` is not.
+
+    Parameters
+    ----------
+    p1, p2 : (N, 3), m
+    S1, S2 : (3, 3) or (N, 3, 3), positive definite, m^2
+    pose : where to start; :func:`register_svd` unless given
+    robust : None, "huber" or "cauchy", with the 95 % quantile of an honest residual as its constant
+
+    Raises
+    ------
+    InputError, DegenerateError
+        As :func:`register_svd`; S1 or S2 not positive definite; no such loss.
+    GimbalLockError
+        A pitch of +-90 degrees.
+    ConvergenceError
+        No minimum was reached.
+    """
+    p1, p2 = matched(p1, p2)
+    S1, S2 = input_checks.covariances("S1", S1, len(p1), 3), input_checks.covariances("S2", S2, len(p1), 3)
+    frames = TwoFrames(PointMatches(), p1, p2, _weights("S1", S1), _weights("S2", S2))
+    return _refined(frames, S1, S2, pose or register_svd(p1, p2), p2, robust)
+
+
+def refine_reprojection(
+    rig: StereoRig,
+    uv1: Array,
+    uv2: Array,
+    pose: RelativePose,
+    S_uv: Array,
+    S_uv2: Array | None = None,
+    *,
+    robust: Robust | None = None,
+) -> Refined:
+    """Pose and points whose projections into all four images fit best: bundle adjustment of two stereo frames.
+
+    For Gaussian pixel noise this is the maximum of the likelihood (Hartley & Zisserman 2004 sec. 18.1). Where the
+    points of one frame are taken as known, the pose is biased by their triangulation; here they are estimated too.
+
+    Parameters
+    ----------
+    uv1, uv2 : (N, 4), u, v, u', v' of the same points in frame 1 and 2, px
+    pose : where to start, p1 = R p2 + t
+    S_uv : (4, 4) or (N, 4, 4), positive definite, px^2; of frame 1, and of frame 2 unless S_uv2 is given
+    S_uv2 : the same of frame 2
+    robust : None, "huber" or "cauchy", with the 95 % quantile of an honest residual as its constant
+
+    Raises
+    ------
+    PointError
+        As :func:`triangulate`, for either frame; or a point that ``pose`` puts behind a camera.
+    InputError, DegenerateError, GimbalLockError, ConvergenceError
+        As :func:`register_weighted`.
+    """
+    uv1, uv2 = input_checks.rows("uv1", uv1, 4), input_checks.rows("uv2", uv2, 4)
+    input_checks.same_length("uv1, uv2", uv1, uv2)
+    S1 = input_checks.covariances("S_uv", S_uv, len(uv1), 4)
+    S2 = S1 if S_uv2 is None else input_checks.covariances("S_uv2", S_uv2, len(uv1), 4)
+    _, q = matched(triangulate(rig, uv1), triangulate(rig, uv2))
+    rig.project(pose.apply(q))
+    frames = TwoFrames(PixelMatches(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))
+    return _refined(frames, S1, S2, pose, q, robust)
+
+
+def _weights(name: str, S: Array) -> Array:
+    """Inverse covariances; those given once for all rows are inverted once."""
+    once = S[:1] if S.strides[0] == 0 else S
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(once))
+    except np.linalg.LinAlgError:
+        raise InputError(f"{name}: not positive definite; every direction needs some noise to be weighted by") from None
+    return np.broadcast_to(np.swapaxes(root, 1, 2) @ root, S.shape)
+
+
+def _refined(frames: TwoFrames, S1: Array, S2: Array, pose: RelativePose, q: Array, robust: Robust | None) -> Refined:
+    free = 2 * frames.z1.shape[1] - 3  # of a point's residual, its position eliminated
+    c = threshold(free)
+    pose, q = _minimum(frames, pose, q, robust, c)
+    s = frames.squared(pose, q)
+    _, weight, bend = loss(robust, s, c)
+    C_dd, C_dz = _profile(derivatives(frames, pose, q, exact=True), weight, bend)
+    S = implicit_covariance(C_dd, C_dz, np.concatenate([S1, S2]))
+    return Refined(pose, S, weight, pose.apply(q), s, free * len(q) - 6)
+
+
+def _profile(f: Derivatives, weight: Array, bend: Array) -> tuple[Array, Array]:
+    """C_dd (6, 6) and C_dz (2N, 6, k) of the cost of the pose alone, each point at its best position."""
+    inverse, definite = batch_inverses.inverse(f.qq)
+    if not definite.all():
+        k = int(np.argmin(definite))
+        raise DegenerateError(f"match {k}: its point is not fixed by the images; leave it out", k)
+    gain = f.dq @ inverse  # (N, 6, 3)
+    dd = f.dd - gain @ np.swapaxes(f.dq, 1, 2)
+    dz1, dz2 = f.dz1 - gain @ f.qz1, -gain @ f.qz2
+    w, b = weight[:, None, None], 2.0 * bend[:, None, None]
+    d = f.d[:, :, None]
+    C_dd = (w * dd + b * d @ np.swapaxes(d, 1, 2)).sum(axis=0)
+    return C_dd, np.concatenate([w * dz1 + b * d @ f.z1[:, None], w * dz2 + b * d @ f.z2[:, None]])
+
+
+def _minimum(
+    frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None, c: float
+) -> tuple[RelativePose, Array]:
+    """Levenberg and Marquardt on pose and points, and Newton's steps near the minimum."""
+    damping, newton = 0.0, False
+    cost, weight, bend = _cost(frames, pose, q, robust, c)
+    for _ in range(STEPS):
+        f = derivatives(frames, pose, q, exact=newton)
+        while True:
+            step, step_q, decrement = _step(f, weight, bend if newton else 0.0 * bend, damping)
+            if newton and not decrement >= 0.0:
+                newton, f = False, derivatives(frames, pose, q, exact=False)
+                continue
+            there, q_there = RelativePose.from_vector(pose.vector + step), q + step_q
+            if decrement < DECREMENT and damping < 1.0:
+                return there, q_there
+            reached, *losses = _cost(frames, there, q_there, robust, c)
+            if reached <= cost * (1.0 + SLACK):
+                break
+            damping = max(10.0 * damping, 1e-4)
+            if damping > 1e12:
+                raise ConvergenceError("pose: no step lowers the cost; start nearer, or take the outliers out first")
+        pose, q, cost, (weight, bend) = there, q_there, reached, losses
+        damping, newton = 0.1 * damping if damping > 1e-8 else 0.0, decrement < NEAR
+    raise ConvergenceError(f"pose: no minimum in {STEPS} steps; start nearer, or take the outliers out first")
+
+
+def _cost(
+    frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None, c: float
+) -> tuple[float, Array, Array]:
+    """The cost, and rho' and rho'' of each point."""
+    rho, weight, bend = loss(robust, frames.squared(pose, q), c)
+    return 0.5 * float(rho.sum()), weight, bend
+
+
+def _step(f: Derivatives, weight: Array, bend: Array, damping: float) -> tuple[Array, Array, float]:
+    """Step of the pose (6,) and of the points (N, 3), and twice the decrease that it predicts; NaN: not downhill."""
+    dd, qq = f.dd, f.qq
+    if damping:
+        dd, qq = dd * (1.0 + damping * np.eye(6)), qq * (1.0 + damping * np.eye(3))
+    inverse, definite = batch_inverses.inverse(qq)
+    gain = f.dq @ inverse
+    g = f.d - (gain @ f.q[:, :, None])[:, :, 0]
+    H = np.dot(weight[None], (dd - gain @ np.swapaxes(f.dq, 1, 2)).reshape(-1, 36)).reshape(6, 6)
+    H += 2.0 * (g.T * bend) @ g
+    try:
+        np.linalg.cholesky(H)
+        step = -np.linalg.solve(H, weight @ g)
+    except np.linalg.LinAlgError:
+        return np.zeros(6), np.zeros(f.q.shape), np.nan
+    step_q = -(inverse @ (f.q + step @ f.dq)[:, :, None])[:, :, 0]
+    slope = float(step @ (weight @ f.d) + weight @ (step_q * f.q).sum(axis=1))
+    return step, step_q, -slope if definite.all() else np.nan

@@ -1,0 +1,152 @@
+"""Consensus among the matches of two stereo pairs by their reprojection: P3P inside RANSAC.
+
+Triples of points of the first pair, and where the left camera saw them at the second, give poses (Gao et al. 2003;
+OpenCV solves for them). All four coordinates in pixels judge a pose, of near and far points alike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from consistency.referee.types import Array
+from consistency.stereo.visual_odometry import input_checks
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
+from consistency.stereo.visual_odometry.consensus import draws_for, fewest
+from consistency.stereo.visual_odometry.features import opencv
+from consistency.stereo.visual_odometry.input_errors import ConsensusError
+from consistency.stereo.visual_odometry.pose import RelativePose
+from consistency.stereo.visual_odometry.propagation import triangulation_covariance
+from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches
+
+ROUND = 32  # draws at once
+MOST = 1024  # draws at most; finds CONFIDENCE from a share of inliers of 19 % on
+SLACK_PX = 1.0  # of a coordinate in the search: poses of three noisy points miss all others by some pixels
+MEDIAN = float(stats.chi2.median(4))  # of an honest squared distance
+ROUNDS = 10  # of the gate to the noise that is there, at most
+FEWEST = 8  # inliers that tell how large the noise is
+
+
+def resect_ransac(
+    rig: StereoRig,
+    uv0: Array,
+    uv1: Array,
+    sigma0: Array,
+    sigma1: Array,
+    *,
+    gate: float,
+    rng: np.random.Generator,
+) -> tuple[RelativePose, Array]:
+    """The pose that most matches agree on, p0 = R p1 + t, and these matches.
+
+    Triples are drawn until one without outliers was among them with probability 0.999, by the share of inliers found so
+    far, and at most 1024 times. The best has the least sum of truncated squared distances (Torr & Zisserman 2000).
+
+    Parameters
+    ----------
+    uv0, uv1 : (N, 4), u, v, u', v' of the same points in frame 0 and 1, px; all triangulable in frame 0
+    sigma0, sigma1 : (N, 4), their standard deviations, px
+    gate : standard deviations that an inlier may miss by; see :func:`inliers_within`
+    rng : the only source of chance
+
+    Returns
+    -------
+    pose, inliers (N,) bool
+
+    Raises
+    ------
+    InputError
+        Shapes do not fit, or OpenCV is not installed.
+    ConsensusError
+        No motion has enough inliers: 4, and a tenth of the matches.
+    """
+    uv0, uv1 = input_checks.rows("uv0", uv0, 4), input_checks.rows("uv1", uv1, 4)
+    input_checks.same_length("uv0, uv1", uv0, uv1)
+    sigma0, sigma1 = input_checks.rows("sigma0", sigma0, 4), input_checks.rows("sigma1", sigma1, 4)
+    input_checks.same_length("sigma0, sigma1", sigma0, sigma1)
+    input_checks.same_length("uv0, sigma0", uv0, sigma0)
+    least = fewest(len(uv0))
+    found, inliers = _search(rig, triangulate(rig, uv0), uv1, sigma0**2 + sigma1**2 + SLACK_PX**2, gate, rng)
+    if found is not None:
+        inliers = inliers_within(squared_reprojections(rig, uv0, uv1, sigma0, sigma1, found), gate, inliers)
+    if found is None or inliers.sum() < least:
+        raise ConsensusError(
+            f"uv0, uv1: {int(inliers.sum())} of {len(uv0)} matches agree on a motion, at least {least} must; look at "
+            "the matches, or allow a larger gate"
+        )
+    return found, inliers
+
+
+def squared_reprojections(
+    rig: StereoRig, uv0: Array, uv1: Array, sigma0: Array, sigma1: Array, pose: RelativePose
+) -> Array:
+    """Squared Mahalanobis distances (N,) in frame 1 of the points triangulated in frame 0, 4 degrees of freedom.
+
+    Infinite where ``pose``, p0 = R p1 + t, puts a point behind a camera.
+    """
+    camera = PixelMatches(rig)
+    seen = (triangulate(rig, uv0) - pose.t) @ pose.R
+    residual, J = uv1 - camera.value(seen), camera.jacobian(seen) @ pose.R.T
+    C0 = triangulation_covariance(rig, uv0, sigma0[:, :, None] ** 2 * np.eye(4))
+    S = J @ C0 @ np.swapaxes(J, 1, 2) + sigma1[:, :, None] ** 2 * np.eye(4)
+    squared, there = np.full(len(uv0), np.inf), np.isfinite(S).all(axis=(1, 2))
+    solved = np.linalg.solve(S[there], residual[there][:, :, None])[:, :, 0]
+    squared[there] = (residual[there] * solved).sum(axis=1)
+    return squared
+
+
+def inliers_within(squared: Array, gate: float, among: Array) -> Array:
+    """Which squared distances (N,), of 4 degrees of freedom, are within a gate of so many standard deviations.
+
+    The stated noise lacks what all matches share, such as errors of the calibration: where the median of the inliers is
+    larger than noise alone would make it, the gate grows with it.
+
+    Parameters
+    ----------
+    among : (N,) bool, what is taken for inliers so far
+    """
+    inliers = among
+    for _ in range(ROUNDS):
+        scale = max(1.0, float(np.median(squared[inliers])) / MEDIAN) if inliers.sum() >= FEWEST else 1.0
+        found = np.asarray(squared <= scale * gate**2)
+        if (found == inliers).all():
+            break
+        inliers = found
+    return inliers
+
+
+def _search(
+    rig: StereoRig, p0: Array, uv1: Array, variance: Array, gate: float, rng: np.random.Generator
+) -> tuple[RelativePose | None, Array]:
+    """The pose of the least cost of adaptively many draws, None where no triple gave one, and its inliers (N,)."""
+    least, best, inliers, draws, needed = np.inf, None, np.zeros(len(p0), bool), 0, float(MOST)
+    while draws < needed:
+        R, t = _poses_of(rig, p0, uv1, rng.random((ROUND, len(p0))).argpartition(2, axis=1)[:, :3])
+        draws += ROUND
+        if not len(R):
+            continue
+        seen = ((p0 - t[:, None]) @ R).reshape(-1, 3)
+        residual = uv1 - PixelMatches(rig).value(seen).reshape(len(R), -1, 4)
+        squared = np.nan_to_num((residual**2 / variance).sum(axis=2), nan=np.inf)
+        cost = np.minimum(squared, gate**2).sum(axis=1)
+        k = int(np.argmin(cost))
+        if cost[k] < least:
+            least, best, inliers = cost[k], RelativePose(R[k], t[k]), squared[k] <= gate**2
+            needed = draws_for(float(inliers.mean()), MOST)
+    return best, inliers
+
+
+def _poses_of(rig: StereoRig, p0: Array, uv1: Array, triples: Array) -> tuple[Array, Array]:
+    """R (k, 3, 3) and t (k, 3) of p0 = R p1 + t, up to four for each triple (n, 3)."""
+    cv2 = opencv()
+    R, t = [], []
+    for triple in triples:
+        _, turns, shifts = cv2.solveP3P(
+            p0[triple], np.ascontiguousarray(uv1[triple, :2]), rig.K_left, None, flags=cv2.SOLVEPNP_AP3P
+        )
+        for turn, shift in zip(turns or (), shifts or (), strict=True):
+            back = cv2.Rodrigues(turn)[0].T
+            if np.isfinite(back).all() and np.isfinite(shift).all():
+                R.append(back)
+                t.append(-(back @ shift).ravel())
+    return np.array(R), np.array(t)

@@ -1,0 +1,128 @@
+"""Errors that the motions of a drive share: calibration of the rig, mounting and clock of the truth.
+
+Pixel noise is independent from match to match; these are not, and no number of matches averages them out.
+``referee.diagnostics.imperfect_truth.shared_errors`` fits them to a part of a drive, with a prior as wide as
+calibrations usually are, and predicts them for another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.diagnostics.imperfect_truth import shared_errors
+from consistency.referee.diagnostics.imperfect_truth.shared_errors import SharedError as SharedError
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+from consistency.stereo.visual_odometry.bridging import neighbours
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig
+from consistency.stereo.visual_odometry.motion import RelativeMotion, diagonal
+from consistency.stereo.visual_odometry.pose import RelativePose, cross_matrix
+from consistency.stereo.visual_odometry.refinement import refine_reprojection
+
+# What is shared, and the standard deviation of its prior
+SHARED = {
+    "focal length": 0.005,  # relative
+    "cx": 3.0,  # px
+    "cy": 3.0,
+    "baseline": 0.005,  # relative
+    "roll of the right camera": 0.005,  # rad, about x: rows of the right image
+    "pitch of the right camera": 0.002,  # about y: disparities
+    "yaw of the right camera": 0.005,  # about z
+    "mounting about x": 0.02,  # rad, of the camera in the body that the truth is of
+    "mounting about y": 0.02,
+    "mounting about z": 0.02,
+    "clock of the truth": 0.05,  # s
+}
+RIG = 7  # of these are the rig's
+STEP = 1e-2  # of a prior standard deviation, for derivatives
+
+
+def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -> Array:
+    """Derivative (n, 6, 11) of each motion's error by what is shared.
+
+    An error is the difference of the translations (m) and the rotation vector of R R_true' (rad), in the first camera's
+    axes. For the rig's parameters the refinement of the inliers is repeated with another rig. A bridge errs by the rig
+    as the motions do that it is interpolated from.
+
+    Parameters
+    ----------
+    t : (n + 1,), s, of the stereo pairs
+
+    Raises
+    ------
+    InputError
+        Every motion is a bridge, or the refinement with another rig fails.
+    """
+    dt = np.diff(t)
+    speed = np.array([_twist(m.pose) for m in motions]) / dt[:, None]
+    rate = np.gradient(speed, 0.5 * (t[1:] + t[:-1]), axis=0) if len(motions) > 1 else np.zeros_like(speed)
+    J, measured = np.empty((len(motions), 6, len(SHARED))), np.array([not motion.fault for motion in motions], bool)
+    if not measured.any():
+        raise InputError("motions: all are bridges, and have no matches that could tell")
+    for k in np.flatnonzero(measured).tolist():
+        J[k, :, :RIG] = _by_rig(rig, motions[k])
+    for k in np.flatnonzero(~measured).tolist():
+        around, share = neighbours(measured, t, k)
+        J[k, :, :RIG] = np.tensordot(dt[k] * share / dt[around], J[around, :, :RIG], axes=1)
+    for k, motion in enumerate(motions):
+        J[k, :3, RIG:-1] = cross_matrix(motion.pose.t)
+        J[k, 3:, RIG:-1] = motion.pose.R - np.eye(3)
+        J[k, :, -1] = rate[k] * dt[k]
+    return J
+
+
+def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
+    """Shared errors and floor of highest likelihood (:func:`shared_errors.fit_shared`).
+
+    Parameters
+    ----------
+    errors : (n, 6), against truth
+    J : (n, 6, 11), of :func:`sensitivities`
+    S : (n, 6, 6), propagated from the noise of the pixels
+
+    Raises
+    ------
+    InputError
+        Fewer than 12 motions, or shapes that do not fit.
+    """
+    return shared_errors.fit_shared(errors, J, S, np.array(list(SHARED.values())))
+
+
+def _twist(pose: RelativePose) -> Array:
+    return np.concatenate([pose.t, Rotation.from_matrix(pose.R).as_rotvec()])
+
+
+def _by_rig(rig: StereoRig, motion: RelativeMotion) -> Array:
+    """Derivative (6, 7) of the refined pose, by central differences."""
+    i = motion.inliers
+    S0, S1 = diagonal(motion.sigma0[i]), diagonal(motion.sigma1[i])
+    columns = []
+    for k, prior in enumerate(list(SHARED.values())[:RIG]):
+        change = np.zeros(RIG)
+        change[k] = STEP * prior
+        one, other = (
+            refine_reprojection(
+                perturbed(rig, sign * change), motion.uv0[i], motion.uv1[i], motion.pose, S0, S1, robust="cauchy"
+            ).pose
+            for sign in (1.0, -1.0)
+        )
+        turn = Rotation.from_matrix(one.R @ other.R.T).as_rotvec()
+        columns.append(np.concatenate([one.t - other.t, turn]) / (2.0 * STEP * prior))
+    return np.column_stack(columns)
+
+
+def perturbed(rig: StereoRig, change: Array) -> StereoRig:
+    """The rig with other parameters: ``change`` (7,) in the order and units of :data:`SHARED`."""
+    f, cx, cy, baseline = change[:4]
+    scale = np.diag([1.0 + f, 1.0 + f, 1.0])
+    shift = np.array([[0.0, 0.0, cx], [0.0, 0.0, cy], [0.0, 0.0, 0.0]])
+    lenses = []
+    for K in (rig.K_left, rig.K_right):
+        lens = scale @ K
+        lens[:, 2] = K[:, 2]
+        lenses.append(lens + shift)
+    turn = Rotation.from_rotvec(change[4:]).as_matrix()
+    return StereoRig(lenses[0], lenses[1], rig.R @ turn, (1.0 + baseline) * rig.t, rig.image_size)

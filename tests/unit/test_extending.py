@@ -131,7 +131,7 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
 def test_the_kind_of_files_of_the_document_is_read(copy: Path) -> None:
     """One file and a row; what is refused of it is refused, and what is broken is said."""
     module, row = code("Add a kind of files")
-    (copy / "consistency/referee/readers/json_lines.py").write_text(module, encoding="utf-8")
+    (copy / "consistency/referee/readers/formats/json_lines.py").write_text(module, encoding="utf-8")
     last = ")  # fmt: skip\nSUFFIXES"
     changed(copy / "consistency/referee/readers/file_kinds.py", last, f"    {row.strip()},\n{last}")
     lines = [f'{{"errors": [[{run}], [{run}]], "covariances": [[[1]], [[1]]]}}' for run in (3, 7)]

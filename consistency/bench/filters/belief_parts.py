@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
-from consistency.bench.filters.kernel.part_functions import Sensor
-from consistency.bench.filters.landmark.planar_point import PlanarPoint
-from consistency.bench.filters.landmark.world_point import WorldPoint
+from consistency.bench.filters.landmark.world_point import PlanarPoint, WorldPoint
 from consistency.bench.filters.motion.unicycle import Unicycle
 from consistency.bench.filters.sensor.range_bearing import RangeBearing
 from consistency.bench.filters.sensor.relative_xy import RelativeXy
@@ -15,7 +14,7 @@ from consistency.bench.filters.sensor.xyz import Xyz
 from consistency.bench.models.point import Mounting
 from consistency.bench.scenario import Belief
 
-PLANAR: dict[str, Callable[[Mounting], Sensor]] = {
+PLANAR: dict[str, Callable[[Mounting], NamedTuple]] = {
     "relative-xy": RelativeXy,
     "range-bearing": RangeBearing,
 }  # sensors of landmarks in the plane, by model
@@ -26,7 +25,7 @@ def motion_of(belief: Belief) -> Unicycle:
     return Unicycle(belief.motion.sigma_v, belief.motion.sigma_omega)
 
 
-def sensor_of(belief: Belief, uvd: bool) -> Sensor:
+def sensor_of(belief: Belief, uvd: bool) -> NamedTuple:
     """Eq. 22 with the believed rig, a sensor of landmarks in the plane, or eq. 19."""
     sensor = belief.sensor
     if sensor.model in PLANAR:

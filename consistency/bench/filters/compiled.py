@@ -22,7 +22,7 @@ from consistency.bench.filters.guard.guarded import Guarded
 from consistency.bench.filters.guard.settings import KINDS
 from consistency.bench.filters.kernel.gain import HALTED, REASONS
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
-from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width, robot_width
+from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
 from consistency.bench.protocols import Filter, Problem, TrialTruth
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import Control, Estimates, Gaussian, Info, Map, Observation, Trial
@@ -177,12 +177,12 @@ class Compiled:
         first, landmark = (np.array(a, np.int64, order="C") for a in (trial.first, trial.landmark))
         halt = np.zeros(1, np.int64) if halt is None else halt
         data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks, halt)
-        r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-        slam = self._with_covariance_update(slam, r + w * trial.n_landmarks)
+        w = landmark_width(slam.landmark)
+        slam = self._with_covariance_update(slam, 3 + w * trial.n_landmarks)
         if self.guard is not None:
             most = int(np.diff(first).max(initial=1))
             slam = slam._replace(guard=guard_part(self.guard, belief.guard or GuardSettings(), z.shape[1], most))
-        return slam, data, r + w * len(np.unique(landmark))
+        return slam, data, 3 + w * len(np.unique(landmark))
 
     def _with_covariance_update(self, slam: Slam, most: int) -> Slam:
         """Local updating, which takes longer to compile, only in a world in which the state may grow so large."""

@@ -15,7 +15,7 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.kernel.part_functions import Data, Slam, observed_width, robot_width, spare_width
+from consistency.bench.filters.kernel.part_functions import Data, Slam, observed_width, spare_width
 from consistency.bench.runs.memory_touched import NUMBER, touched
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Trial
@@ -58,9 +58,9 @@ def trial_bytes(filters: Sequence[Compiled], trial: Trial, belief: Belief) -> in
 
 def _working(slam: Slam, data: Data, size: int) -> int:
     """What ``run_trial`` writes to: covariance and outcome, which it fills, and a part of what it works with."""
-    T, labels, r = len(data.controls), data.n_landmarks, robot_width(slam.motion)
+    T, labels = len(data.controls), data.n_landmarks
     spare = spare_width(slam.covariance, T, labels)
-    outcome = T * (r + 2 * r * r + 3) + 12 * labels
+    outcome = T * (3 + 2 * 9 + 3) + 12 * labels
     return touched(slam, data, size, spare) + NUMBER * ((size + spare) ** 2 + outcome)
 
 

@@ -116,8 +116,8 @@ class Content:
             return
         bodies = bodies_of(function)
         if bodies is not None:  # those that this kernel cannot choose are left out
-            chosen = [(k, v) for k, v in bodies.items() if all(c in self._classes or not is_part(c) for c in k)]
-            self._each(sorted(chosen, key=lambda item: [cls.__qualname__ for cls in item[0]]))
+            chosen = [(k, v) for k, v in bodies.items() if k is None or k in self._classes or not is_part(k)]
+            self._each(sorted(chosen, key=lambda item: getattr(item[0], "__qualname__", "")))
             return
         if is_routine(function):  # Python alone calls the wrapper
             function = function.__wrapped__  # type: ignore[attr-defined]

@@ -25,7 +25,7 @@ INNER: dict[str, Any] = OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper
 _overload: Callable[..., Any] = overload
 Function = TypeVar("Function", bound=Callable[..., Any])
 Part = TypeVar("Part", bound=type)
-Bodies = dict[tuple[type, ...], Callable[..., Any]]
+Bodies = dict[type | None, Callable[..., Any]]
 
 _parts: dict[str, type] = {}
 _needs: dict[type, dict[str, frozenset[str]]] = {}
@@ -63,22 +63,22 @@ def part(**needs: str) -> Callable[[Part], Part]:
     return register
 
 
-def generic(deciding: int = 1) -> Callable[[Function], Function]:
-    """Decorator of a function whose body is chosen by the types of its first ``deciding`` arguments.
+def generic(*, default: bool = False) -> Callable[[Function], Function]:
+    """Decorator of a function whose body is chosen by the type of its first argument.
 
-    The decorated body is never run: its signature and docstring say what every implementation does.
+    Its signature and docstring say what every implementation does. Its own body is that of parts that have none, if it
+    is a ``default``, and is never run if not.
     """
 
     def declare(stub: Function) -> Function:
-        bodies: Bodies = {}
+        bodies: Bodies = {None: stub} if default else {}
 
         @wraps(stub)
         def call(*args: Any) -> Any:
-            return _body(stub, bodies, tuple(type(a) for a in args[:deciding]))(*args)
+            return _body(stub, bodies, type(args[0]))(*args)
 
         def choose(*args: Any) -> Any:
-            classes = tuple(getattr(a, "instance_class", None) for a in args[:deciding])
-            return _body(stub, bodies, classes)
+            return _body(stub, bodies, getattr(args[0], "instance_class", None))
 
         _overload(call, strict=False, jit_options=INNER)(choose)
         _bodies[call] = bodies
@@ -88,23 +88,23 @@ def generic(deciding: int = 1) -> Callable[[Function], Function]:
     return declare
 
 
-def implement(function: Callable[..., Any], *classes: type) -> Callable[[Function], Function]:
-    """Decorator of the body of a generic ``function`` for parts of these types; one body may serve several.
+def implement(function: Callable[..., Any], cls: type) -> Callable[[Function], Function]:
+    """Decorator of the body of a generic ``function`` for parts of this type; one body may serve several.
 
     Raises
     ------
     TypeError
-        The body is a closure, its name is taken, or there is a body for these types.
+        The body is a closure, its name is taken, or there is a body for this type.
     """
 
     def register(body: Function) -> Function:
         name = f"{body.__module__}.{body.__qualname__}"
         if "<locals>" in name or _named_bodies.get(name, body) is not body:
             raise TypeError(f"kernel function '{name}' must stand at module level under a name of its own")
-        if classes in _bodies[function]:
-            raise TypeError(f"'{function.__name__}' has a body for {_named(classes)} already")
+        if cls in _bodies[function]:
+            raise TypeError(f"'{function.__name__}' has a body for {cls.__name__} already")
         _named_bodies[name] = body
-        _bodies[function][classes] = body
+        _bodies[function][cls] = body
         return body
 
     return register
@@ -167,19 +167,13 @@ def is_routine(function: Any) -> bool:
 
 
 def bodies_of(function: Any) -> Bodies | None:
-    """Bodies of a generic function by the types that choose them; None for any other function."""
+    """Bodies of a generic function by the type that chooses them, None for the default; None for any other function."""
     return _bodies.get(function)
 
 
-def _body(stub: Any, bodies: Bodies, classes: tuple[Any, ...]) -> Callable[..., Any]:
-    if classes not in bodies:
-        raise TypeError(f"'{stub.__name__}' has no body for {_named(classes)}; there are {_known(bodies)}")
-    return bodies[classes]
-
-
-def _named(classes: tuple[Any, ...]) -> str:
-    return " and ".join(getattr(cls, "__name__", str(cls)) for cls in classes)
-
-
-def _known(bodies: Bodies) -> str:
-    return ", ".join(sorted(_named(classes) for classes in bodies)) or "none"
+def _body(stub: Any, bodies: Bodies, cls: Any) -> Callable[..., Any]:
+    body = bodies.get(cls, bodies.get(None))
+    if body is None:
+        known = ", ".join(sorted(each.__name__ for each in bodies if each is not None)) or "none"
+        raise TypeError(f"'{stub.__name__}' has no body for {getattr(cls, '__name__', cls)}; there are {known}")
+    return body

@@ -10,20 +10,15 @@ from consistency.bench.filters.kernel.blas import add_transposed_times
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
-    add_motion_noise,
     expands,
-    insert_error,
     motion_point,
-    move,
-    move_about,
     pose_covariance,
     propagate,
     propagate_covariance_at,
     retract,
-    robot_width,
-    to_error,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.motion.unicycle import add_motion_noise, move, move_about
 from consistency.referee.types import Array
 
 
@@ -37,24 +32,14 @@ def propagate_additive(
     error: Additive, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """One step of motion, eq. 9 and 10: x <- f(x) and P <- F P F' + G Q G' in the robot's rows."""
-    pose = state.x[: robot_width(slam.motion)]
+    pose = state.x[:3]
     at = motion_point(slam.point, pose, k)
     propagate_covariance_at(slam.point, slam, state, k, u, Phi, work)
     add_motion_noise(slam.motion, at, u, state.P)
     if expands(slam.point):
-        move_about(slam.motion, at, u, pose)
+        move_about(at, u, pose)
     else:
-        move(slam.motion, pose, u, pose)
-
-
-@implement(to_error, Additive)
-def additive_as_it_is(error: Additive, pose: Array, values: Array, Hp: Array, Hl: Array) -> None:
-    """Nothing to do: the error is that of the variables."""
-
-
-@implement(insert_error, Additive)
-def additive_insert(error: Additive, pose: Array, values: Array, Jp: Array) -> None:
-    """Nothing to do: the error is that of the variables."""
+        move(pose, u, pose)
 
 
 @implement(retract, Additive)
@@ -65,5 +50,5 @@ def retract_additive(error: Additive, slam: Slam, state: State, A: Array, y: Arr
 
 @implement(pose_covariance, Additive)
 def additive_pose_covariance(error: Additive, x: Array, P: Array, out: Array) -> None:
-    """``out`` (r, r) <- P (r, r), which is already that of the additive error."""
+    """``out`` (3, 3) <- P (3, 3), which is already that of the additive error."""
     copy_matrix(P, out)

@@ -9,13 +9,13 @@ import numpy as np
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.planar import exponential, shifted_covariance
-from consistency.bench.filters.kernel.part_functions import insert_error, pose_covariance, to_error
+from consistency.bench.filters.kernel.part_functions import pose_covariance, to_error
 from consistency.referee.types import Array
 
 FLAT = 1e-9  # determinant of a covariance of positions over its squared trace, up to which they are on a line
 
 
-@part(motion="Unicycle", landmark="InverseRange")
+@part(landmark="InverseRange")
 class InvariantPose(NamedTuple):
     """``moments``: the covariance of the additive error is stated as it is, not as that of a linear one."""
 
@@ -26,11 +26,6 @@ class InvariantPose(NamedTuple):
 def to_invariant_pose(error: InvariantPose, pose: Array, values: Array, Hp: Array, Hl: Array) -> None:
     for a in range(len(Hp)):
         Hp[a, 2] += pose[0] * Hp[a, 1] - pose[1] * Hp[a, 0]
-
-
-@implement(insert_error, InvariantPose)
-def insert_beside_pose(error: InvariantPose, pose: Array, values: Array, Jp: Array) -> None:
-    pass
 
 
 @implement(pose_covariance, InvariantPose)

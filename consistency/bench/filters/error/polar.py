@@ -14,72 +14,53 @@ from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.invariant_pose import move_pose
 from consistency.bench.filters.error.planar import shifted_covariance
 from consistency.bench.filters.kernel.arrays import fill
-from consistency.bench.filters.kernel.blas import add_gram, add_transposed_times
-from consistency.bench.filters.kernel.covariance import move_block
+from consistency.bench.filters.kernel.blas import add_transposed_times
+from consistency.bench.filters.kernel.covariance import add_gram_to_state, move_block
 from consistency.bench.filters.kernel.part_functions import (
-    Frame,
-    Sensor,
     Slam,
     State,
     Triple,
-    insert_error,
-    move,
-    noise_columns,
     pose_covariance,
     propagate,
     retract,
-    robot_frame,
     to_error,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.landmark.inverse_range import inward, outward
-from consistency.bench.filters.landmark.sensor_point import SensorPoint, sight
+from consistency.bench.filters.landmark.sensor_point import sight
+from consistency.bench.filters.motion.unicycle import Frame, move, noise_columns, robot_frame
 from consistency.bench.models import point
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array
 
 
-@part(motion="Unicycle", landmark="SensorPoint", point="AtEstimate")
+@part(landmark="SensorPoint", point="AtEstimate")
 class Polar(NamedTuple):
     """No parameters. Right-invariant error of the pose; turn and logarithm of the scale of each landmark."""
 
 
-class PolarSlam(NamedTuple):
-    """The parts of such a filter, a :class:`consistency.bench.filters.kernel.part_functions.Slam` of these types."""
-
-    motion: NamedTuple
-    sensor: Sensor
-    landmark: SensorPoint
-    error: Polar
-    point: NamedTuple
-    update: NamedTuple
-    covariance: NamedTuple
-
-
 @implement(propagate, Polar)
 def propagate_polar(
-    error: Polar, slam: PolarSlam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+    error: Polar, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """Pose and landmarks move; P <- F P F' + G Q G', F the identity but for a block for each landmark."""
     x, P, n, G = state.x, state.P, state.n, work.small
-    columns, before = noise_columns(slam.motion, x[:3], u, G), robot_frame(slam.motion, x[:3])
-    move(slam.motion, x[:3], u, x[:3])
-    after, noise = robot_frame(slam.motion, x[:3]), work.rows[:columns, :n]
+    noise_columns(slam.motion, x[:3], u, G)
+    before = robot_frame(x[:3])
+    move(x[:3], u, x[:3])
+    after, noise = robot_frame(x[:3]), work.rows[:2, :n]
     for o in range(3, n, 3):
         body = _move_landmark(slam.landmark.mount, before, after, x[o : o + 3], work.Jz, work.Jb)
         move_block(P, n, o, work.Jz)
-        for i in range(columns):
+        for i in range(2):
             dx = -after.c * G[0, i] - after.s * G[1, i] + G[2, i] * body[1]
             dy = after.s * G[0, i] - after.c * G[1, i] - G[2, i] * body[0]
             for a in range(3):
                 noise[i, o + a] = work.Jb[a, 0] * dx + work.Jb[a, 1] * dy
-    for i in range(columns):
+    for i in range(2):
         turn = G[2, i]
         noise[i, 0], noise[i, 1], noise[i, 2] = G[0, i] + x[1] * turn, G[1, i] - x[0] * turn, turn
-    add_gram(1.0, noise, P[:n, :n])
-    for a in range(3):
-        for b in range(a):
-            P[a, b] = P[b, a]
+    add_gram_to_state(1.0, noise, P, n)
 
 
 @inner
@@ -112,11 +93,6 @@ def to_polar(error: Polar, pose: Array, values: Array, Hp: Array, Hl: Array) -> 
         x, y, z = Hl[a, 0], Hl[a, 1], Hl[a, 2]
         for b in range(3):
             Hl[a, b] = r * (x * e[3 * b] + y * e[3 * b + 1] + z * e[3 * b + 2])
-
-
-@implement(insert_error, Polar)
-def insert_polar(error: Polar, pose: Array, values: Array, Jp: Array) -> None:
-    """A new landmark does not depend on the pose."""
 
 
 @implement(retract, Polar)

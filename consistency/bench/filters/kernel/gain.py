@@ -14,11 +14,11 @@ from consistency.bench.filters.kernel.blas import (
     add_transposed_times,
     solve_transposed,
 )
-from consistency.bench.filters.kernel.covariance import definite_root, gather_rows, subtract_gram
-from consistency.bench.filters.kernel.local_state import Factors
+from consistency.bench.filters.kernel.covariance import add_gram_to_state, definite_root, gather_rows
 from consistency.bench.filters.kernel.observation_model import linearise
 from consistency.bench.filters.kernel.part_functions import (
     Data,
+    Factors,
     Slam,
     State,
     combine,
@@ -26,7 +26,6 @@ from consistency.bench.filters.kernel.part_functions import (
     observed_width,
     predict_innovation,
     retract,
-    robot_width,
     to_error,
     wrap_residual,
 )
@@ -43,23 +42,23 @@ REASONS = {
 
 @inner
 def gather(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
-    """``work.rows`` (r + w m, n) <- rows of P of the robot and of the ``m`` seen landmarks.
+    """``work.rows`` (3 + w m, n) <- rows of P of the robot and of the ``m`` seen landmarks.
 
     The rows of Phi, which are treated alike, follow them in columns n..n + base - 1.
     """
-    r, w, n, base = robot_width(slam.motion), landmark_width(slam.landmark), state.n, state.base
-    gather_rows(state.P, n, r, w, work.at, m, work.rows)
+    w, n, base = landmark_width(slam.landmark), state.n, state.base
+    gather_rows(state.P, n, w, work.at, m, work.rows)
     if base > 0:
-        copy_matrix(local.Phi[:r, :base], work.rows[:r, n : n + base])
+        copy_matrix(local.Phi[:3, :base], work.rows[:3, n : n + base])
         for i in range(m):
-            first, o = r + w * i, work.at[i]
+            first, o = 3 + w * i, work.at[i]
             copy_matrix(local.Phi[o : o + w, :base], work.rows[first : first + w, n : n + base])
 
 
 @inner
 def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTuple]) -> None:
-    """``work``: zhat (s m,), Hp (m, s, r), Hl (m, s, w) <- h of the seen landmarks; Jacobians by the filter's error."""
-    pose, w, s = state.x[: robot_width(slam.motion)], landmark_width(slam.landmark), observed_width(slam.sensor)
+    """``work``: zhat (s m,), Hp (m, s, 3), Hl (m, s, w) <- h of the seen landmarks; Jacobians by the filter's error."""
+    pose, w, s = state.x[:3], landmark_width(slam.landmark), observed_width(slam.sensor)
     for i in range(m):
         o, expected = work.at[i], work.zhat[s * i : s * i + s]
         values = state.x[o : o + w]
@@ -70,7 +69,7 @@ def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTup
 @inner
 def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> None:
     """``work.A`` (s m, n + base) <- H P from the gathered rows; upper half of ``work.S`` (s m, s m) <- H P H'."""
-    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
+    w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
     A, S, Hp, Hl, width = work.A, work.S, work.Hp, work.Hl, state.n + state.base
     for i in range(m):
         combine(slam.landmark, Hp[i], Hl[i], work.rows[:, :width], i, A[s * i : s * i + s, :width])
@@ -79,9 +78,9 @@ def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> No
         for row in range(s * i + s):
             for a in range(s):
                 total = 0.0
-                for c in range(max(r, w)):
+                for c in range(max(3, w)):
                     term = 0.0
-                    if c < r:
+                    if c < 3:
                         term += A[row, c] * Hp[i, a, c]
                     if c < w:
                         term += A[row, o + c] * Hl[i, a, c]
@@ -142,10 +141,10 @@ def add_noise(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTupl
     y, total = joined[:, width], 0.0
     for i in range(m):
         for a in range(s):
-            r = s * i + a
+            row = s * i + a
             for c in range(s):
-                S[r, s * i + c] += data.R[work.known[i], a, c]
-            total += y[r] + sum_of(S[r, r:])
+                S[row, s * i + c] += data.R[work.known[i], a, c]
+            total += y[row] + sum_of(S[row, row:])
     return total
 
 
@@ -162,9 +161,9 @@ def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float
         return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan, np.nan
     solve_transposed(S, joined)
     nis, log_det = 0.0, 0.0
-    for r in range(rows):
-        nis += y[r] * y[r]
-        log_det += 2.0 * np.log(S[r, r])
+    for row in range(rows):
+        nis += y[row] * y[row]
+        log_det += 2.0 * np.log(S[row, row])
     if np.isfinite(nis):
         return 0, nis, log_det
     return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan, np.nan
@@ -185,7 +184,7 @@ def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTupl
     rows, n = observed_width(slam.sensor) * m, state.n
     A, y = work.A[:rows, :n], work.A[:rows, n + state.base]
     retract(slam.error, slam, state, A, y, work)
-    subtract_gram(state.P, n, robot_width(slam.motion), A)
+    add_gram_to_state(-1.0, A, state.P, n)
     apply_beyond(state, rows, local, work)
 
 

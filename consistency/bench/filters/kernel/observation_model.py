@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.part_functions import (
-    Frame,
     Slam,
     Triple,
     expands,
@@ -18,12 +17,12 @@ from consistency.bench.filters.kernel.part_functions import (
     measure_jacobian,
     observation_point,
     observed_width,
-    robot_frame,
     stands_apart,
     to_body,
     to_body_jacobian,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.motion.unicycle import Frame, robot_frame
 from consistency.bench.models import point
 from consistency.referee.types import Array
 
@@ -40,7 +39,7 @@ def observe(slam: Slam, frame: Frame, values: Array, z: Array) -> None:
 
 @inner
 def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, Hl: Array) -> None:
-    """z (s,), Hp (s, r), Hl (s, w) <- h at ``frame`` and ``values`` (w,), and its Jacobians by variables of both."""
+    """z (s,), Hp (s, 3), Hl (s, w) <- h at ``frame`` and ``values`` (w,), and its Jacobians by variables of both."""
     body = to_body(slam.landmark, frame, values)
     mount = slam.sensor.mount
     cx, cy, cz = point.to_sensor(body[0], body[1], body[2], mount)
@@ -62,20 +61,20 @@ def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, H
 def linearise(
     slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array, work: Work[NamedTuple]
 ) -> None:
-    """z (s,) <- h expected of pose (r,), values (w,) in step k + 1; Hp (s, r), Hl (s, w) <- Jacobians at the point."""
+    """z (s,) <- h expected of pose (3,), values (w,) in step k + 1; Hp (s, 3), Hl (s, w) <- Jacobians at the point."""
     at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label, work)
-    linearise_at(slam, robot_frame(slam.motion, at), landmark, z, Hp, Hl)
+    linearise_at(slam, robot_frame(at), landmark, z, Hp, Hl)
     if expands(slam.point):
         for i in range(observed_width(slam.sensor)):
             for j in range(len(pose)):
                 z[i] += Hp[i, j] * (pose[j] - at[j]) + Hl[i, j] * (values[j] - landmark[j])
     if stands_apart(slam.point):
-        observe(slam, robot_frame(slam.motion, pose), values, z)
+        observe(slam, robot_frame(pose), values, z)
 
 
 @inner
 def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work[NamedTuple]) -> None:
-    """values (w,), ``work.Jp`` (w, r), ``work.Jz`` (w, s) <- inverse of h at ``pose`` (r,) for z (s,); Jacobians."""
+    """values (w,), ``work.Jp`` (w, 3), ``work.Jz`` (w, s) <- inverse of h at ``pose`` (3,) for z (s,); Jacobians."""
     mount, Jb, s = slam.sensor.mount, work.Jb, observed_width(slam.sensor)
     cx, cy, cz = locate(slam.sensor, z)
     body = point.from_sensor(cx, cy, cz, mount)
@@ -84,4 +83,4 @@ def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work[
         Jb[0, j] = mount.xx * J[j] + mount.xy * J[s + j] + mount.xz * J[2 * s + j]
         Jb[1, j] = mount.yx * J[j] + mount.yy * J[s + j] + mount.yz * J[2 * s + j]
         Jb[2, j] = mount.zx * J[j] + mount.zy * J[s + j] + mount.zz * J[2 * s + j]
-    insert(slam.landmark, robot_frame(slam.motion, pose), body, Jb, mount, values, work.Jp, work.Jz)
+    insert(slam.landmark, robot_frame(pose), body, Jb, mount, values, work.Jp, work.Jz)

@@ -13,7 +13,8 @@ import numpy as np
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import fill_matrix
-from consistency.bench.filters.kernel.part_functions import Frame, Nine, Triple, landmark_width, world_point
+from consistency.bench.filters.kernel.part_functions import Nine, Triple, landmark_width, world_point
+from consistency.bench.filters.motion.unicycle import Frame
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array
 

@@ -14,7 +14,6 @@ from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import fill, fill_matrix
 from consistency.bench.filters.kernel.part_functions import (
-    Frame,
     Nine,
     Triple,
     combine,
@@ -26,6 +25,7 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.landmark.inverse_range import inward, outward
 from consistency.bench.filters.landmark.world_point import combine_world_point
+from consistency.bench.filters.motion.unicycle import Frame
 from consistency.bench.models import point
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array

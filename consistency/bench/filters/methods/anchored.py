@@ -9,12 +9,9 @@ import numpy as np
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.covariance import combine_rows
 from consistency.bench.filters.kernel.part_functions import (
-    Frame,
     Slam,
     Triple,
-    combine,
     insert,
     landmark_width,
     to_body,
@@ -22,13 +19,14 @@ from consistency.bench.filters.kernel.part_functions import (
     world_point,
 )
 from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.motion.unicycle import Frame
 from consistency.bench.filters.textbook.anchored import AnchoredKalman
 from consistency.bench.models.point import Mounting, turned_to_robot
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 
-@part(motion="Unicycle", error="Additive", point="AtEstimate", covariance="Dense")
+@part(error="Additive", point="AtEstimate", covariance="Dense")
 class AnchoredInverseDepth(NamedTuple):
     """No parameters."""
 
@@ -118,12 +116,6 @@ def anchored_world_point(
         point[a] = values[a] + m[a] / values[5]
         Dp[a, 0] = Dp[a, 1] = Dp[a, 2] = 0.0
         _by_values(values, 1.0 if a == 0 else 0.0, 1.0 if a == 1 else 0.0, 1.0 if a == 2 else 0.0, Dl[a])
-
-
-@implement(combine, AnchoredInverseDepth)
-def combine_anchored(landmark: AnchoredInverseDepth, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
-    """out (3, width) <- H P, by the version for any width."""
-    combine_rows(Hp, Hl, rows, i, out)
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:

@@ -16,24 +16,21 @@ from consistency.bench.filters.kernel.gain import (
     innovate,
     linearise_seen,
 )
-from consistency.bench.filters.kernel.local_state import Factors
 from consistency.bench.filters.kernel.part_functions import (
     Data,
-    Sensor,
+    Factors,
     Slam,
     State,
     correct,
     locate,
-    make_room,
     measure_jacobian,
-    predict,
     predict_innovation,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.landmark.sensor_point import SensorPoint, sight
 from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.sensor.uvd import Uvd
 from consistency.bench.filters.textbook.equivariant import EquivariantKalman
-from consistency.bench.filters.update.joint_update import NoRoom, joint_room, predict_by_error
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
@@ -43,8 +40,6 @@ class EquivariantOutput(NamedTuple):
     """No parameters. The joint update with C* in the place of the Jacobian."""
 
 
-implement(make_room, EquivariantOutput)(joint_room)
-implement(predict, EquivariantOutput)(predict_by_error)
 implement(correct, EquivariantOutput)(correct_at_once)
 
 
@@ -57,7 +52,7 @@ def predict_innovation_equivariant(
     k: int,
     m: int,
     local: Factors,
-    work: Work[NoRoom],
+    work: Work[NamedTuple],
 ) -> tuple[int, float]:
     """Innovation and S with C* in the place of the Jacobian."""
     gather(slam, state, m, local, work)
@@ -70,7 +65,7 @@ def predict_innovation_equivariant(
 
 
 @inner
-def _average(sensor: Sensor, z: Array, q: Array, H: Array) -> None:
+def _average(sensor: Uvd, z: Array, q: Array, H: Array) -> None:
     """H (3, 3) <- C*, the mean of H, at the estimate q (3,), and of the derivative along the group at z (3,)."""
     if z[2] <= 0.0:  # of no point
         return

@@ -12,23 +12,21 @@ from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import vector
 from consistency.bench.filters.kernel.covariance import state_index
 from consistency.bench.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, shift, whiten
-from consistency.bench.filters.kernel.local_state import Factors
 from consistency.bench.filters.kernel.part_functions import (
     Data,
+    Factors,
     Slam,
     State,
     correct,
     landmark_width,
     make_room,
     observed_width,
-    predict,
     predict_innovation,
-    robot_width,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.iekf import PASSES, IteratedKalman
-from consistency.bench.filters.update.joint_update import predict_by_error, predict_innovation_linearised
+from consistency.bench.filters.update.joint_update import predict_innovation_linearised
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
@@ -41,17 +39,16 @@ class Iterated(NamedTuple):
 
 
 class PriorRoom(NamedTuple):
-    """The prior of the variables involved, r + w m."""
+    """The prior of the variables involved, 3 + w m."""
 
     prior: Array
 
 
 @implement(make_room, Iterated)
-def iterated_room(update: Iterated, r: int, w: int, s: int, m: int, n: int) -> PriorRoom:
-    return PriorRoom(vector(r + w * m))
+def iterated_room(update: Iterated, w: int, s: int, m: int, n: int) -> PriorRoom:
+    return PriorRoom(vector(3 + w * m))
 
 
-implement(predict, Iterated)(predict_by_error)
 implement(predict_innovation, Iterated)(predict_innovation_linearised)
 
 
@@ -67,11 +64,11 @@ def correct_iterated(
     local: Factors,
     work: Work[PriorRoom],
 ) -> tuple[int, float, float]:
-    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-    involved, first_nis, first_log_det = r + w * m, np.nan, np.nan
+    w = landmark_width(slam.landmark)
+    involved, first_nis, first_log_det = 3 + w * m, np.nan, np.nan
     gather(slam, state, m, local, work)
     for a in range(involved):
-        work.room.prior[a] = state.x[state_index(r, w, a, work.at)]
+        work.room.prior[a] = state.x[state_index(w, a, work.at)]
     for i in range(update.passes):
         linearise_seen(slam, state, k, m, work)
         combine_seen(slam, state, m, work)
@@ -83,7 +80,7 @@ def correct_iterated(
             first_nis, first_log_det = nis, log_det
         is_last = i == update.passes - 1
         for a in range(involved):
-            j = state_index(r, w, a, work.at)
+            j = state_index(w, a, work.at)
             state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
     apply(slam, state, m, local, work)
     return 0, first_nis, first_log_det
@@ -92,15 +89,15 @@ def correct_iterated(
 @inner
 def _relate_to_prior(slam: Slam, state: State, m: int, y: Array, work: Work[PriorRoom]) -> None:
     """y (s m,) <- z - h(x) - H (prior - x)."""
-    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
+    w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
     x, prior = state.x, work.room.prior
     for i in range(m):
         o = work.at[i]
         for a in range(s):
-            for c in range(r):
+            for c in range(3):
                 y[s * i + a] -= work.Hp[i, a, c] * (prior[c] - x[c])
             for c in range(w):
-                y[s * i + a] -= work.Hl[i, a, c] * (prior[r + w * i + c] - x[o + c])
+                y[s * i + a] -= work.Hl[i, a, c] * (prior[3 + w * i + c] - x[o + c])
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:

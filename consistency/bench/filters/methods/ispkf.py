@@ -12,9 +12,9 @@ from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.covariance import state_index
 from consistency.bench.filters.kernel.gain import POSE, apply, gather, innovate, shift, whiten
-from consistency.bench.filters.kernel.local_state import Factors
 from consistency.bench.filters.kernel.part_functions import (
     Data,
+    Factors,
     Slam,
     State,
     correct,
@@ -22,7 +22,6 @@ from consistency.bench.filters.kernel.part_functions import (
     make_room,
     predict,
     predict_innovation,
-    robot_width,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ukf
@@ -41,9 +40,9 @@ class IteratedPoints(NamedTuple):
 
 
 @implement(make_room, IteratedPoints)
-def iterated_points_room(update: IteratedPoints, r: int, w: int, s: int, m: int, n: int) -> NamedTuple:
+def iterated_points_room(update: IteratedPoints, w: int, s: int, m: int, n: int) -> NamedTuple:
     """Arrays of sigma points, as for one pass."""
-    return make_room(update.points, r, w, s, m, n)
+    return make_room(update.points, w, s, m, n)
 
 
 @implement(predict, IteratedPoints)
@@ -66,15 +65,15 @@ def correct_by_iterated_points(
     local: Factors,
     work: Work[SigmaRoom],
 ) -> tuple[int, float, float]:
-    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-    involved, first_nis, first_log_det = r + w * m, np.nan, np.nan
+    w = landmark_width(slam.landmark)
+    involved, first_nis, first_log_det = 3 + w * m, np.nan, np.nan
     gather(slam, state, m, local, work)
     for a in range(involved):
-        work.room.prior[a] = state.x[state_index(r, w, a, work.at)]
+        work.room.prior[a] = state.x[state_index(w, a, work.at)]
     for i in range(update.passes):
         if not innovate_by_points(update.points, slam, state, m, work):
             return POSE, np.nan, np.nan
-        _relate_to_prior(r, w, state, m, innovate(slam, state, data, m, work), work)
+        _relate_to_prior(w, state, m, innovate(slam, state, data, m, work), work)
         code, nis, log_det = whiten(slam, state, data, m, work)
         if code > 0:
             return code, nis, log_det
@@ -82,7 +81,7 @@ def correct_by_iterated_points(
             first_nis, first_log_det = nis, log_det
         is_last = i == update.passes - 1
         for a in range(involved):
-            j = state_index(r, w, a, work.at)
+            j = state_index(w, a, work.at)
             state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
     apply(slam, state, m, local, work)
     return 0, first_nis, first_log_det
@@ -97,10 +96,10 @@ def predict_innovation_by_first_points(
 
 
 @inner
-def _relate_to_prior(r: int, w: int, state: State, m: int, y: Array, work: Work[SigmaRoom]) -> None:
+def _relate_to_prior(w: int, state: State, m: int, y: Array, work: Work[SigmaRoom]) -> None:
     """y (s m,) <- z - z_i - A (prior - x_i)."""
-    for a in range(r + w * m):
-        away = work.room.prior[a] - state.x[state_index(r, w, a, work.at)]
+    for a in range(3 + w * m):
+        away = work.room.prior[a] - state.x[state_index(w, a, work.at)]
         for row in range(len(y)):
             y[row] -= work.room.Mt[a, row] * away
 

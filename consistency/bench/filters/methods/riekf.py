@@ -9,14 +9,13 @@ from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.planar import exponential, shifted_covariance
 from consistency.bench.filters.kernel.arrays import fill
-from consistency.bench.filters.kernel.blas import add_gram, add_transposed_times
+from consistency.bench.filters.kernel.blas import add_transposed_times
+from consistency.bench.filters.kernel.covariance import add_gram_to_state
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     insert_error,
     landmark_width,
-    move,
-    noise_columns,
     pose_covariance,
     propagate,
     retract,
@@ -24,12 +23,13 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.motion.unicycle import move, noise_columns
 from consistency.bench.filters.textbook.riekf import RightInvariantKalman
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 
-@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", point="AtEstimate", update="Joint", covariance="Dense")
+@part(landmark="WorldPoint PlanarPoint", point="AtEstimate", update="Joint", covariance="Dense")
 class RightInvariant(NamedTuple):
     """No parameters. Motion moves the error of every landmark, so updating is dense."""
 
@@ -39,20 +39,17 @@ def propagate_right(
     error: RightInvariant, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """x <- f(x) and P <- P + Ad G Q G' Ad': F is the identity, and the noise turns with the world, (n, q)."""
-    x, P, n, w, G = state.x, state.P, state.n, landmark_width(slam.landmark), work.small
-    columns = noise_columns(slam.motion, x[:3], u, G)
-    move(slam.motion, x[:3], u, x[:3])
-    noise = work.rows[:columns, :n]
-    for c in range(columns):
+    x, n, w, G = state.x, state.n, landmark_width(slam.landmark), work.small
+    noise_columns(slam.motion, x[:3], u, G)
+    move(x[:3], u, x[:3])
+    noise = work.rows[:2, :n]
+    for c in range(2):
         turn = G[2, c]
         noise[c, 0], noise[c, 1], noise[c, 2] = G[0, c] + x[1] * turn, G[1, c] - x[0] * turn, turn
         for o in range(3, n, w):
             noise[c, o], noise[c, o + 1] = x[o + 1] * turn, -x[o] * turn
             fill(noise[c, o + 2 : o + w], 0.0)
-    add_gram(1.0, noise, P[:n, :n])
-    for a in range(3):
-        for b in range(a):
-            P[a, b] = P[b, a]
+    add_gram_to_state(1.0, noise, state.P, n)
 
 
 @implement(to_error, RightInvariant)

@@ -9,22 +9,19 @@ from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import sum_of
 from consistency.bench.filters.kernel.gain import combine_seen, correct_at_once, gather, innovate, linearise_seen
-from consistency.bench.filters.kernel.local_state import Factors
 from consistency.bench.filters.kernel.part_functions import (
     Data,
+    Factors,
     Slam,
     State,
     Triple,
     correct,
     locate,
     locate_jacobian,
-    make_room,
     measure,
     measure_jacobian,
     observed_width,
-    predict,
     predict_innovation,
-    wrap_residual,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
@@ -33,11 +30,9 @@ from consistency.bench.filters.sensor.xyz import (
     locate_xyz_jacobian,
     measure_xyz,
     measure_xyz_jacobian,
-    xyz_has_no_angle,
     xyz_width,
 )
 from consistency.bench.filters.textbook.triangulated import TriangulatedKalman
-from consistency.bench.filters.update.joint_update import NoRoom, joint_room, predict_by_error
 from consistency.bench.models import stereo
 from consistency.bench.models.point import Mounting
 from consistency.bench.protocols import Problem
@@ -58,7 +53,6 @@ class DebiasedXyz(NamedTuple):
 
 
 implement(observed_width, DebiasedXyz)(xyz_width)
-implement(wrap_residual, DebiasedXyz)(xyz_has_no_angle)
 implement(measure, DebiasedXyz)(measure_xyz)
 implement(measure_jacobian, DebiasedXyz)(measure_xyz_jacobian)
 implement(locate_jacobian, DebiasedXyz)(locate_xyz_jacobian)  # the bias is taken as known
@@ -88,8 +82,6 @@ class NoiseAtPrediction(NamedTuple):
     growth: Growth
 
 
-implement(make_room, NoiseAtPrediction)(joint_room)
-implement(predict, NoiseAtPrediction)(predict_by_error)
 implement(correct, NoiseAtPrediction)(correct_at_once)
 
 
@@ -102,7 +94,7 @@ def predict_innovation_with_noise_at_prediction(
     k: int,
     m: int,
     local: Factors,
-    work: Work[NoRoom],
+    work: Work[NamedTuple],
 ) -> tuple[int, float]:
     gather(slam, state, m, local, work)
     linearise_seen(slam, state, k, m, work)
@@ -111,7 +103,7 @@ def predict_innovation_with_noise_at_prediction(
 
 
 @inner
-def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Work[NoRoom]) -> float:
+def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Work[NamedTuple]) -> float:
     """y (3 m,) <- y - bias, S (3 m, 3 m) <- S + R; returns a sum that is finite if all that is given is."""
     total, rows = 0.0, 3 * m
     for i in range(m):

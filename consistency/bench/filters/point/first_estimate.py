@@ -17,23 +17,19 @@ from consistency.bench.filters.kernel.observation_model import place_observed
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
-    expands,
     landmark_point,
     landmark_width,
     make_notes,
-    motion_point,
-    move,
-    observation_point,
     place,
     propagate_covariance_at,
-    propagate_covariance_by,
     stands_apart,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.motion.unicycle import move, propagate_covariance_by
 from consistency.referee.types import Array
 
 
-@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", error="Additive", update="Joint")
+@part(landmark="WorldPoint PlanarPoint", error="Additive", update="Joint")
 class FirstEstimate(NamedTuple):
     """No parameters."""
 
@@ -45,12 +41,6 @@ class FirstEstimates(NamedTuple):
     landmarks: Array  # (labels, w)
 
 
-@implement(expands, FirstEstimate)
-def first_estimate_is_not_expanded(point: FirstEstimate) -> bool:
-    """False: f and h are evaluated at the estimate itself."""
-    return False
-
-
 @implement(stands_apart, FirstEstimate)
 def first_estimate_stands_apart(point: FirstEstimate) -> bool:
     """True: the Jacobians are taken elsewhere."""
@@ -58,15 +48,9 @@ def first_estimate_stands_apart(point: FirstEstimate) -> bool:
 
 
 @implement(make_notes, FirstEstimate)
-def note_first_estimates(point: FirstEstimate, r: int, w: int, steps: int, labels: int) -> FirstEstimates:
+def note_first_estimates(point: FirstEstimate, w: int, steps: int, labels: int) -> FirstEstimates:
     """Room for the predictions of all steps and the first estimate of each landmark."""
-    return FirstEstimates(matrix(steps + 1, r), matrix(labels, w))
-
-
-@implement(motion_point, FirstEstimate)
-def motion_about_estimate(point: FirstEstimate, pose: Array, k: int) -> Array:
-    """The estimate ``pose`` (r,), before the step."""
-    return pose
+    return FirstEstimates(matrix(steps + 1, 3), matrix(labels, w))
 
 
 @implement(propagate_covariance_at, FirstEstimate)
@@ -77,14 +61,8 @@ def propagate_covariance_between_first_estimates(
     before, after = work.notes.path[k], work.notes.path[k + 1]
     if k == 0:
         copy(state.x[:3], before)
-    move(slam.motion, state.x[:3], u, after)
-    propagate_covariance_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
-
-
-@implement(observation_point, FirstEstimate)
-def observation_at_prediction(point: FirstEstimate, pose: Array, k: int) -> Array:
-    """The estimate ``pose`` (r,), after the prediction: its first."""
-    return pose
+    move(state.x[:3], u, after)
+    propagate_covariance_by(after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
 
 
 @implement(landmark_point, FirstEstimate)

@@ -36,23 +36,19 @@ from consistency.bench.filters.kernel.observation_model import place_observed
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
-    expands,
     landmark_point,
     landmark_width,
     make_notes,
-    motion_point,
-    move,
-    observation_point,
     place,
     propagate_covariance_at,
-    propagate_covariance_by,
     stands_apart,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.motion.unicycle import move, propagate_covariance_by
 from consistency.referee.types import Array, Indices
 
 
-@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", error="Additive", update="Joint", covariance="Dense")
+@part(landmark="WorldPoint PlanarPoint", error="Additive", update="Joint", covariance="Dense")
 class ObservabilityConstrained(NamedTuple):
     """No parameters. The points depend on the estimates of the whole map, so updating is dense."""
 
@@ -67,12 +63,6 @@ class UnobservedTurn(NamedTuple):
     at: Array  # (w,), the point of the landmark asked for last
 
 
-@implement(expands, ObservabilityConstrained)
-def constrained_is_not_expanded(point: ObservabilityConstrained) -> bool:
-    """False: f and h are evaluated at the estimate itself."""
-    return False
-
-
 @implement(stands_apart, ObservabilityConstrained)
 def constrained_stands_apart(point: ObservabilityConstrained) -> bool:
     """True: the Jacobians are taken elsewhere."""
@@ -80,16 +70,10 @@ def constrained_stands_apart(point: ObservabilityConstrained) -> bool:
 
 
 @implement(make_notes, ObservabilityConstrained)
-def note_unobserved_turn(point: ObservabilityConstrained, r: int, w: int, steps: int, labels: int) -> UnobservedTurn:
+def note_unobserved_turn(point: ObservabilityConstrained, w: int, steps: int, labels: int) -> UnobservedTurn:
     """Room for the direction in all steps and of all landmarks."""
     path, landmarks = matrix(steps + 1, 2), matrix(labels, 2)
     return UnobservedTurn(path, landmarks, integers(labels, 0), filled(2, 0.0), vector(w))
-
-
-@implement(motion_point, ObservabilityConstrained)
-def motion_from_estimate(point: ObservabilityConstrained, pose: Array, k: int) -> Array:
-    """The estimate ``pose`` (r,), before the step."""
-    return pose
 
 
 @implement(propagate_covariance_at, ObservabilityConstrained)
@@ -99,7 +83,7 @@ def propagate_covariance_constrained(
     """F by the displacement p_k+1|k - p*_k|k; notes a_k+1 and e."""
     x, notes, predicted, w = state.x, work.notes, work.pose, landmark_width(slam.landmark)
     before, after, shift = notes.path[k], notes.path[k + 1], notes.shift
-    move(slam.motion, x[:3], u, predicted)
+    move(x[:3], u, predicted)
     count = (state.n - 3) // w
     for a in range(2):
         if k == 0:
@@ -109,13 +93,7 @@ def propagate_covariance_constrained(
             total += x[3 + w * i + a] - notes.landmarks[notes.order[i], a]
         shift[a] = total / (1 + count)
         after[a] = predicted[a] - shift[a]
-    propagate_covariance_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
-
-
-@implement(observation_point, ObservabilityConstrained)
-def observation_from_prediction(point: ObservabilityConstrained, pose: Array, k: int) -> Array:
-    """The estimate ``pose`` (r,), after the prediction, which the constraint leaves free."""
-    return pose
+    propagate_covariance_by(after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
 
 
 @implement(landmark_point, ObservabilityConstrained)

@@ -14,17 +14,13 @@ from consistency.bench.filters.kernel.part_functions import (
     State,
     expands,
     landmark_point,
-    make_notes,
     motion_point,
     observation_point,
     place,
-    propagate_covariance,
     propagate_covariance_at,
-    robot_frame,
-    robot_width,
-    stands_apart,
 )
-from consistency.bench.filters.kernel.work_arrays import NoNotes, Work
+from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.motion.unicycle import propagate_covariance, robot_frame
 from consistency.referee.types import Array
 
 
@@ -42,16 +38,6 @@ def reference_is_expanded(point: Reference) -> bool:
     return True
 
 
-@implement(stands_apart, Reference)
-def reference_stands_apart(point: Reference) -> bool:
-    return False
-
-
-@implement(make_notes, Reference)
-def no_notes_reference(point: Reference, r: int, w: int, steps: int, labels: int) -> NoNotes:
-    return NoNotes()
-
-
 @implement(motion_point, Reference)
 def motion_at_reference(point: Reference, pose: Array, k: int) -> Array:
     """Reference pose (r,) of step k, before the step."""
@@ -63,7 +49,7 @@ def propagate_covariance_at_reference(
     point: Reference, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """F at the reference pose before the step."""
-    propagate_covariance(slam.motion, point.path[k], u, state.P, state.n, Phi, state.base)
+    propagate_covariance(point.path[k], u, state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, Reference)
@@ -84,9 +70,9 @@ def place_about_reference(
 ) -> None:
     """x[n:n + w] <- the landmark that solves the expanded h for z (3,), where w = 3; Jz = Hl^-1 and Jp = -Hl^-1 Hp."""
     pose, landmark, n = point.path[k + 1], point.landmarks[label], state.n
-    r = robot_width(slam.motion)
+    r = 3
     z0, Hp, Hl = vector(3), matrix(3, r), matrix(3, len(landmark))
-    linearise_at(slam, robot_frame(slam.motion, pose), landmark, z0, Hp, Hl)
+    linearise_at(slam, robot_frame(pose), landmark, z0, Hp, Hl)
     copy_matrix(np.linalg.inv(Hl), work.Jz)
     copy_matrix(-np.dot(work.Jz, Hp), work.Jp)
     for i in range(len(landmark)):

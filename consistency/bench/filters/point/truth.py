@@ -16,24 +16,21 @@ from consistency.bench.filters.kernel.observation_model import linearise_at, pla
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
-    expands,
     landmark_point,
     landmark_width,
-    make_notes,
     motion_point,
     observation_point,
     observed_width,
     place,
     propagate_covariance_at,
-    propagate_covariance_by,
-    robot_frame,
     stands_apart,
 )
-from consistency.bench.filters.kernel.work_arrays import NoNotes, Work
+from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.motion.unicycle import propagate_covariance_by, robot_frame
 from consistency.referee.types import Array
 
 
-@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", error="Additive", update="Joint")
+@part(landmark="WorldPoint PlanarPoint", error="Additive", update="Joint")
 class AtTruth(NamedTuple):
     """Where robot and landmarks are."""
 
@@ -41,22 +38,10 @@ class AtTruth(NamedTuple):
     landmarks: Array  # (n_landmarks, w)
 
 
-@implement(expands, AtTruth)
-def truth_is_not_expanded(point: AtTruth) -> bool:
-    """False: f and h are evaluated at the estimate itself."""
-    return False
-
-
 @implement(stands_apart, AtTruth)
 def truth_stands_apart(point: AtTruth) -> bool:
     """True: the Jacobians are taken elsewhere."""
     return True
-
-
-@implement(make_notes, AtTruth)
-def no_notes_at_truth(point: AtTruth, r: int, w: int, steps: int, labels: int) -> NoNotes:
-    """Nothing: the truth is known from the start."""
-    return NoNotes()
 
 
 @implement(motion_point, AtTruth)
@@ -71,7 +56,7 @@ def propagate_covariance_at_truth(
 ) -> None:
     """F by the true displacement of the robot."""
     before, after = point.path[k], point.path[k + 1]
-    propagate_covariance_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
+    propagate_covariance_by(after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, AtTruth)
@@ -94,6 +79,6 @@ def place_at_truth(
     w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
     place_observed(slam, state.x[:3], z, state.x[state.n : state.n + w], work)
     expected, Hp, Hl = vector(s), matrix(s, 3), matrix(s, w)
-    linearise_at(slam, robot_frame(slam.motion, point.path[k + 1]), point.landmarks[label], expected, Hp, Hl)
+    linearise_at(slam, robot_frame(point.path[k + 1]), point.landmarks[label], expected, Hp, Hl)
     copy_matrix(np.linalg.inv(Hl), work.Jz)
     copy_matrix(-np.dot(work.Jz, Hp), work.Jp)

@@ -14,7 +14,6 @@ from consistency.bench.filters.kernel.part_functions import (
     measure,
     measure_jacobian,
     observed_width,
-    wrap_residual,
 )
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array
@@ -31,11 +30,6 @@ class RelativeXy(NamedTuple):
 def relative_xy_width(sensor: RelativeXy) -> int:
     """2: dx, dy in m."""
     return 2
-
-
-@implement(wrap_residual, RelativeXy)
-def relative_xy_has_no_angle(sensor: RelativeXy, z: Array, about: Array) -> None:
-    """Nothing to do: lengths do not wrap."""
 
 
 @implement(measure, RelativeXy)

@@ -13,7 +13,6 @@ from consistency.bench.filters.kernel.part_functions import (
     measure,
     measure_jacobian,
     observed_width,
-    wrap_residual,
 )
 from consistency.bench.models import stereo
 from consistency.bench.models.point import Mounting
@@ -33,11 +32,6 @@ class Uvd(NamedTuple):
 def uvd_width(sensor: Uvd) -> int:
     """3: u, v, d in px."""
     return 3
-
-
-@implement(wrap_residual, Uvd)
-def uvd_has_no_angle(sensor: Uvd, z: Array, about: Array) -> None:
-    """Nothing to do: pixels do not wrap."""
 
 
 @implement(measure, Uvd)

@@ -13,7 +13,6 @@ from consistency.bench.filters.kernel.part_functions import (
     measure,
     measure_jacobian,
     observed_width,
-    wrap_residual,
 )
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array
@@ -30,11 +29,6 @@ class Xyz(NamedTuple):
 def xyz_width(sensor: Xyz) -> int:
     """3: x, y, z in m."""
     return 3
-
-
-@implement(wrap_residual, Xyz)
-def xyz_has_no_angle(sensor: Xyz, z: Array, about: Array) -> None:
-    """Nothing to do: lengths do not wrap."""
 
 
 @implement(measure, Xyz)

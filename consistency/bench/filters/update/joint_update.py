@@ -13,41 +13,13 @@ from consistency.bench.filters.kernel.gain import (
     innovate,
     linearise_seen,
 )
-from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.part_functions import (
-    Data,
-    Slam,
-    State,
-    correct,
-    make_room,
-    predict,
-    predict_innovation,
-    propagate,
-)
+from consistency.bench.filters.kernel.part_functions import Data, Factors, Slam, State, correct, predict_innovation
 from consistency.bench.filters.kernel.work_arrays import Work
-from consistency.referee.types import Array
 
 
 @part()
 class Joint(NamedTuple):
     """No parameters."""
-
-
-class NoRoom(NamedTuple):
-    """No arrays."""
-
-
-@implement(make_room, Joint)
-def joint_room(update: Joint, r: int, w: int, s: int, m: int, n: int) -> NoRoom:
-    return NoRoom()
-
-
-@implement(predict, Joint)
-def predict_by_error(
-    update: NamedTuple, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[NamedTuple]
-) -> None:
-    """Motion as the part ``error`` has it, for every update that linearises."""
-    propagate(slam.error, slam, state, k, u, local.Phi, work)
 
 
 implement(correct, Joint)(correct_at_once)

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,13 @@ from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
 from consistency.bench.protocols import Filter, Problem, TrialTruth
 from consistency.bench.scenario import Belief, GuardSettings
-from consistency.bench.types import Control, Estimates, Gaussian, Info, Map, Observation, Trial
+from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE
 from consistency.referee.types import Array, Failure, Indices
+
+# models of sensors by what the name of a filter ends in
+SENSORS = {"xyz": ("xyz", "uvd"), "uvd": ("uvd",), "xy": ("relative-xy",), "rb": ("range-bearing",)}
 
 _lock = threading.Lock()
 _inside: list[Any] = []  # the limit in force, once for every trial that is running
@@ -58,68 +61,39 @@ class Halted(Exception):
 
 
 class Compiled:
-    """``init``, ``predict``, ``update``, ``pose`` of the textbook's filter, and ``run`` of the kernels.
+    """``init``, ``predict``, ``update``, ``pose``, ``map`` of the textbook's filter, and ``run`` of the kernels.
 
     Parameters
     ----------
-    textbook : the filter in plain NumPy, with ``name`` and the optional ``map``
-    parts : gives the parts of the filter for a problem and the controls (T, 3) of a trial
+    textbook : the filter in plain NumPy, with ``name`` and ``uvd``: whether it works on (u, v, d); if not, such data are
+        turned into points by eq. 21
+    parts : gives the parts of the filter for a problem, the controls (T, 3) of a trial, and ``uvd``
     sensors : models of sensors whose data it takes
-    uvd : whether it works on (u, v, d); if not, such data are turned into points by eq. 21
-    innovations : "optimal" where they are white if the belief is right, see
-        :class:`consistency.protocols.Filter`
-    error : convention of the error in which its covariance is meant, see
-        :mod:`consistency.referee.geometry.conventions`
-    guard : kind of the guard that ``textbook`` has, if it has one
 
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
-    allow it; the numbers are the same. ``realisable`` and ``needs`` are those of ``textbook``: False for a bound
-    that is told the truth, and the keys of ``belief.sensor`` that it cannot do without and others can.
+    allow it; the numbers are the same. What else ``textbook`` declares is declared of this: ``innovations`` and
+    ``realisable`` (:class:`consistency.bench.protocols.Filter`), ``error``
+    (:mod:`consistency.referee.geometry.conventions`), and ``needs``, the keys of ``belief.sensor`` that it cannot do without
+    and others can.
     """
 
     local_from = LOCAL_FROM
 
-    def __init__(
-        self,
-        textbook: Any,
-        parts: Callable[[Problem, Array], Slam],
-        *,
-        sensors: tuple[str, ...],
-        uvd: bool,
-        innovations: str | None = None,
-        error: str = ADDITIVE,
-        guard: str | None = None,
-    ) -> None:
-        self.textbook, self.parts, self.sensors, self.uvd = textbook, parts, sensors, uvd
-        self.innovations, self.error = innovations, error
+    def __init__(self, textbook: Any, parts: Callable[[Problem, Array, bool], Slam], sensors: tuple[str, ...]) -> None:
+        self.textbook, self.sensors, self.uvd = textbook, sensors, textbook.uvd
+        self.parts: Callable[[Problem, Array], Slam] = partial(parts, uvd=self.uvd)
+        self.innovations: str | None = getattr(textbook, "innovations", None)
+        self.error: str = getattr(textbook, "error", ADDITIVE)
         self.name: str = textbook.name
         self.realisable: bool = is_realisable(textbook)
         self.needs: tuple[str, ...] = getattr(textbook, "needs", ())
-        self.guard = guard
+        self.guard: str | None = textbook.kind if isinstance(textbook, Guarded) else None
+        self.init, self.predict, self.update = textbook.init, textbook.predict, textbook.update
+        self.pose, self.map = textbook.pose, textbook.map
 
     def guarded(self, kind: str) -> Compiled:
         """This filter behind a guard, with the textbook's behind the same guard in plain Python."""
-        return Compiled(
-            Guarded(self.textbook, kind), self.parts, sensors=self.sensors, uvd=self.uvd, error=self.error, guard=kind
-        )
-
-    def init(self, problem: Problem) -> Any:
-        return self.textbook.init(problem)
-
-    def predict(self, state: Any, control: Control) -> Any:
-        return self.textbook.predict(state, control)
-
-    def update(self, state: Any, observation: Observation) -> tuple[Any, Info | None]:
-        updated: tuple[Any, Info | None] = self.textbook.update(state, observation)
-        return updated
-
-    def pose(self, state: Any) -> Gaussian:
-        pose: Gaussian = self.textbook.pose(state)
-        return pose
-
-    def map(self, state: Any) -> dict[int, Gaussian]:
-        landmarks: dict[int, Gaussian] = self.textbook.map(state)
-        return landmarks
+        return Compiled(Guarded(self.textbook, kind), self.parts, self.sensors)
 
     def own_covariance(self, state: Any) -> Array:
         """Covariance (3, 3) of the error that the filter declares."""
@@ -220,19 +194,17 @@ def guarded(filter_: Filter, kind: str) -> Any:
     return filter_.guarded(kind) if isinstance(filter_, Compiled) else Guarded(filter_, kind)
 
 
-def planar(
-    textbook: Callable[..., Any], method: str, parts: Callable[[Problem, Array], Slam], **options: str
-) -> tuple[Compiled, Compiled]:
-    """A method on landmarks in the plane, by relative positions (``METHOD-xy``) or range and bearing (``METHOD-rb``).
+def variants(
+    textbook: Callable[..., Any],
+    method: str,
+    parts: Callable[[Problem, Array, bool], Slam],
+    suffixes: str = "xyz uvd xy rb",
+) -> tuple[Compiled, ...]:
+    """A method on points (``METHOD-xyz``) and pixels (``METHOD-uvd``), relative positions (``METHOD-xy``), range and bearing.
 
-    ``textbook`` makes the plain filter of a name and ``uvd``, ``parts`` take sensor and landmark from the belief, and
-    ``options`` are those of :class:`Compiled`.
+    ``textbook`` makes the plain filter of a name and ``uvd``.
     """
-    xy, rb = (textbook(f"{method}-{suffix}", uvd=False) for suffix in ("xy", "rb"))
-    return (
-        Compiled(xy, parts, sensors=("relative-xy",), uvd=False, **options),
-        Compiled(rb, parts, sensors=("range-bearing",), uvd=False, **options),
-    )
+    return tuple(Compiled(textbook(f"{method}-{s}", uvd=s == "uvd"), parts, SENSORS[s]) for s in suffixes.split())
 
 
 def problem_of(trial: Trial, belief: Belief) -> Problem:

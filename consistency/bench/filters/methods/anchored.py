@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.part_functions import (
@@ -118,15 +118,9 @@ def anchored_world_point(
         _by_values(values, 1.0 if a == 0 else 0.0, 1.0 if a == 1 else 0.0, 1.0 if a == 2 else 0.0, Dl[a])
 
 
-def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``anchored-ekf-xyz``."""
-    return ekf.xyz_parts(problem, controls)._replace(landmark=AnchoredInverseDepth())
+def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
+    """Those of the EKF, and the landmark."""
+    return ekf.parts(problem, controls, uvd)._replace(landmark=AnchoredInverseDepth())
 
 
-def uvd_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``anchored-ekf-uvd``."""
-    return ekf.uvd_parts(problem, controls)._replace(landmark=AnchoredInverseDepth())
-
-
-XYZ = Compiled(AnchoredKalman("anchored-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
-UVD = Compiled(AnchoredKalman("anchored-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XYZ, UVD = variants(AnchoredKalman, "anchored-ekf", parts, "xyz uvd")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.polar import Polar
@@ -83,10 +83,10 @@ def _average(sensor: Uvd, z: Array, q: Array, H: Array) -> None:
             H[a, b] = 0.5 * (H[a, b] + along)
 
 
-def parts(problem: Problem, controls: Array) -> Slam:
+def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
     """Parts of ``eqf-uvd``."""
-    slam = ekf.uvd_parts(problem, controls)
+    slam = ekf.parts(problem, controls, uvd)
     return slam._replace(landmark=SensorPoint(slam.sensor.mount), error=Polar(), update=EquivariantOutput())
 
 
-FILTER = Compiled(EquivariantKalman("eqf-uvd"), parts, sensors=("uvd",), uvd=True, error="right")
+(FILTER,) = variants(EquivariantKalman, "eqf", parts, "uvd")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.compiled import Compiled, planar
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import vector
@@ -100,16 +100,9 @@ def _relate_to_prior(slam: Slam, state: State, m: int, y: Array, work: Work[Prio
                 y[s * i + a] -= work.Hl[i, a, c] * (prior[3 + w * i + c] - x[o + c])
 
 
-def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``iekf-xyz``, and with landmarks in the plane where the sensor has them."""
-    return ekf.xyz_parts(problem, controls)._replace(update=Iterated(PASSES))
+def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
+    """Those of the EKF, and the update."""
+    return ekf.parts(problem, controls, uvd)._replace(update=Iterated(PASSES))
 
 
-def uvd_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``iekf-uvd``."""
-    return ekf.uvd_parts(problem, controls)._replace(update=Iterated(PASSES))
-
-
-XYZ = Compiled(IteratedKalman("iekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
-UVD = Compiled(IteratedKalman("iekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
-XY, RB = planar(IteratedKalman, "iekf", xyz_parts)
+XYZ, UVD, XY, RB = variants(IteratedKalman, "iekf", parts)

@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.belief_parts import sensor_of
-from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.covariance import state_index
@@ -104,17 +103,10 @@ def _relate_to_prior(w: int, state: State, m: int, y: Array, work: Work[SigmaRoo
             y[row] -= work.room.Mt[a, row] * away
 
 
-def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ispkf-xyz``."""
-    points = problem.belief.sigma_points
-    update = IteratedPoints(Unscented(points.alpha, points.beta, points.kappa), PASSES)
-    return ukf.xyz_parts(problem, controls)._replace(update=update)
+def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
+    """Those of the unscented filter, whose points are drawn again."""
+    slam = ukf.parts(problem, controls, uvd)
+    return slam._replace(update=IteratedPoints(slam.update, PASSES))
 
 
-def uvd_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ispkf-uvd``."""
-    return xyz_parts(problem, controls)._replace(sensor=sensor_of(problem.belief, uvd=True))
-
-
-XYZ = Compiled(IteratedPointsKalman("ispkf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
-UVD = Compiled(IteratedPointsKalman("ispkf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XYZ, UVD = variants(IteratedPointsKalman, "ispkf", parts, "xyz uvd")

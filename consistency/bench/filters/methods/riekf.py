@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from consistency.bench.filters.compiled import Compiled, planar
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.planar import exponential, shifted_covariance
@@ -96,18 +96,9 @@ def right_pose_covariance(error: RightInvariant, x: Array, P: Array, out: Array)
     shifted_covariance(x, P, out)
 
 
-def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ri-ekf-xyz``, and with landmarks in the plane where the sensor has them."""
-    return ekf.xyz_parts(problem, controls)._replace(error=RightInvariant())
+def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
+    """Those of the EKF, and the error."""
+    return ekf.parts(problem, controls, uvd)._replace(error=RightInvariant())
 
 
-def uvd_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ri-ekf-uvd``."""
-    return ekf.uvd_parts(problem, controls)._replace(error=RightInvariant())
-
-
-XYZ = Compiled(
-    RightInvariantKalman("ri-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False, error="right"
-)
-UVD = Compiled(RightInvariantKalman("ri-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True, error="right")
-XY, RB = planar(RightInvariantKalman, "ri-ekf", xyz_parts, error="right")
+XYZ, UVD, XY, RB = variants(RightInvariantKalman, "ri-ekf", parts)

@@ -39,7 +39,7 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
     """The filter with its kernel."""
     which = textbook.which
 
-    def parts(problem: Problem, controls: Array) -> Slam:
+    def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
         sensor = problem.belief.sensor
         low, high = searched(sensor, textbook.name) if which.truncation else (0.0, 0.0)
         su, sv, sd = sensor.sigma
@@ -53,7 +53,7 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
         decades, cooling = (0.0, COOLING) if which.tempering else (TEMPERED, COOLING_EARLY)
         waiting = KNOWN if which.waiting else 0.0
         return Slam(
-            motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
+            motion_of(problem.belief), sensor_of(problem.belief, uvd), InverseRange(sensor.mount.packed()),
             InvariantPose(which.moments), Converted(),
             Converting(
                 pixels, waiting, passes, chain if which.turning else 0, clones, which.recency, which.curvature,
@@ -62,7 +62,7 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
             Parking(every, unseen, doubt, adrift, which.turning, which.patience),
         )  # fmt: skip
 
-    return Compiled(textbook, parts, sensors=("uvd",), uvd=True)
+    return Compiled(textbook, parts, textbook.sensors)
 
 
 PARKED = compiled(RobotCentredKalman("parked-ekf-uvd", Corrections()))

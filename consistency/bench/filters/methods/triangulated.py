@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 from consistency.bench.filters.compiled import Compiled
@@ -129,27 +130,16 @@ def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Wor
     return total
 
 
-def predicted_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``predicted-ekf-xyz``."""
-    sensor = problem.belief.sensor
-    su, sv, sd = sensor.sigma
-    noise = NoiseAtPrediction(sensor.f or 0.0, sensor.B or 0.0, su, sv, sd, 0.0, growth_of(sensor))
-    return ekf.xyz_parts(problem, controls)._replace(update=noise)
+def parts(problem: Problem, controls: Array, uvd: bool, debiasing: bool) -> Slam:
+    """Those of the EKF, and the update; with ``debiasing`` also the sensor."""
+    sensor, slam = problem.belief.sensor, ekf.parts(problem, controls, uvd)
+    f, B, growth, (su, sv, sd) = sensor.f or 0.0, sensor.B or 0.0, growth_of(sensor), sensor.sigma
+    rho = sd / (f * B) if debiasing else 0.0
+    slam = slam._replace(update=NoiseAtPrediction(f, B, su, sv, sd, rho, growth))
+    return slam._replace(sensor=DebiasedXyz(rho, growth, f * B, slam.sensor.mount)) if debiasing else slam
 
 
-def debiased_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``debiased-ekf-xyz``."""
-    sensor = problem.belief.sensor
-    f, B = sensor.f or 0.0, sensor.B or 0.0
-    su, sv, sd = sensor.sigma
-    rho = sd / (f * B)
-    growth = growth_of(sensor)
-    noise = NoiseAtPrediction(f, B, su, sv, sd, rho, growth)
-    part_ = DebiasedXyz(rho, growth, f * B, sensor.mount.packed())
-    return ekf.xyz_parts(problem, controls)._replace(sensor=part_, update=noise)
-
-
-PREDICTED = Compiled(
-    TriangulatedKalman("predicted-ekf-xyz", debiasing=False), predicted_parts, sensors=("uvd",), uvd=False
+PREDICTED, DEBIASED = (
+    Compiled(TriangulatedKalman(f"{method}-ekf-xyz", debiasing), partial(parts, debiasing=debiasing), ("uvd",))
+    for method, debiasing in (("predicted", False), ("debiased", True))
 )
-DEBIASED = Compiled(TriangulatedKalman("debiased-ekf-xyz", debiasing=True), debiased_parts, sensors=("uvd",), uvd=False)

@@ -16,8 +16,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from consistency.bench.filters.textbook import basics, ukf
+from consistency.bench.filters.textbook import ukf
 from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.filters.textbook.sensors import view
 from consistency.bench.types import Info
@@ -43,7 +44,7 @@ class IteratedPointsKalman(ukf.UnscentedKalman):
             points, wm, wc = ukf.sigma_points(x, state.P, involved, set_)
             Z = sensor.measure(points[:, None, :3], points[:, at]).reshape(len(points), -1)
             zhat = wm @ Z
-            S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + basics.block_diagonal(R)
+            S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + block_diag(*R)
             C = (points - x).T @ (wc[:, None] * (Z - zhat))
             W = np.linalg.solve(S, C.T).T
             # only the involved variables have moved; P of these may be singular in the first steps

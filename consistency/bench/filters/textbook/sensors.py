@@ -91,6 +91,12 @@ class PlanarSensor:
         return difference
 
 
+def mounted(sensor: BelievedSensor) -> tuple[Array, Array]:
+    """Position (3,) of a sensor in the frame of the robot, m, and its axes (3, 3) as columns."""
+    mount = np.array(sensor.mount.packed())
+    return mount[:3], mount[3:].reshape(3, 3)
+
+
 def view(sensor: BelievedSensor, uvd: bool) -> PointSensor | PlanarSensor:
     """What a filter takes the sensor to measure: raw (u, v, d) where ``uvd``, else what its model says, or points."""
     return PlanarSensor(sensor) if sensor.model in PLANAR_SENSORS else PointSensor(sensor, uvd)

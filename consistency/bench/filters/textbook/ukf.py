@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.filters.textbook.sensors import view
 from consistency.bench.scenario import SigmaPoints
 from consistency.bench.types import Control, Info
 from consistency.referee.types import Array
 
 
-class UnscentedKalman(basics.WorldPointFilter):
+class UnscentedKalman(ExtendedKalman):
     """UKF-SLAM over the whole state.
 
     The variables are ordered robot, landmarks seen in this step (as observed), the rest before the
@@ -24,8 +26,6 @@ class UnscentedKalman(basics.WorldPointFilter):
     they are given.
     """
 
-    robot = basics.Unicycle()
-
     def __init__(self, name: str, uvd: bool, points: SigmaPoints | None = None) -> None:
         super().__init__(name, uvd)
         self.points = points
@@ -34,10 +34,10 @@ class UnscentedKalman(basics.WorldPointFilter):
         belief = state.problem.belief
         points, wm, wc = sigma_points(state.x, state.P, np.arange(3), self.points or belief.sigma_points)
         moved = points.copy()
-        moved[:, :3] = [self.robot.move(p[:3], control) for p in points]
+        moved[:, :3] = [basics.move(p[:3], control) for p in points]
         x = wm @ moved
         P = (moved - x).T @ (wc[:, None] * (moved - x))
-        _, G = self.robot.jacobians(state.x[:3], control)
+        _, G = basics.motion_jacobians(state.x[:3], control)
         P[:3, :3] += basics.process_noise(G, belief)
         return replace(state, x=x, P=P)
 
@@ -50,7 +50,7 @@ class UnscentedKalman(basics.WorldPointFilter):
         Z = sensor.measure(points[:, None, :3], points[:, at])
         Z = (Z[0] + sensor.less(Z, Z[0])).reshape(len(points), -1)
         zhat = wm @ Z
-        S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + basics.block_diagonal(R)
+        S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + block_diag(*R)
         W = np.linalg.solve(S, (Z - zhat).T @ (wc[:, None] * (points - state.x))).T
         innovation = basics.innovation_of(state, z, zhat, self.uvd)
         x, P = state.x + W @ innovation, state.P - W @ S @ W.T

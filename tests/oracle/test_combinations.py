@@ -33,7 +33,7 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.kernel.work_arrays import make_work
 from consistency.bench.filters.motion.unicycle import Unicycle
-from consistency.bench.filters.point.truth import AtTruth
+from consistency.bench.filters.point.at_known import AtTruth
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState

@@ -7,10 +7,7 @@ from typing import NamedTuple
 
 from consistency.bench.filters.landmark.world_point import PlanarPoint, WorldPoint
 from consistency.bench.filters.motion.unicycle import Unicycle
-from consistency.bench.filters.sensor.range_bearing import RangeBearing
-from consistency.bench.filters.sensor.relative_xy import RelativeXy
-from consistency.bench.filters.sensor.uvd import Uvd
-from consistency.bench.filters.sensor.xyz import Xyz
+from consistency.bench.filters.sensor.models import RangeBearing, RelativeXy, Uvd, Xyz
 from consistency.bench.models.point import Mounting
 from consistency.bench.scenario import Belief
 

@@ -79,7 +79,7 @@ class Compiled:
 
     local_from = LOCAL_FROM
 
-    def __init__(self, textbook: Any, parts: Callable[[Problem, Array, bool], Slam], sensors: tuple[str, ...]) -> None:
+    def __init__(self, textbook: Any, parts: Callable[..., Slam], sensors: tuple[str, ...]) -> None:
         self.textbook, self.sensors, self.uvd = textbook, sensors, textbook.uvd
         self.parts: Callable[[Problem, Array], Slam] = partial(parts, uvd=self.uvd)
         self.innovations: str | None = getattr(textbook, "innovations", None)
@@ -197,7 +197,7 @@ def guarded(filter_: Filter, kind: str) -> Any:
 def variants(
     textbook: Callable[..., Any],
     method: str,
-    parts: Callable[[Problem, Array, bool], Slam],
+    parts: Callable[..., Slam],
     suffixes: str = "xyz uvd xy rb",
 ) -> tuple[Compiled, ...]:
     """A method on points (``METHOD-xyz``) and pixels (``METHOD-uvd``), relative positions (``METHOD-xy``), range and bearing.

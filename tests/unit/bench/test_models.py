@@ -19,7 +19,7 @@ from consistency.bench.filters.kernel.work_arrays import make_work
 from consistency.bench.filters.landmark.world_point import WorldPoint
 from consistency.bench.filters.motion import unicycle
 from consistency.bench.filters.point.at_estimate import AtEstimate
-from consistency.bench.filters.point.reference import Reference, place_about_reference
+from consistency.bench.filters.point.at_known import Reference, place_about_reference
 from consistency.bench.filters.textbook.basics import Unicycle
 from consistency.bench.filters.textbook.sensors import PointSensor
 from consistency.bench.filters.update.joint_update import Joint

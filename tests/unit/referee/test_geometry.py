@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
-from consistency.bench.filters.error.planar import exponential, shifted_covariance
+from consistency.bench.filters.error.invariant_pose import exponential, shifted_covariance
 from consistency.bench.filters.kernel.part_functions import Frame, world_point
 from consistency.bench.filters.landmark.sensor_point import SensorPoint
 from consistency.bench.models.point import Mounting

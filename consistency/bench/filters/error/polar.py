@@ -11,8 +11,7 @@ import numpy as np
 
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.error.invariant_pose import move_pose
-from consistency.bench.filters.error.planar import shifted_covariance
+from consistency.bench.filters.error.invariant_pose import move_pose, shifted_covariance
 from consistency.bench.filters.kernel.arrays import fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
 from consistency.bench.filters.kernel.covariance import add_gram_to_state, move_block

@@ -244,7 +244,7 @@ def expands(point: NamedTuple) -> bool:
 @generic(default=True)
 def stands_apart(point: NamedTuple) -> bool:
     """Whether only the Jacobians are taken at the point, f and h at the estimate; a constant."""
-    return False
+    return not expands(point)
 
 
 @generic(default=True)

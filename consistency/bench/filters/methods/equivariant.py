@@ -29,7 +29,7 @@ from consistency.bench.filters.kernel.part_functions import (
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.landmark.sensor_point import SensorPoint, sight
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.sensor.uvd import Uvd
+from consistency.bench.filters.sensor.models import Uvd
 from consistency.bench.filters.textbook.equivariant import EquivariantKalman
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array

@@ -7,7 +7,7 @@ import numpy as np
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.kernel.part_functions import Slam, landmark_width
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.point.truth import AtTruth
+from consistency.bench.filters.point.at_known import AtTruth
 from consistency.bench.filters.textbook.ideal import IdealKalman, truth_of
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array

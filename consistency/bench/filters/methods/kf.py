@@ -7,7 +7,7 @@ import numpy as np
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.point.reference import Reference
+from consistency.bench.filters.point.at_known import Reference
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.kf import LinearKalman
 from consistency.bench.models.motion import dead_reckoning

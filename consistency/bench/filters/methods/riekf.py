@@ -7,7 +7,7 @@ from typing import NamedTuple
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.error.planar import exponential, shifted_covariance
+from consistency.bench.filters.error.invariant_pose import exponential, shifted_covariance
 from consistency.bench.filters.kernel.arrays import fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
 from consistency.bench.filters.kernel.covariance import add_gram_to_state

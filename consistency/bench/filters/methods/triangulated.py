@@ -27,11 +27,11 @@ from consistency.bench.filters.kernel.part_functions import (
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.sensor.growth import Growth, growth_of, ratio_at
-from consistency.bench.filters.sensor.xyz import (
+from consistency.bench.filters.sensor.models import (
     locate_xyz_jacobian,
     measure_xyz,
     measure_xyz_jacobian,
-    xyz_width,
+    three_values,
 )
 from consistency.bench.filters.textbook.triangulated import TriangulatedKalman
 from consistency.bench.models import stereo
@@ -53,7 +53,7 @@ class DebiasedXyz(NamedTuple):
     mount: Mounting
 
 
-implement(observed_width, DebiasedXyz)(xyz_width)
+implement(observed_width, DebiasedXyz)(three_values)
 implement(measure, DebiasedXyz)(measure_xyz)
 implement(measure_jacobian, DebiasedXyz)(measure_xyz_jacobian)
 implement(locate_jacobian, DebiasedXyz)(locate_xyz_jacobian)  # the bias is taken as known

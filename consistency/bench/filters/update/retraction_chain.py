@@ -12,8 +12,7 @@ import numpy as np
 
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.covariance_update.parking import Clones
-from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
-from consistency.bench.filters.error.planar import exponential
+from consistency.bench.filters.error.invariant_pose import exponential, left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
 from consistency.bench.filters.kernel.covariance import replace_rows
 from consistency.bench.filters.kernel.part_functions import State, Triple

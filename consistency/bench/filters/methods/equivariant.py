@@ -7,7 +7,7 @@ from typing import NamedTuple
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.error.polar import Polar
+from consistency.bench.filters.error.polar import Polar, SensorPoint, sight
 from consistency.bench.filters.kernel.gain import (
     add_noise,
     combine_seen,
@@ -27,7 +27,6 @@ from consistency.bench.filters.kernel.part_functions import (
     predict_innovation,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
-from consistency.bench.filters.landmark.sensor_point import SensorPoint, sight
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.sensor.models import Uvd
 from consistency.bench.filters.textbook.equivariant import EquivariantKalman

@@ -1,20 +1,26 @@
-"""UKF-SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.ukf`."""
+"""UKF-SLAM and cubature SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.ukf`."""
 
 from __future__ import annotations
+
+from functools import partial
 
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.textbook.ukf import UnscentedKalman
+from consistency.bench.filters.textbook.ukf import CUBATURE, UnscentedKalman
 from consistency.bench.filters.update.unscented import Unscented
 from consistency.bench.protocols import Problem
+from consistency.bench.scenario import SigmaPoints
 from consistency.referee.types import Array
 
 
-def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Those of the EKF, and the update."""
-    points = problem.belief.sigma_points
+def parts(problem: Problem, controls: Array, uvd: bool, points: SigmaPoints | None = None) -> Slam:
+    """Those of the EKF, and the update, with ``points`` or those of the belief."""
+    points = points or problem.belief.sigma_points
     return ekf.parts(problem, controls, uvd)._replace(update=Unscented(points.alpha, points.beta, points.kappa))
 
 
 XYZ, UVD, XY, RB = variants(UnscentedKalman, "ukf", parts)
+CKF_XYZ, CKF_UVD = variants(
+    partial(UnscentedKalman, points=CUBATURE), "ckf", partial(parts, points=CUBATURE), "xyz uvd"
+)

@@ -1,4 +1,11 @@
-"""UKF-SLAM, Herath et al. (2007) sec. 4.5; sigma points after Julier & Uhlmann (2004)."""
+"""UKF-SLAM, Herath et al. (2007) sec. 4.5; sigma points after Julier & Uhlmann (2004).
+
+Cubature SLAM, Arasaratnam & Haykin (2009), is the unscented filter with its points fixed to the cubature rule.
+The third-degree spherical-radial rule has 2 L points at +-sqrt(L) columns of a root of P, with weights 1 / (2 L) and no
+centre. Sigma points with alpha = 1, beta = kappa = 0 are these, and are the default of a belief: then ``ckf`` and
+``ukf`` are one filter. ``ckf`` has them whatever the belief says of sigma points. L counts the variables that f or h
+reads, a rule over the whole state would have a spread that grows with the map.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +21,8 @@ from consistency.bench.filters.textbook.sensors import view
 from consistency.bench.scenario import SigmaPoints
 from consistency.bench.types import Control, Info
 from consistency.referee.types import Array
+
+CUBATURE = SigmaPoints(alpha=1.0, beta=0.0, kappa=0.0)
 
 
 class UnscentedKalman(ExtendedKalman):

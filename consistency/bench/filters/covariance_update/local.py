@@ -109,7 +109,6 @@ def append_factors(
 
 @implement(settle, Local)
 def settle_active(covariance: Local, slam: Slam, whole: State, state: State, local: Factors) -> None:
-    """``whole`` <- what the active part and the factors say, if there is an active part."""
     if state.base > 0:
         join(slam, whole, state.n, state.base, local)
 

@@ -44,11 +44,9 @@ def propagate_additive(
 
 @implement(retract, Additive)
 def retract_additive(error: Additive, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]) -> None:
-    """x (n,) <- x + A' y, with A (k, n) and y (k,)."""
     add_transposed_times(A, y, state.x[: state.n])
 
 
 @implement(pose_covariance, Additive)
 def additive_pose_covariance(error: Additive, x: Array, P: Array, out: Array) -> None:
-    """``out`` (3, 3) <- P (3, 3), which is already that of the additive error."""
     copy_matrix(P, out)

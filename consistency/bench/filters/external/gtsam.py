@@ -9,7 +9,6 @@ gtsam's smoothers change in place: a state is good for one step forward, and no 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -107,8 +106,8 @@ class SmootherState:
         return {label: self.world.point(label, self.marginal(landmark_key(label))) for label in self.world.origins}
 
 
-class _Stepwise(ABC):
-    """A smoother judged like a filter: in each step the last pose, by the data up to that step."""
+class Incremental:
+    """Maximum a posteriori of all data so far, by iSAM2, judged like a filter: in each step the last pose."""
 
     sensors = ("uvd",)
     innovates = False  # so that no guard can judge what it is given
@@ -139,25 +138,15 @@ class _Stepwise(ABC):
         with _solving():
             return state.map()
 
-    @abstractmethod
-    def _engine(self) -> Any: ...
-
-    @abstractmethod
-    def _solve(self, state: SmootherState) -> None:
-        """Give the smoother what is new, and iterate once."""
-
-
-class Incremental(_Stepwise):
-    """Maximum a posteriori of all data so far, by iSAM2."""
-
     def _engine(self) -> Any:
         return gtsam.ISAM2(_isam(MOVED))
 
     def _solve(self, state: SmootherState) -> None:
+        """Give the smoother what is new, and iterate once."""
         state.engine.update(state.factors, state.values)
 
 
-class FixedLag(_Stepwise):
+class FixedLag(Incremental):
     """Of the poses only the last ``lag`` steps are kept, the landmarks all: older poses are marginalised for good."""
 
     def __init__(self, name: str, lag: int, world: World = PlanarStereo) -> None:

@@ -52,7 +52,6 @@ def guard_part(kind: str, settings: GuardSettings, s: int, m: int) -> Guard:
 
 @implement(make_watch, Guard)
 def watch_tracks(guard: Guard, s: int, m: int, rows: int, n_landmarks: int) -> Watch:
-    """Nothing rejected, nothing seen."""
     return Watch(
         np.zeros(rows, np.bool_),
         np.zeros(n_landmarks, np.int64),
@@ -166,5 +165,4 @@ def enters_unless_rejected(guard: Guard, row: int, is_known: bool, watch: Watch)
 
 @implement(rejected_rows, Guard)
 def rejected_of(guard: Guard, watch: Watch) -> Array:
-    """The rows that were rejected, (M,)."""
     return watch.rejected.copy()

@@ -7,9 +7,10 @@ writes P does it here, but for the block and the rows of the robot, which are wh
 from __future__ import annotations
 
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import copy_matrix
+from consistency.bench.filters.kernel.arrays import copy, copy_matrix
 from consistency.bench.filters.kernel.blas import add_gram, upper_cholesky
 from consistency.bench.filters.kernel.linalg import DEFICIENT
+from consistency.bench.filters.kernel.part_functions import State
 from consistency.referee.types import Array, Indices
 
 
@@ -33,6 +34,15 @@ def gather_rows(P: Array, n: int, w: int, at: Indices, m: int, rows: Array) -> N
                 rows[first + a, j] = P[o + a, j]
             for b in range(a):
                 rows[first + a, o + b] = rows[first + b, o + a]
+
+
+@inner
+def gather_all_rows(state: State, Phi: Array, w: int, at: Indices, m: int, rows: Array) -> None:
+    """:func:`gather_rows`, with those of Phi, which are treated alike, in columns n..n + base - 1."""
+    n, base = state.n, state.base
+    gather_rows(state.P, n, w, at, m, rows)
+    for i in range(3 + w * m if base > 0 else 0):
+        copy(Phi[state_index(w, i, at), :base], rows[i, n : n + base])
 
 
 @inner

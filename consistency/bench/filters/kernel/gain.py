@@ -14,7 +14,7 @@ from consistency.bench.filters.kernel.blas import (
     add_transposed_times,
     solve_transposed,
 )
-from consistency.bench.filters.kernel.covariance import add_gram_to_state, definite_root, gather_rows
+from consistency.bench.filters.kernel.covariance import add_gram_to_state, definite_root, gather_all_rows
 from consistency.bench.filters.kernel.observation_model import linearise
 from consistency.bench.filters.kernel.part_functions import (
     Data,
@@ -42,17 +42,8 @@ REASONS = {
 
 @inner
 def gather(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
-    """``work.rows`` (3 + w m, n) <- rows of P of the robot and of the ``m`` seen landmarks.
-
-    The rows of Phi, which are treated alike, follow them in columns n..n + base - 1.
-    """
-    w, n, base = landmark_width(slam.landmark), state.n, state.base
-    gather_rows(state.P, n, w, work.at, m, work.rows)
-    if base > 0:
-        copy_matrix(local.Phi[:3, :base], work.rows[:3, n : n + base])
-        for i in range(m):
-            first, o = 3 + w * i, work.at[i]
-            copy_matrix(local.Phi[o : o + w, :base], work.rows[first : first + w, n : n + base])
+    """``work.rows`` (3 + w m, n + base) <- rows of P and of Phi of the robot and of the ``m`` seen landmarks."""
+    gather_all_rows(state, local.Phi, landmark_width(slam.landmark), work.at, m, work.rows)
 
 
 @inner

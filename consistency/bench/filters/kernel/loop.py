@@ -207,13 +207,6 @@ class Memory(NamedTuple):
 
 
 @inner
-def _make_memory(size: int, n_landmarks: int) -> Memory:
-    return Memory(
-        filled(size, 0.0), filled_matrix(size, size, 0.0), integers(n_landmarks, -1), integers(n_landmarks, -1)
-    )
-
-
-@inner
 def _empty_outcome(T: int, n_landmarks: int) -> Outcome:
     """Outcome of T steps, NaN everywhere."""
     return Outcome(
@@ -258,14 +251,6 @@ def _settle_new(labels: Indices, n: int, w: int, state: State, home: Indices) ->
     return n
 
 
-@inner
-def _forget_pose(k: int, out: Outcome) -> None:
-    """NaN in the rows of step k + 1."""
-    fill(out.pose[k], np.nan)
-    fill_matrix(out.covariance[k], np.nan)
-    fill_matrix(out.own[k], np.nan)
-
-
 def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     """Filter a whole trial whose state grows to at most ``size`` variables.
 
@@ -275,12 +260,11 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     slam, data = by_reference(own_slam), by_reference(own_data)
     T, w = len(data.controls), landmark_width(slam.landmark)
     size += spare_width(slam.covariance, T, data.n_landmarks)
-    own_memory, own_out = _make_memory(size, data.n_landmarks), _empty_outcome(T, data.n_landmarks)
-    own_work = make_work(slam, size, _most_seen(data.first), T, data.n_landmarks)
-    own_local = make_local(slam.covariance, w, size, T, data.n_landmarks)
-    own_watch = make_watch(
-        slam.guard, observed_width(slam.sensor), _most_seen(data.first), len(data.landmark), data.n_landmarks
-    )
+    labels, most = data.n_landmarks, _most_seen(data.first)
+    own_memory = Memory(filled(size, 0.0), filled_matrix(size, size, 0.0), integers(labels, -1), integers(labels, -1))
+    own_out, own_work = _empty_outcome(T, labels), make_work(slam, size, most, T, labels)
+    own_local = make_local(slam.covariance, w, size, T, labels)
+    own_watch = make_watch(slam.guard, observed_width(slam.sensor), most, len(data.landmark), labels)
     memory, work, local, out = (
         by_reference(own_memory),
         by_reference(own_work),
@@ -296,8 +280,8 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
         if data.halt[0] != 0:
             step, code = k + 1, HALTED
             break
-        labels = data.landmark[data.first[k] : data.first[k + 1]]
-        whole, state = prepare(slam.covariance, slam, whole, state, labels, local)
+        seen = data.landmark[data.first[k] : data.first[k + 1]]
+        whole, state = prepare(slam.covariance, slam, whole, state, seen, local)
         state, code, m, nis, log_det = _step(slam, state, data, k, local, work, watch)
         if m > 0:
             out.nis[k], out.nis_dof[k], out.log_det[k] = nis, observed_width(slam.sensor) * m, log_det
@@ -305,12 +289,14 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
             rank = _keep_pose(slam, state, k, out, work)
             if rank < 0 or (full_rank and rank == 0):
                 code = POSE
-                _forget_pose(k, out)
+                fill(out.pose[k], np.nan)
+                fill_matrix(out.covariance[k], np.nan)
+                fill_matrix(out.own[k], np.nan)
             full_rank = full_rank or rank == 1
         if code > 0:
             step = k + 1
             break
-        whole = State(memory.x, memory.P, _settle_new(labels, whole.n, w, state, memory.home), 0, memory.home)
+        whole = State(memory.x, memory.P, _settle_new(seen, whole.n, w, state, memory.home), 0, memory.home)
     if code == 0:
         settle(slam.covariance, slam, whole, state, local)
         joint = _map(slam.motion, slam.landmark, slam.error, slam.covariance, whole, local, out.points, out.spread)

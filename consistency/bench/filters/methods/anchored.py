@@ -45,7 +45,6 @@ def _ray(values: Array) -> Triple:
 
 @implement(to_body, AnchoredInverseDepth)
 def to_body_of_anchored(landmark: AnchoredInverseDepth, frame: Frame, values: Array) -> Triple:
-    """The end of the ray in the frame of the robot, in m."""
     mx, my, mz = _ray(values)
     x, y, z = values[0] + mx / values[5], values[1] + my / values[5], values[2] + mz / values[5]
     return turned_to_robot(frame.x, frame.y, frame.c, frame.s, x, y, z)
@@ -110,7 +109,6 @@ def insert_anchored(
 def anchored_world_point(
     landmark: AnchoredInverseDepth, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array
 ) -> None:
-    """point (3,) <- anchor + ray / inverse depth, m; Dp (3, r) <- 0, Dl (3, 6) <- its Jacobian."""
     m = _ray(values)
     for a in range(3):
         point[a] = values[a] + m[a] / values[5]

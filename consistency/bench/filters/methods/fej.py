@@ -48,7 +48,6 @@ class FirstEstimates(NamedTuple):
 
 @implement(make_notes, FirstEstimate)
 def note_first_estimates(point: FirstEstimate, w: int, steps: int, labels: int) -> FirstEstimates:
-    """Room for the predictions of all steps and the first estimate of each landmark."""
     return FirstEstimates(matrix(steps + 1, 3), matrix(labels, w))
 
 
@@ -66,7 +65,6 @@ def propagate_covariance_between_first_estimates(
 
 @implement(landmark_point, FirstEstimate)
 def landmark_at_first_estimate(point: FirstEstimate, values: Array, label: int, work: Work[NamedTuple]) -> Array:
-    """The first estimate (w,) of landmark ``label``."""
     first: Array = work.notes.landmarks[label]
     return first
 

@@ -40,7 +40,6 @@ class IteratedPoints(NamedTuple):
 
 @implement(make_room, IteratedPoints)
 def iterated_points_room(update: IteratedPoints, w: int, s: int, m: int, n: int) -> NamedTuple:
-    """Arrays of sigma points, as for one pass."""
     return make_room(update.points, w, s, m, n)
 
 

@@ -70,7 +70,6 @@ class UnobservedTurn(NamedTuple):
 
 @implement(make_notes, ObservabilityConstrained)
 def note_unobserved_turn(point: ObservabilityConstrained, w: int, steps: int, labels: int) -> UnobservedTurn:
-    """Room for the direction in all steps and of all landmarks."""
     path, landmarks = matrix(steps + 1, 2), matrix(labels, 2)
     return UnobservedTurn(path, landmarks, integers(labels, 0), filled(2, 0.0), vector(w))
 

@@ -60,7 +60,6 @@ def to_right(error: RightInvariant, pose: Array, values: Array, Hp: Array, Hl: A
 
 @implement(insert_error, RightInvariant)
 def insert_right(error: RightInvariant, pose: Array, values: Array, Jp: Array) -> None:
-    """Jp (w, 3) <- Jacobian between the errors of the robot and of a new landmark."""
     for a in range(len(Jp)):
         Jp[a, 2] += pose[0] * Jp[a, 1] - pose[1] * Jp[a, 0]
     Jp[0, 2] += values[1]

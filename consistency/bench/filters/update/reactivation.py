@@ -10,7 +10,7 @@ from consistency.bench.filters.covariance_update.parking import Clones, is_in_do
 from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
-from consistency.bench.filters.kernel.covariance import add_gram_to_state, gather_rows, replace_rows, state_index
+from consistency.bench.filters.kernel.covariance import add_gram_to_state, gather_all_rows, replace_rows, state_index
 from consistency.bench.filters.kernel.gain import apply_beyond, divide_by_root
 from consistency.bench.filters.kernel.part_functions import Data, Slam, State, correct, predict_innovation
 from consistency.bench.filters.kernel.work_arrays import Work
@@ -22,7 +22,6 @@ from consistency.bench.filters.update.retraction_chain import (
     aim_apart,
     aim_chained,
     cast_columns,
-    cast_rows,
     cast_state,
     move_chain,
     unchain,
@@ -139,7 +138,7 @@ def _gather(state: State, m: int, is_chained: bool, local: Clones, work: Work[Co
     They are those of parked landmarks that are seen, or in a chain all of them in the order of time. There the robot
     hangs on the first with a landmark that was in doubt in the last step, too, or on the last of all.
     """
-    n, base, room, Phi = state.n, state.base, work.room, local.factors.Phi
+    room = work.room
     clones = _list_all(local, room.number) if is_chained else _list_seen(m, local, work)
     for i in range(m):
         room.at[i], room.clone[i] = work.at[i], -1
@@ -151,11 +150,7 @@ def _gather(state: State, m: int, is_chained: bool, local: Clones, work: Work[Co
         room.at[m + c] = local.here[room.number[c]]
         if local.doubted[room.number[c]] == 2:
             room.on[0] = c
-    count = m + clones
-    gather_rows(state.P, n, 3, room.at, count, room.rows)
-    if base > 0:
-        for i in range(3 + 3 * count):
-            copy(Phi[state_index(3, i, room.at), :base], room.rows[i, n : n + base])
+    gather_all_rows(state, local.factors.Phi, 3, room.at, m + clones, room.rows)
     return clones
 
 
@@ -219,8 +214,8 @@ def _iterate(
         copy_matrix(among, cast)
         if is_chained:
             aim_chained(state, m, clones, local, room)
-            cast_rows(cast, size, m, clones, room)
-            cast_columns(cast, room.place, m, clones, room)
+            cast_columns(cast.T, size, room.place, m, clones, room)
+            cast_columns(cast, size, room.place, m, clones, room)
         else:
             aim_apart(state, m, clones, update.recency, local, room)
         _expect(update, slam, state, data, i == 0, m, clones, local, work)
@@ -413,9 +408,7 @@ def _reactivate(slam: Slam, state: State, label: int, local: Clones, work: Work[
     left_jacobian(x[q : q + 3], D)
     _times(1.0, shift, D, turned)
     room.at[0], room.at[1] = o, q
-    gather_rows(P, n, 3, room.at, 2, room.rows)
-    for i in range(9 if base > 0 else 0):
-        copy(Phi[state_index(3, i, room.at), :base], room.rows[i, n : n + base])
+    gather_all_rows(state, Phi, 3, room.at, 2, room.rows)
     rows, out = room.rows, work.rows
     for i in range(n + base):
         for a in range(3):

@@ -29,7 +29,7 @@ FOREIGN = sys.stdlib_module_names | set(VERSIONED)  # covered by their versions
 # decide how code is made
 COMPILING = (
     "../kernel/blas.py",
-    *(f"{name}.py" for name in ("content_key", "dispatch", "type_inference", "jit", "by_reference", "whole_program")),
+    *(f"{name}.py" for name in ("content_key", "dispatch", "jit", "by_reference", "whole_program")),
 )
 SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "LLVM_REFPRUNE_PASS", "LLVM_REFPRUNE_FLAGS", "BOUNDSCHECK",
             "DEBUGINFO_DEFAULT", "ENABLE_AVX", "USING_SVML")  # fmt: skip

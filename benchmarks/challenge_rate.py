@@ -40,7 +40,7 @@ class DeadReckoning(Compiled):
     def __init__(self) -> None:
         ekf = cs.get_filter("ekf-uvd")  # whose memory is more than enough
         assert isinstance(ekf, Compiled)
-        super().__init__(ekf.textbook, ekf.parts, sensors=ekf.sensors, uvd=True)
+        super().__init__(ekf.textbook, ekf.parts, ekf.sensors)
         self.name = "dead-reckoning"
 
     def is_ready(self, trial: Any, belief: Any) -> bool:

@@ -200,13 +200,13 @@ class LinearWorld:
     def moved(self, pose: Array, control: Control) -> Array:
         step = len(self.reference)
         at = self.reference.setdefault(0, self.problem.start) if step == 0 else self.reference[step - 1]
-        self.reference[max(step, 1)] = basics.Unicycle().move(at, control)
-        F, _ = basics.Unicycle().jacobians(at, control)
+        self.reference[max(step, 1)] = basics.move(at, control)
+        F, _ = basics.motion_jacobians(at, control)
         return self.reference[max(step, 1)] + F @ (pose - at)
 
     def motion(self, step: int, control: Control) -> Any:
         at, belief = self.reference[step - 1], self.problem.belief.motion
-        F, _ = basics.Unicycle().jacobians(at, control)
+        F, _ = basics.motion_jacobians(at, control)
         turn, ahead = heading_matrix(at[2]).T, self.reference[step]
         sigmas = control.dt * np.array([belief.sigma_v, 1e-7 * belief.sigma_v, belief.sigma_omega])
 

@@ -15,12 +15,12 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.filters.compiled import Compiled, problem_of
 from consistency.bench.filters.compiler.jit import Kernel
-from consistency.bench.filters.guard import joint_compatibility, plain_rules
-from consistency.bench.filters.guard.guard_part import guard_part
+from consistency.bench.filters.guard import kernel_rules, plain_rules
+from consistency.bench.filters.guard.guard_part import guard_part, keep_agreeing
 from consistency.bench.filters.guard.plain_rules import kept
 from consistency.bench.filters.guard.settings import KINDS, limits_of
 from consistency.bench.filters.kernel import loop
-from consistency.bench.filters.kernel.part_functions import keep_some, make_watch
+from consistency.bench.filters.kernel.part_functions import make_watch
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Estimates, Observation
@@ -93,7 +93,7 @@ ORACLES = {"gate": by_gate, "joint": by_subsets, "ransac": by_updates}
 def by_kernel(kind: str, step: Step) -> Array:
     guard = guard_part(kind, SETTINGS, step.s, step.m)
     watch: Any = make_watch(guard, step.s, step.m, step.m, step.m)
-    assert keep_some(guard, step.s, step.m, step.y, np.triu(step.S), watch)  # the upper half alone
+    assert keep_agreeing(guard, step.s, step.m, step.y, np.triu(step.S), watch)  # the upper half alone
     return np.array(watch.kept)
 
 
@@ -120,7 +120,7 @@ def test_kinds_differ(rng: np.random.Generator) -> None:
 def test_a_search_that_is_cut_short_is_so_at_the_same_node(
     nodes: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (plain_rules, joint_compatibility):
+    for module in (plain_rules, kernel_rules):
         monkeypatch.setattr(module, "MOST_NODES", nodes)
     for _ in range(40):
         step = Step(rng, 6, 3)
@@ -143,7 +143,7 @@ def test_a_covariance_that_is_not_definite_ends_the_run(rng: np.random.Generator
     step.S[2, 2] = -1.0
     guard = guard_part("gate", SETTINGS, 3, 2)
     watch: Any = make_watch(guard, 3, 2, 2, 2)
-    assert not keep_some(guard, 3, 2, step.y, step.S, watch)
+    assert not keep_agreeing(guard, 3, 2, step.y, step.S, watch)
     with pytest.raises(np.linalg.LinAlgError):
         kept("gate", step.y, step.S, 3, limits_of(SETTINGS, 3, 2))
 

@@ -24,7 +24,7 @@ from consistency.bench.filters.textbook import inverse_range, robocentric_state
 from consistency.bench.filters.textbook import robocentric as textbook
 from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.filters.update.converting import Converting, converting_room
-from consistency.bench.filters.update.retraction_chain import aim_chained, cast_columns, cast_rows, unchain
+from consistency.bench.filters.update.retraction_chain import aim_chained, cast_columns, unchain
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.types import Control
 from consistency.referee.types import Array
@@ -303,8 +303,8 @@ def test_the_chain_of_the_kernel_is_that_of_its_twin(rng: np.random.Generator, o
     P = rng.normal(size=(size, size))
     P, cast, whole = P @ P.T, P @ P.T, np.eye(size)
     whole[np.ix_(places.ravel(), places.ravel())] = C
-    cast_rows(cast, size, m, clones, room)
-    cast_columns(cast, room.place, m, clones, room)
+    cast_columns(cast.T, size, room.place, m, clones, room)
+    cast_columns(cast, size, room.place, m, clones, room)
     assert close(cast, whole @ P @ whole.T, 1e-11)
     unchain(room.delta, m, clones, room)
     assert close(room.delta[places], before[places], 1e-13)

@@ -12,8 +12,7 @@ import pytest
 import consistency as cs
 from consistency.bench.filters.kernel.loop import trial_kernel
 from consistency.bench.filters.stepping import step_through
-from consistency.bench.filters.textbook.ckf import CUBATURE
-from consistency.bench.filters.textbook.ukf import sigma_points
+from consistency.bench.filters.textbook.ukf import CUBATURE, sigma_points
 from consistency.bench.scenario import Belief
 from consistency.bench.simulation import planned_path
 from consistency.bench.types import Estimates, Trial

@@ -65,16 +65,16 @@ class Compiled:
 
     Parameters
     ----------
-    textbook : the filter in plain NumPy, with ``name`` and ``uvd``: whether it works on (u, v, d); if not, such data are
-        turned into points by eq. 21
+    textbook : the filter in plain NumPy, with ``name`` and ``uvd``: whether it works on (u, v, d); if not, such data
+        are turned into points by eq. 21
     parts : gives the parts of the filter for a problem, the controls (T, 3) of a trial, and ``uvd``
     sensors : models of sensors whose data it takes
 
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
     allow it; the numbers are the same. What else ``textbook`` declares is declared of this: ``innovations`` and
     ``realisable`` (:class:`consistency.bench.protocols.Filter`), ``error``
-    (:mod:`consistency.referee.geometry.conventions`), and ``needs``, the keys of ``belief.sensor`` that it cannot do without
-    and others can.
+    (:mod:`consistency.referee.geometry.conventions`), and ``needs``, the keys of ``belief.sensor`` that it cannot do
+    without and others can.
     """
 
     local_from = LOCAL_FROM
@@ -200,7 +200,7 @@ def variants(
     parts: Callable[..., Slam],
     suffixes: str = "xyz uvd xy rb",
 ) -> tuple[Compiled, ...]:
-    """A method on points (``METHOD-xyz``) and pixels (``METHOD-uvd``), relative positions (``METHOD-xy``), range and bearing.
+    """A method on points (``METHOD-xyz``), pixels (``-uvd``), relative positions (``-xy``), and by bearings (``-rb``).
 
     ``textbook`` makes the plain filter of a name and ``uvd``.
     """

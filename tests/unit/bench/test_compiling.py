@@ -19,7 +19,7 @@ from consistency.bench.filters.compiler import compile_time, disk_cache
 from consistency.bench.filters.compiler.compile_time import FIRST
 from consistency.bench.filters.compiler.content_key import Content
 from consistency.bench.filters.compiler.jit import Kernel, Outlook
-from consistency.bench.filters.kernel.part_functions import robot_width
+from consistency.bench.filters.kernel.part_functions import landmark_width
 from consistency.bench.runs import compiling
 from consistency.bench.runs.findings import experiments
 from consistency.bench.runs.montecarlo import resolve_filters
@@ -240,7 +240,7 @@ def test_the_size_is_that_of_all_functions() -> None:
 
 
 def of_a_part(part: Any) -> int:
-    return robot_width(part)
+    return landmark_width(part)
 
 
 def test_what_only_chooses_a_body_has_no_size() -> None:

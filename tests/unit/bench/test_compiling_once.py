@@ -17,7 +17,7 @@ from numba.core.types import functions
 
 import consistency as cs
 from consistency.bench.filters.compiler import jit
-from consistency.bench.filters.compiler.type_inference import remembered_types
+from consistency.bench.filters.compiler.whole_program import remembered_types
 from consistency.bench.filters.kernel import arrays
 from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.runs.trial_work import Simulated, TrialWork
@@ -54,7 +54,7 @@ def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> Counts:
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Counts:
     """Calls whose type Numba has looked for."""
-    monkeypatch.setattr("consistency.bench.filters.compiler.type_inference._known", {})
+    monkeypatch.setattr("consistency.bench.filters.compiler.whole_program._known", {})
     return counted(monkeypatch, functions.BaseFunction, "get_call_type")
 
 

@@ -12,9 +12,8 @@ import consistency as cs
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.covariance_update.local import Local as Locally
 from consistency.bench.filters.covariance_update.parking import Parking
-from consistency.bench.filters.kernel.local_state import make_factors
 from consistency.bench.filters.kernel.loop import _make_memory
-from consistency.bench.filters.kernel.part_functions import Data, Slam, make_local
+from consistency.bench.filters.kernel.part_functions import Data, Slam, make_factors, make_local
 from consistency.bench.runs import memory_needed as module
 from consistency.bench.runs import memory_touched as touched
 from consistency.bench.runs.backends.local import LocalThreads
@@ -187,16 +186,16 @@ def test_a_local_base_grows_until_it_is_due(parts: Slam) -> None:
     slam = parts._replace(covariance=Locally(60))
     every = list(range(40))
     data = seen([every, [0, 1], [2, 1], [2, 3], [3, 40]])
-    local = touched._tally(slam, 3, 3, 126)
-    assert len(local.x) == len(make_local(slam.covariance, 3, 3, 126, 5, 41).x)
-    reach = touched._reach(slam, data, 3, 3, 126, local)
+    local = touched._tally(slam, 3, 126)
+    assert len(local.x) == len(make_local(slam.covariance, 3, 126, 5, 41).x)
+    reach = touched._reach(slam, data, 3, 126, local)
     assert (reach.base, reach.active) == (15, 15), "the robot and four landmarks; what is new is active after the step"
     assert reach.width == 30
     a, b = reach.active, reach.base
     numbers = touched.half(6) + 2 * 9 * 30 + a * a + a * b + touched.half(b) + (a + b) * 126
     assert touched.touched(slam, data, 126, 0) == 8 * numbers
     dense = seen([every, every, every])
-    assert touched._reach(slam, dense, 3, 3, 123, touched._tally(slam, 3, 3, 123)).base == 0
+    assert touched._reach(slam, dense, 3, 123, touched._tally(slam, 3, 123)).base == 0
 
 
 def test_parked_landmarks_are_left_alone() -> None:

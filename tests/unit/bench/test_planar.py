@@ -12,7 +12,6 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters import PLANAR
-from consistency.bench.filters.belief_parts import sensor_of
 from consistency.bench.filters.kernel.part_functions import (
     locate,
     locate_jacobian,
@@ -20,6 +19,7 @@ from consistency.bench.filters.kernel.part_functions import (
     measure_jacobian,
     wrap_residual,
 )
+from consistency.bench.filters.methods.ekf import sensor_of
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.models import planar
 from consistency.bench.runs.findings import sibling

@@ -13,7 +13,7 @@ import pytest
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.filters.textbook.basics import Unicycle
+from consistency.bench.filters.textbook.basics import motion_jacobians
 from consistency.bench.filters.textbook.sensors import PointSensor
 from consistency.bench.simulation import draw_landmarks, planned_controls, planned_path, require_landmarks_in_view
 from consistency.bench.types import Control, Trial
@@ -286,7 +286,7 @@ def test_linear_world_moves_by_the_jacobians_at_the_plan(linear: cs.Scenario) ->
     trial, reference = cs.simulate(linear), planned_path(linear.truth)
     deviation, noises = trial.truth - reference, []
     for k in range(trial.steps):
-        F, G = Unicycle().jacobians(reference[k], Control(*planned_controls(linear.truth)[k]))
+        F, G = motion_jacobians(reference[k], Control(*planned_controls(linear.truth)[k]))
         noise, _, _, _ = np.linalg.lstsq(G, deviation[k + 1] - F @ deviation[k], rcond=None)
         assert np.allclose(G @ noise, deviation[k + 1] - F @ deviation[k], rtol=0, atol=1e-12)
         noises.append(noise)

@@ -110,7 +110,7 @@ def _closure(libraries: Any) -> list[Any]:
 
 @contextmanager
 def remembered_types() -> Iterator[None]:
-    """Types of calls are inferred once for all kernels of a process, while one is compiled and under the compiler's lock.
+    """Types of calls are inferred once for all kernels of a process: while one is compiled, under the compiler's lock.
 
     For each call in each function, and each time that what it is given becomes known, Numba asks all that is registered
     for what is called: for ``a * b`` some thirty templates, of strings, lists and dates, before that of numbers.

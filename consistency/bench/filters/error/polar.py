@@ -1,7 +1,7 @@
-"""A robot-centred map in its polar symmetry: landmarks in the frame of the sensor, m, which a turn and a scaling err by.
+"""A robot-centred map in its polar symmetry: landmarks in the frame of the sensor, m, and their polar error.
 
-The error of a landmark is (left, up, s): turns about the axes across the line of sight, in rad, and the logarithm of the
-scale. That of the pose is right-invariant, T_true = Exp(xi) T. See ``methods/equivariant.py``.
+The error of a landmark is (left, up, s): turns about the axes across the line of sight, in rad, and the logarithm of
+the scale. That of the pose is right-invariant, T_true = Exp(xi) T. See ``methods/equivariant.py``.
 """
 
 from __future__ import annotations

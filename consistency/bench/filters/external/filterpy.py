@@ -16,7 +16,6 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 from scipy.linalg import block_diag
 
-from consistency.bench.filters.compiled import SENSORS
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
@@ -42,7 +41,7 @@ class FilterpyEkf(ExtendedKalman):
 
     def __init__(self, name: str, uvd: bool) -> None:
         super().__init__(name, uvd)
-        self.sensors = SENSORS["uvd" if uvd else "xyz"]
+        self.sensors = ("uvd",) if uvd else ("xyz", "uvd")
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         ekf = _Ekf(state, lambda x: np.concatenate([basics.move(x[:3], control), x[3:]]))

@@ -34,7 +34,7 @@ JOINT, RANSAC = list(KINDS).index("joint"), list(KINDS).index("ransac")
 class Guard(NamedTuple):
     """Squared distances up to which 0, 1, ... observations are accepted together, and one supports a hypothesis.
 
-    A track is used from ``min_age`` sightings on, and ended by ``forget_after`` rejections in a row; by none if that is 0.
+    A track is used from ``min_age`` sightings on, and ended by ``forget_after`` rejections in a row, none if it is 0.
     """
 
     kind: int  # JOINT, RANSAC, or a gate of each observation alone (Cox 1993)

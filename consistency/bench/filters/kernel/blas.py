@@ -49,7 +49,7 @@ for _routine, _module in ROUTINES.items():
 
 
 def _signature_and_code(routine: str, flags: bytes, arguments: tuple[Any, ...]) -> Any:
-    """Of a call by reference: flags, then arrays as pointers and numbers through the stack; LAPACK also gives ``info``."""
+    """Of a call by reference: flags, then arrays as pointers, numbers through the stack; LAPACK also gives ``info``."""
     has_info = ROUTINES[routine] is cython_lapack
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:

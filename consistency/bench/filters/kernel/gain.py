@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import copy_matrix, sum_of
+from consistency.bench.filters.kernel.arrays import sum_of
 from consistency.bench.filters.kernel.blas import (
     add_gram,
     add_product_of_transposed,

@@ -1,8 +1,8 @@
 """What a filter is made of, and the functions that its parts provide.
 
 The loop and the shared steps call nothing but these. The type of the first argument chooses the body; a function with
-``default=True`` has one for parts that have none of their own. Pose, landmark and covariance arrays are written in place
-where a docstring says ``<-``.
+``default=True`` has one for parts that have none of their own. Pose, landmark and covariance arrays are written in
+place where a docstring says ``<-``.
 """
 # mypy: disable-error-code="empty-body"
 

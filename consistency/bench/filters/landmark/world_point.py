@@ -1,4 +1,4 @@
-"""A point in world coordinates in m, seen from a planar robot: Herath et al. (2007) eq. 19; in space or in its plane."""
+"""A point in world coordinates, m, in space or in the plane of a planar robot: Herath et al. (2007) eq. 19."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def sensor_of(belief: Belief, uvd: bool) -> Any:
 
 
 def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Eq. 18 with the believed noise, the sensor, and points in the world, or in its plane if no heights are measured."""
+    """Eq. 18 with the believed noise, the sensor, and points in the world, in its plane if no heights are measured."""
     belief = problem.belief
     landmark = PlanarPoint() if belief.sensor.model in PLANAR_SENSORS else WorldPoint()
     motion, sensor = Unicycle(belief.motion.sigma_v, belief.motion.sigma_omega), sensor_of(belief, uvd)

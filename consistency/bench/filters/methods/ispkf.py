@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,7 +39,7 @@ class IteratedPoints(NamedTuple):
 
 
 @implement(make_room, IteratedPoints)
-def iterated_points_room(update: IteratedPoints, w: int, s: int, m: int, n: int) -> NamedTuple:
+def iterated_points_room(update: IteratedPoints, w: int, s: int, m: int, n: int) -> Any:
     return make_room(update.points, w, s, m, n)
 
 

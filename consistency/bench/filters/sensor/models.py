@@ -33,7 +33,7 @@ class Xyz(NamedTuple):
 
 @part()
 class Uvd(NamedTuple):
-    """Rectified stereo (u, v, disparity) in px, eq. 21 and 22: focal length in px, baseline in m, where it is mounted."""
+    """Rectified stereo (u, v, disparity) in px, eq. 21, 22: focal length in px, baseline in m, where it is mounted."""
 
     f: float
     B: float

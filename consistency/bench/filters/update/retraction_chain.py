@@ -98,7 +98,7 @@ def unchain(delta: Array, m: int, clones: int, room: ConvertingRoom) -> None:
 
 @inner
 def cast_columns(rows: Array, count: int, at: Indices, m: int, clones: int, room: ConvertingRoom) -> None:
-    """``rows`` (count, n) <- rows C', where ``at`` says where the landmarks, and then the clones, are among the columns."""
+    """``rows`` (count, n) <- rows C'; ``at`` says where the landmarks, and then the clones, are among the columns."""
     for i in range(count):
         row = rows[i]
         u = v = u_on = v_on = (0.0, 0.0, 0.0)

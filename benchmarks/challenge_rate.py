@@ -24,6 +24,7 @@ import consistency as cs
 from consistency.bench.challenging.challenge import Plan, challenge
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.jit import Outlook
+from consistency.bench.filters.methods.ekf import parts
 from consistency.bench.models.motion import dead_reckoning, unicycle_jacobian, unicycle_noise
 from consistency.bench.types import Estimates
 
@@ -40,7 +41,7 @@ class DeadReckoning(Compiled):
     def __init__(self) -> None:
         ekf = cs.get_filter("ekf-uvd")  # whose memory is more than enough
         assert isinstance(ekf, Compiled)
-        super().__init__(ekf.textbook, ekf.parts, ekf.sensors)
+        super().__init__(ekf.textbook, parts, ekf.sensors)
         self.name = "dead-reckoning"
 
     def is_ready(self, trial: Any, belief: Any) -> bool:

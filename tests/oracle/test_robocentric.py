@@ -18,7 +18,7 @@ from consistency.bench.filters.kernel.part_functions import Frame, State
 from consistency.bench.filters.landmark.inverse_range import curvature
 from consistency.bench.filters.methods import robocentric as rc
 from consistency.bench.filters.sensor.conversion import Pixels
-from consistency.bench.filters.sensor.growth import Growth
+from consistency.bench.filters.sensor.models import Growth
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook import inverse_range, robocentric_state
 from consistency.bench.filters.textbook import robocentric as textbook

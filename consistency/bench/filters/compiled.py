@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from consistency.bench.filters.covariance_update.local import LOCAL_FROM, Local
 from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.guard.guard_part import guard_part
 from consistency.bench.filters.guard.guarded import Guarded
-from consistency.bench.filters.guard.settings import KINDS
+from consistency.bench.filters.guard.plain_rules import KINDS
 from consistency.bench.filters.kernel.gain import HALTED, REASONS
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
@@ -32,6 +32,8 @@ from consistency.referee.types import Array, Failure, Indices
 
 # models of sensors by what the name of a filter ends in
 SENSORS = {"xyz": ("xyz", "uvd"), "uvd": ("uvd",), "xy": ("relative-xy",), "rb": ("range-bearing",)}
+
+Parts = Callable[[Problem, Array, bool], Slam]
 
 _lock = threading.Lock()
 _inside: list[Any] = []  # the limit in force, once for every trial that is running
@@ -67,8 +69,9 @@ class Compiled:
     ----------
     textbook : the filter in plain NumPy, with ``name`` and ``uvd``: whether it works on (u, v, d); if not, such data
         are turned into points by eq. 21
-    parts : gives the parts of the filter for a problem, the controls (T, 3) of a trial, and ``uvd``
+    parts : gives the parts of a filter for a problem, the controls (T, 3) of a trial, and ``uvd``
     sensors : models of sensors whose data it takes
+    changes : parts in the place of those, by role
 
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
     allow it; the numbers are the same. What else ``textbook`` declares is declared of this: ``innovations`` and
@@ -79,9 +82,9 @@ class Compiled:
 
     local_from = LOCAL_FROM
 
-    def __init__(self, textbook: Any, parts: Callable[..., Slam], sensors: tuple[str, ...]) -> None:
+    def __init__(self, textbook: Any, parts: Parts, sensors: tuple[str, ...], **changes: Any) -> None:
         self.textbook, self.sensors, self.uvd = textbook, sensors, textbook.uvd
-        self.parts: Callable[[Problem, Array], Slam] = partial(parts, uvd=self.uvd)
+        self._parts, self._changes = parts, changes
         self.innovations: str | None = getattr(textbook, "innovations", None)
         self.error: str = getattr(textbook, "error", ADDITIVE)
         self.name: str = textbook.name
@@ -93,7 +96,11 @@ class Compiled:
 
     def guarded(self, kind: str) -> Compiled:
         """This filter behind a guard, with the textbook's behind the same guard in plain Python."""
-        return Compiled(Guarded(self.textbook, kind), self.parts, self.sensors)
+        return Compiled(Guarded(self.textbook, kind), self._parts, self.sensors, **self._changes)
+
+    def parts(self, problem: Problem, controls: Array) -> Slam:
+        """Parts of the filter for a problem and the controls (T, 3) of a trial."""
+        return self._parts(problem, controls, self.uvd)._replace(**self._changes)
 
     def own_covariance(self, state: Any) -> Array:
         """Covariance (3, 3) of the error that the filter declares."""
@@ -195,16 +202,14 @@ def guarded(filter_: Filter, kind: str) -> Any:
 
 
 def variants(
-    textbook: Callable[..., Any],
-    method: str,
-    parts: Callable[..., Slam],
-    suffixes: str = "xyz uvd xy rb",
+    textbook: Callable[..., Any], method: str, parts: Parts, suffixes: str = "xyz uvd xy rb", **changes: Any
 ) -> tuple[Compiled, ...]:
     """A method on points (``METHOD-xyz``), pixels (``-uvd``), relative positions (``-xy``), and by bearings (``-rb``).
 
-    ``textbook`` makes the plain filter of a name and ``uvd``.
+    ``textbook`` makes the plain filter of a name and ``uvd``; ``changes`` are as for :class:`Compiled`.
     """
-    return tuple(Compiled(textbook(f"{method}-{s}", uvd=s == "uvd"), parts, SENSORS[s]) for s in suffixes.split())
+    plain = [(textbook(f"{method}-{s}", uvd=s == "uvd"), SENSORS[s]) for s in suffixes.split()]
+    return tuple(Compiled(each, parts, sensors, **changes) for each, sensors in plain)
 
 
 def problem_of(trial: Trial, belief: Belief) -> Problem:

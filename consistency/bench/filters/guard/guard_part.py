@@ -9,7 +9,7 @@ import numpy as np
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.guard.kernel_rules import Watch, keep_compatible, keep_supported, pass_gate
-from consistency.bench.filters.guard.settings import KINDS, limits_of
+from consistency.bench.filters.guard.plain_rules import KINDS, limits_of
 from consistency.bench.filters.kernel.gain import INNOVATION
 from consistency.bench.filters.kernel.part_functions import (
     Data,

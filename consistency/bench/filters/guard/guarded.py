@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.filters.guard.plain_rules import kept
-from consistency.bench.filters.guard.settings import limits_of
+from consistency.bench.filters.guard.plain_rules import kept, limits_of
 from consistency.bench.protocols import Filter, Problem
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Control, Gaussian, Info, Observation

@@ -14,8 +14,9 @@ import numpy as np
 
 from consistency.bench.filters.compiler.dispatch import generic, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import fill_matrix, filled, integers, matrix, vector
-from consistency.bench.filters.motion.unicycle import Frame, propagate_covariance
+from consistency.bench.filters.kernel.arrays import copy_matrix, fill_matrix, filled, integers, matrix, vector
+from consistency.bench.filters.kernel.blas import add_transposed_times
+from consistency.bench.filters.motion.unicycle import Frame, add_motion_noise, move, move_about, propagate_covariance
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array, Indices
 
@@ -198,12 +199,21 @@ def combine(landmark: NamedTuple, Hp: Array, Hl: Array, rows: Array, i: int, out
 # --- error -----------------------------------------------------------------------------------------
 
 
-@generic()
+@generic(default=True)
 def propagate(error: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Any) -> None:
     """x (n,), P (n, n), Phi (n, base) <- one step of motion under the control ``u`` (3,), to step k + 1.
 
-    The Jacobians are taken where the linearisation point asks for them.
+    The Jacobians are taken where the linearisation point asks for them. By default they are
+    those of eq. 9 and 10: x <- f(x) and P <- F P F' + G Q G' in the robot's rows.
     """
+    pose = state.x[:3]
+    at = motion_point(slam.point, pose, k)
+    propagate_covariance_at(slam.point, slam, state, k, u, Phi, work)
+    add_motion_noise(slam.motion, at, u, state.P)
+    if expands(slam.point):
+        move_about(at, u, pose)
+    else:
+        move(pose, u, pose)
 
 
 @generic(default=True)
@@ -222,14 +232,22 @@ def insert_error(error: NamedTuple, pose: Array, values: Array, Jp: Array) -> No
     """
 
 
-@generic()
+@generic(default=True)
 def retract(error: NamedTuple, slam: Slam, state: State, A: Array, y: Array, work: Any) -> None:
-    """x (n,) <- x moved by the error A' y, with A (k, n) and y (k,)."""
+    """x (n,) <- x moved by the error A' y, with A (k, n) and y (k,).
+
+    By default by a sum.
+    """
+    add_transposed_times(A, y, state.x[: state.n])
 
 
-@generic()
+@generic(default=True)
 def pose_covariance(error: NamedTuple, x: Array, P: Array, out: Array) -> None:
-    """``out`` (3, 3) <- covariance of the additive error of the robot at x (n,), from that of this error, P (3, 3)."""
+    """``out`` (3, 3) <- covariance of the additive error of the robot at x (n,), from that of this error, P (3, 3).
+
+    By default they are the same.
+    """
+    copy_matrix(P, out)
 
 
 # --- linearisation point -----------------------------------------------------------------------------

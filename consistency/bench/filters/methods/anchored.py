@@ -10,7 +10,6 @@ from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.part_functions import (
-    Slam,
     Triple,
     insert,
     landmark_width,
@@ -22,7 +21,6 @@ from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.motion.unicycle import Frame
 from consistency.bench.filters.textbook.anchored import AnchoredKalman
 from consistency.bench.models.point import Mounting, turned_to_robot
-from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 
@@ -116,9 +114,4 @@ def anchored_world_point(
         _by_values(values, 1.0 if a == 0 else 0.0, 1.0 if a == 1 else 0.0, 1.0 if a == 2 else 0.0, Dl[a])
 
 
-def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Those of the EKF, and the landmark."""
-    return ekf.parts(problem, controls, uvd)._replace(landmark=AnchoredInverseDepth())
-
-
-XYZ, UVD = variants(AnchoredKalman, "anchored-ekf", parts, "xyz uvd")
+XYZ, UVD = variants(AnchoredKalman, "anchored-ekf", ekf.parts, "xyz uvd", landmark=AnchoredInverseDepth())

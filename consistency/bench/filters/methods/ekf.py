@@ -1,22 +1,88 @@
-"""EKF-SLAM, compiled. Equations and source: :mod:`consistency.bench.filters.textbook.ekf`."""
+"""EKF-SLAM, compiled, and its parts, most of which other methods have as well.
+
+Equations and source: :mod:`consistency.bench.filters.textbook.ekf`.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from consistency.bench.filters.compiled import variants
-from consistency.bench.filters.covariance_update.dense import Dense
-from consistency.bench.filters.error.additive import Additive
-from consistency.bench.filters.kernel.part_functions import Slam
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.kernel.gain import (
+    add_noise,
+    combine_seen,
+    correct_at_once,
+    gather,
+    innovate,
+    linearise_seen,
+)
+from consistency.bench.filters.kernel.observation_model import place_observed
+from consistency.bench.filters.kernel.part_functions import (
+    Data,
+    Factors,
+    Slam,
+    State,
+    correct,
+    place,
+    predict_innovation,
+    stands_apart,
+)
+from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.landmark.world_point import PlanarPoint, WorldPoint
 from consistency.bench.filters.motion.unicycle import Unicycle
-from consistency.bench.filters.point.at_estimate import AtEstimate
 from consistency.bench.filters.sensor.models import RangeBearing, RelativeXy, Uvd, Xyz
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
-from consistency.bench.filters.update.joint_update import Joint
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import PLANAR_SENSORS, Belief
 from consistency.referee.types import Array
+
+
+@part()
+class Additive(NamedTuple):
+    """Truth minus estimate, variable by variable, in world coordinates. No parameters."""
+
+
+@part()
+class Dense(NamedTuple):
+    """Every step works on the whole state, and nothing is kept beside it. No parameters."""
+
+
+@part()
+class AtEstimate(NamedTuple):
+    """Jacobians at the current estimate. No parameters."""
+
+
+@implement(stands_apart, AtEstimate)
+def estimate_stands_apart(point: AtEstimate) -> bool:
+    return False
+
+
+@implement(place, AtEstimate)
+def place_at_estimate(
+    point: AtEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+) -> None:
+    place_observed(slam, state.x[:3], z, state.x[state.n :], work)
+
+
+@part()
+class Joint(NamedTuple):
+    """One joint update with all landmarks seen in a step. No parameters."""
+
+
+implement(correct, Joint)(correct_at_once)
+
+
+@implement(predict_innovation, Joint)
+def predict_innovation_linearised(
+    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NamedTuple]
+) -> tuple[int, float]:
+    """Innovation and S with Jacobians at the prediction, eq. 11; an iterated update begins there, too."""
+    gather(slam, state, m, local, work)
+    linearise_seen(slam, state, k, m, work)
+    combine_seen(slam, state, m, work)
+    innovate(slam, state, data, m, work)
+    return 0, add_noise(slam, state, data, m, work)
 
 
 def sensor_of(belief: Belief, uvd: bool) -> Any:

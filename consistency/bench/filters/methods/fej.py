@@ -30,7 +30,6 @@ from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.motion.unicycle import move, propagate_covariance_by
 from consistency.bench.filters.textbook.fej import FirstEstimateKalman
-from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 
@@ -82,9 +81,4 @@ def place_first_estimate(
     work.Jp[1, 2] += pose[0] - predicted[0]
 
 
-def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Those of the EKF, and the point."""
-    return ekf.parts(problem, controls, uvd)._replace(point=FirstEstimate())
-
-
-XYZ, UVD, XY, RB = variants(FirstEstimateKalman, "fej-ekf", parts)
+XYZ, UVD, XY, RB = variants(FirstEstimateKalman, "fej-ekf", ekf.parts, point=FirstEstimate())

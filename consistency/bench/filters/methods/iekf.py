@@ -25,9 +25,8 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.methods.ekf import predict_innovation_linearised
 from consistency.bench.filters.textbook.iekf import PASSES, IteratedKalman
-from consistency.bench.filters.update.joint_update import predict_innovation_linearised
-from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 
@@ -100,9 +99,4 @@ def _relate_to_prior(slam: Slam, state: State, m: int, y: Array, work: Work[Prio
                 y[s * i + a] -= work.Hl[i, a, c] * (prior[3 + w * i + c] - x[o + c])
 
 
-def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Those of the EKF, and the update."""
-    return ekf.parts(problem, controls, uvd)._replace(update=Iterated(PASSES))
-
-
-XYZ, UVD, XY, RB = variants(IteratedKalman, "iekf", parts)
+XYZ, UVD, XY, RB = variants(IteratedKalman, "iekf", ekf.parts, update=Iterated(PASSES))

@@ -49,7 +49,6 @@ from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.motion.unicycle import move, propagate_covariance_by
 from consistency.bench.filters.textbook.oc import ConstrainedKalman
-from consistency.bench.protocols import Problem
 from consistency.referee.types import Array, Indices
 
 
@@ -118,9 +117,4 @@ def place_constrained(
         notes.landmarks[label, a] = notes.path[k + 1, a] + x[n + a] - x[a]
 
 
-def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Those of the EKF, and the point."""
-    return ekf.parts(problem, controls, uvd)._replace(point=ObservabilityConstrained())
-
-
-XYZ, UVD, XY, RB = variants(ConstrainedKalman, "oc-ekf", parts)
+XYZ, UVD, XY, RB = variants(ConstrainedKalman, "oc-ekf", ekf.parts, point=ObservabilityConstrained())

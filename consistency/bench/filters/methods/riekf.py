@@ -25,7 +25,6 @@ from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.motion.unicycle import move, noise_columns
 from consistency.bench.filters.textbook.riekf import RightInvariantKalman
-from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 
@@ -95,9 +94,4 @@ def right_pose_covariance(error: RightInvariant, x: Array, P: Array, out: Array)
     shifted_covariance(x, P, out)
 
 
-def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Those of the EKF, and the error."""
-    return ekf.parts(problem, controls, uvd)._replace(error=RightInvariant())
-
-
-XYZ, UVD, XY, RB = variants(RightInvariantKalman, "ri-ekf", parts)
+XYZ, UVD, XY, RB = variants(RightInvariantKalman, "ri-ekf", ekf.parts, error=RightInvariant())

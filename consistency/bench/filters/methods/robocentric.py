@@ -14,7 +14,7 @@ from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.landmark.inverse_range import InverseRange
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.sensor.conversion import Pixels
-from consistency.bench.filters.sensor.growth import growth_of
+from consistency.bench.filters.sensor.models import growth_of
 from consistency.bench.filters.textbook.inverse_range import Corrections, searched
 from consistency.bench.filters.textbook.robocentric import (
     ADRIFT,

@@ -26,11 +26,13 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.sensor.growth import Growth, growth_of, ratio_at
 from consistency.bench.filters.sensor.models import (
+    Growth,
+    growth_of,
     locate_xyz_jacobian,
     measure_xyz,
     measure_xyz_jacobian,
+    ratio_at,
     three_values,
 )
 from consistency.bench.filters.textbook.triangulated import TriangulatedKalman

@@ -10,17 +10,17 @@ from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.ukf import CUBATURE, UnscentedKalman
 from consistency.bench.filters.update.unscented import Unscented
 from consistency.bench.protocols import Problem
-from consistency.bench.scenario import SigmaPoints
 from consistency.referee.types import Array
 
 
-def parts(problem: Problem, controls: Array, uvd: bool, points: SigmaPoints | None = None) -> Slam:
-    """Those of the EKF, and the update, with ``points`` or those of the belief."""
-    points = points or problem.belief.sigma_points
+def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
+    """Those of the EKF, and the update."""
+    points = problem.belief.sigma_points
     return ekf.parts(problem, controls, uvd)._replace(update=Unscented(points.alpha, points.beta, points.kappa))
 
 
 XYZ, UVD, XY, RB = variants(UnscentedKalman, "ukf", parts)
 CKF_XYZ, CKF_UVD = variants(
-    partial(UnscentedKalman, points=CUBATURE), "ckf", partial(parts, points=CUBATURE), "xyz uvd"
-)
+    partial(UnscentedKalman, points=CUBATURE), "ckf", ekf.parts, "xyz uvd",
+    update=Unscented(CUBATURE.alpha, CUBATURE.beta, CUBATURE.kappa),
+)  # fmt: skip

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.sensor.growth import Growth, ratio_at
-from consistency.bench.filters.sensor.models import Uvd
+from consistency.bench.filters.sensor.models import Growth, Uvd, ratio_at
 from consistency.referee.types import Array
 
 BESIDE = 0.1  # cosine of the angle to the optical axis below which a prediction is in no image

@@ -117,19 +117,13 @@ def curvature(
     return np.asarray(0.5 * np.square(noise) * np.stack([of_drive, of_turn], axis=2))
 
 
-def exponential(xi: Array) -> tuple[Array, Array]:
-    """Exp of SE(2): rotation (2, 2) and translation (2,) of xi = (x, y, angle)."""
+def moved(pose: Array, xi: Array) -> Array:
+    """Exp(xi) T of a pose (3,), with xi = (x, y, angle) in SE(2)."""
     angle = xi[2]
     along = np.sinc(angle / np.pi)
     across = 0.5 * angle if abs(angle) < 1e-4 else (1.0 - np.cos(angle)) / angle
     V = np.array([[along, -across], [across, along]])
-    return heading_matrix(angle)[:2, :2], V @ xi[:2]
-
-
-def moved(pose: Array, xi: Array) -> Array:
-    """Exp(xi) T of a pose (3,)."""
-    R, t = exponential(xi)
-    return np.array([*(R @ pose[:2] + t), pose[2] + xi[2]])
+    return np.array([*(heading_matrix(angle)[:2, :2] @ pose[:2] + V @ xi[:2]), pose[2] + angle])
 
 
 def moments(C: Array) -> Array:

@@ -102,7 +102,10 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, record: RunRecor
             if step == 1:
                 state = filter_.init(problem)
             state = filter_.predict(state, given.control(step))
-            state, info = _state_and_info(filter_.update(state, given.observation(step)))
+            updated: Any = filter_.update(state, given.observation(step))
+            if not isinstance(updated, tuple) or len(updated) != 2:
+                raise TypeError("update must return (state, info)")
+            state, info = updated
             if rejects(filter_):
                 record.rejected[: trial.first[step]] = _value_of(filter_, "rejected", state)
             mean, covariances = _pose_and_covariances(filter_, state, error)
@@ -193,12 +196,6 @@ def _require_symmetric(name: str, P: Array) -> None:
 def _require_finite(name: str, *values: Array | float) -> None:
     if not all(np.isfinite(each).all() for each in values):
         raise _Unusable(f"{name} is not finite")
-
-
-def _state_and_info(value: Any) -> tuple[Any, Info | None]:
-    if not isinstance(value, tuple) or len(value) != 2:
-        raise TypeError("update must return (state, info)")
-    return value
 
 
 def _map(filter_: Filter, state: Any, trial: Trial) -> Map | None:

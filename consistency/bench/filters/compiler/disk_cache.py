@@ -31,7 +31,6 @@ def folder() -> Path:
 
 
 def place(key: str) -> Path:
-    """File of the content with this key."""
     return folder() / f"{key}{SUFFIX}"
 
 

@@ -27,11 +27,11 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Part = TypeVar("Part", bound=type)
 Bodies = dict[type | None, Callable[..., Any]]
 
-_parts: dict[str, type] = {}
+PARTS: dict[str, type] = {}
 _needs: dict[type, dict[str, frozenset[str]]] = {}
-_bodies: dict[Any, Bodies] = {}
+BODIES: dict[Any, Bodies] = {}  # of each generic function by the type that chooses them, None for the default
 _named_bodies: dict[str, Callable[..., Any]] = {}
-_routines: set[Any] = set()
+ROUTINES: set[Any] = set()  # plain Python around the functions that kernels are made of
 
 
 def part(**needs: str) -> Callable[[Part], Part]:
@@ -51,12 +51,12 @@ def part(**needs: str) -> Callable[[Part], Part]:
     def register(cls: Part) -> Part:
         if not (issubclass(cls, tuple) and hasattr(cls, "_fields")) or "<locals>" in cls.__qualname__:
             raise TypeError(f"part '{cls.__qualname__}' must be a NamedTuple at module level")
-        if cls.__name__ in _parts:
-            other = _parts[cls.__name__].__module__
+        if cls.__name__ in PARTS:
+            other = PARTS[cls.__name__].__module__
             raise TypeError(
                 f"a part named '{cls.__name__}' is there already, in {other}; two would share compiled code"
             )
-        _parts[cls.__name__] = cls
+        PARTS[cls.__name__] = cls
         _needs[cls] = {role: frozenset(names.split()) for role, names in needs.items()}
         return cls
 
@@ -81,7 +81,7 @@ def generic(*, default: bool = False) -> Callable[[Function], Function]:
             return _body(stub, bodies, getattr(args[0], "instance_class", None))
 
         _overload(call, strict=False, jit_options=INNER)(choose)
-        _bodies[call] = bodies
+        BODIES[call] = bodies
         chosen: Any = call
         return chosen
 
@@ -101,10 +101,10 @@ def implement(function: Callable[..., Any], cls: type) -> Callable[[Function], F
         name = f"{body.__module__}.{body.__qualname__}"
         if "<locals>" in name or _named_bodies.get(name, body) is not body:
             raise TypeError(f"kernel function '{name}' must stand at module level under a name of its own")
-        if cls in _bodies[function]:
+        if cls in BODIES[function]:
             raise TypeError(f"'{function.__name__}' has a body for {cls.__name__} already")
         _named_bodies[name] = body
-        _bodies[function][cls] = body
+        BODIES[function][cls] = body
         return body
 
     return register
@@ -122,7 +122,7 @@ def routine(function: Function) -> Function:
         return function
 
     _overload(call, strict=False, jit_options=INNER)(choose)
-    _routines.add(call)
+    ROUTINES.add(call)
     called: Any = call
     return called
 
@@ -137,7 +137,7 @@ def require_fitting(parts: Any) -> None:
     """
     for role, value in zip(parts._fields, parts, strict=True):
         cls = type(value)
-        if not is_part(cls):
+        if PARTS.get(cls.__name__) is not cls:
             raise TypeError(f"{role}: '{cls.__name__}' is no registered part")
         for other, names in _needs[cls].items():
             chosen = type(getattr(parts, other)).__name__
@@ -154,21 +154,6 @@ def fits(parts: Any) -> bool:
     except TypeError:
         return False
     return True
-
-
-def is_part(cls: type) -> bool:
-    """Whether a class is a registered part."""
-    return _parts.get(cls.__name__) is cls
-
-
-def is_routine(function: Any) -> bool:
-    """Whether a function is a :func:`routine`: plain Python around the function that kernels are made of."""
-    return function in _routines
-
-
-def bodies_of(function: Any) -> Bodies | None:
-    """Bodies of a generic function by the type that chooses them, None for the default; None for any other function."""
-    return _bodies.get(function)
 
 
 def _body(stub: Any, bodies: Bodies, cls: Any) -> Callable[..., Any]:

@@ -67,14 +67,12 @@ class SmootherState:
     values: gtsam.Values = field(default_factory=gtsam.Values)  # of new variables
 
     def moved(self, control: Control) -> SmootherState:
-        """With the next step of motion."""
         step, guess = self.step + 1, self.world.moved(self.guess, control)
         self.factors.add(self.world.motion(step, control))
         self.values.insert(pose_key(step), guess)
         return replace(self, step=step, guess=guess)
 
     def seen(self, observation: Observation) -> None:
-        """Add what is seen in this step."""
         for label, z in zip(observation.landmarks, observation.z, strict=True):
             if int(label) not in self.world.origins:
                 self.values.insert(landmark_key(int(label)), self.world.placed(int(label), self.guess, z))
@@ -102,7 +100,6 @@ class SmootherState:
         return Gaussian(marginal.mean, along @ marginal.covariance @ along)
 
     def map(self) -> dict[int, Gaussian]:
-        """Landmarks (3,) in the world by label, m."""
         return {label: self.world.point(label, self.marginal(landmark_key(label))) for label in self.world.origins}
 
 

@@ -159,7 +159,6 @@ def _without_rejected(m: int, work: Work[NamedTuple], watch: Watch) -> int:
 
 @implement(may_enter, Guard)
 def enters_unless_rejected(guard: Guard, row: int, is_known: bool, watch: Watch) -> bool:
-    """A new landmark begins with an observation that was not rejected."""
     return watch.anew[row] if is_known else not watch.rejected[row]
 
 

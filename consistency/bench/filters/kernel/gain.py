@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from consistency.bench.filters.kernel.blas import (
     add_transposed_times,
     solve_transposed,
 )
-from consistency.bench.filters.kernel.covariance import add_gram_to_state, definite_root, gather_all_rows
+from consistency.bench.filters.kernel.covariance import add_gram_to_state, definite_root, gather_all_rows, state_index
 from consistency.bench.filters.kernel.observation_model import linearise
 from consistency.bench.filters.kernel.part_functions import (
     Data,
@@ -22,6 +22,7 @@ from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     combine,
+    innovate_again,
     landmark_width,
     observed_width,
     predict_innovation,
@@ -114,6 +115,40 @@ def correct_at_once(
     if code == 0:
         apply(slam, state, m, local, work)
     return code, nis, log_det
+
+
+@inner
+def correct_iterated(
+    update: Any,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    has_innovation: bool,
+    local: Factors,
+    work: Work[Any],
+) -> tuple[int, float, float]:
+    """The update in ``update.passes``, each linearised where the one before led to, from the same prior."""
+    w = landmark_width(slam.landmark)
+    involved, first_nis, first_log_det = 3 + w * m, np.nan, np.nan
+    gather(slam, state, m, local, work)
+    for a in range(involved):
+        work.room.prior[a] = state.x[state_index(w, a, work.at)]
+    for i in range(update.passes):
+        if not innovate_again(update, slam, state, data, k, m, work):
+            return POSE, np.nan, np.nan
+        code, nis, log_det = whiten(slam, state, data, m, work)
+        if code > 0:
+            return code, nis, log_det
+        if i == 0:
+            first_nis, first_log_det = nis, log_det
+        is_last = i == update.passes - 1
+        for a in range(involved):
+            j = state_index(w, a, work.at)
+            state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
+    apply(slam, state, m, local, work)
+    return 0, first_nis, first_log_det
 
 
 @inner

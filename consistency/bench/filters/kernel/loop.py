@@ -130,34 +130,25 @@ def _most_seen(first: Indices) -> int:
 
 
 @inner
-def _map(
-    motion: NamedTuple,
-    landmark: NamedTuple,
-    error: NamedTuple,
-    covariance: NamedTuple,
-    state: State,
-    local: NamedTuple,
-    points: Array,
-    spread: Array,
-) -> Array:
+def _map(slam: Slam, state: State, local: NamedTuple, points: Array, spread: Array) -> Array:
     """``points``, ``spread`` <- the landmarks in the world, as ``Outcome`` has them; returns its ``joint``, D P D'."""
-    w, P = landmark_width(landmark), state.P
+    w, P = landmark_width(slam.landmark), state.P
     width, count = 3 + w, 1
     for label in range(len(points)):
         count += 1 if state.offset[label] >= 0 else 0
     D, at, block = filled_blocks(count, 3, width, 0.0), integers(count * width, 0), matrix(width, width)
     for a in range(3):
         D[0, a, a], at[a] = 1.0, a
-    to_error(error, state.x[:3], filled(w, 1.0), D[0, :, :3], D[0, :, 3:])
+    to_error(slam.error, state.x[:3], filled(w, 1.0), D[0, :, :3], D[0, :, 3:])
     i, n = 0, 3
     for label in range(len(points)):
         o = state.offset[label]
         if o >= 0:
             i += 1
-            pose_at, own = held_at(covariance, label, local), at[width * i : width * i + width]
+            pose_at, own = held_at(slam.covariance, label, local), at[width * i : width * i + width]
             pose, values = state.x[pose_at : pose_at + 3], state.x[o : o + w]
-            world_point(landmark, robot_frame(pose), values, points[label], D[i, :, :3], D[i, :, 3:])
-            to_error(error, pose, values, D[i, :, :3], D[i, :, 3:])
+            world_point(slam.landmark, robot_frame(pose), values, points[label], D[i, :, :3], D[i, :, 3:])
+            to_error(slam.error, pose, values, D[i, :, :3], D[i, :, 3:])
             for a in range(width):
                 own[a] = pose_at + a if a < 3 else o + a - 3
                 n = max(n, own[a] + 1)
@@ -299,7 +290,7 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
         whole = State(memory.x, memory.P, _settle_new(seen, whole.n, w, state, memory.home), 0, memory.home)
     if code == 0:
         settle(slam.covariance, slam, whole, state, local)
-        joint = _map(slam.motion, slam.landmark, slam.error, slam.covariance, whole, local, out.points, out.spread)
+        joint = _map(slam, whole, local, out.points, out.spread)
     else:
         joint = matrix(0, 0)
     rejected = rejected_rows(slam.guard, own_watch)

@@ -53,7 +53,6 @@ def predict_innovation_equivariant(
     local: Factors,
     work: Work[NamedTuple],
 ) -> tuple[int, float]:
-    """Innovation and S with C* in the place of the Jacobian."""
     gather(slam, state, m, local, work)
     linearise_seen(slam, state, k, m, work)
     for i in range(m):
@@ -83,7 +82,6 @@ def _average(sensor: Uvd, z: Array, q: Array, H: Array) -> None:
 
 
 def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Parts of ``eqf-uvd``."""
     slam = ekf.parts(problem, controls, uvd)
     return slam._replace(landmark=SensorPoint(slam.sensor.mount), error=Polar(), update=EquivariantOutput())
 

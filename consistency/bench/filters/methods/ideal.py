@@ -14,7 +14,6 @@ from consistency.referee.types import Array
 
 
 def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Those of the EKF, and the point."""
     truth, slam = truth_of(problem), ekf.parts(problem, controls, uvd)
     width = landmark_width(slam.landmark)
     point = AtTruth(np.array(truth.path, float), np.array(truth.landmarks[:, :width], float, order="C"))

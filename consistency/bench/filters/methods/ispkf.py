@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
-from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.covariance import state_index
-from consistency.bench.filters.kernel.gain import POSE, apply, gather, innovate, shift, whiten
+from consistency.bench.filters.kernel.gain import correct_iterated, innovate
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Factors,
     Slam,
     State,
     correct,
+    innovate_again,
     landmark_width,
     make_room,
     predict,
@@ -51,38 +49,7 @@ def predict_by_points(
     predict(update.points, slam, state, k, u, local, work)
 
 
-@implement(correct, IteratedPoints)
-def correct_by_iterated_points(
-    update: IteratedPoints,
-    slam: Slam,
-    state: State,
-    data: Data,
-    k: int,
-    m: int,
-    has_innovation: bool,
-    local: Factors,
-    work: Work[SigmaRoom],
-) -> tuple[int, float, float]:
-    w = landmark_width(slam.landmark)
-    involved, first_nis, first_log_det = 3 + w * m, np.nan, np.nan
-    gather(slam, state, m, local, work)
-    for a in range(involved):
-        work.room.prior[a] = state.x[state_index(w, a, work.at)]
-    for i in range(update.passes):
-        if not innovate_by_points(update.points, slam, state, m, work):
-            return POSE, np.nan, np.nan
-        _relate_to_prior(w, state, m, innovate(slam, state, data, m, work), work)
-        code, nis, log_det = whiten(slam, state, data, m, work)
-        if code > 0:
-            return code, nis, log_det
-        if i == 0:
-            first_nis, first_log_det = nis, log_det
-        is_last = i == update.passes - 1
-        for a in range(involved):
-            j = state_index(w, a, work.at)
-            state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
-    apply(slam, state, m, local, work)
-    return 0, first_nis, first_log_det
+implement(correct, IteratedPoints)(correct_iterated)
 
 
 @implement(predict_innovation, IteratedPoints)
@@ -93,17 +60,23 @@ def predict_innovation_by_first_points(
     return predict_innovation(update.points, slam, state, data, k, m, local, work)
 
 
-@inner
-def _relate_to_prior(w: int, state: State, m: int, y: Array, work: Work[SigmaRoom]) -> None:
-    """y (s m,) <- z - z_i - A (prior - x_i)."""
+@implement(innovate_again, IteratedPoints)
+def innovate_about_points(
+    update: IteratedPoints, slam: Slam, state: State, data: Data, k: int, m: int, work: Work[SigmaRoom]
+) -> bool:
+    """The innovation is z - z_i - A (prior - x_i)."""
+    w = landmark_width(slam.landmark)
+    if not innovate_by_points(update.points, slam, state, m, work):
+        return False
+    y = innovate(slam, state, data, m, work)
     for a in range(3 + w * m):
         away = work.room.prior[a] - state.x[state_index(w, a, work.at)]
         for row in range(len(y)):
             y[row] -= work.room.Mt[a, row] * away
+    return True
 
 
 def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Those of the unscented filter, whose points are drawn again."""
     slam = ukf.parts(problem, controls, uvd)
     return slam._replace(update=IteratedPoints(slam.update, PASSES))
 

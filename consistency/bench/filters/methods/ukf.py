@@ -14,7 +14,6 @@ from consistency.referee.types import Array
 
 
 def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
-    """Those of the EKF, and the update."""
     points = problem.belief.sigma_points
     return ekf.parts(problem, controls, uvd)._replace(update=Unscented(points.alpha, points.beta, points.kappa))
 

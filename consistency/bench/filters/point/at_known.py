@@ -114,6 +114,5 @@ def place_about_reference(
 def place_at_truth(
     point: AtTruth, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
-    """By the inverse of h at the estimated pose."""
     place_observed(slam, state.x[:3], z, state.x[state.n : state.n + landmark_width(slam.landmark)], work)
     _invert_at(point, slam, k, label, work)

@@ -185,13 +185,8 @@ def map_of(state: SlamState) -> dict[int, Gaussian]:
     """Landmarks (3,) by label, m, with covariance (3, 3), of a state of world points whose error is additive."""
     w = state.width
     blocks = {label: slice(state.at(label), state.at(label) + w) for label in state.landmarks}
-    return {label: in_space(state.x[at], state.P[at, at]) for label, at in blocks.items()}
-
-
-def in_space(mean: Array, P: Array) -> Gaussian:
-    """A landmark (w,) as a point (3,): one in the plane is known to be at height zero."""
-    missing = 3 - len(mean)
-    return Gaussian(np.pad(mean, (0, missing)), np.pad(P, (0, missing)))
+    up = (0, 3 - w)  # the height of one in the plane is known to be zero
+    return {label: Gaussian(np.pad(state.x[at], up), np.pad(state.P[at, at], up)) for label, at in blocks.items()}
 
 
 def joint_of(state: SlamState) -> Gaussian:

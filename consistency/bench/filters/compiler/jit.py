@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
@@ -113,7 +112,9 @@ class Kernel:
             with disk_cache.one_at_a_time(path):
                 if not self._load(entry, disk_cache.read(path)):
                     self._compiled(entry, signature, content)
-                    _keep(path, entry.overloads[signature])
+                    result = entry.overloads[signature]
+                    if not result.library.has_dynamic_globals and not result.lifted:  # no address of this process
+                        disk_cache.write(path, serialize.dumps(result._reduce()))  # type: ignore[no-untyped-call]
         return entry
 
     def _compiled(self, entry: Any, signature: tuple[Any, ...], content: Content) -> Any:
@@ -134,12 +135,6 @@ class Kernel:
             entry.add_overload(result)
         self.loaded += 1
         return True
-
-
-def _keep(path: Path, result: Any) -> None:
-    """Keep what holds no address of this process."""
-    if not result.library.has_dynamic_globals and not result.lifted:
-        disk_cache.write(path, serialize.dumps(result._reduce()))  # type: ignore[no-untyped-call]
 
 
 def _signature(args: tuple[Any, ...]) -> tuple[Any, ...]:

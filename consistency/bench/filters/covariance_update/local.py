@@ -177,11 +177,6 @@ def _work(n: int, b: int, seen: int) -> float:
 
 
 @inner
-def _settling(whole: int, n: int, b: int) -> float:
-    return whole * whole * (b + TRAFFIC) + 2.0 * whole * b * (n + b)
-
-
-@inner
 def may_split(w: int, seen: int, local: Factors) -> bool:
     """Whether the next steps are to be local; counts the pause down."""
     tally = local.tally
@@ -223,6 +218,7 @@ def is_due(whole: int, n: int, b: int, seen: int, local: Factors) -> bool:
 def count_settling(whole: int, n: int, b: int, local: Factors) -> None:
     """Whether the stretch paid; if not, a pause."""
     tally = local.tally
-    paid = tally[SPENT] + _settling(whole, n, b) < tally[DENSE]
+    settling = whole * whole * (b + TRAFFIC) + 2.0 * whole * b * (n + b)
+    paid = tally[SPENT] + settling < tally[DENSE]
     tally[LONG] = 0.0 if paid else max(4.0 * tally[LONG], PAUSE)
     tally[LEFT] = tally[LONG]

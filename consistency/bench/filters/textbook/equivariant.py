@@ -40,8 +40,6 @@ from consistency.referee.types import Array
 
 
 class EquivariantKalman(ExtendedKalman):
-    """The equivariant filter as its definitions have it."""
-
     error = "right"
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
@@ -83,7 +81,6 @@ class EquivariantKalman(ExtendedKalman):
         return Gaussian(state.x[:3], T @ state.P[:3, :3] @ T.T)
 
     def own_covariance(self, state: SlamState) -> Array:
-        """Covariance (3, 3) of the right-invariant error of the pose."""
         return state.P[:3, :3]
 
     def map(self, state: SlamState) -> dict[int, Gaussian]:

@@ -28,8 +28,6 @@ class FirstState:
 
 
 class FirstEstimateKalman(basics.WrappedFilter):
-    """EKF-SLAM with every variable linearised at its first estimate."""
-
     def init(self, problem: Problem) -> FirstState:
         return FirstState(basics.start(problem), problem.start.copy())
 

@@ -30,8 +30,6 @@ class IdealState:
 
 
 class IdealKalman(basics.WrappedFilter):
-    """EKF-SLAM linearised at the true poses and landmarks."""
-
     realisable = False
 
     def init(self, problem: Problem) -> IdealState:

@@ -16,15 +16,9 @@ PASSES = 5  # linearisations of an update; the first is the EKF's
 
 
 class IteratedKalman(ExtendedKalman):
-    """EKF-SLAM whose update is a Gauss-Newton iteration."""
-
-    def __init__(self, name: str, uvd: bool, passes: int = PASSES) -> None:
-        super().__init__(name, uvd)
-        self.passes = passes
-
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         after, infos = state, []
-        for _ in range(self.passes):
+        for _ in range(PASSES):
             zhat, H = basics.expect(after, seen, self.uvd)
             innovation = basics.innovation_of(state, z, zhat, self.uvd) - H @ (state.x - after.x)
             after, info = basics.corrected(state, H, innovation, R)

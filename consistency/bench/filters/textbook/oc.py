@@ -27,8 +27,6 @@ class ConstrainedState:
 
 
 class ConstrainedKalman(basics.WrappedFilter):
-    """EKF-SLAM with points that leave a turn of robot and map unobserved."""
-
     def init(self, problem: Problem) -> ConstrainedState:
         return ConstrainedState(basics.start(problem), problem.start[None, :2])
 

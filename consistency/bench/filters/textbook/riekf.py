@@ -52,7 +52,6 @@ class RightInvariantKalman(ExtendedKalman):
         return Gaussian(state.x[:3], T @ state.P[:3, :3] @ T.T)
 
     def own_covariance(self, state: SlamState) -> Array:
-        """Covariance (3, 3) of the right-invariant error of the pose."""
         return state.P[:3, :3]
 
     def map(self, state: SlamState) -> dict[int, Gaussian]:

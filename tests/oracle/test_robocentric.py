@@ -15,9 +15,8 @@ from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.covariance_update.parking import Parking, _is_worth_it, make_clones, unpark
 from consistency.bench.filters.error.invariant_pose import bend
 from consistency.bench.filters.kernel.part_functions import Frame, State
-from consistency.bench.filters.landmark.inverse_range import curvature
+from consistency.bench.filters.landmark.inverse_range import Pixels, curvature
 from consistency.bench.filters.methods import robocentric as rc
-from consistency.bench.filters.sensor.conversion import Pixels
 from consistency.bench.filters.sensor.models import Growth
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook import inverse_range, robocentric_state

@@ -20,9 +20,9 @@ from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.guard.guard_part import guard_part
 from consistency.bench.filters.guard.guarded import Guarded
 from consistency.bench.filters.guard.plain_rules import KINDS
-from consistency.bench.filters.kernel.gain import HALTED, REASONS
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
+from consistency.bench.filters.kernel.update_steps import HALTED, REASONS
 from consistency.bench.protocols import Filter, Problem, TrialTruth
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import Estimates, Map, Trial

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.compiler import compile_time, disk_cache
+from consistency.bench.filters.compiler import disk_cache
 from consistency.bench.filters.compiler.jit import Outlook
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter, WholeTrial
@@ -108,7 +108,7 @@ def _label(missing: Sequence[Need]) -> str:
 def _wall(seconds: Sequence[float], workers: int) -> float:
     """Seconds for all of them: the first of each process in full, as later ones share functions with it."""
     longest = sorted(seconds, reverse=True)
-    total = sum(longest[:workers]) + compile_time.AGAIN * sum(longest[workers:])
+    total = sum(longest[:workers]) + disk_cache.AGAIN * sum(longest[workers:])
     return max(longest[0], total / workers)
 
 

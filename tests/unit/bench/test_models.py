@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from consistency.bench.filters.believed_noise import sensor_noise
-from consistency.bench.filters.kernel.observation_model import linearise, linearise_at, observe, place_observed
 from consistency.bench.filters.kernel.part_functions import Slam, State
+from consistency.bench.filters.kernel.update_steps import linearise, linearise_at, observe, place_observed
 from consistency.bench.filters.kernel.work_arrays import make_work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.motion import unicycle

@@ -10,7 +10,6 @@ from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.guard.kernel_rules import Watch, keep_compatible, keep_supported, pass_gate
 from consistency.bench.filters.guard.plain_rules import KINDS, limits_of
-from consistency.bench.filters.kernel.gain import INNOVATION
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
@@ -23,6 +22,7 @@ from consistency.bench.filters.kernel.part_functions import (
     screen,
     withhold,
 )
+from consistency.bench.filters.kernel.update_steps import INNOVATION
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.scenario import GuardSettings
 from consistency.referee.types import Array, Indices

@@ -21,7 +21,6 @@ from consistency.bench.filters.kernel.arrays import (
     sum_of,
 )
 from consistency.bench.filters.kernel.covariance import begin_landmark
-from consistency.bench.filters.kernel.gain import HALTED, NOT_FINITE, POSE
 from consistency.bench.filters.kernel.linalg import definiteness_with
 from consistency.bench.filters.kernel.part_functions import (
     Data,
@@ -47,6 +46,7 @@ from consistency.bench.filters.kernel.part_functions import (
     to_error,
     world_point,
 )
+from consistency.bench.filters.kernel.update_steps import HALTED, NOT_FINITE, POSE
 from consistency.bench.filters.kernel.work_arrays import Work, make_work
 from consistency.bench.filters.motion.unicycle import robot_frame
 from consistency.referee.types import Array, Indices

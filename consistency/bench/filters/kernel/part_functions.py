@@ -357,7 +357,7 @@ def correct(
 def innovate_again(update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, work: Any) -> bool:
     """A, S without noise, and the innovation about x, for an update that iterates; False where the prior is indefinite.
 
-    From the innovation is taken what the linearisation makes of the way from x to ``work.room.prior`` (3 + w m,).
+    From the innovation is taken what the linearisation makes of the way from x to ``work.prior`` (3 + w m,).
     """
 
 

@@ -30,6 +30,7 @@ class Work(NamedTuple, Generic[Room]):
     Jz: Array  # (w, s)
     Jb: Array  # (3, s) of its position in the robot frame
     pose: Array  # (3,)
+    prior: Array  # (L,) of the variables involved, for an update that iterates
     small: Array  # (3, 3)
     room: Room  # what the update alone needs
     notes: Any  # what the linearisation point alone needs, of a type of its own
@@ -56,6 +57,7 @@ def make_work(slam: Slam, n: int, m: int, steps: int, labels: int) -> Work[Named
         matrix(w, s),
         matrix(3, s),
         vector(3),
+        vector(3 + w * m),
         matrix(3, 3),
         make_room(slam.update, w, s, m, n),
         make_notes(slam.point, w, steps, labels),

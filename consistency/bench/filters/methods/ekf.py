@@ -9,15 +9,6 @@ from typing import Any, NamedTuple
 
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
-from consistency.bench.filters.kernel.gain import (
-    add_noise,
-    combine_seen,
-    correct_at_once,
-    gather,
-    innovate,
-    linearise_seen,
-)
-from consistency.bench.filters.kernel.observation_model import place_observed
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Factors,
@@ -27,6 +18,15 @@ from consistency.bench.filters.kernel.part_functions import (
     place,
     predict_innovation,
     stands_apart,
+)
+from consistency.bench.filters.kernel.update_steps import (
+    add_noise,
+    combine_seen,
+    correct_at_once,
+    gather,
+    innovate,
+    linearise_seen,
+    place_observed,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.landmark.world_point import PlanarPoint, WorldPoint

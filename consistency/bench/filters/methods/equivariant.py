@@ -8,14 +8,6 @@ from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.error.polar import Polar, SensorPoint, sight
-from consistency.bench.filters.kernel.gain import (
-    add_noise,
-    combine_seen,
-    correct_at_once,
-    gather,
-    innovate,
-    linearise_seen,
-)
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Factors,
@@ -25,6 +17,14 @@ from consistency.bench.filters.kernel.part_functions import (
     locate,
     measure_jacobian,
     predict_innovation,
+)
+from consistency.bench.filters.kernel.update_steps import (
+    add_noise,
+    combine_seen,
+    correct_at_once,
+    gather,
+    innovate,
+    linearise_seen,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf

@@ -6,13 +6,6 @@ from typing import NamedTuple
 
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
-from consistency.bench.filters.kernel.arrays import vector
-from consistency.bench.filters.kernel.gain import (
-    combine_seen,
-    correct_iterated,
-    innovate,
-    linearise_seen,
-)
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
@@ -20,15 +13,19 @@ from consistency.bench.filters.kernel.part_functions import (
     correct,
     innovate_again,
     landmark_width,
-    make_room,
     observed_width,
     predict_innovation,
+)
+from consistency.bench.filters.kernel.update_steps import (
+    combine_seen,
+    correct_iterated,
+    innovate,
+    linearise_seen,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.ekf import predict_innovation_linearised
 from consistency.bench.filters.textbook.iekf import PASSES, IteratedKalman
-from consistency.referee.types import Array
 
 
 @part(error="Additive", point="AtEstimate")
@@ -38,30 +35,19 @@ class Iterated(NamedTuple):
     passes: int
 
 
-class PriorRoom(NamedTuple):
-    """The prior of the variables involved, 3 + w m."""
-
-    prior: Array
-
-
-@implement(make_room, Iterated)
-def iterated_room(update: Iterated, w: int, s: int, m: int, n: int) -> PriorRoom:
-    return PriorRoom(vector(3 + w * m))
-
-
 implement(predict_innovation, Iterated)(predict_innovation_linearised)
 implement(correct, Iterated)(correct_iterated)
 
 
 @implement(innovate_again, Iterated)
 def innovate_about_estimate(
-    update: Iterated, slam: Slam, state: State, data: Data, k: int, m: int, work: Work[PriorRoom]
+    update: Iterated, slam: Slam, state: State, data: Data, k: int, m: int, work: Work[NamedTuple]
 ) -> bool:
     """The innovation is z - h(x) - H (prior - x)."""
     w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
     linearise_seen(slam, state, k, m, work)
     combine_seen(slam, state, m, work)
-    x, prior, y = state.x, work.room.prior, innovate(slam, state, data, m, work)
+    x, prior, y = state.x, work.prior, innovate(slam, state, data, m, work)
     for i in range(m):
         o = work.at[i]
         for a in range(s):

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.kernel.covariance import state_index
-from consistency.bench.filters.kernel.gain import correct_iterated, innovate
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Factors,
@@ -20,6 +19,7 @@ from consistency.bench.filters.kernel.part_functions import (
     predict,
     predict_innovation,
 )
+from consistency.bench.filters.kernel.update_steps import correct_iterated, innovate
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ukf
 from consistency.bench.filters.textbook.ispkf import PASSES, IteratedPointsKalman
@@ -70,7 +70,7 @@ def innovate_about_points(
         return False
     y = innovate(slam, state, data, m, work)
     for a in range(3 + w * m):
-        away = work.room.prior[a] - state.x[state_index(w, a, work.at)]
+        away = work.prior[a] - state.x[state_index(w, a, work.at)]
         for row in range(len(y)):
             y[row] -= work.room.Mt[a, row] * away
     return True

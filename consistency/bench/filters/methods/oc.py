@@ -35,7 +35,6 @@ from typing import NamedTuple
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.kernel.arrays import filled, integers, matrix, vector
-from consistency.bench.filters.kernel.observation_model import place_observed
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
@@ -45,6 +44,7 @@ from consistency.bench.filters.kernel.part_functions import (
     place,
     propagate_covariance_at,
 )
+from consistency.bench.filters.kernel.update_steps import place_observed
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.motion.unicycle import move, propagate_covariance_by

@@ -11,9 +11,8 @@ from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.error.invariant_pose import InvariantPose
 from consistency.bench.filters.kernel.part_functions import Slam
-from consistency.bench.filters.landmark.inverse_range import InverseRange
+from consistency.bench.filters.landmark.inverse_range import InverseRange, Pixels
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.sensor.conversion import Pixels
 from consistency.bench.filters.sensor.models import growth_of
 from consistency.bench.filters.textbook.inverse_range import Corrections, searched
 from consistency.bench.filters.textbook.robocentric import (

@@ -9,7 +9,6 @@ from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import sum_of
-from consistency.bench.filters.kernel.gain import combine_seen, correct_at_once, gather, innovate, linearise_seen
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Factors,
@@ -23,6 +22,13 @@ from consistency.bench.filters.kernel.part_functions import (
     measure_jacobian,
     observed_width,
     predict_innovation,
+)
+from consistency.bench.filters.kernel.update_steps import (
+    combine_seen,
+    correct_at_once,
+    gather,
+    innovate,
+    linearise_seen,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf

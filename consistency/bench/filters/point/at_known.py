@@ -9,7 +9,6 @@ import numpy as np
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import copy_matrix, matrix, vector
-from consistency.bench.filters.kernel.observation_model import linearise_at, place_observed
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
@@ -22,6 +21,7 @@ from consistency.bench.filters.kernel.part_functions import (
     place,
     propagate_covariance_at,
 )
+from consistency.bench.filters.kernel.update_steps import linearise_at, place_observed
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.motion.unicycle import propagate_covariance, propagate_covariance_by, robot_frame
 from consistency.referee.types import Array

@@ -13,9 +13,15 @@ from consistency.bench.filters.kernel.arrays import blocks, copy, fill_matrix, i
 from consistency.bench.filters.kernel.covariance import add_gram_to_state, multiply_columns, multiply_rows
 from consistency.bench.filters.kernel.part_functions import Slam, State, make_room, place, predict
 from consistency.bench.filters.kernel.work_arrays import Work
-from consistency.bench.filters.landmark.inverse_range import carried, curvature
+from consistency.bench.filters.landmark.inverse_range import (
+    Pixels,
+    carried,
+    conversion_jacobian,
+    convert,
+    curvature,
+    subtract_bias,
+)
 from consistency.bench.filters.motion.unicycle import Frame, move, noise_columns
-from consistency.bench.filters.sensor.conversion import Pixels, conversion_jacobian, convert, subtract_bias
 from consistency.referee.types import Array, Indices
 
 

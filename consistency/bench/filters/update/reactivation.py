@@ -11,12 +11,11 @@ from consistency.bench.filters.error.invariant_pose import left_jacobian, move_p
 from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
 from consistency.bench.filters.kernel.covariance import add_gram_to_state, gather_all_rows, replace_rows, state_index
-from consistency.bench.filters.kernel.gain import apply_beyond, divide_by_root
 from consistency.bench.filters.kernel.part_functions import Data, Slam, State, correct, predict_innovation
+from consistency.bench.filters.kernel.update_steps import apply_beyond, divide_by_root
 from consistency.bench.filters.kernel.work_arrays import Work
-from consistency.bench.filters.landmark.inverse_range import carried
+from consistency.bench.filters.landmark.inverse_range import carried, observe_range
 from consistency.bench.filters.motion.unicycle import Frame, robot_frame
-from consistency.bench.filters.sensor.conversion import observe_range
 from consistency.bench.filters.update.converting import Converting, ConvertingRoom
 from consistency.bench.filters.update.retraction_chain import (
     aim_apart,

@@ -22,9 +22,7 @@ from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import copy, fill, matrix, vector
 from consistency.bench.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
 from consistency.bench.filters.kernel.covariance import definite_root, state_index
-from consistency.bench.filters.kernel.gain import POSE, add_noise, correct_at_once, gather, innovate
 from consistency.bench.filters.kernel.linalg import semidefinite_cholesky
-from consistency.bench.filters.kernel.observation_model import observe
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Factors,
@@ -38,6 +36,7 @@ from consistency.bench.filters.kernel.part_functions import (
     predict_innovation,
     wrap_residual,
 )
+from consistency.bench.filters.kernel.update_steps import POSE, add_noise, correct_at_once, gather, innovate, observe
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.motion.unicycle import add_motion_noise, move, propagate_covariance_root, robot_frame
 from consistency.referee.types import Array
@@ -63,7 +62,6 @@ class SigmaRoom(NamedTuple):
     Mt: Array  # (L, s m) transposed statistical linearisation
     pose: Array  # (3,)
     landmark: Array  # (w,)
-    prior: Array  # (L,) mean of that prior, for an update that iterates
 
 
 @implement(make_room, Unscented)
@@ -78,7 +76,6 @@ def sigma_room(update: Unscented, w: int, s: int, m: int, n: int) -> SigmaRoom:
         matrix(L, s * m),
         vector(3),
         vector(w),
-        vector(L),
     )
 
 

@@ -168,7 +168,7 @@ def parts(linear: cs.Scenario) -> Slam:
 
 def test_rows_are_touched_for_what_is_known(parts: Slam) -> None:
     data = seen([[0, 1, 2], [1], [0, 2, 3, 4], [0, 1, 2]])
-    reach = touched._reach(parts, data, 3, 3, 18, touched._tally(parts, 3, 3, 18))
+    reach = touched._reach(parts, data, 3, 18, touched._tally(parts, 3, 18))
     assert reach == (3, 3, 18, 12 * 18, 0, 0), "in the last step, with three of the five that are known"
     S, rows = touched.half(9), 12 * 18
     assert touched.touched(parts, data, 18, 0) == 8 * (S + 2 * rows)

@@ -1,8 +1,8 @@
 """What the filter believes: SLAM filters by name.
 
 A method is two files of one name: in ``textbook`` as a textbook writes it, in ``methods`` the parts that its kernel is
-made of. Parts that several methods use are in ``methods.ekf`` or in a folder for each role; ``kernel`` is what all share. Nothing here knows
-the simulation.
+made of. Parts that several methods use are in ``methods.ekf`` or in a folder for each role; ``kernel`` is what all
+share. Nothing here knows the simulation.
 """
 
 from __future__ import annotations

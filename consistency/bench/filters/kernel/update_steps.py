@@ -1,4 +1,4 @@
-"""Steps that updates share: to the observation and back, and the correction, eq. 11 and 12 with W = S^-1/2 Cov(z, x)."""
+"""Steps of all updates: to the observation and back, and the correction, eq. 11 and 12 with W = S^-1/2 Cov(z, x)."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def to_body_jacobian_of_point(
     """The ``row`` turned by the heading."""
     c, s, d0, d1 = frame.c, frame.s, row[0], row[1]
     Hl[0], Hl[1] = c * d0 - s * d1, s * d0 + c * d1
-    if len(values) > 2:
+    if len(Hl) > 2:
         Hl[2] = row[2]
     Hp[0], Hp[1], Hp[2] = -Hl[0], -Hl[1], d0 * body[1] - d1 * body[0]
 
@@ -74,7 +74,7 @@ def insert_point(
     Jp[0, 2], Jp[1, 2] = -s * bx - c * by, c * bx - s * by
     for j in range(Jz.shape[1]):
         Jz[0, j], Jz[1, j] = c * Jb[0, j] - s * Jb[1, j], s * Jb[0, j] + c * Jb[1, j]
-        if len(values) > 2:
+        if len(Jz) > 2:
             values[2], Jz[2, j] = height, Jb[2, j]
 
 

@@ -15,6 +15,7 @@ from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     correct,
+    landmark_width,
     place,
     predict_innovation,
     stands_apart,
@@ -62,7 +63,7 @@ def estimate_stands_apart(point: AtEstimate) -> bool:
 def place_at_estimate(
     point: AtEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
-    place_observed(slam, state.x[:3], z, state.x[state.n :], work)
+    place_observed(slam, state.x[:3], z, state.x[state.n : state.n + landmark_width(slam.landmark)], work)
 
 
 @part()

@@ -1,5 +1,7 @@
 """How files of another estimator are read: one record of options, for readers, commands and Python alike."""
 
+# ruff: noqa: RUF009  # an option is a field
+
 from __future__ import annotations
 
 import math

@@ -21,12 +21,11 @@ from consistency.referee.readers.formats.named_columns import begins_with_number
 from consistency.referee.readers.formats.sheet import Places, TableRows, read_sheet
 from consistency.referee.readers.formats.table_columns import (
     POSE,
+    by_run,
     cross_covariances,
     has_own,
     nis_columns,
-    present_columns,
     require_columns,
-    row_order,
     stated_covariance,
     stated_deviations,
 )
@@ -57,8 +56,10 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
     sheet, note = _sheet(estimates, axes, bool(r.motions))
     estimates = sheet.path
     convention = _convention(r.error, axes, truth)
-    if relative is not None:
-        require_poses(estimates, axes, convention, truth)
+    if relative is not None and truth is None:
+        raise InputError(f"{estimates}: --relative needs --truth FILE, poses in any world")
+    if relative is not None and (axes != POSE or convention == "vector"):
+        raise InputError(f"{estimates}: --relative needs poses x, y, heading, with --error so2, left or right")
     if r.align is not None and manifold_of(convention) != "planar":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
     other, notes = None, [note]
@@ -115,14 +116,6 @@ def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | Non
     return "vector"
 
 
-def require_poses(path: Path, axes: tuple[str, ...], convention: str, truth: Path | None) -> None:
-    """Refuse windows unless the table has planar poses beside a truth."""
-    if truth is None:
-        raise InputError(f"{path}: --relative needs --truth FILE, poses in any world")
-    if axes != POSE or convention == "vector":
-        raise InputError(f"{path}: --relative needs poses x, y, heading, with --error so2, left or right")
-
-
 def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
     """The column that says which estimate belongs to which truth."""
     if r.time_offset is not None:
@@ -152,17 +145,16 @@ def _recording(
     r: Reading,
     relative: Relative | None,
 ) -> Evidence:
-    runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
-    order = row_order(sheet, runs, key)
-    sheet, runs = sheet.rows(order), runs[order]
+    sheet, runs = by_run(sheet, key)
     keys = sheet.numbers(key, finite=True)
     error = covariance = deviations = of_truth = path = None
     keep = np.ones(len(runs), bool)
     notes: list[str] = []
     moved = Aligned(())
     if truth is None:
-        broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *present_columns(sheet, axes)])).all(axis=1)
-        error = None if not broken.any() else np.where(broken, np.nan, 0.0)[:, None]
+        there = [sheet.numbers(axis) for axis in axes if axis in sheet]
+        broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *there])).all(axis=1)
+        error = np.where(broken, np.nan, 0.0)[:, None] if broken.any() else None
     else:
         own = convention != ADDITIVE and axes == POSE and has_own(sheet)
         deviations = None if own else stated_deviations(sheet, axes)
@@ -170,26 +162,22 @@ def _recording(
         estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
         estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
         samples = samples_of(truth, axes, key, r.truth_covariance)
-        shift, clocks = 0.0, list[str]()
+        shift, clocks, reach = r.shift, list[str](), r.tolerance if key == "t" else 0.0
         if relative is not None and deviations is not None:
             raise InputError(
                 f"{sheet.path}: --relative needs covariances; here deviations of each component are stated"
             )
-        if relative is not None:
-            shift = r.shift
-        elif key == "step" and r.align is None:
-            clocks = hints(name, axes, _poses(sheet, samples, runs, keys, estimate, covariance, convention, 0.0))
-        else:
-            reach = r.tolerance if key == "t" else 0.0
-            poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, reach)
-            from consistency.referee.readers.clock_offset import clocks_and_frames
+        if relative is None:
+            moved = Aligned(_poses(sheet, samples, runs, keys, estimate, covariance, convention, reach))
+            if key == "t" or r.align is not None:
+                from consistency.referee.readers.clock_offset import clocks_and_frames
 
-            shift, clocks, moved = clocks_and_frames(name, poses, r.time_offset, r.align, range(len(axes)))
+                shift, clocks, moved = clocks_and_frames(name, moved.runs, r.time_offset, r.align, range(len(axes)))
             clocks += [*moved.notes, *hints(name, axes, moved.runs, shift)]
             if r.align is not None:
-                there = np.isin(runs, np.unique(samples.runs)) if samples.runs is not None else np.ones(len(runs), bool)
-                estimate[there] = np.concatenate([p.estimate for p in moved.runs])
-                covariance[there] = np.concatenate([p.covariance for p in moved.runs])
+                with_truth = np.isin(runs, runs if samples.runs is None else samples.runs)
+                estimate[with_truth] = np.concatenate([p.estimate for p in moved.runs])
+                covariance[with_truth] = np.concatenate([p.covariance for p in moved.runs])
         keep, true, of_truth, notes = matched(
             name, sheet, truth, samples, runs, keys + shift, key, axes, convention, r.tolerance
         )
@@ -294,14 +282,9 @@ def _poses(
 
 def _exact_start(steps: Array, covariance: Array) -> Array:
     """Rows of step 0 where no run is uncertain yet: the start, not an estimate."""
-    start: Array = steps == 0
-    if not start.any() or (steps < 0).any() or not _is_exact(covariance[start]):
-        return np.zeros(len(steps), bool)
-    return start
-
-
-def _is_exact(covariance: Array) -> bool:
-    return bool(np.isin(classify(covariance, ROUNDED), (Validity.DEFICIENT, Validity.INDEFINITE)).all())
+    start: Array = (steps == 0) & ~(steps < 0).any()
+    kinds = classify(covariance[start], ROUNDED)
+    return start & np.isin(kinds, (Validity.DEFICIENT, Validity.INDEFINITE)).all()
 
 
 # --- poses alone -------------------------------------------------------------------------------------
@@ -317,9 +300,7 @@ def table_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
     require_columns(sheet, POSE)
     key = _key(sheet, truth, r)
     samples = samples_of(truth, POSE, key, None)
-    runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
-    order = row_order(sheet, runs, key)
-    sheet, runs = sheet.rows(order), runs[order]
+    sheet, runs = by_run(sheet, key)
     keys, clock = sheet.numbers(key, finite=True), sheet.numbers("t") if "t" in sheet else np.full(len(runs), np.nan)
     estimate = np.column_stack([sheet.numbers(axis) for axis in POSE])
     for run in np.unique(runs):

@@ -42,6 +42,13 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
     return order
 
 
+def by_run(sheet: TableRows, key: str) -> tuple[TableRows, Array]:
+    """The rows in the order of :func:`row_order`, and the run of each, (N,): 0 without a column ``run``."""
+    runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
+    order = row_order(sheet, runs, key)
+    return sheet.rows(order), runs[order]
+
+
 def cross_covariances(sheet: TableRows) -> Array | None:
     """Cross-covariances with the row before, columns C_xx, C_xy, C_xh, C_yx, ..., (N, 3, 3); None without any."""
     out, missing = np.empty((len(sheet), 3, 3)), []
@@ -112,11 +119,6 @@ def require_columns(sheet: TableRows, axes: tuple[str, ...]) -> None:
     if missing:
         hint = "; name other states with --state a,b,c" if axes == POSE else ""
         raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}{hint}")
-
-
-def present_columns(sheet: TableRows, axes: tuple[str, ...]) -> list[Array]:
-    """Columns (N,) of the state that are there."""
-    return [sheet.numbers(axis) for axis in axes if axis in sheet]
 
 
 def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:

@@ -75,13 +75,8 @@ def matched(
         if not len(there.keys):
             has = ", ".join(map(str, np.unique(true_runs)[:5])) if true_runs is not None else ""
             raise InputError(f"{truth.path}: holds no run {run} (it has {has}); without a column 'run' it serves all")
-        if key == "step":
-            own, match = _equal(keys[rows], there.keys)
-            found = there.values[match]
-        else:
-            manifold = manifold_of(convention)
-            own, found, match, apart, _ = truth_at(keys[rows], there.keys, there.values, manifold, tolerance)
-            furthest = max(furthest, float(apart.max(initial=0.0)))
+        own, found, match, apart, _ = truth_at(keys[rows], there.keys, there.values, manifold_of(convention), tolerance)
+        furthest = max(furthest, float(apart.max(initial=0.0)))
         if not len(own):
             spans = [f"{each.min():.10g} to {each.max():.10g}" for each in (keys[rows], there.keys)]
             odd = unit_apart(keys[rows], there.keys, (sheet.path, truth.path))
@@ -106,12 +101,6 @@ def matched(
     if furthest > 1e-6:
         notes.append(f"{name}: the truth is interpolated, from samples up to {furthest:.2g} s away")
     return keep, true, of_truth, notes
-
-
-def _equal(steps: Array, reference: Array) -> tuple[Indices, Indices]:
-    """Indices of equal numbers in two increasing lists."""
-    _, own, match = np.intersect1d(steps, reference, assume_unique=True, return_indices=True)
-    return own, match
 
 
 def _same_instants(sheet: TableRows, truth: TableRows, keep: Array, partner: Array, max_dt: float) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -52,47 +52,68 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
     cross-covariance is not in the file, so a joint NEES would be wrong. With the states and standard deviations of a
     simulation each component is one. The truth may be a drive of KITTI.
     """
-    order = r.covariance_order
     if r.error not in (None, *INERTIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    if order not in (None, *ORDERS):
-        raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}")
+    if r.covariance_order not in (None, *ORDERS):
+        raise InputError(f"--covariance-order {r.covariance_order}: must be {' or '.join(ORDERS)}")
     require_axes(r.axes, STATE)
     if r.truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
-    runs = _runs(estimates, r.truth, r.covariance)
+    files = _runs(estimates, r.truth, r.covariance)
     truth_of = _truths(r)
+    runs = ((read_trajectory(path), truth_of(true), P, list[str]()) for path, true, P in files)
+    source, poses, parts = poses_of(estimates, [(path, true) for path, true, _ in files], runs, r, relative)
+    return recordings_of(source, poses, parts, r, relative)
+
+
+def poses_of(
+    estimates: Path,
+    files: Sequence[tuple[Path | str, Path | str]],
+    runs: Iterable[tuple[Lines, Lines, Path | None, list[str]]],
+    r: Reading,
+    relative: Relative | None = None,
+    why: str = "",
+    apart: str = "",
+) -> tuple[TrajectorySource, list[Poses], Mapping[str, range]]:
+    """Runs before any error is taken, with their origin, and the components whose covariance is known.
+
+    Parameters
+    ----------
+    files : of each run: its estimates, its truth
+    runs : estimates and truth, a file of covariances where they are not in the lines, and notes
+    why : the default error is what it is; that of the layout where empty
+    apart : message where runs are of different layouts
+    """
+    order = r.covariance_order or ORDERS[0]
     parts: Mapping[str, range] = WHOLE
     poses: list[Poses] = []
     notes: list[str] = []
-    for path, true_path, P_path in runs:
-        own, true = read_trajectory(path), truth_of(true_path)
+    for (path, _), (own, true, P_path, said) in zip(files, runs, strict=True):
         own, true, world = localised(own, true)
-        notes += [note for note in (own.note, true.note, world, unused(true, r)) if note]
+        notes += [note for note in (own.note, true.note, world, unused(true, r), *said) if note]
         if not poses:
-            parts = _parts(own)
+            parts, is_fixed = _parts(own), isinstance(own, Fixes)
             error_kind = r.error or ("so3" if parts in (WHOLE, ALONE) else "so3-body")
             require_error(own, r.error)
-        if parts not in (WHOLE, ALONE) and order == ORDERS[0]:
+        if parts not in (WHOLE, ALONE) and r.covariance_order == ORDERS[0]:
             raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
         if _parts(own) is not parts:
-            raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
+            raise InputError(apart or f"{path}: has {own.values.shape[1]} columns, {files[0][0]} another layout")
         if isinstance(own, Fixes):
             poses.append(fixed(own, true, r, of_truth(true, own, ORDERS[0], r)))
             continue
-        k, why = judged_rest(own, true, r, relative)
-        notes += [why] * bool(why)
-        poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r, k))
+        k, unjudged = judged_rest(own, true, r, relative)
+        notes += [unjudged] * bool(unjudged)
+        poses.append(_poses(own, true, P_path, error_kind, order, r, k))
         if _is_point(true):
             poses[-1] = positions(poses[-1], r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE)
-    why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
-    files = [(path, true) for path, true, _ in runs]
+    why = "" if r.error else why or f"; the default of this layout, {_origin(parts)}"
     source = TrajectorySource(estimates, files, r.covariance or estimates, why, tuple(dict.fromkeys(notes)))
     if any(one.manifold == "vector" for one in poses):
-        source = position_source(source, poses, "" if parts is POINTS else error_kind, r, relative)
+        source = position_source(source, poses, "" if is_fixed else error_kind, r, relative)
     elif r.lever_arm is not None:
         raise InputError("--lever-arm: goes with a truth of positions alone; this one has the orientation of its body")
-    return recordings_of(source, poses, parts, r, relative)
+    return source, poses, parts
 
 
 def _truths(r: Reading) -> Callable[[Path], Lines]:
@@ -113,7 +134,7 @@ def _is_point(lines: Lines) -> bool:
 def _parts(own: Lines) -> Mapping[str, range]:
     """Components whose covariance is known, by the layout of a file."""
     if isinstance(own, Fixes):
-        return POINTS
+        return ALONE if own.alone else POINTS
     if isinstance(own, States):
         return SINGLE
     stated = own.values.shape[1] - POSE
@@ -370,6 +391,11 @@ def trajectory_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
         for lines, name in ((own, path), (truth, true_path)):
             if _is_point(lines):
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")
-        place, pose = Places(own.place, np.arange(len(own.t))), slice(1, POSE)
-        poses = Poses.bare(place, own.t, own.values[:, pose], truth.t, truth.values[:, pose], "spatial", r.tolerance)
-        yield NamedPoses(path.stem, poses, own.t)
+        yield bare_poses(path.stem, own, truth, r)
+
+
+def bare_poses(name: str, own: Lines, truth: Lines, r: Reading) -> NamedPoses:
+    """A run of poses in space without covariances."""
+    place, pose = Places(own.place, np.arange(len(own.t))), slice(1, POSE)
+    poses = Poses.bare(place, own.t, own.values[:, pose], truth.t, truth.values[:, pose], "spatial", r.tolerance)
+    return NamedPoses(name, poses, own.t)

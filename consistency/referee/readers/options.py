@@ -5,10 +5,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
+
+from consistency.referee.errors import InputError
 
 COLUMNS = "columns"  # covariance of the truth: of its own file
 MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
@@ -93,6 +95,12 @@ class Reading:
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""
         return [name for name in names or [each.name for each in fields(self)] if getattr(self, name) is not None]
+
+    def refuse(self, flag: str, others: Mapping[str, str]) -> None:
+        """Refuse options that do not go with ``flag``, each with its reason."""
+        for name, why in others.items():
+            if getattr(self, name):
+                raise InputError(f"{flag}: does not go with {flag_of(name)}{why}")
 
     @property
     def tolerance(self) -> float:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
@@ -30,16 +30,14 @@ from consistency.referee.readers.file_kinds import (
 )
 from consistency.referee.readers.formats.text_blocks import is_cut, without_end
 from consistency.referee.readers.options import Reading, flag_of
-
-if TYPE_CHECKING:
-    from consistency.referee.readers.windows import Relative
+from consistency.referee.readers.windows import Relative, relative_of
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 GUESS = "guess"  # judge every convention
 NO_GUESS = {
-    "truth_covariance": "whose covariance is of a declared error too",
-    "shared": "which is fitted to a declared error",
-    "relative": "which judges motions in one error; name the conventions one by one",
+    "truth_covariance": ", whose covariance is of a declared error too",
+    "shared": ", which is fitted to a declared error",
+    "relative": ", which judges motions in one error; name the conventions one by one",
 }
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_SHARED = ("shared", "shared_from", "shared_truth")
@@ -87,14 +85,12 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Evidence]:
     from consistency.referee.readers.formats.sheet import frame_rows
     from consistency.referee.readers.formats.table import read_tables
 
-    over = _windows(reading)
+    over = relative_of(reading.relative, bool(reading.motions), reading.windows)
     sheet = frame_rows(estimates, "estimates") if hasattr(estimates, "columns") else Path(estimates)
     true = frame_rows(truth, "truth") if hasattr(truth, "columns") else truth if truth is None else Path(truth)
     r = _checked(replace(reading, truth=cast(Any, true)), over)
     _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
-    if r.error == GUESS:
-        return guessed("tables", r, lambda kind: _asked(read_tables(sheet, replace(r, error=kind), over), r, over))
-    return _asked(read_tables(sheet, r, over), r, over)
+    return _asked("tables", r, over, lambda kind: read_tables(sheet, replace(r, error=kind), over))
 
 
 def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evidence]:
@@ -141,22 +137,9 @@ def _cut_by(reason: str) -> tuple[Path, int] | None:
 
 def _read(estimates: Path, r: Reading) -> list[Evidence]:
     """Recordings of files as they stand, with the options given."""
-    over = _windows(r)
+    over = relative_of(r.relative, bool(r.motions), r.windows)
     r = _checked(r, over)
-    if r.error == GUESS:
-        return guessed(
-            str(estimates), r, lambda kind: _asked(_by_kind(estimates, replace(r, error=kind), over), r, over)
-        )
-    return _asked(_by_kind(estimates, r, over), r, over)
-
-
-def _windows(r: Reading) -> Relative | None:
-    """Windows that are judged in place of poses."""
-    if not r.given(OF_WINDOWS):
-        return None
-    from consistency.referee.readers.windows import relative_of
-
-    return relative_of(r.relative, bool(r.motions), r.windows)
+    return _asked(str(estimates), r, over, lambda kind: _by_kind(estimates, replace(r, error=kind), over))
 
 
 def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]]) -> list[Evidence]:
@@ -166,9 +149,7 @@ def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]])
     ----------
     read : records under a convention, or under the default
     """
-    for option, why in NO_GUESS.items():
-        if getattr(r, option):
-            raise InputError(f"--error {GUESS}: does not go with {flag_of(option)}, {why}")
+    r.refuse(f"--error {GUESS}", NO_GUESS)
     first = read(None)
     default = first[0].convention
     if default not in (*PLANAR, *SPATIAL) or default == "vector":
@@ -178,7 +159,16 @@ def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]])
     return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
 
 
-def _asked(records: list[Evidence], r: Reading, over: Relative | None) -> list[Evidence]:
+def _asked(
+    name: str, r: Reading, over: Relative | None, read: Callable[[str | None], list[Evidence]]
+) -> list[Evidence]:
+    """Records of what is read under a convention, or under each."""
+    if r.error == GUESS:
+        return guessed(name, r, lambda kind: _declared(read(kind), r, over))
+    return _declared(read(r.error), r, over)
+
+
+def _declared(records: list[Evidence], r: Reading, over: Relative | None) -> list[Evidence]:
     """Records with what is declared of their truth, in pieces or without what all share where that is asked."""
     pieces = pieces_asked(r)
     if r.given(OF_TRUTH) or any(record.truth_covariance is not None for record in records):
@@ -222,9 +212,7 @@ def pieces_asked(r: Reading) -> int | None:
     """
     if r.split is None:
         return None
-    for option in OF_WINDOWS:
-        if getattr(r, option):
-            raise InputError(f"--split: does not go with {flag_of(option)}, which cuts the log into windows")
+    r.refuse("--split", dict.fromkeys(OF_WINDOWS, ", which cuts the log into windows"))
     if r.align not in (None, "none"):
         raise InputError(f"--split: does not go with --align {r.align}: all pieces would share the error of one frame")
     if r.split == "auto":

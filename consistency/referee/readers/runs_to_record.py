@@ -14,6 +14,7 @@ from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, 
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.sheet import Places, refuse
 from consistency.referee.types import Array, Failure, Indices
 
 
@@ -23,7 +24,7 @@ class Track:
 
     run: int
     column: Indices  # (k,), increasing, 0..T-1
-    place: Sequence[str]  # (k,), "est.csv, line 7"
+    place: Places  # (k,), "est.csv, line 7"
     error: Array | None = None  # (k, n), NaN where the estimate is
     covariance: Array | None = None  # (k, n, n)
     nis: Array | None = None  # (k,)
@@ -141,10 +142,9 @@ def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
     with np.errstate(invalid="ignore"):  # of infinite ones
         for piece in of_runs(out):
             P = covariance[piece]
-            bad = np.flatnonzero(asymmetric(P, ROUNDED))
-            if len(bad):
-                row = piece.start + int(bad[0])
-                raise InputError(f"{place(row)}: the covariance is not symmetric; write P = (P + P') / 2")
+            rows = Places(place, np.arange(piece.start, piece.stop))
+            what = "the covariance is not symmetric; write P = (P + P') / 2"
+            refuse(asymmetric(P, ROUNDED), rows.__getitem__, what)
             out[piece] = 0.5 * (P + np.swapaxes(P, -1, -2))
     return out
 
@@ -199,7 +199,8 @@ def _cut(track: Track, start: int, end: int) -> Track:
         values[start:] = nees(error[start:], P[start:])
         if start:
             P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
-    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values, t, of_truth, path)
+    place = track.place.at(slice(end))
+    return Track(track.run, track.column[:end], place, error, P, nis, dof, values, t, of_truth, path)
 
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:

@@ -17,9 +17,9 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of
 
 REFUSED = {
-    "split": "pieces of one log all have what is constant over it",
-    "truth_covariance": "what the truth scatters by is fitted as a floor",
-    "align": "a fitted frame takes a part of what all estimates share",
+    "split": ": pieces of one log all have what is constant over it",
+    "truth_covariance": ": what the truth scatters by is fitted as a floor",
+    "align": ": a fitted frame takes a part of what all estimates share",
 }
 ONE_LOG = "what all estimates share was fitted to one half of the same log, and other drives may have other errors"
 
@@ -32,9 +32,7 @@ def require_shared_options(r: Reading) -> None:
         return
     if r.shared not in KINDS:
         raise InputError(f"--shared {r.shared}: must be {', '.join(KINDS[:-1])} or {KINDS[-1]}")
-    for option, why in REFUSED.items():
-        if getattr(r, option):
-            raise InputError(f"--shared: does not go with {flag_of(option)}: {why}")
+    r.refuse("--shared", REFUSED)
 
 
 def other_drives(r: Reading) -> Reading:

@@ -17,7 +17,7 @@ class Aligned:
     """Runs in the world of the truth, with notes on the alignment."""
 
     runs: Sequence[Poses]  # moved estimates, with covariances of the residual errors
-    mode: str = "none"
+    align: str = "none"  # the mode
     notes: tuple[str, ...] = ()
     caption: str = ""  # what the verdict has to say of it
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
@@ -26,14 +26,7 @@ class Aligned:
 
     def on(self, recording: Evidence) -> Evidence:
         """Recording of these runs, with the notes on their alignment."""
-        return replace(
-            recording,
-            align=self.mode,
-            caption=self.caption,
-            reduced=self.reduced,
-            unavailable=self.unavailable,
-            unseen=self.unseen,
-        )
+        return replace(recording, **{key: value for key, value in vars(self).items() if key not in ("runs", "notes")})
 
 
 def require_alignment(mode: str | None, truth: object) -> str | None:

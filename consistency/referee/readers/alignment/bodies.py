@@ -68,15 +68,15 @@ def _jacobian(convention: str, R: Array, body: BodyTransform) -> Array:
     J = np.broadcast_to(np.eye(6), (len(R), 6, 6)).copy()
     back, arm = body.turn.inv().as_matrix(), np.broadcast_to(body.arm, (len(R), 3))
     if convention == "left":
-        J[:, :3, :3], J[:, :3, 3:], J[:, 3:, 3:] = back, -back @ _skew(arm), back
+        J[:, :3, :3], J[:, :3, 3:], J[:, 3:, 3:] = back, -back @ skew(arm), back
     elif convention == "so3-body":
-        J[:, :3, 3:], J[:, 3:, 3:] = -R @ _skew(arm), back
+        J[:, :3, 3:], J[:, 3:, 3:] = -R @ skew(arm), back
     elif convention != "right":
-        J[:, :3, 3:] = -_skew((R @ arm[..., None])[..., 0])
+        J[:, :3, 3:] = -skew((R @ arm[..., None])[..., 0])
     return np.asarray(J)
 
 
-def _skew(v: Array) -> Array:
+def skew(v: Array) -> Array:
     """Matrices (..., 3, 3) of the cross product with v (..., 3)."""
     return np.asarray(np.cross(np.eye(3), v[..., None, :]))
 

@@ -74,7 +74,7 @@ def aligned(
     frames = frames_of(name, runs, mode, judged) if frames is None else frames
     there = [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
     found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
-    return replace(found, mode=mode, notes=(_sizes(name, mode, frames), *found.notes))
+    return replace(found, align=mode, notes=(_sizes(name, mode, frames), *found.notes))
 
 
 # --- residual errors -------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, one_line, require_name
 from consistency.referee.readers.formats.numpy_archive import load_arrays, run_lengths, step_times, whole_numbers
-from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet
+from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet, refuse
 from consistency.referee.readers.formats.table_columns import row_order
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array
@@ -88,12 +88,8 @@ def checked_dof(nis: Array, dof: Array, place: Callable[[int], str]) -> Array:
     """
     dof = np.where(np.isnan(nis) & np.isnan(dof), 0.0, dof)
     bad = (nis < 0) | np.isinf(nis) | ~are_dof(dof)
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise InputError(
-            f"{place(row)}: nis {nis[row]:g} with nis_dof {dof[row]:g}; "
-            "nis must be 0 or more and finite, nis_dof a whole number from 0 to below 2^31"
-        )
+    needed = "nis must be 0 or more and finite, nis_dof a whole number from 0 to below 2^31"
+    refuse(bad, place, lambda row: f"nis {nis[row]:g} with nis_dof {dof[row]:g}; {needed}")
     return dof
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.records.symmetric import diagonal
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.sheet import Lines, read_numbers
+from consistency.referee.readers.formats.sheet import Lines, read_numbers, refuse
 from consistency.referee.types import Array
 
 CAMERAS, CALIBRATION = 18, 15  # column with the number of cameras, and numbers of each one's calibration
@@ -51,9 +51,7 @@ def read_deviations(path: Path) -> tuple[Lines, Array]:
     if not _has_cameras(lines.values, CAMERAS - 1, CALIBRATION - 1):
         raise InputError(f"{lines.place(0)}: has {lines.values.shape[1]} columns; should be {LAYOUT}")
     sigma = lines.values[:, SIGMA]
-    negative = np.flatnonzero((sigma < 0).any(axis=1))
-    if len(negative):
-        raise InputError(f"{lines.place(int(negative[0]))}: a standard deviation is below 0; should be {LAYOUT}")
+    refuse((sigma < 0).any(axis=1), lines.place, f"a standard deviation is below 0; should be {LAYOUT}")
     return lines, diagonal(np.concatenate([sigma[:, 3:6], sigma[:, :3], sigma[:, 6:]], axis=1))
 
 

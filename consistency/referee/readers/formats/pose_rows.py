@@ -27,7 +27,7 @@ from consistency.referee.readers.formats.named_columns import (  # fmt: skip
 )
 from consistency.referee.readers.formats.openvins import FULL as STATES
 from consistency.referee.readers.formats.openvins import as_states
-from consistency.referee.readers.formats.sheet import Lines, increasing, read_rows, read_sheet
+from consistency.referee.readers.formats.sheet import Lines, increasing, read_rows, read_sheet, refuse
 from consistency.referee.readers.formats.text_blocks import blocks
 from consistency.referee.types import Array, Indices
 
@@ -177,12 +177,8 @@ def _is_rigid(numbers: Array) -> Indices:
 def _matrices(lines: Lines) -> Lines:
     """Matrices that turn body into world coordinates, row by row, behind a time or a number or neither."""
     numbers, before, covariance = _matrix(lines)
-    wrong = np.flatnonzero(~_is_rigid(numbers))
-    if len(wrong):
-        raise InputError(
-            f"{lines.place(int(wrong[0]))}: the {numbers.shape[1]} numbers are no rotation and translation, row by "
-            f"row; should be these, or {LAYOUT}"
-        )
+    what = f"the {numbers.shape[1]} numbers are no rotation and translation, row by row; should be these, or {LAYOUT}"
+    refuse(~_is_rigid(numbers), lines.place, what)
     t, clock = _clock(lines, before)
     M = numbers.reshape(len(numbers), -1, 4)
     quaternion = np.full((len(M), 4), np.nan)

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -133,27 +133,25 @@ class Lines:
         return replace(self, values=self.values[:, columns].copy())
 
 
-class Places(Sequence[str]):
+class Places:
     """Places of some rows of a file, put into words when asked for."""
 
     def __init__(self, of: Callable[[int], str], rows: Indices) -> None:
         self._of, self._rows = of, rows
 
-    @overload
-    def __getitem__(self, which: int) -> str: ...
-    @overload
-    def __getitem__(self, which: slice) -> Places: ...
-    def __getitem__(self, which: int | slice) -> str | Places:
-        if isinstance(which, slice):
-            return Places(self._of, self._rows[which])
+    def __getitem__(self, which: int) -> str:
         return self._of(int(self._rows[which]))
 
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def at(self, rows: Indices) -> Places:
+    def at(self, rows: Indices | slice) -> Places:
         """Places of some of the rows."""
         return Places(self._of, self._rows[rows])
+
+
+def refuse(bad: Any, place: Callable[[int], str], what: str | Callable[[int], str]) -> None:
+    """Refuse rows, (N,) of bool, that are ``bad``, by what is wrong with the first of them."""
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(f"{place(row)}: {what if isinstance(what, str) else what(row)}")
 
 
 def bounded(values: Array) -> Array:
@@ -172,9 +170,7 @@ def read_sheet(path: Path) -> TableRows:
     if not len(sheet):
         raise InputError(f"{path}: holds no row")
     if "filter" in sheet:
-        empty = np.flatnonzero(sheet.empty("filter"))
-        if len(empty):
-            raise InputError(f"{sheet.place(int(empty[0]))}: column 'filter' is empty")
+        refuse(sheet.empty("filter"), sheet.place, "column 'filter' is empty")
         for name in dict.fromkeys(sheet.texts("filter")):
             require_name(name, f"{path}: column 'filter'")
     return sheet
@@ -324,14 +320,8 @@ def _number(cell: object) -> float:
 def _joined(parts: list[Column]) -> Column:
     """Parts of a column below each other, as objects where one of them is."""
     if any(part.dtype.kind == "O" for part in parts):
-        parts = [part if part.dtype.kind == "O" else _objects(part) for part in parts]
+        parts = [part if part.dtype.kind == "O" else np.where(np.isnan(part), np.array(None), part) for part in parts]
     return np.concatenate(parts)
-
-
-def _objects(values: Array) -> Column:
-    cells = values.astype(object)
-    cells[np.isnan(values)] = None
-    return cells
 
 
 def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
@@ -358,16 +348,14 @@ def read_rows(path: Path, widths: Sequence[int], layout: str, header: int = 0) -
 
 def increasing(lines: Lines) -> Lines:
     """Lines whose first column is finite and increases; others are refused."""
-    wrong = np.flatnonzero(~np.isfinite(lines.t))
-    if len(wrong):
-        raise InputError(f"{lines.place(int(wrong[0]))}: the timestamp is not finite")
-    wrong = np.flatnonzero(np.diff(lines.t) <= 0)
-    if len(wrong):
-        row = int(wrong[0]) + 1
-        what = "is there twice" if lines.t[row] == lines.t[row - 1] else "is less than the one before"
-        raise InputError(
-            f"{lines.place(row)}: timestamp {lines.t[row]:.10g} {what}; they must increase, so leave the row out"
-        )
+    t = lines.t
+    refuse(~np.isfinite(t), lines.place, "the timestamp is not finite")
+
+    def what(row: int) -> str:
+        of = "is there twice" if t[row] == t[row - 1] else "is less than the one before"
+        return f"timestamp {t[row]:.10g} {of}; they must increase, so leave the row out"
+
+    refuse(np.append(False, np.diff(t) <= 0), lines.place, what)
     return lines
 
 

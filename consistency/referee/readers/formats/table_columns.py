@@ -9,7 +9,7 @@ import numpy as np
 from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.named_columns import DEVIATIONS
-from consistency.referee.readers.formats.sheet import TableRows, are_dof
+from consistency.referee.readers.formats.sheet import TableRows, are_dof, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.types import Array, Indices
 
@@ -129,10 +129,6 @@ def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:
         raise InputError(f"{sheet.path}: column 'nis_dof' is missing; it is the number of measurements in each nis")
     nis, dof = sheet.numbers("nis"), sheet.numbers("nis_dof")
     bad = (nis < 0) | np.isinf(nis) | (np.isfinite(nis) & ~are_dof(dof))
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise InputError(
-            f"{sheet.place(row)}: nis {nis[row]:g} with nis_dof {dof[row]:g}; "
-            "nis must be 0 or more, nis_dof a whole number from 0 to below 2^31"
-        )
+    what = "nis {:g} with nis_dof {:g}; nis must be 0 or more, nis_dof a whole number from 0 to below 2^31".format
+    refuse(bad, sheet.place, lambda row: what(nis[row], dof[row]))
     return nis, np.where(np.isfinite(nis), dof, 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.sheet import TableRows
+from consistency.referee.readers.formats.sheet import TableRows, refuse
 from consistency.referee.readers.formats.table_columns import require_columns, row_order, stated_covariance
 from consistency.referee.readers.matching import Manifold, nearest, truth_at, unit_apart
 from consistency.referee.readers.options import COLUMNS
@@ -104,12 +104,7 @@ def matched(
 
 
 def _same_instants(sheet: TableRows, truth: TableRows, keep: Array, partner: Array, max_dt: float) -> None:
-    own = sheet.numbers("t")[keep]
-    other = truth.numbers("t")[partner[keep]]
-    off = np.flatnonzero(np.abs(own - other) > max_dt + 1e-6)
-    if len(off):
-        row = int(np.flatnonzero(keep)[off[0]])
-        raise InputError(
-            f"{sheet.place(row)}: t is {own[off[0]]:.10g}, but {other[off[0]]:.10g} in the same step of {truth.path}; "
-            "number the same instants by the same step, or raise --max-dt"
-        )
+    own, other = sheet.numbers("t"), truth.numbers("t")[partner]
+    where = f"in the same step of {truth.path}; number the same instants by the same step, or raise --max-dt"
+    off = keep & (np.abs(own - other) > max_dt + 1e-6)
+    refuse(off, sheet.place, lambda row: f"t is {own[row]:.10g}, but {other[row]:.10g} {where}")

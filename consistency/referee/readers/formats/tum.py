@@ -18,7 +18,7 @@ from consistency.referee.readers.formats.kitti_oxts import read_drive
 from consistency.referee.readers.formats.openvins import LAYOUT, States, read_deviations
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, POINT, POSE, SPLIT, TRIANGLE, read_poses
 from consistency.referee.readers.formats.position_truth import fixed, position_source, positions
-from consistency.referee.readers.formats.sheet import Lines, Places, read_numbers
+from consistency.referee.readers.formats.sheet import Lines, Places, read_numbers, refuse
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.poses import NamedPoses, Poses
@@ -312,26 +312,17 @@ def read_trajectory(path: Path, true: bool = False) -> Lines:
     """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
     lines = read_poses(path, true)
     pose = lines.values[:, 1:POSE]
-    if true and not np.isfinite(pose).all():
-        row = int(np.flatnonzero(~np.isfinite(pose).all(axis=1))[0])
-        raise InputError(f"{lines.place(row)}: the truth is not finite; leave such lines out")
+    finite = np.isfinite(pose).all(axis=1)
+    if true:
+        refuse(~finite, lines.place, "the truth is not finite; leave such lines out")
     if _is_point(lines):
         return lines
     length = np.linalg.norm(pose[:, 3:], axis=1)
-    bad = np.flatnonzero(np.isfinite(pose).all(axis=1) & (np.abs(length - 1.0) > UNIT))
-    if len(bad):
-        row = int(bad[0])
-        raise InputError(
-            f"{lines.place(row)}: the quaternion has length {length[row]:.4g}, not 1; {_columns_of(lines)}"
-        )
+    columns = f"columns {'2 to 5' if isinstance(lines, States) else '5 to 8'} must be qx qy qz qw"
+    where = lines.note.partition(": ")[2] or columns
+    bad = finite & (np.abs(length - 1.0) > UNIT)
+    refuse(bad, lines.place, lambda row: f"the quaternion has length {length[row]:.4g}, not 1; {where}")
     return lines
-
-
-def _columns_of(lines: Lines) -> str:
-    """Where a quaternion should be."""
-    if lines.note:
-        return lines.note.partition(": ")[2]
-    return f"columns {'2 to 5' if isinstance(lines, States) else '5 to 8'} must be qx qy qz qw"
 
 
 def read_covariances(path: Path) -> Lines:

@@ -58,20 +58,10 @@ class Windows:
     """The windows of one run, W of them."""
 
     track: Track  # with the times of their beginnings
+    error: Array  # (W, n), NaN where the estimate is
+    covariance: Array  # (W, n, n)
     t: Array  # (W,), s, at the end of each
     left_out: int
-
-    @property
-    def error(self) -> Array:
-        """(W, n), NaN where the estimate is."""
-        assert self.track.error is not None
-        return self.track.error
-
-    @property
-    def covariance(self) -> Array:
-        """(W, n, n)."""
-        assert self.track.covariance is not None
-        return self.track.covariance
 
 
 def windows_of(stretch: Stretch, relative: Relative) -> Windows:
@@ -103,7 +93,7 @@ def windows_of(stretch: Stretch, relative: Relative) -> Windows:
         error = np.concatenate([error, np.full((1, error.shape[1]), 0.0 if finite else np.nan)])
         covariance = np.concatenate([covariance, np.full((1, *s.covariance.shape[1:]), np.nan)])
     track = Track(s.run, np.arange(len(last)), s.place.at(last), error, covariance, t=s.t[first])
-    return Windows(track, s.t[last], left_out)
+    return Windows(track, error, covariance, s.t[last], left_out)
 
 
 def _sound(s: Stretch, relative: Relative) -> int:
@@ -174,7 +164,7 @@ def relative_recording(
         columns, t = common_times(times)
         tracks = [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
     notes = _notes(name, found, axes, stretches[0].convention, relative)
-    of = _independence(found)
+    of = independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
     notes += _doubt(name, of, relative) if relative.independent else []
     record = assemble(name, tracks, t, tuple(axes[i] for i in part), file, KIND, notes)
     if not relative.independent:
@@ -224,10 +214,6 @@ def _widest(found: Sequence[Windows]) -> float:
     angles = P[:, 2:, 2:] if P.shape[-1] == 3 else P[:, 3:, 3:]
     angles = angles[np.isfinite(angles).all(axis=(1, 2))]
     return float(np.median(np.sqrt(np.maximum(np.linalg.eigvalsh(angles)[:, -1], 0.0)))) if len(angles) else 0.0
-
-
-def _independence(found: Sequence[Windows]) -> Independence:
-    return independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
 
 
 def _doubt(name: str, of: Independence, relative: Relative) -> list[str]:

@@ -51,7 +51,7 @@ class Match:
     """The estimates of one run that have truth and covariance."""
 
     track: Track
-    t: Array  # (k,)
+    t: Array  # (k,), s
     left_out: int
     angle: float  # rad, median of the rotation error
     bent: float  # sigma, median of what the interpolated truth may be off by

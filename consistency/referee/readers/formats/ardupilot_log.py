@@ -19,7 +19,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.formats.innovation_files import NisLog, choose
-from consistency.referee.readers.formats.px4_log import MICRO, Pairs, nis_of
+from consistency.referee.readers.formats.px4_log import MICRO, Pairs, nis_of, require_in_order
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array
 
@@ -164,6 +164,5 @@ def _times(path: Path, message: str, rows: list[dict[str, float]]) -> Array:
     t = np.array([row["TimeUS"] * MICRO if "TimeUS" in row else row.get("TimeMS", np.nan) * 1e-3 for row in rows])
     if not np.isfinite(t).all():
         raise InputError(f"{path}: {message} has no field TimeUS")
-    if len(back := np.flatnonzero(np.diff(t) < 0)):
-        raise InputError(f"{path}: message {back[0] + 2} of {message} is older than the one before; the log is damaged")
+    require_in_order(path, message, t)
     return t

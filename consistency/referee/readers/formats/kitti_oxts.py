@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_text, reading
 from consistency.referee.readers.formats.kitti_files import NANO, numbers, place_of, read_keys, read_times, turn
+from consistency.referee.readers.formats.pose_rows import on_plane
 from consistency.referee.readers.formats.sheet import Lines, TableRows
 from consistency.referee.types import Array
 
@@ -69,9 +70,7 @@ def drive_sheet(folder: Path, body: str | None = None) -> TableRows:
     if body not in (None, *LEVEL):
         raise InputError(f"--body {body}: with x, y, heading it is {' or '.join(LEVEL)}, whose x and y are level")
     lines = read_drive(folder, body)
-    ahead = Rotation.from_quat(lines.values[:, 4:]).apply([1.0, 0.0, 0.0])
-    columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
-    return TableRows(folder, columns, lines.line, "packet")
+    return on_plane(lines, "packet")
 
 
 def mercator(place: Array) -> Array:
@@ -98,18 +97,13 @@ def _packet(path: Path) -> list[float]:
 
 
 def _mount(folder: Path, body: str) -> Array:
-    """Matrix (4, 4) that takes points of the inertial unit to the body."""
+    """Matrix (4, 4) that takes points of the inertial unit to the body, of the lines R and T of calibration files."""
     mount = np.eye(4)
     for name in BODIES[body]:
-        mount = _calibration(folder, f"calib_{name}.txt") @ mount
+        path = place_of(folder, f"calib_{name}.txt")
+        if path is None:
+            raise InputError(f"{folder}: --body needs calib_{name}.txt, here or in the folder above")
+        rows, part = read_keys(path), np.eye(4)
+        part[:3, :3], part[:3, 3] = turn(path, rows, "R"), numbers(path, rows, "T", (3,))
+        mount = part @ mount
     return mount
-
-
-def _calibration(folder: Path, name: str) -> Array:
-    """Matrix (4, 4) of the lines R and T of a file of calibration."""
-    path = place_of(folder, name)
-    if path is None:
-        raise InputError(f"{folder}: --body needs {name}, here or in the folder above")
-    rows, out = read_keys(path), np.eye(4)
-    out[:3, :3], out[:3, 3] = turn(path, rows, "R"), numbers(path, rows, "T", (3,))
-    return out

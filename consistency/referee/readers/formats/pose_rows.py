@@ -27,7 +27,7 @@ from consistency.referee.readers.formats.named_columns import (  # fmt: skip
 )
 from consistency.referee.readers.formats.openvins import FULL as STATES
 from consistency.referee.readers.formats.openvins import as_states
-from consistency.referee.readers.formats.sheet import Lines, increasing, read_rows, read_sheet, refuse
+from consistency.referee.readers.formats.sheet import Lines, TableRows, increasing, read_rows, read_sheet, refuse
 from consistency.referee.readers.formats.text_blocks import blocks
 from consistency.referee.types import Array, Indices
 
@@ -79,6 +79,13 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     if states is None:
         raise InputError(f"{lines.place(0)}: has {width} columns; should be {LAYOUT}")
     return states
+
+
+def on_plane(lines: Lines, unit: str) -> TableRows:
+    """Columns t, x, y and heading of poses in space, which is that of the x axis."""
+    ahead = Rotation.from_quat(lines.values[:, 4:POSE]).apply([1.0, 0.0, 0.0])
+    columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
+    return TableRows(lines.path, columns, lines.line, unit)
 
 
 def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:

@@ -139,10 +139,14 @@ def _paired(path: Path, innovations: dict[str, Array], variances: dict[str, Arra
 
 
 def _times(path: Path, topic: str, stamps: Array) -> Array:
-    back = np.flatnonzero(np.diff(stamps.astype(np.int64)) < 0)
-    if len(back):
-        raise InputError(f"{path}: message {back[0] + 2} of {topic} is older than the one before; the log is damaged")
+    require_in_order(path, topic, stamps.astype(np.int64))
     return stamps.astype(float) * MICRO
+
+
+def require_in_order(path: Path, topic: str, t: Array) -> None:
+    """Refuse messages whose times go back."""
+    if len(back := np.flatnonzero(np.diff(t) < 0)):
+        raise InputError(f"{path}: message {back[0] + 2} of {topic} is older than the one before; the log is damaged")
 
 
 def _together(times: Array, others: Array, exact: bool) -> tuple[Indices, Indices]:

@@ -94,7 +94,8 @@ def folds_of(
     none = np.zeros(len(drives), np.int64)
     every = np.arange(len(drives))
     if held_out == HALF or (held_out is None and len(drives) == 1):
-        middle = np.array([_middle(windows, int(i)) for i in every])
+        ends = [windows.last[windows.drive == i] for i in every]
+        middle = np.array([int(each[(len(each) - 1) // 2]) if len(each) else 0 for each in ends])  # rows at half time
         early = windows.of(windows.last <= middle[windows.drive])
         return fit_noise(windows, correct), [Fold(fit_noise(early, correct), every, middle)]
     if held_out is None:
@@ -112,12 +113,6 @@ def folds_of(
         raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if not rest.any() else 'judge'}")
     noise = fit_noise(windows.of(rest), correct)
     return noise, [Fold(noise, judged, none)]
-
-
-def _middle(windows: Windows, drive: int) -> int:
-    """Row at which half of the windows of a drive are over."""
-    ends = windows.last[windows.drive == drive]
-    return int(ends[(len(ends) - 1) // 2]) if len(ends) else 0
 
 
 def judged_by(folds: Sequence[Fold], windows: Windows, drives: int, general: bool) -> Judged:

@@ -13,12 +13,12 @@ from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, ZERO, solid, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, Span
-from consistency.referee.extras import require
 from consistency.referee.fit_covariance.covariance_ratios import Judged
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
+from consistency.referee.fit_covariance.variances import nees_of
 from consistency.referee.fit_covariance.windows import span_of
 from consistency.referee.fit_covariance.wording import document
-from consistency.referee.types import Array
+from consistency.referee.pages.write_pages import plotted
 
 SHOWN = 3  # spans with a panel of errors
 WIDTH, HEIGHT = 3.0, 2.7  # inches, of a panel
@@ -61,18 +61,8 @@ def panels(model: NoiseModel) -> tuple[tuple[Panel, ...], ...]:
 
 def plot(model: NoiseModel, path: str | Path | None) -> Any:
     """All panels in one figure of Matplotlib; see :meth:`NoiseModel.plot`."""
-    require("a plot", "plot")
-    from consistency.referee.show.with_matplotlib import drawn, picture
-
     errors, rest = panels(model)
-    figure = drawn(Sheet((*errors, *rest), 5.0, columns=3))
-    if path is not None:
-        from consistency.referee.pages.write_pages import require_plot, write_file
-
-        path = Path(path)
-        require_plot(path, overwrite=True)
-        write_file(path, picture(figure, path.suffix.lower().removeprefix(".")))
-    return figure
+    return plotted(Sheet((*errors, *rest), 5.0, columns=3), path)
 
 
 def _errors(model: NoiseModel, judged: Judged) -> Panel:
@@ -82,9 +72,8 @@ def _errors(model: NoiseModel, judged: Judged) -> Panel:
     values, vectors = np.linalg.eigh(C)
     radius = np.sqrt(float(stats.chi2.ppf(CONFIDENCE, 2)))
     ellipse = radius * (vectors * np.sqrt(np.maximum(values, 0.0))) @ np.array([np.cos(CIRCLE), np.sin(CIRCLE)])
-    inside = float(
-        (stats.chi2.cdf(_squared(error[:, :2], model.noise.covariance(windows.pieces)), 2) < CONFIDENCE).mean()
-    )
+    squared = nees_of(error[:, :2], model.noise.covariance(windows.pieces)[:, :2, :2])
+    inside = float((stats.chi2.cdf(squared, 2) < CONFIDENCE).mean())
     marks: tuple[Mark, ...] = (
         Points(error[:, 0], error[:, 1], replace(style(0), size=2.5, alpha=0.7), whole=True),
         Line(ellipse[0], ellipse[1], solid(style(1)), path=True),
@@ -92,11 +81,6 @@ def _errors(model: NoiseModel, judged: Judged) -> Panel:
     )  # fmt: skip
     title = f"{span_of(judged.span).text}: {100 * inside:.0f} % of {len(error)} inside"
     return Panel(Axis("error in x (m)"), Axis("error in y (m)"), marks, f"Errors over {judged.span}", title=title)
-
-
-def _squared(error: Array, C: Array) -> Array:
-    P = C[:, : error.shape[1], : error.shape[1]]
-    return np.asarray((error * np.linalg.solve(P, error[..., None])[..., 0]).sum(axis=1))
 
 
 def _growth(model: NoiseModel, axes: range, unit: str) -> Panel:

@@ -76,7 +76,6 @@ def robot_localization(model: NoiseModel) -> str:
 
 def seconds(model: NoiseModel) -> float:
     """Median time that a motion over the span takes, s, over which the floor is spread; 1 without a clock."""
-    assert model.windows is not None
     w = model.windows
     took = [model.drives[i].t[b] - model.drives[i].t[a] for i, a, b in zip(w.drive, w.first, w.last, strict=True)]
     median = float(np.median(took)) if took else float("nan")
@@ -138,7 +137,6 @@ constexpr double kSqrtInformation[{n * n}] = {{
 
 def straight(model: NoiseModel) -> Array:
     """Covariance (n, n) of a straight motion as long as the median one of the windows."""
-    assert model.windows is not None
     d = model.windows.d
     way = float(np.median(ways(model.noise.mean.applied(model.windows).pieces).sum(axis=1)))
     motion = np.zeros(3 if d == 2 else 7)

@@ -12,7 +12,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, none_of
 from consistency.referee.fit_covariance.variances import blocks_of, fit_terms, interval_of, nees_of, terms_of
-from consistency.referee.fit_covariance.windows import Windows, windows_of
+from consistency.referee.fit_covariance.windows import Windows, windows_at
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
@@ -99,13 +99,10 @@ def with_jitter(noise: Noise, drives: Sequence[Drive], windows: Windows, planar:
     squares, stated = [], []
     for part in SHORTER:
         size = windows.span.size / part
-        try:
-            if windows.span.unit == "step" and size < 1:
-                continue
-            some = windows_of(
-                drives, replace(windows.span, size=round(size) if windows.span.unit == "step" else size), planar
-            )
-        except InputError:
+        if windows.span.unit == "step":
+            size = round(size) if size >= 1 else 0
+        some = windows_at(drives, windows, size, planar) if size else None
+        if some is None:
             continue
         now = noise.mean.applied(some)
         squares.append((now.errors**2).mean(axis=0))

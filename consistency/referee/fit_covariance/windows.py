@@ -118,6 +118,14 @@ def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) ->
     return found.of(moved & ~jumped)
 
 
+def windows_at(drives: Sequence[Drive], windows: Windows, size: float, planar: bool) -> Windows | None:
+    """The windows of all drives over a span of another size; None where none fits."""
+    try:
+        return windows_of(drives, replace(windows.span, size=size), planar)
+    except InputError:
+        return None
+
+
 def _pieces(
     number: int, drive: Drive, first: Indices, last: Indices, planar: bool
 ) -> tuple[Indices, Indices, Indices, Array, Array, Array]:

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.words.sentences import plural
 from consistency.referee.document.blocks import Bullets, Facts
 from consistency.referee.document.verdict import summary
-from consistency.referee.extras import require
 from consistency.referee.show import as_html, text
-from consistency.referee.system.atomic import write_whole
-
-if TYPE_CHECKING:
-    from consistency.referee.show.with_matplotlib import Drawn
 
 
 def record_text(record: Record) -> str:
@@ -48,19 +43,9 @@ def verdict_html(verdict: Verdict) -> str:
     return as_html.fragment(*summary(verdict)) + "".join(map(as_html.block, pictures))
 
 
-def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Drawn:
+def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Any:
     """See :meth:`Record.plot`."""
+    from consistency.referee.pages.write_pages import plotted
     from consistency.referee.pages.files_report import record_sheet
 
-    sheet = record_sheet(record, verdict)
-    require("a plot", "plot")
-    from consistency.referee.show.with_matplotlib import drawn, picture
-
-    figure = drawn(sheet)
-    if path is not None:
-        from consistency.referee.pages.write_pages import require_plot
-
-        path = Path(path)
-        require_plot(path, overwrite=True)
-        write_whole(path, picture(figure, path.suffix.lower().removeprefix(".")), 0o644)
-    return figure
+    return plotted(record_sheet(record, verdict), path)

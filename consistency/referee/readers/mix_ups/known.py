@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -161,7 +162,7 @@ def _quaternions() -> Iterator[Guess]:
     )
 
 
-def _changed(names: Sequence[str], function: Callable[[Array], Array]) -> Change:
+def _changed(names: Sequence[str], function: Callable[[Array], Any]) -> Change:
     return lambda p: replace(p, **{name: function(getattr(p, name)) for name in names})
 
 

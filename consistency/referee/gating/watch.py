@@ -120,6 +120,8 @@ def terms(
     ValueError
         An argument out of its range.
     """
+    from consistency.referee.diagnostics import Settings
+
     watch = current()
     given: dict[str, Any] = {
         "false_alarm": false_alarm, "detect": detect, "power": power, "allow": allow, "tolerance": tolerance,
@@ -127,23 +129,10 @@ def terms(
     }  # fmt: skip
     choices: dict[str, Any] = dict(watch.marked) | {key: value for key, value in given.items() if value is not None}
     options = DEFAULTS | choices
-    for key in ("false_alarm", "power"):
-        if not 0.0 < options[key] < 1.0:
-            raise ValueError(f"{key} must lie between 0 and 1, got {options[key]}")
-    if not 0.0 < options["detect"] < float("inf") or options["detect"] == 1.0:
-        raise ValueError(
-            f"detect must be a positive ratio of true to stated covariance, not 1; got {options['detect']}"
-        )
-    if options["allow"] not in (None, "conservative"):
-        raise ValueError(f"allow must be 'conservative' or None, got '{options['allow']}'")
+    Settings(**{key: options[key] for key in given})  # refuses what is out of range
     if options["allow"] == "conservative" and options["detect"] < 1.0:
         raise ValueError(f"detect {options['detect']} is a covariance too large, which allow='conservative' accepts")
-    wide = options["tolerance"]
-    if wide is not None and (not 0.0 < wide < float("inf") or wide == 1.0):
-        raise ValueError(f"tolerance must be a positive ratio of true to stated covariance, not 1; got {wide}")
-    if options["lost"] is not None and not 0.0 < options["lost"] < 1.0:
-        raise ValueError(f"lost must lie between 0 and 1, got {options['lost']}")
-    rest = float(options["detect"]), float(options["power"]), options["allow"], wide
+    rest = float(options["detect"]), float(options["power"]), options["allow"], options["tolerance"]
     if watch.budget is None or "false_alarm" in choices:
         return Terms(float(options["false_alarm"]), *rest, lost=options["lost"])
     rate = in_place_rate(watch.budget, watch.tests, watch.budgeted)

@@ -199,7 +199,11 @@ def _by_kind(estimates: Path, r: Reading, over: Relative | None) -> list[Evidenc
         known = f"{', '.join(SUFFIXES)} (TUM trajectories)"
         hint = HINTS.get(estimates.suffix.lower(), "")
         raise InputError(f"{estimates}: unknown kind of file; known are {known}{hint}")
-    return _with_frame(function_at(kind.records)(estimates, r, over), r)
+    records: list[Evidence] = function_at(kind.records)(estimates, r, over)
+    if r.truth is None or not is_drive(r.truth):
+        return records
+    of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
+    return [replace(records[0], notes=(f"{r.truth}: {of}", *records[0].notes)), *records[1:]]
 
 
 def pieces_asked(r: Reading) -> int | None:
@@ -250,17 +254,6 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     pieces_asked(r)  # refused before anything is read
     return replace(r, time_offset=offset, align=align)
-
-
-def _with_frame(recordings: list[Evidence], r: Reading) -> list[Evidence]:
-    """Add a note on the body and the world frame of the poses of a drive."""
-    if r.truth is None or not is_drive(r.truth):
-        return recordings
-    note = (
-        f"{r.truth}: the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first "
-        "packet"
-    )
-    return [replace(recordings[0], notes=(note, *recordings[0].notes)), *recordings[1:]]
 
 
 def _refuse(path: Path, r: Reading, *names: str) -> None:

@@ -31,7 +31,8 @@ class Compared:
         """Result of the comparison in a sentence."""
         c = self.comparison
         way = "run by run on the same trials" if c.paired else "as independent samples"
-        text = f"{self.a} is {'less consistent' if c.worse else 'not found less consistent'} than {self._reference}"
+        reference = self.b if self.a != self.b else "the reference"
+        text = f"{self.a} is {'less consistent' if c.worse else 'not found less consistent'} than {reference}"
         text += f": {c.runs} runs, {way}, p {c.p_value:.2g}"
         if c.distance == c.standard_error == 0.0:
             text += "; every run is the same in both"
@@ -57,10 +58,6 @@ class Compared:
         if most < 0.0:
             return f"nearer to consistent, by x{np.exp(-most):.3g} at least"
         return "no difference shown" + (f"; at most x{np.exp(most):.3g} farther off" if np.isfinite(most) else "")
-
-    @property
-    def _reference(self) -> str:
-        return self.b if self.a != self.b else "the reference"
 
     @property
     def worse(self) -> bool:

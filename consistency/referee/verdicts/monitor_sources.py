@@ -103,17 +103,13 @@ def watch_lines(lines: Iterable[str], name: str, monitor: Monitor, on_alarm: Cal
     """
     try:
         for place, nis, dof in stream_nis(lines, name):
-            alarm = _updated(monitor, place, nis, dof)
+            try:
+                alarm = monitor.update(nis, dof)  # type: ignore[arg-type]  # refuses what is not whole
+            except ValueError as error:
+                raise InputError(f"{place}: {error}") from None
             if alarm is not None:
                 on_alarm(alarm)
     except UnicodeDecodeError:
         raise InputError(f"{name}: not text; lines of a CSV file are needed") from None
     empty = np.empty(0)
     return Watched(name, monitor, monitor.alarm, math.nan, math.nan, empty, empty, empty, empty)
-
-
-def _updated(monitor: Monitor, place: str, nis: float, dof: float) -> Alarm | None:
-    try:
-        return monitor.update(nis, dof)  # type: ignore[arg-type]  # refuses what is not whole
-    except ValueError as error:
-        raise InputError(f"{place}: {error}") from None

@@ -58,7 +58,14 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     sheet = read_sheet(path)
     _require_columns(str(path), list(sheet.data))
     sheet = _of_one(_of_one(sheet, "filter", filter_name), "run", run)
-    return _of_sheet(str(sheet.data["filter"][0]) if "filter" in sheet else path.stem, sheet)
+    key = next((column for column in ("step", "t") if column in sheet), None)
+    if key is not None:
+        sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))
+    nis = sheet.numbers("nis")
+    dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
+    step = sheet.numbers("step") if "step" in sheet else np.arange(1.0, len(nis) + 1)
+    t = sheet.numbers("t") if "t" in sheet else np.full(len(nis), np.nan)
+    return NisLog(str(sheet.data["filter"][0]) if "filter" in sheet else path.stem, step, t, nis, dof)
 
 
 def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "") -> Any:
@@ -110,17 +117,6 @@ def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRow
     values = sheet.texts(column) if column == "filter" else sheet.numbers(column, whole=True)
     there = [str(v) if column == "filter" else int(v) for v in dict.fromkeys(values.tolist())]
     return sheet.rows(values == choose(sheet.path, column, there, choice))
-
-
-def _of_sheet(name: str, sheet: TableRows) -> NisLog:
-    key = next((column for column in ("step", "t") if column in sheet), None)
-    if key is not None:
-        sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))
-    nis = sheet.numbers("nis")
-    dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
-    step = sheet.numbers("step") if "step" in sheet else np.arange(1.0, len(nis) + 1)
-    t = sheet.numbers("t") if "t" in sheet else np.full(len(nis), np.nan)
-    return NisLog(name, step, t, nis, dof)
 
 
 def _of_archive(path: Path, run: int | None) -> NisLog:

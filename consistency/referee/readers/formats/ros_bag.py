@@ -193,12 +193,6 @@ def _raw(reader: Any, topic: str) -> Iterator[Any]:
         yield reader.deserialize(raw, connection.msgtype)
 
 
-def _messages(reader: Any, topic: str) -> Iterator[tuple[Any, Any]]:
-    """Header and content of the messages of a topic."""
-    for message in _raw(reader, topic):
-        yield message.header, getattr(message, "pose", None) or message.transform
-
-
 def _frames(reader: Any, topic: str) -> tuple[str, str]:
     """World and body by the first message of a topic, or of PARENT:CHILD; "" where it does not name one."""
     if ":" in topic:
@@ -235,7 +229,8 @@ def _lines(bag: Path, reader: Any, topic: str) -> Lines:
         raise InputError(f"{bag}: --truth-topic {topic}: is not there with poses; there are: {_listed(there, reader)}")
     if topic in _topics(reader, (FIX,)):
         return _fixes(bag, topic, list(_raw(reader, topic)))
-    return _track(bag, topic, _messages(reader, topic))
+    messages = ((each.header, getattr(each, "pose", None) or each.transform) for each in _raw(reader, topic))
+    return _track(bag, topic, messages)
 
 
 def _fixes(bag: Path, topic: str, messages: Sequence[Any]) -> Fixes:

@@ -216,17 +216,17 @@ def _poses(
     with_P = np.zeros(len(own.t), bool)
     with_P[rows] = True
     own = own.of(slice(0, POSE))
-    place, (estimate, true) = Places(own.place, np.arange(len(own.t))), (_states(lines, k) for lines in (own, truth))
+    estimate, true = (
+        np.column_stack([each.values[:, 1:POSE], each.rest[:, :k]])
+        if k and each.rest is not None
+        else each.values[:, 1:POSE]
+        for each in (own, truth)
+    )
+    place = Places(own.place, np.arange(len(own.t)))
     return Poses(
         place, own.t, estimate, P, with_P, truth.t, true, "spatial", convention, tolerance, cross,
         of_truth(truth, own, order, r),
     )  # fmt: skip
-
-
-def _states(lines: Lines, k: int) -> Array:
-    """Poses (N, 7 + k) with ``k`` numbers of the velocity and the biases."""
-    pose = lines.values[:, 1:POSE]
-    return pose if lines.rest is None or not k else np.column_stack([pose, lines.rest[:, :k]])
 
 
 def _width(lines: Lines) -> int:

@@ -18,7 +18,6 @@ def data_folder(name: str) -> Path:
 
 
 def summaries() -> dict[str, dict[str, str]]:
-    """What each scenario, experiment and sweep is, in a line, by kind and name."""
     experiments = data_folder("experiments")
     scripts = {path.stem: path.read_text(encoding="utf-8") for path in sorted(experiments.glob("e[0-9][0-9]_*.py"))}
     return {

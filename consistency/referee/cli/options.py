@@ -93,7 +93,6 @@ def are_files(path: Path, files: Reading) -> bool:
 
 
 def read_files(path: Path, files: Reading) -> list[Evidence]:
-    """Files of another estimator."""
     from consistency.referee.readers.read_files import read_recordings
 
     return read_recordings(path, files)

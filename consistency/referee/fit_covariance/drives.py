@@ -101,7 +101,6 @@ def drive_of(
 
 
 def _poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
-    """Name and poses of each drive."""
     kind = kind_of(path, r)
     if not is_bag(path) and path.is_dir() and not trajectory_files(path):
         yield from _of_folder(path, r)
@@ -127,7 +126,6 @@ def _of_folder(folder: Path, r: Reading) -> Iterator[NamedPoses]:
 
 
 def _drive(read: NamedPoses, r: Reading) -> Drive:
-    """The rows of a drive whose truth is known."""
     name, poses, clock = read
     finite = np.isfinite(poses.estimate).all(axis=1)
     if not finite.all():

@@ -234,7 +234,6 @@ def _matrices(motion: ArrayLike, noise: Noise) -> Array:
 
 
 def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
-    """Whether x, y and yaw are modelled."""
     if not drives or not all(isinstance(drive, Drive) for drive in drives):
         raise InputError("records: needs at least one drive, of cs.read_drives or cs.drive_of")
     if axes not in (None, 3, 6):
@@ -266,5 +265,4 @@ def _spans(
 
 
 def error_windows(model: NoiseModel, judged: Judged) -> Windows:
-    """Corrected windows of one of the spans."""
     return model.noise.mean.applied(windows_of(model.drives, span_of(judged.span), model.is_planar))

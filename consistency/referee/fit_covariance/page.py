@@ -26,14 +26,12 @@ CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 
 
 def page(model: NoiseModel, with_pictures: bool) -> Document:
-    """The sentence, the table, and pictures."""
     said = document(model)
     blocks: tuple[Block, ...] = figures(model) if with_pictures else ()
     return Document(said.title, "", (Chapter("pictures", "Pictures", "pictures", blocks),), said.opening, said.data)
 
 
 def figures(model: NoiseModel) -> tuple[Figure, ...]:
-    """One figure for errors, one for growth and ratios."""
     captions = (
         (
             "Errors of motions",
@@ -53,7 +51,6 @@ def figures(model: NoiseModel) -> tuple[Figure, ...]:
 
 
 def panels(model: NoiseModel) -> tuple[tuple[Panel, ...], ...]:
-    """Errors by span; growth, and ratios by drive."""
     d = 2 if len(model.noise.axes) == 3 else 3
     growth = (_growth(model, range(d), "m²"), _growth(model, range(d, len(model.noise.axes)), "rad²"))
     return tuple(_errors(model, judged) for judged in model.spans[:SHOWN]), (*growth, _drives(model))
@@ -66,7 +63,6 @@ def plot(model: NoiseModel, path: str | Path | None) -> Any:
 
 
 def _errors(model: NoiseModel, judged: Judged) -> Panel:
-    """Errors in x and y of the windows of one span, and the ellipse of their mean covariance."""
     windows = error_windows(model, judged)
     error, C = windows.errors, model.noise.covariance(windows.pieces).mean(axis=0)[:2, :2]
     values, vectors = np.linalg.eigh(C)
@@ -84,7 +80,6 @@ def _errors(model: NoiseModel, judged: Judged) -> Panel:
 
 
 def _growth(model: NoiseModel, axes: range, unit: str) -> Panel:
-    """Mean squared errors over spans on logarithmic axes, beside the model."""
     found = [error_windows(model, judged) for judged in model.spans]
     spans = np.array([windows.span.size for windows in found])
     squares = np.array([(windows.errors**2).mean(axis=0) for windows in found])
@@ -105,7 +100,6 @@ def _growth(model: NoiseModel, axes: range, unit: str) -> Panel:
 
 
 def _drives(model: NoiseModel) -> Panel:
-    """Ratio of each judged drive at the span of the fit."""
     ratios = model.spans[0].by_drive[:, 0]
     known = np.flatnonzero(np.isfinite(ratios))
     rows = np.arange(len(known), dtype=float)

@@ -38,12 +38,10 @@ class Growth:
 
     @property
     def shrinks(self) -> bool:
-        """Errors do not add up as white noise."""
         return self.power < SHRINKING and self.power + ERRORS * self.error < 1.0
 
     @property
     def persists(self) -> bool:
-        """Errors add up faster."""
         return self.power > PERSISTENT and self.power - ERRORS * self.error > 1.0
 
 

@@ -155,7 +155,6 @@ def _list(values: Array) -> str:
 
 
 def snippets(model: NoiseModel) -> dict[str, str]:
-    """Files by name."""
     return {
         "noise.toml": toml(model), "robot_localization_noise.py": robot_localization(model),
         "gtsam_noise.py": gtsam(model), "ceres_noise.h": ceres(model),

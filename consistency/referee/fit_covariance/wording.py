@@ -30,7 +30,6 @@ def sentence(model: NoiseModel) -> str:
 
 
 def _text(span: str) -> str:
-    """1 m, 10 steps."""
     return span_of(span).text
 
 
@@ -156,7 +155,6 @@ def lines(model: NoiseModel) -> list[str]:
 
 
 def _of_second(second: Second, axes: Sequence[str]) -> str:
-    """How errors of both correlate, and where the second errs too much to tell."""
     shown = ", ".join(f"{axis} {each:.2f}" for axis, each in zip(axes, second.correlation, strict=True))
     rough = ", ".join(np.array(axes)[second.is_rough])
     text = f"correlation with errors of the second estimator: {shown}; above {SHARED:g} they are the truth's"

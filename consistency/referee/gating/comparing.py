@@ -25,8 +25,6 @@ NONE_FAILED = FailedRuns(0, 0)
 
 @dataclass(frozen=True)
 class Sides:
-    """Two filters to compare."""
-
     candidate: Record
     a: RunSummary
     b: RunSummary
@@ -47,7 +45,6 @@ class Sides:
         return len(np.intersect1d(a, b)) if self.paired else min(len(a), len(b))
 
     def compare(self, false_alarm: float) -> Comparison:
-        """See :func:`consistency.diagnostics.compare`."""
         return compare(self.a, self.b, false_alarm, self.axes, self.paired)
 
     def reasons(self, c: Comparison) -> list[str]:

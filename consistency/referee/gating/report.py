@@ -16,7 +16,6 @@ NUMBERS = {"p", "false-alarm rate", "runs", "planned", "true / stated"}
 
 
 def _cells(e: Entry) -> dict[str, Cell]:
-    """Cells of a gate by their heads."""
     first, *rest = e.reasons
     value, low, high = e.axis_ratio or (e.inflation, *(e.inflation_interval or (None, None)))
     low, high = (float("inf") if end is None else end for end in (low, high))
@@ -48,7 +47,6 @@ BRIEF = ("test", "gate", "outcome", "p", "runs", "planned", "true / stated", "")
 
 
 def _p(value: float | None) -> str:
-    """A p value, or a dash."""
     return "-" if value is None else f"{min(value, 1.0):.2g}" if value >= 1e-6 else "<1e-6"
 
 
@@ -63,7 +61,6 @@ def lines(ledger: Ledger) -> list[str]:
 
 
 def document(ledger: Ledger) -> Document:
-    """All gates in one table, and the statistics of their verdicts as data."""
     data = {
         "schema_version": 1,
         "kind": "gates",

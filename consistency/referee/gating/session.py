@@ -26,8 +26,6 @@ def to_property(entry: Entry) -> tuple[str, str]:
 
 @dataclass
 class Tested:
-    """What the reports of one test said."""
-
     nodeid: str
     location: tuple[str, int | None, str]
     outcome: str = ""
@@ -62,7 +60,6 @@ class Ledger:
             tested.outcome = report.outcome
 
     def entries(self) -> list[Entry]:
-        """All gates, each with the outcome of its test."""
         return [
             replace(entry, test_outcome=tested.outcome) for tested in self.tests.values() for entry in tested.entries
         ]

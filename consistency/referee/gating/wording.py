@@ -8,13 +8,11 @@ from consistency.referee.gating.watch import Terms
 
 
 def fault_text(gate: str, name: str, reasons: Sequence[str]) -> str:
-    """Gate, sentence, and what stands behind it."""
     first, *rest = reasons
     return "\n  - ".join([f"{gate}: {name} is {first}", *rest])
 
 
 def plan_command(dof: int, terms: Terms) -> str:
-    """The command that plans the same number of runs."""
     return (
         f"consistency plan --dof {dof} --detect {terms.detect!r} --false-alarm {terms.false_alarm!r} "
         f"--power {terms.power!r}"

@@ -14,14 +14,12 @@ from consistency.referee.show import as_html, text
 
 
 def record_text(record: Record) -> str:
-    """One line."""
     runs, unit = plural(len(record.run_numbers), "run"), "step" if record.window is None else "window"
     size = f"{runs} x {plural(len(record.t), unit)}"
     return f"<Record {record.name}: {size}, error {record.convention or '-'} of {', '.join(record.axes)}>"
 
 
 def record_html(record: Record) -> str:
-    """Table of its size and origin, and its notes."""
     rows = (
         ("runs", str(len(record.run_numbers))), ("steps", str(len(record.t))), ("error", record.convention or "-"),
         ("components", ", ".join(record.axes)), ("failed runs", str(len(record.failures))),
@@ -31,7 +29,6 @@ def record_html(record: Record) -> str:
 
 
 def verdict_text(verdict: Verdict) -> str:
-    """The sentence and a short table."""
     return text.fragment(*summary(verdict))
 
 

@@ -21,7 +21,6 @@ def _names(text: str) -> list[str]:
 
 
 def _seconds(text: str) -> float | str:
-    """A number where the text is one."""
     try:
         return float(text)
     except ValueError:

@@ -62,7 +62,6 @@ class Poses:
         return out
 
     def later(self, shift: float) -> Poses:
-        """The estimates ``shift`` s later."""
         return replace(self, t=self.t + shift) if shift else self
 
     def sound(self) -> Poses:

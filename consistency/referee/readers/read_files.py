@@ -136,7 +136,6 @@ def _cut_by(reason: str) -> tuple[Path, int] | None:
 
 
 def _read(estimates: Path, r: Reading) -> list[Evidence]:
-    """Recordings of files as they stand, with the options given."""
     over = relative_of(r.relative, bool(r.motions), r.windows)
     r = _checked(r, over)
     return _asked(str(estimates), r, over, lambda kind: _by_kind(estimates, replace(r, error=kind), over))

@@ -28,7 +28,6 @@ class Compared:
 
     @property
     def sentence(self) -> str:
-        """Result of the comparison in a sentence."""
         c = self.comparison
         way = "run by run on the same trials" if c.paired else "as independent samples"
         reference = self.b if self.a != self.b else "the reference"
@@ -109,7 +108,6 @@ def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, 
 
 
 def document(compared: Sequence[Compared]) -> Document:
-    """A table and a sentence for each pair, and the numbers of all as data."""
     blocks: list[Block] = []
     for each in compared:
         blocks += [comparison_table(each.a, each.b, each.comparison), Text(each.sentence), Text("")]

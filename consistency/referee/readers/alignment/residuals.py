@@ -120,7 +120,6 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
-    """Covariances of the errors relative to the first poses, or bounds of them."""
     out, factors = zip(*(from_first_pose(name, p, judged) for p in runs), strict=True)
     every = np.concatenate(factors)
     larger = float(np.median(every)) if len(every) else 1.0
@@ -138,7 +137,6 @@ def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Alig
 
 
 def _sizes(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
-    """How far the worlds are turned and shifted."""
     if len(frames) == 1 or mode.endswith("-all"):
         axis, where = (
             ", ".join(f"{value:.4g}" for value in values)

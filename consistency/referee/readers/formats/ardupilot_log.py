@@ -42,7 +42,6 @@ LEAST = 1.0  # sigma, of a gate: ArduPilot takes a smaller one for it
 
 
 def is_dataflash(path: Path) -> bool:
-    """Whether a path is a flight log of ArduPilot, by its suffix."""
     return path.suffix.lower() == SUFFIX
 
 
@@ -154,7 +153,6 @@ def _row(message: Any, fields: Sequence[str]) -> dict[str, float]:
 
 
 def _of_core(path: Path, rows: list[dict[str, float]], core: int | None) -> list[dict[str, float]]:
-    """Messages of one instance of the EKF; older logs have one and no number of it."""
     cores = sorted({int(row.get(CORE, 0)) for row in rows})
     own = choose(path, "run", cores, core, "core of the EKF")
     return [row for row in rows if int(row.get(CORE, 0)) == own]

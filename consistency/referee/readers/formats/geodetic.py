@@ -52,7 +52,6 @@ class Fixes(Lines):
 
     @property
     def origin(self) -> Array:
-        """The first place, (3,)."""
         return self.values[0, 1:4]
 
     def local(self, origin: Array | None = None) -> tuple[Array, Array]:

@@ -72,7 +72,6 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
 
 
 def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[str]:
-    """Parts as they stand in the covariance."""
     if ("bg" in parts) != ("ba" in parts):
         raise InputError(f"{path}: key '{'ba' if 'bg' in parts else 'bg'}' is missing; there are two biases or none")
     if missing := [f"{TRUE}{part}" for part in parts if f"{TRUE}{part}" not in arrays]:
@@ -84,7 +83,6 @@ def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[st
 
 
 def _part(path: Path, arrays: Mapping[str, Array], key: str) -> Array:
-    """One part, with a first dimension for runs."""
     tail = (3, 3) if key.endswith("R") else (3,)
     array = np.asarray(arrays[key], float)
     if array.shape[-len(tail) :] != tail or array.ndim not in (len(tail) + 1, len(tail) + 2):

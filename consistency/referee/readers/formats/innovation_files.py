@@ -109,7 +109,6 @@ def _require_columns(place: str, columns: list[str]) -> None:
 
 
 def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRows:
-    """The rows of one filter or run."""
     if column not in sheet:
         if choice is not None:
             raise InputError(f"--{column} {choice}: {sheet.path} has no column '{column}'")

@@ -85,7 +85,6 @@ def mercator(place: Array) -> Array:
 
 
 def _packet(path: Path) -> list[float]:
-    """The first six numbers of a packet."""
     fields = read_text(path, "cannot be read").split()
     with reading(path, "is not a packet of numbers"):
         values = [float(field) for field in fields]

@@ -206,7 +206,6 @@ def _of_arrays(
 
 
 def steps_of(of: Path | str, run: int, rows: Indices) -> Places:
-    """Steps of a run as places."""
     return Places(lambda row: f"{of}, run {run}, step {row + 1}", rows)
 
 
@@ -290,7 +289,6 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
 
 
 def _numbers(path: Path, archive: Any, key: str) -> Array:
-    """One array of an archive; what only Python could read is refused."""
     try:
         array: Array = archive[key]
     except ValueError as error:

@@ -121,7 +121,6 @@ def _divided(data: dict[str, Array]) -> tuple[dict[str, Array], dict[str, Array]
 
 
 def _paired(path: Path, innovations: dict[str, Array], variances: dict[str, Array]) -> Pairs:
-    """The messages of both topics that belong together."""
     fields = [name for name in innovations if name in variances and not name.startswith("timestamp")]
     clock = next((name for name in CLOCKS if name in innovations and name in variances), None)
     if clock is None:
@@ -158,7 +157,6 @@ def _together(times: Array, others: Array, exact: bool) -> tuple[Indices, Indice
 
 
 def _groups(pairs: Pairs) -> dict[str, list[str]]:
-    """Components of each sensor."""
     groups: dict[str, list[str]] = {}
     for field in pairs.innovation:
         groups.setdefault(COMPONENT.sub("", field), []).append(field)
@@ -197,7 +195,6 @@ def nis_of(pairs: Pairs, parts: list[str]) -> tuple[Array, Array, int]:
 
 
 def _notes(path: Path, name: str, pairs: Pairs, dof: Array, held: int, log: Any) -> list[str]:
-    """Notes on left-out messages, and on data missing in the log."""
     notes = [f"{path}: {name}: {int((dof > 0).sum())} innovations in {len(dof)} messages"]
     if held:
         notes[0] += f"; {plural(held, 'message')} repeat the innovation before, as no measurement came between"

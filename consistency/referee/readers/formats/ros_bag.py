@@ -176,7 +176,6 @@ def _listed(topics: Sequence[str], reader: Any) -> str:
 
 
 def _chosen(bag: Path, reader: Any, topic: str | None) -> str:
-    """The topic of the estimates."""
     there = _topics(reader, STATED) or _topics(reader, (FIX,))
     if topic is None and len(there) == 1:
         return there[0]
@@ -187,7 +186,6 @@ def _chosen(bag: Path, reader: Any, topic: str | None) -> str:
 
 
 def _raw(reader: Any, topic: str) -> Iterator[Any]:
-    """Messages of a topic."""
     connections = [connection for connection in reader.connections if connection.topic == topic]
     for connection, _, raw in reader.messages(connections=connections):
         yield reader.deserialize(raw, connection.msgtype)
@@ -279,7 +277,6 @@ def _row(header: Any, content: Any) -> tuple[float, list[float], Array]:
 
 
 def _stamp(header: Any) -> float:
-    """Time of a message, s."""
     return float(header.stamp.sec + SECOND * header.stamp.nanosec)
 
 

@@ -64,7 +64,6 @@ class TableRows:
 
     @property
     def columns(self) -> str:
-        """The names of the first columns, for messages."""
         names = list(self.data)
         return ", ".join(names[:12]) + ", …" * (len(names) > 12)
 
@@ -94,7 +93,6 @@ class TableRows:
         return values
 
     def rows(self, keep: Array) -> TableRows:
-        """The rows of a mask or of indices."""
         return TableRows(
             self.path, {name: cells[keep] for name, cells in self.data.items()}, self.line[keep], self.unit
         )
@@ -143,7 +141,6 @@ class Places:
         return self._of(int(self._rows[which]))
 
     def at(self, rows: Indices | slice) -> Places:
-        """Places of some of the rows."""
         return Places(self._of, self._rows[rows])
 
 

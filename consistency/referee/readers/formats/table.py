@@ -237,7 +237,6 @@ def _stretches(
     sheet: TableRows, runs: Array, keep: Array, true: Array, estimate: Array, covariance: Array, convention: str,
     relative: Relative,
 ) -> list[Stretch]:  # fmt: skip
-    """Each run before its windows are taken."""
     from consistency.referee.readers.relative_motions import Stretch
 
     t = sheet.numbers("t", finite=True) if "t" in sheet else np.full(len(runs), np.nan)
@@ -265,7 +264,6 @@ def _poses(
     convention: str,
     max_dt: float,
 ) -> list[Poses]:
-    """Each run that has a truth, with it."""
     found = []
     for run in np.unique(runs):
         rows, true = np.flatnonzero(runs == run), samples.of(run)

@@ -26,7 +26,6 @@ class Samples(NamedTuple):
     runs: Indices | None  # (M,); None: it serves all
 
     def of(self, run: int) -> Samples:
-        """Samples of one run."""
         if self.runs is None:
             return self
         here = self.runs == run

@@ -51,7 +51,6 @@ class Block:
 
     @cached_property
     def count(self) -> int:
-        """Number of lines."""
         return len(self._starts) if self.plain else len(self.text.splitlines())
 
     def lines(self) -> list[tuple[int, str]]:

@@ -117,8 +117,6 @@ def poses_of(
 
 
 def _truths(r: Reading) -> Callable[[Path], Lines]:
-    """Reads a truth, once where runs that follow each other have the same."""
-
     @lru_cache(maxsize=1)
     def read(path: Path) -> Lines:
         return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, true=True)
@@ -127,7 +125,6 @@ def _truths(r: Reading) -> Callable[[Path], Lines]:
 
 
 def _is_point(lines: Lines) -> bool:
-    """Whether they hold positions without orientations."""
     return lines.values.shape[1] == POINT or isinstance(lines, Fixes)
 
 

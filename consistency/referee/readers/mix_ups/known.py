@@ -120,7 +120,6 @@ def _ned(convention: str) -> Iterator[Guess]:
 
 
 def _mirrored(convention: str) -> Guess:
-    """A plane of x north and y east."""
     A = np.diag([1.0, -1.0, -1.0])
     if convention != "left":
         A[:2, :2] = [[0.0, 1.0], [1.0, 0.0]]

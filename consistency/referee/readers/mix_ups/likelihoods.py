@@ -61,7 +61,6 @@ class ReadingFit:
         return max(float(size), 1.0)
 
     def right(self) -> bool:
-        """Whether scale, mean, correlations and median of the errors agree with the covariance."""
         n, size = self.n, self.size
         ratios = np.append(np.square(self.own).mean(axis=0), np.square(self.w).mean())
         pairs = np.triu_indices(n, 1)

@@ -10,14 +10,15 @@ from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.drives import Drive, names_of
+from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.variances import BLOCKS, ENOUGH
 from consistency.referee.fit_covariance.white_noise import Noise, fit_noise
 from consistency.referee.fit_covariance.windows import Windows
+from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array, Indices
 
 DECIDE = 50  # windows that decide where drives are fewer than ENOUGH
-TURN, HALF = "in turn", "half"
+HALF = "half"
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def folds_of(
     names = [name.strip() for name in held_out.split(",")]
     known = [drive.name for drive in drives]
     if unknown := [name for name in names if name not in known]:
-        raise InputError(f"--held-out {held_out}: no drive '{unknown[0]}'; there are {names_of(drives)}, or 'half'")
+        raise InputError(f"--held-out {held_out}: no drive '{unknown[0]}'; there are {listed(known)}, or 'half'")
     judged = np.array([known.index(name) for name in names])
     rest = ~np.isin(windows.drive, judged)
     if not rest.any() or rest.all():

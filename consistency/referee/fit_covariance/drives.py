@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from consistency.referee.readers.file_kinds import (
     kind_of,
     trajectory_files,
 )
+from consistency.referee.readers.formats.sheet import refuse
 from consistency.referee.readers.formats.table import table_poses
 from consistency.referee.readers.matching import truth_at
 from consistency.referee.readers.options import Reading
@@ -128,9 +129,8 @@ def _of_folder(folder: Path, r: Reading) -> Iterator[NamedPoses]:
 def _drive(read: NamedPoses, r: Reading) -> Drive:
     name, poses, clock = read
     finite = np.isfinite(poses.estimate).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise InputError(f"{poses.place[row]}: the pose is not finite; end the drive before it, or leave the row out")
+    what = "the pose is not finite; end the drive before it, or leave the row out"
+    refuse(~finite, poses.place.__getitem__, what)
     t = poses.t + r.shift
     known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
     if len(known.rows) < 2:
@@ -141,8 +141,3 @@ def _drive(read: NamedPoses, r: Reading) -> Drive:
     T = matrices(poses.estimate)
     T = composed(T) if r.motions else T
     return Drive(name, clock[known.rows] + r.shift, known.rows, T[known.rows], matrices(known.truth))
-
-
-def names_of(drives: Sequence[Drive]) -> str:
-    """The first names, for messages."""
-    return ", ".join(drive.name for drive in drives[:5]) + ", …" * (len(drives) > 5)

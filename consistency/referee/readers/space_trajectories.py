@@ -13,6 +13,7 @@ from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.readers.clock_offset import clocks_and_frames
+from consistency.referee.readers.formats.sheet import refuse
 from consistency.referee.readers.matching import common_times, truth_at, unit_apart
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
@@ -150,11 +151,8 @@ def _stretch(run: int, poses: Poses, path: Path | str, truth: Path | str, shift:
     """A run before its windows are taken: all its motions, or the poses that have a covariance."""
     rows = np.arange(len(poses.t))
     if relative.motions:
-        bare = np.flatnonzero(~poses.stated[1:])
-        if bare.size:
-            raise InputError(
-                f"{poses.place[int(bare[0]) + 1]}: this motion has no covariance within {poses.max_dt:g} s"
-            )
+        bare = np.append(False, ~poses.stated[1:])
+        refuse(bare, poses.place.__getitem__, f"this motion has no covariance within {poses.max_dt:g} s")
     elif poses.cross is not None:
         rows = rows[poses.stated]
     t = poses.t[rows] + shift

@@ -95,7 +95,9 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     t, unit = times_of(lines, roles.time, columns[: len(roles.time)], roles.unit)
     of = roles.kind if true else roles.kind.replace(" truth", " poses")
     clock = UNIT_NAMES[unit] if len(roles.time) == 1 else "seconds and nanoseconds"
-    order = f"quaternion {'w first' if roles.w_first else 'w last'}" if roles.quaternion else "no orientation"
+    order = "no orientation"
+    if roles.quaternion:
+        order = f"quaternion {'w first' if roles.quaternion[3] < roles.quaternion[0] else 'w last'}"
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if roles.covariance:
         stated = "standard deviations" if len(roles.covariance) in DEVIATIONS else "covariance"

@@ -243,15 +243,21 @@ def _header(path: Path, line: str) -> tuple[list[str], str]:
 def _rows(
     path: Path, lines: list[tuple[int, str]], names: list[str], separator: str
 ) -> tuple[dict[str, Column], Indices] | None:
-    """Rows of a table from its lines, and their numbers; None without any."""
+    """Rows of a table from its lines, out of quotes where they are in some, and their numbers; None without any."""
+    rows = []
     for number, line in lines:
-        fields = line.count(separator) + 1
-        if fields != len(names) and '"' not in line:
-            raise InputError(f"{path}, line {number}: has {fields} columns, the header has {len(names)}")
-    if not lines:
-        return None
-    numbers = [number for number, _ in lines]
-    return _columns(_fields(path, lines, separator, len(names)), names), np.array(numbers)
+        fields = line.split(separator)
+        if '"' in line:
+            if line.count('"') % 2:
+                raise InputError(
+                    f"{path}: cannot be read as CSV (line {number}: a quoted field goes over several lines)"
+                )
+            with reading(path, f"line {number} cannot be read as CSV"):
+                (fields,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+        if len(fields) != len(names):
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the header has {len(names)}")
+        rows.append(fields)
+    return (_columns(rows, names), np.array([number for number, _ in lines])) if rows else None
 
 
 def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[str, Column], Indices] | None:
@@ -265,24 +271,6 @@ def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[st
     if found is not None and found[0].shape == (block.count, len(names)):
         return dict(zip(names, found[0].T, strict=True)), numbers
     return _columns([line.split(separator) for line in block.text.splitlines()], names), numbers
-
-
-def _fields(path: Path, lines: list[tuple[int, str]], separator: str, width: int) -> list[list[str]]:
-    """The fields of lines, out of their quotes where they are in some."""
-    rows = []
-    for number, line in lines:
-        fields = line.split(separator)
-        if '"' in line:
-            if line.count('"') % 2:
-                raise InputError(
-                    f"{path}: cannot be read as CSV (line {number}: a quoted field goes over several lines)"
-                )
-            with reading(path, f"line {number} cannot be read as CSV"):
-                (fields,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
-        if len(fields) != width:
-            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the header has {width}")
-        rows.append(fields)
-    return rows
 
 
 def _columns(rows: list[list[str]], names: list[str]) -> dict[str, Column]:

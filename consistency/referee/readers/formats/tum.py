@@ -285,11 +285,9 @@ def of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
 
 def _cross(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str) -> Array:
     """Cross-covariances with the line before, on the rows of ``own``, (N, 6, 6)."""
-    if len(gap := np.flatnonzero(np.diff(picked) != 1)):
-        raise InputError(
-            f"{source.place(int(picked[gap[0]]) + 1)}: no pose of {own.path} has this time, but the "
-            "cross-covariance of the next line is with this one; give each line its pose"
-        )
+    what = "but the cross-covariance of the next line is with this one; give each line its pose"
+    gap = np.diff(picked) != 1
+    refuse(gap, lambda row: source.place(int(picked[row]) + 1), f"no pose of {own.path} has this time, {what}")
     out = np.full((len(own.t), 6, 6), np.nan)
     out[rows] = _matrices(source.values[picked, 1 + FULL :], order)
     return out

@@ -42,7 +42,7 @@ def verdict_html(verdict: Verdict) -> str:
 
 def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Any:
     """See :meth:`Record.plot`."""
-    from consistency.referee.pages.write_pages import plotted
     from consistency.referee.pages.files_report import record_sheet
+    from consistency.referee.pages.write_pages import plotted
 
     return plotted(record_sheet(record, verdict), path)

@@ -15,8 +15,16 @@ from consistency.referee.diagnostics.comparison import FEWEST
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.gating.comparing import Sides, of_arrays, of_filters
 from consistency.referee.gating.input_checks import checked, of_results, planned_dof, shares
-from consistency.referee.gating.watch import DEFAULTS, Entry, Terms, current, terms
-from consistency.referee.gating.wording import fault_text, few_to_compare, undecided_text
+from consistency.referee.gating.watch import (
+    DEFAULTS,
+    Entry,
+    Terms,
+    current,
+    fault_text,
+    few_to_compare,
+    terms,
+    undecided_text,
+)
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline

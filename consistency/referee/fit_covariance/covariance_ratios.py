@@ -11,8 +11,7 @@ from scipy import stats
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.variances import BLOCKS, ENOUGH
-from consistency.referee.fit_covariance.white_noise import Noise, fit_noise
+from consistency.referee.fit_covariance.white_noise import BLOCKS, ENOUGH, Noise, fit_noise
 from consistency.referee.fit_covariance.windows import Windows
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array, Indices

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.errors import InputError
+from consistency.referee.extras import function_at
 from consistency.referee.geometry.groups import composed, matrices
-from consistency.referee.outside import function_at
 from consistency.referee.readers.file_kinds import (
     TABLES,
     TRAJECTORIES,
@@ -23,9 +23,8 @@ from consistency.referee.readers.file_kinds import (
 )
 from consistency.referee.readers.formats.sheet import refuse
 from consistency.referee.readers.formats.table import table_poses
-from consistency.referee.readers.matching import truth_at
+from consistency.referee.readers.matching import NamedPoses, truth_at
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.poses import NamedPoses
 from consistency.referee.types import Array, Indices
 
 

@@ -20,8 +20,7 @@ from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.motions import record_of, stretches_of
 from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
 from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_sound
-from consistency.referee.fit_covariance.variances import ENOUGH
-from consistency.referee.fit_covariance.white_noise import Noise, intervals, with_jitter
+from consistency.referee.fit_covariance.white_noise import ENOUGH, Noise, intervals, with_jitter
 from consistency.referee.fit_covariance.windows import PIECES, Windows, span_of, windows_at, windows_of
 from consistency.referee.geometry.groups import matrices
 from consistency.referee.readers.relative_motions import Stretch

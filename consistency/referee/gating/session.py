@@ -9,9 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from consistency.referee.gating.false_alarm_budget import final_rate
-from consistency.referee.gating.watch import Entry, Terms
-from consistency.referee.gating.wording import fault_text, few_to_compare
+from consistency.referee.gating.watch import Entry, Terms, fault_text, few_to_compare, final_rate
 from consistency.referee.show import FORMATS
 
 PROPERTY = "consistency"  # of a test, one a gate: JSON without the statistics

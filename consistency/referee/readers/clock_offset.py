@@ -11,8 +11,7 @@ from scipy import optimize
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.errors import InputError
-from consistency.referee.readers.alignment.align import Aligned
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.matching import Aligned, Poses
 from consistency.referee.types import Array
 
 REACH = 1.0  # s, the largest offset that is looked for

@@ -14,10 +14,9 @@ from typing import Any, cast
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
+from consistency.referee.extras import function_at
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
-from consistency.referee.outside import function_at
 from consistency.referee.parsing import require_name
-from consistency.referee.readers.alignment.align import require_alignment
 from consistency.referee.readers.file_kinds import (
     OF_BAGS,
     OF_TRAJECTORIES,
@@ -33,6 +32,7 @@ from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.windows import Relative, relative_of
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
+ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
 GUESS = "guess"  # judge every convention
 NO_GUESS = {
     "truth_covariance": ", whose covariance is of a declared error too",
@@ -248,7 +248,11 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
         from consistency.referee.readers.shared_calibration import require_shared_options
 
         require_shared_options(r)
-    align = require_alignment(r.align, r.truth or r.truth_topic)
+    if r.align not in (None, *ALIGNMENTS):
+        raise InputError(f"--align {r.align}: must be one of {', '.join(ALIGNMENTS)}")
+    align = None if r.align == "none" else r.align
+    if align is not None and (r.truth or r.truth_topic) is None:
+        raise InputError(f"--align {align} needs --truth, with which the estimates are aligned")
     if over is not None and align is not None:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     pieces_asked(r)  # refused before anything is read

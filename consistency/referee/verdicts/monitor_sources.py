@@ -12,7 +12,7 @@ import numpy as np
 
 from consistency.referee.diagnostics import Alarm, Monitor
 from consistency.referee.errors import InputError
-from consistency.referee.outside import outside
+from consistency.referee.extras import outside
 from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash, read_stated
 from consistency.referee.readers.formats.innovation_files import NisLog, choose, read_nis, stream_nis
 from consistency.referee.readers.formats.px4_log import SUFFIX, read_ulog

@@ -21,8 +21,8 @@ from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.pose_rows import POSE
 from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.formats.tum import UNIT, bare_poses, poses_of
+from consistency.referee.readers.matching import NamedPoses, Poses
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.relative_motions import MARGINAL
 from consistency.referee.readers.space_trajectories import (
     AXES,

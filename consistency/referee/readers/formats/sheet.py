@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.extras import require
-from consistency.referee.outside import outside
+from consistency.referee.extras import outside, require
 from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.referee.readers.formats.text_blocks import Block, blocks
 from consistency.referee.types import Array, Indices

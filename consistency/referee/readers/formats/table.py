@@ -15,25 +15,26 @@ from consistency.referee.diagnostics.records.symmetric import diagonal
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR, planar_error
-from consistency.referee.readers.alignment.align import Aligned
 from consistency.referee.readers.file_kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.formats.named_columns import begins_with_numbers, head_of
 from consistency.referee.readers.formats.sheet import Places, TableRows, read_sheet
 from consistency.referee.readers.formats.table_columns import (
     POSE,
+    Samples,
     by_run,
     cross_covariances,
     has_own,
+    manifold_of,
+    matched,
     nis_columns,
     require_columns,
+    samples_of,
     stated_covariance,
     stated_deviations,
 )
-from consistency.referee.readers.formats.table_truth import Samples, manifold_of, matched, samples_of
-from consistency.referee.readers.matching import common_steps, common_times
+from consistency.referee.readers.matching import Aligned, NamedPoses, Poses, common_steps, common_times
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.runs_to_record import Track, assemble
 from consistency.referee.types import Array
 

@@ -15,13 +15,22 @@ from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.readers.file_kinds import TABLES, is_drive, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_oxts import read_drive
-from consistency.referee.readers.formats.openvins import LAYOUT, States, read_deviations
-from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, POINT, POSE, SPLIT, TRIANGLE, read_poses
+from consistency.referee.readers.formats.pose_rows import (
+    DEVIATIONS,
+    DEVIATIONS_LAYOUT,
+    FULL,
+    POINT,
+    POSE,
+    SPLIT,
+    TRIANGLE,
+    States,
+    read_deviations,
+    read_poses,
+)
 from consistency.referee.readers.formats.position_truth import fixed, position_source, positions
 from consistency.referee.readers.formats.sheet import Lines, Places, read_numbers, refuse
-from consistency.referee.readers.matching import associate
+from consistency.referee.readers.matching import NamedPoses, Poses, associate
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.space_trajectories import (
     ALONE,
@@ -205,7 +214,11 @@ def _poses(
         if source.values.shape[1] == 1 + BOTH:
             cross = _cross(own, source, rows, picked, order)
     if covariance is None:
-        of = f"the standard deviations of {LAYOUT}" if isinstance(own, States) else f"lines of t and {FULL} numbers"
+        of = (
+            f"the standard deviations of {DEVIATIONS_LAYOUT}"
+            if isinstance(own, States)
+            else f"lines of t and {FULL} numbers"
+        )
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
     covariance = covariance[:, : 6 + k, : 6 + k]
     P = np.full((len(own.t), 6 + k, 6 + k), np.nan)

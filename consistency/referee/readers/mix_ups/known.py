@@ -13,9 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
-from consistency.referee.readers.alignment.bodies import fitted_body, on_body
-from consistency.referee.readers.alignment.world_frames import WorldTransform, fitted_frame, moved, spread
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.alignment.world_frames import (
+    WorldTransform,
+    fitted_body,
+    fitted_frame,
+    moved,
+    on_body,
+    spread,
+)
+from consistency.referee.readers.matching import Poses
 from consistency.referee.types import Array
 
 ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
@@ -29,7 +29,9 @@ from consistency.referee.readers.file_kinds import (
 )
 from consistency.referee.readers.formats.text_blocks import is_cut, without_end
 from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.windows import Relative, relative_of
+
+if TYPE_CHECKING:
+    from consistency.referee.readers.windows import Relative
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
@@ -85,7 +87,7 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Evidence]:
     from consistency.referee.readers.formats.sheet import frame_rows
     from consistency.referee.readers.formats.table import read_tables
 
-    over = relative_of(reading.relative, bool(reading.motions), reading.windows)
+    over = _windows(reading)
     sheet = frame_rows(estimates, "estimates") if hasattr(estimates, "columns") else Path(estimates)
     true = frame_rows(truth, "truth") if hasattr(truth, "columns") else truth if truth is None else Path(truth)
     r = _checked(replace(reading, truth=cast(Any, true)), over)
@@ -136,7 +138,7 @@ def _cut_by(reason: str) -> tuple[Path, int] | None:
 
 
 def _read(estimates: Path, r: Reading) -> list[Evidence]:
-    over = relative_of(r.relative, bool(r.motions), r.windows)
+    over = _windows(r)
     r = _checked(r, over)
     return _asked(str(estimates), r, over, lambda kind: _by_kind(estimates, replace(r, error=kind), over))
 
@@ -156,6 +158,15 @@ def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]])
     kinds = [kind for kind in (SPATIAL if default in SPATIAL else PLANAR) if kind not in (default, "vector")]
     others = {kind: {one.name: one for one in read(kind)} for kind in kinds}
     return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
+
+
+def _windows(r: Reading) -> Relative | None:
+    """Windows that are judged in place of poses."""
+    if not r.given(OF_WINDOWS):
+        return None
+    from consistency.referee.readers.windows import relative_of
+
+    return relative_of(r.relative, bool(r.motions), r.windows)
 
 
 def _asked(

@@ -88,7 +88,7 @@ def _sheet(
     if isinstance(table, TableRows):
         return table, ""
     if is_drive(table):
-        from consistency.referee.readers.formats.kitti_oxts import drive_sheet
+        from consistency.referee.readers.formats.kitti_files import drive_sheet
 
         return drive_sheet(table, body), ""
     return planar_sheet(table, motions) if axes == POSE else (read_sheet(table), "")

@@ -14,7 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.readers.file_kinds import TABLES, is_drive, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
-from consistency.referee.readers.formats.kitti_oxts import read_drive
+from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.readers.formats.pose_rows import (
     DEVIATIONS,
     DEVIATIONS_LAYOUT,

@@ -82,7 +82,9 @@ def windows_of(stretch: Stretch, relative: Relative) -> Windows:
     first, last, left_out = windows(s.t, s.truth[:, : s.d], s.rows, relative, s.file)
     sound = _sound(s, relative)
     first, last = first[last < sound], last[last < sound]
-    T, true = _poses(s, sound, relative), matrices(s.truth)
+    T, true = matrices(s.estimate[int(relative.motions) : sound]), matrices(s.truth)
+    if relative.motions:  # from the origin on
+        T = composed(np.concatenate([np.eye(s.d + 1)[None], T]))
     start, end = np.searchsorted(s.rows, first), np.searchsorted(s.rows, last)
     D, M = inverse(T[first]) @ T[last], inverse(true[start]) @ true[end]
     error = log(inverse(D) @ M)
@@ -104,14 +106,6 @@ def _sound(s: Stretch, relative: Relative) -> int:
     if relative.motions:
         ok[0] = True
     return len(ok) if ok.all() else int(np.argmin(ok))
-
-
-def _poses(s: Stretch, sound: int, relative: Relative) -> Array:
-    """Estimated poses (sound, d + 1, d + 1); of motions from the origin on."""
-    if not relative.motions:
-        return matrices(s.estimate[:sound])
-    D = matrices(s.estimate[1:sound])
-    return composed(np.concatenate([np.eye(s.d + 1)[None], D]))
 
 
 def _of_motions(s: Stretch, T: Array, first: Indices, last: Indices) -> Array:

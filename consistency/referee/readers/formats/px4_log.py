@@ -17,7 +17,7 @@ from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.formats.innovation_files import NisLog, choose
 from consistency.referee.readers.matching import associate
-from consistency.referee.types import Array, Indices
+from consistency.referee.types import Array
 
 TOPICS = ("estimator_innovations", "estimator_innovation_variances")
 OLD = "ekf2_innovations"  # of older firmware: innovations and variances in one message
@@ -126,7 +126,10 @@ def _paired(path: Path, innovations: dict[str, Array], variances: dict[str, Arra
     if clock is None:
         raise InputError(f"{path}: {TOPICS[0]} lacks a field 'timestamp'")
     times, others = _times(path, TOPICS[0], innovations[clock]), _times(path, TOPICS[1], variances[clock])
-    rows, match = _together(times, others, exact=clock == CLOCKS[0])
+    if clock == CLOCKS[0]:  # of several with one stamp the first
+        _, rows, match = np.intersect1d(times, others, return_indices=True)
+    else:
+        rows, match = associate(times, others, TOGETHER)
     if not len(rows):
         raise InputError(f"{path}: no message of {TOPICS[0]} has its partner in {TOPICS[1]}; both must be logged")
     return Pairs(
@@ -146,14 +149,6 @@ def require_in_order(path: Path, topic: str, t: Array) -> None:
     """Refuse messages whose times go back."""
     if len(back := np.flatnonzero(np.diff(t) < 0)):
         raise InputError(f"{path}: message {back[0] + 2} of {topic} is older than the one before; the log is damaged")
-
-
-def _together(times: Array, others: Array, exact: bool) -> tuple[Indices, Indices]:
-    """Messages of either topic that belong together; of several with one stamp the first."""
-    if exact:
-        _, rows, match = np.intersect1d(times, others, return_indices=True)
-        return rows, match
-    return associate(times, others, TOGETHER)
 
 
 def _groups(pairs: Pairs) -> dict[str, list[str]]:

@@ -162,7 +162,14 @@ def are_dof(values: Array) -> Array:
 
 def read_sheet(path: Path) -> TableRows:
     """A CSV file (comma, semicolon or tab; # comments) or a Parquet file."""
-    sheet = _read_parquet(path) if path.suffix.lower() in (".parquet", ".pq") else _read_csv(path)
+    if path.suffix.lower() in (".parquet", ".pq"):
+        if not is_file(path):
+            raise InputError(f"{path}: no such file")
+        require(f"{path}: Parquet", "parquet")
+        columns, rows = outside("columns")(path, "cannot be read as Parquet")
+        sheet = TableRows(path, columns, np.arange(rows), "row")
+    else:
+        sheet = _read_csv(path)
     if not len(sheet):
         raise InputError(f"{path}: holds no row")
     if "filter" in sheet:
@@ -195,14 +202,6 @@ def _cells(values: Array) -> Column:
     if values.dtype.kind in "fiu":
         return np.asarray(values, float)
     return np.array([None if str(cell) in EMPTY else cell for cell in values.tolist()], object)
-
-
-def _read_parquet(path: Path) -> TableRows:
-    if not is_file(path):
-        raise InputError(f"{path}: no such file")
-    require(f"{path}: Parquet", "parquet")
-    columns, rows = outside("columns")(path, "cannot be read as Parquet")
-    return TableRows(path, columns, np.arange(rows), "row")
 
 
 def _read_csv(path: Path) -> TableRows:

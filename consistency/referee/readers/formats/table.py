@@ -200,7 +200,10 @@ def _recording(
         if own:
             notes.append(f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error")
         if key == "step":
-            keep &= ~_exact_start(keys, covariance)
+            start = (keys == 0) & ~(keys < 0).any()
+            kinds = classify(covariance[start], ROUNDED)
+            # rows of step 0 where no run is uncertain yet: the start, not an estimate
+            keep &= ~(start & np.isin(kinds, (Validity.DEFICIENT, Validity.INDEFINITE)).all())
     nis, dof = nis_columns(sheet)
     numbers = [int(run) for run in np.unique(runs[keep])]
     members = [np.flatnonzero(keep & (runs == run)) for run in numbers]
@@ -277,13 +280,6 @@ def _poses(
                 )
             )  # fmt: skip
     return found
-
-
-def _exact_start(steps: Array, covariance: Array) -> Array:
-    """Rows of step 0 where no run is uncertain yet: the start, not an estimate."""
-    start: Array = (steps == 0) & ~(steps < 0).any()
-    kinds = classify(covariance[start], ROUNDED)
-    return start & np.isin(kinds, (Validity.DEFICIENT, Validity.INDEFINITE)).all()
 
 
 # --- poses alone -------------------------------------------------------------------------------------

@@ -209,7 +209,10 @@ def matched(
         if of_truth is not None and there.covariance is not None:
             of_truth[rows[own]] = there.covariance[nearest(keys[rows[own]], there.keys, match)]
     if key == "step" and "t" in sheet and "t" in truth:
-        _same_instants(sheet, truth, keep, partner, max_dt)
+        t, other = sheet.numbers("t"), truth.numbers("t")[partner]
+        where = f"in the same step of {truth.path}; number the same instants by the same step, or raise --max-dt"
+        off = keep & (np.abs(t - other) > max_dt + 1e-6)
+        refuse(off, sheet.place, lambda row: f"t is {t[row]:.10g}, but {other[row]:.10g} {where}")
     notes = []
     absent = [] if true_runs is None else sorted({int(run) for run in true_runs} - {int(run) for run in runs})
     if absent:
@@ -222,10 +225,3 @@ def matched(
     if furthest > 1e-6:
         notes.append(f"{name}: the truth is interpolated, from samples up to {furthest:.2g} s away")
     return keep, true, of_truth, notes
-
-
-def _same_instants(sheet: TableRows, truth: TableRows, keep: Array, partner: Array, max_dt: float) -> None:
-    own, other = sheet.numbers("t"), truth.numbers("t")[partner]
-    where = f"in the same step of {truth.path}; number the same instants by the same step, or raise --max-dt"
-    off = keep & (np.abs(own - other) > max_dt + 1e-6)
-    refuse(off, sheet.place, lambda row: f"t is {own[row]:.10g}, but {other[row]:.10g} {where}")

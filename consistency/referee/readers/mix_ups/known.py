@@ -48,7 +48,10 @@ class Guess:
 def guesses_of(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
     """Possible mix-ups, the likelier first."""
     kind, convention = runs[0].manifold, runs[0].convention
-    guesses = [*_covariances()]
+    guesses = [
+        Guess("its diagonal holds standard deviations; square them", _squared),
+        Guess("it is an information matrix; invert it", _inverted),
+    ]
     if kind == "spatial":
         own = [*_orders(convention), *_quaternions(), *guesses, *_permuted(axes, 3)]
         return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_positions(3), *_frames(runs), *_bodies(runs)]
@@ -215,11 +218,6 @@ def _weighed(p: Poses, part: slice, factor: float) -> Poses:
     scale = np.ones(p.covariance.shape[-1])
     scale[part] = factor
     return replace(p, covariance=p.covariance * scale[:, None] * scale)
-
-
-def _covariances() -> Iterator[Guess]:
-    yield Guess("its diagonal holds standard deviations; square them", _squared)
-    yield Guess("it is an information matrix; invert it", _inverted)
 
 
 def _squared(p: Poses) -> Poses:

@@ -64,11 +64,8 @@ class NoiseModel:
     @property
     def status(self) -> str:
         """consistent, overconfident, conservative, inconsistent or undecided."""
-        # nothing is consistent whose errors are the truth's, or last for a whole drive: such an error has one value a
-        # drive, so that a fit to few drives, and its judgement, rest on as few values
-        of_truth = self.second is not None and bool(self.second.is_shared.any())
-        doubted = of_truth or any(each.decides for each in self.lasting)
-        return "undecided" if doubted and self.spans[0].status == "consistent" else self.spans[0].status
+        is_of_truth = self.second is not None and bool(self.second.is_shared.any())
+        return decided(self.spans[0].status, is_of_truth or any(each.decides for each in self.lasting))
 
     @property
     def stretches(self) -> list[tuple[str, Stretch]]:
@@ -107,6 +104,14 @@ class NoiseModel:
 
     def __repr__(self) -> str:
         return f"<NoiseModel {self.name}: {_shown('wording', 'sentence', self)}>"
+
+
+def decided(status: str, doubted: bool) -> str:
+    """A status at the span: nothing is consistent whose errors are the truth's, or last for a whole drive.
+
+    Such an error has one value a drive, so that a fit to few drives, and its judgement, rest on as few values.
+    """
+    return "undecided" if doubted and status == "consistent" else status
 
 
 def _shown(module: str, function: str, *arguments: Any) -> Any:

@@ -263,8 +263,6 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
 
 @dataclass(frozen=True)
 class _Look:
-    """The result of a gate at one false-alarm rate."""
-
     bad: bool
     sure: bool  # bad at any rate
     p_value: float
@@ -277,7 +275,6 @@ class _Look:
 def _settle(
     gate: str, record: Record, demand: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
 ) -> _Look:
-    """Record the result of a gate, and raise if it is already decided."""
     __tracebackhide__ = True
     result, late = look(demand.false_alarm), None
     runs, dof = len(record.run_numbers), planned_dof(record)

@@ -248,7 +248,6 @@ def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
 def _spans(
     folds: Sequence[Fold], drives: Sequence[Drive], windows: Windows, planar: bool, general: bool
 ) -> tuple[Judged, ...]:
-    """The span of the fit and its multiples, as long as there are windows."""
     found = []
     for times in SPANS:
         some = windows if times == 1 else windows_at(drives, windows, windows.span.size * times, planar)

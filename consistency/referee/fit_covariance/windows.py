@@ -41,7 +41,6 @@ class Windows:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Names of the components of the error."""
         return PLANE if self.d == 2 else SPACE
 
     @property
@@ -56,11 +55,9 @@ class Windows:
 
     @property
     def cut(self) -> float:
-        """Share of windows that have a jump."""
         return self.jumps / max(len(self.drive) + self.jumps, 1)
 
     def of(self, keep: Indices | Array) -> Windows:
-        """Some of the windows."""
         names = ("drive", "first", "last", "pieces", "true")
         return replace(self, **{name: getattr(self, name)[keep] for name in names})
 

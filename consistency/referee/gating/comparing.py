@@ -35,7 +35,6 @@ class Sides:
 
     @property
     def failed_more(self) -> bool:
-        """a has more failed runs than b on the same trials."""
         return self.paired and self.failures.a > self.failures.b
 
     @property
@@ -48,7 +47,6 @@ class Sides:
         return compare(self.a, self.b, false_alarm, self.axes, self.paired)
 
     def reasons(self, c: Comparison) -> list[str]:
-        """A sentence, then each quantity of both."""
         anees = c.differences[0]
         outcome = "worse" if c.worse or self.failed_more else "not worse"
         lines = [

@@ -199,7 +199,6 @@ class Poses:
         return replace(self, t=self.t + shift) if shift else self
 
     def sound(self) -> Poses:
-        """The estimates that are finite, with a finite covariance."""
         return self._of(
             np.flatnonzero(np.isfinite(self.estimate).all(axis=1) & np.isfinite(self.covariance).all((1, 2)))
         )
@@ -247,7 +246,6 @@ class Aligned:
     unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
 
     def on(self, recording: Evidence) -> Evidence:
-        """Recording of these runs, with the notes on their alignment."""
         return replace(recording, **{key: value for key, value in vars(self).items() if key not in ("runs", "notes")})
 
 

@@ -38,7 +38,6 @@ class Track:
     path: Array | None = None  # (k, 2, 2 or 3), m, true and estimated positions
 
     def part(self, index: Sequence[int]) -> Track:
-        """Track of some components of the error."""
         assert self.error is not None
         assert self.covariance is not None
         if len(index) == self.error.shape[1]:

@@ -123,7 +123,6 @@ def recordings_of(
 
 
 def _match(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: float) -> Match:
-    """The estimates of a run that have truth and covariance."""
     known = poses.known(shift)
     if not len(known.rows):
         raise apart(path, poses.t + shift, truth, poses.true_t, poses.max_dt, "truth")

@@ -60,7 +60,6 @@ class Compared:
 
     @property
     def worse(self) -> bool:
-        """Less consistent, or, on the same trials, with more failed runs."""
         return self.comparison.worse or (self.comparison.paired and self.failures.a > self.failures.b)
 
 

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -141,15 +139,11 @@ def _loaded(path: Path, wanted: dict[str, list[str]]) -> tuple[dict[str, list[di
         while (message := log.recv_match(type=[*wanted, "PARM"])) is not None:
             kind = message.get_type()
             if kind in rows:
-                rows[kind].append(_row(message, wanted[kind]))
+                fields = {"TimeUS", "TimeMS", CORE, *wanted[kind]} & {*message.get_fieldnames()}
+                rows[kind].append({name: float(getattr(message, name)) for name in fields})
             elif str(message.Name).endswith("_I_GATE"):
                 gates[message.Name] = min(float(message.Value), gates.get(message.Name, np.inf))
     return rows, gates
-
-
-def _row(message: Any, fields: Sequence[str]) -> dict[str, float]:
-    there = message.get_fieldnames()
-    return {name: float(getattr(message, name)) for name in ("TimeUS", "TimeMS", CORE, *fields) if name in there}
 
 
 def _of_core(path: Path, rows: list[dict[str, float]], core: int | None) -> list[dict[str, float]]:

@@ -204,7 +204,6 @@ def _frames(reader: Any, topic: str) -> tuple[str, str]:
 
 
 def _transforms(bag: Path, reader: Any, frames: str) -> Iterator[tuple[Any, Any]]:
-    """Header and transform of CHILD in PARENT from /tf."""
     parent, child = (frame.strip().lstrip("/") for frame in frames.split(":", 1))
     connections = [connection for connection in reader.connections if connection.msgtype in TREE]
     seen = set()

@@ -97,11 +97,9 @@ class TableRows:
         )
 
     def texts(self, column: str) -> Array:
-        """A column as text, (N,)."""
         return np.array([str(cell) for cell in self.data[column]], object)
 
     def empty(self, column: str) -> Array:
-        """Which cells of a column are empty, (N,)."""
         cells = self.data[column]
         return np.isnan(cells) if cells.dtype.kind == "f" else np.array([cell is None for cell in cells], bool)
 
@@ -229,7 +227,6 @@ def _read_csv(path: Path) -> TableRows:
 
 
 def _header(path: Path, line: str) -> tuple[list[str], str]:
-    """Names of the columns, and the character between them."""
     separator = max(",;\t", key=line.count)
     names = [name.strip().strip('"') for name in line.split(separator)]
     twice = {name for name in names if names.count(name) > 1}

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.geometry.space_errors import spatial_error
+from consistency.referee.geometry.groups import spatial_error
 from consistency.referee.readers.alignment.world_frames import (
     BodyTransform,
     WorldTransform,

@@ -70,7 +70,7 @@ def read_bags(path: Path, r: Reading, relative: Relative | None = None) -> list[
         (_run_of(bag, r) for bag in bags),
         r,
         why="; as the ROS messages define it; declare yours with --error",
-        apart=f"{path}: the covariances of some bags have cross terms, of others none; judge them apart",
+        mixed=f"{path}: the covariances of some bags have cross terms, of others none; judge them apart",
     )
     stated, said = _stated(path, poses)
     if r.axes is None and said:

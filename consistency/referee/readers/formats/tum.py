@@ -82,7 +82,7 @@ def poses_of(
     r: Reading,
     relative: Relative | None = None,
     why: str = "",
-    apart: str = "",
+    mixed: str = "",
 ) -> tuple[TrajectorySource, list[Poses], Mapping[str, range]]:
     """Runs before any error is taken, with their origin, and the components whose covariance is known.
 
@@ -90,8 +90,8 @@ def poses_of(
     ----------
     files : of each run: its estimates, its truth
     runs : estimates and truth, a file of covariances where they are not in the lines, and notes
-    why : the default error is what it is; that of the layout where empty
-    apart : message where runs are of different layouts
+    why : reason for the default error, as the end of a note; that of the layout where empty
+    mixed : message where runs are of different layouts
     """
     order = r.covariance_order or ORDERS[0]
     parts: Mapping[str, range] = WHOLE
@@ -107,7 +107,7 @@ def poses_of(
         if parts not in (WHOLE, ALONE) and r.covariance_order == ORDERS[0]:
             raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
         if _parts(own) is not parts:
-            raise InputError(apart or f"{path}: has {own.values.shape[1]} columns, {files[0][0]} another layout")
+            raise InputError(mixed or f"{path}: has {own.values.shape[1]} columns, {files[0][0]} another layout")
         if isinstance(own, Fixes):
             poses.append(fixed(own, true, r, of_truth(true, own, ORDERS[0], r)))
             continue

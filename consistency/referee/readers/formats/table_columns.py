@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.named_columns import DEVIATIONS
 from consistency.referee.readers.formats.sheet import TableRows, are_dof, refuse
-from consistency.referee.readers.matching import Manifold, nearest, truth_at, unit_apart
+from consistency.referee.readers.matching import Known, Manifold, Poses, unit_apart
 from consistency.referee.readers.options import COLUMNS
 from consistency.referee.readers.runs_to_record import listed, symmetric
 from consistency.referee.types import Array, Indices
@@ -177,51 +178,41 @@ def matched(
     sheet: TableRows,
     truth: TableRows,
     samples: Samples,
-    runs: Array,
-    keys: Array,
     key: str,
-    axes: tuple[str, ...],
-    convention: str,
+    numbers: Sequence[int],
+    members: Sequence[Indices],
+    poses: Sequence[Poses],
+    shift: float,
     max_dt: float,
-) -> tuple[Array, Array, Array | None, list[str]]:
-    """Which rows have a truth, (N,), that truth, (N, n), its covariance, (N, n, n), and notes on the matching."""
-    true_runs = samples.runs
-    tolerance = 0.0 if key == "step" else max_dt
-    keep, true = np.zeros(len(keys), bool), np.full((len(keys), len(axes)), np.nan)
-    of_truth = None if samples.covariance is None else np.full((*true.shape, len(axes)), np.nan)
-    partner, furthest = np.full(len(keys), -1), 0.0
-    for run in np.unique(runs):
-        rows = np.flatnonzero(runs == run)
-        there = samples.of(run)
-        if not len(there.keys):
-            has = ", ".join(map(str, np.unique(true_runs)[:5])) if true_runs is not None else ""
-            raise InputError(f"{truth.path}: holds no run {run} (it has {has}); without a column 'run' it serves all")
-        own, found, match, apart, _ = truth_at(keys[rows], there.keys, there.values, manifold_of(convention), tolerance)
-        furthest = max(furthest, float(apart.max(initial=0.0)))
-        if not len(own):
-            spans = [f"{each.min():.10g} to {each.max():.10g}" for each in (keys[rows], there.keys)]
-            odd = unit_apart(keys[rows], there.keys, (sheet.path, truth.path))
-            within = f" within {tolerance:g} s (--max-dt){odd}" if key == "t" else ""
+) -> tuple[list[Known], list[str]]:
+    """The truth of each run, and notes on the matching; ``numbers`` and ``members`` are the runs and their rows."""
+    known, partner = [p.known(shift) for p in poses], np.full(len(sheet), np.nan)
+    timed = key == "step" and "t" in sheet and "t" in truth
+    for run, rows, p, found in zip(numbers, members, poses, known, strict=True):
+        if not len(found.rows):
+            t = p.t + shift
+            spans = [f"{each.min():.10g} to {each.max():.10g}" for each in (t, p.true_t)]
+            odd = unit_apart(t, p.true_t, (sheet.path, truth.path))
+            within = f" within {p.max_dt:g} s (--max-dt){odd}" if key == "t" else ""
             raise InputError(
                 f"{sheet.path}: no {key} of run {run} ({spans[0]}) is in {truth.path} ({spans[1]}){within}"
             )
-        keep[rows[own]], true[rows[own]], partner[rows[own]] = True, found, there.row[match]
-        if of_truth is not None and there.covariance is not None:
-            of_truth[rows[own]] = there.covariance[nearest(keys[rows[own]], there.keys, match)]
-    if key == "step" and "t" in sheet and "t" in truth:
-        t, other = sheet.numbers("t"), truth.numbers("t")[partner]
+        if timed:
+            partner[rows[found.rows]] = truth.numbers("t")[samples.of(run).row[found.before]]
+    if timed:
+        t = sheet.numbers("t")
         where = f"in the same step of {truth.path}; number the same instants by the same step, or raise --max-dt"
-        off = keep & (np.abs(t - other) > max_dt + 1e-6)
-        refuse(off, sheet.place, lambda row: f"t is {t[row]:.10g}, but {other[row]:.10g} {where}")
+        off = np.abs(t - partner) > max_dt + 1e-6
+        refuse(off, sheet.place, lambda row: f"t is {t[row]:.10g}, but {partner[row]:.10g} {where}")
     notes = []
-    absent = [] if true_runs is None else sorted({int(run) for run in true_runs} - {int(run) for run in runs})
+    absent = [] if samples.runs is None else sorted({int(run) for run in samples.runs} - {*numbers})
     if absent:
         notes.append(
             f"{name}: no estimates of {plural(len(absent), 'run')} of the truth ({listed(absent)}); "
             "if the filter broke down there, write a row of NaN, so that the failure counts"
         )
-    if not keep.all():
-        notes.append(f"{name}: {int((~keep).sum())} of {len(keep)} estimates have no truth and are left out")
-    if furthest > 1e-6:
+    if left_out := len(sheet) - sum(len(found.rows) for found in known):
+        notes.append(f"{name}: {left_out} of {len(sheet)} estimates have no truth and are left out")
+    if (furthest := max(float(found.apart.max(initial=0.0)) for found in known)) > 1e-6:
         notes.append(f"{name}: the truth is interpolated, from samples up to {furthest:.2g} s away")
-    return keep, true, of_truth, notes
+    return known, notes

@@ -17,7 +17,7 @@ from consistency.referee.diagnostics import Evidence, judge
 from consistency.referee.diagnostics.records.log_pieces import in_pieces
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.space_errors import spatial_error
+from consistency.referee.geometry.groups import spatial_error
 from consistency.referee.types import Array
 
 STEPS, DOF, RHO = 20_000, 3, 0.95

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.matching import Poses
 from consistency.referee.readers.mix_ups.hints import hints
-from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 
 AXES = {

@@ -24,8 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.referee.system.ending import LEAVE
-from consistency.referee.system.stopping import STOPS
+from consistency.referee.system.stopping import LEAVE, STOPS
 
 LIMIT = 2.0  # s
 LONGEST = 20.0  # s after which a signal comes at the latest

@@ -25,7 +25,7 @@ from consistency.bench.store.data_frames import failures_table, rejections_table
 from consistency.bench.store.log import read_log
 from consistency.bench.store.trial_rows import Rejected
 from consistency.referee.cli import main
-from consistency.referee.readers.formats.kitti_oxts import read_drive
+from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Failure
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import consistency
-from consistency.referee.outside import OUTSIDE, outside
+from consistency.referee.extras import OUTSIDE, outside
 
 PACKAGE = Path(consistency.__file__).parent
 SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((PACKAGE.parent / folder).glob("*.py"))]
@@ -24,8 +24,8 @@ ROOTS = {"referee": 0, "bench": 1, "stereo": 2, "": 3}
 RANKS = {
     "referee": {
         "types": 0, "errors": 0, "defaults": 0, "column_names": 0,
-        "system.progress": 0, "system.atomic": 0, "system.machine": 0, "system.stopping": 0,
-        "extras": 1, "system.ending": 1, "system.provenance": 1, "geometry": 1, "outside": 1, "shipped": 1,
+        "system.progress": 0, "system.atomic": 0, "system.stopping": 0,
+        "extras": 1, "system.provenance": 1, "geometry": 1, "shipped": 1,
         "parsing": 1, "system.folders": 2,
         "diagnostics": 2, "readers": 3, "verdicts": 4, "document": 3, "show": 4, "pages": 5, "gating": 6, "notebook": 6,
         "fit_covariance": 6, "cli": 7,

@@ -22,8 +22,7 @@ from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.system import progress
-from consistency.referee.system.ending import die_with_parent
-from consistency.referee.system.stopping import STOPS, undisturbed
+from consistency.referee.system.stopping import STOPS, die_with_parent, undisturbed
 
 GLANCE = 0.1  # s between looks, for a signal that another thread was given
 NAMED = 3  # filters that are named where several are compiled

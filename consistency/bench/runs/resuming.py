@@ -12,8 +12,8 @@ from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.results import StoredResults, Tables, open_results
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import NewFolder
-from consistency.referee.system.machine import in_words, this_machine
 from consistency.referee.system.progress import say
+from consistency.referee.system.provenance import in_words, this_machine
 
 PLAN = "until_decided"
 KEYS = {

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from consistency.referee.diagnostics import Evidence, Verdict
     from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
     from consistency.referee.document.blocks import Document
+    from consistency.referee.document.drawing import Sheet
     from consistency.referee.system.progress import Advance
     from consistency.referee.verdicts.monitor_sources import Watched
 
@@ -150,6 +151,19 @@ def require_plot(path: Path, overwrite: bool) -> None:
         raise InputError(f"--plot {path}: must end in {', '.join(KINDS)}")
     require("a plot", "plot")
     require_writable(path, overwrite)
+
+
+def plotted(sheet: Sheet, path: str | Path | None) -> Any:
+    """A figure of Matplotlib, which is written to ``path`` as well; needs ``[plot]``."""
+    require("a plot", "plot")
+    from consistency.referee.show.with_matplotlib import drawn, picture
+
+    figure = drawn(sheet)
+    if path is not None:
+        path = Path(path)
+        require_plot(path, overwrite=True)
+        write_file(path, picture(figure, path.suffix.lower().removeprefix(".")))
+    return figure
 
 
 def write_monitor_plot(path: Path, shown: Watched | Sequence[GateRatios]) -> None:

@@ -22,7 +22,7 @@ from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
 from consistency.bench.store.results import StoredResults
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.bench.types import Trial
-from consistency.referee.system.machine import this_machine
+from consistency.referee.system.provenance import this_machine
 
 pytestmark = [
     pytest.mark.skipif(os.name == "nt", reason="signals"),

@@ -37,13 +37,12 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.readers import clock_offset
 from consistency.referee.readers.alignment import residuals
-from consistency.referee.readers.alignment.align import Aligned
 from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.clock_offset import clocks_and_frames
 from consistency.referee.readers.formats.sheet import Places
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.matching import Aligned, Poses
 from consistency.referee.types import Array
 
 STEPS = 30

@@ -23,8 +23,15 @@ from consistency.referee.diagnostics.verdict.as_dictionary import flat, plain
 from consistency.referee.extras import is_installed
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel
-from consistency.referee.fit_covariance.snippets import ceres, gtsam, robot_localization, seconds, straight, toml
-from consistency.referee.fit_covariance.writing import write_model
+from consistency.referee.fit_covariance.writing import (
+    ceres,
+    gtsam,
+    robot_localization,
+    seconds,
+    straight,
+    toml,
+    write_model,
+)
 from consistency.referee.geometry.groups import composed, vectors
 from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array

@@ -17,8 +17,15 @@ from consistency.referee.fit_covariance.covariance_ratios import Ratio, folds_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.noise_model import caution
 from consistency.referee.fit_covariance.systematic_errors import Mean, carriers, design_of, fit_mean
-from consistency.referee.fit_covariance.variances import blocks_of, fit_terms, interval_of, nees_of, terms_of
-from consistency.referee.fit_covariance.white_noise import fit_noise, with_jitter
+from consistency.referee.fit_covariance.white_noise import (
+    blocks_of,
+    fit_noise,
+    fit_terms,
+    interval_of,
+    nees_of,
+    terms_of,
+    with_jitter,
+)
 from consistency.referee.fit_covariance.windows import Windows, in_plane, span_of, windows_of
 from consistency.referee.geometry.groups import composed, inverse, log
 from consistency.referee.types import Array

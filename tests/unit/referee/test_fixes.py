@@ -226,7 +226,7 @@ def test_other_forms_of_a_place(write: object, corner: Array, tmp_path: Path, mo
     place, P = flight()
     place = place - PLACE + np.asarray(corner)
     plain, other = read_solution(Path(solution("a.pos", place, P))), read_solution(Path(write("b.pos", place, P)))
-    here, there = plain.local(), other.local(plain.origin)
+    here, there = plain.local(), other.local(plain.values[0, 1:4])
     np.testing.assert_allclose(there[0], here[0], atol=2e-8)  # 6e6 m in a double, and degrees of 14 digits
     np.testing.assert_allclose(there[1], here[1], rtol=1e-7, atol=1e-12)
     np.testing.assert_array_equal(other.t, plain.t)

@@ -16,15 +16,21 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.geometry.space_errors import spatial_error
-from consistency.referee.readers.alignment.bodies import BodyTransform, fitted_body, on_body
-from consistency.referee.readers.alignment.world_frames import WorldTransform, carried, fitted_frame, moved
+from consistency.referee.geometry.groups import spatial_error
+from consistency.referee.readers.alignment.world_frames import (
+    BodyTransform,
+    WorldTransform,
+    carried,
+    fitted_body,
+    fitted_frame,
+    moved,
+    on_body,
+)
 from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.matching import Poses
 from consistency.referee.readers.mix_ups import hints as readers_hints
-from consistency.referee.readers.mix_ups.hints import decades, hints, turns
+from consistency.referee.readers.mix_ups.hints import FACTOR, ReadingFit, decades, fit_of, hints, turns
 from consistency.referee.readers.mix_ups.known import _ned
-from consistency.referee.readers.mix_ups.likelihoods import FACTOR, ReadingFit, fit_of
-from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 
 RUNS, STEPS = 3, 60

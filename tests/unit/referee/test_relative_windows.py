@@ -14,8 +14,7 @@ import consistency as cs
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error
-from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, to_left
-from consistency.referee.geometry.space_errors import spatial_error
+from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, spatial_error, to_left
 from consistency.referee.readers.relative_motions import windows_of
 from consistency.referee.readers.windows import Relative, relative_of, windows
 from consistency.referee.types import Array

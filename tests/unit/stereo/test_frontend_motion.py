@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.bench.store.log import read_log
-from consistency.referee.geometry.space_errors import spatial_error
+from consistency.referee.geometry.groups import spatial_error
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.types import Array
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log

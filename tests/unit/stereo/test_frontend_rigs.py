@@ -19,7 +19,7 @@ from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor
 from consistency.bench.store.log import read_log
 from consistency.bench.types import Trial
 from consistency.referee.geometry import rotation
-from consistency.referee.readers.formats.kitti_oxts import drive_poses
+from consistency.referee.readers.formats.kitti_files import drive_poses
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
 from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import plane_of

@@ -80,17 +80,6 @@ COUNTED: dict[str, Callable[[Outcome], bool]] = {
 # --- the referee --------------------------------------------------------------------------------------------
 
 
-def _judge_one(gate: Gate, false_alarm: float) -> Verdict:
-    """The verdict on a gate: the only place that calls ``judge``."""
-    return judge(Evidence("gate", **vars(gate)), Settings(false_alarm, DETECT, POWER))
-
-
-def _follow_one(gate_of: Callable[[int], Gate], false_alarm: float, dof: int) -> tuple[Verdict, int]:
-    """The verdict of ``--until-decided``, and the runs it took: the only place that does so."""
-    design = sequential_design(dof, DETECT, false_alarm, POWER, MOST)
-    return follow(design, lambda runs: Evidence("gate", **vars(gate_of(runs))))
-
-
 def _evidence_values(means: Array, dof: int) -> Array:
     """E-values after each run, from run means of the NEES over its degrees of freedom."""
     return e_process(means, dof).both
@@ -133,11 +122,14 @@ def judged(case: Case, numbers: Sequence[int], seed: int) -> list[Outcome]:
 
 
 def _at_once(case: Case, gate_of: Growing) -> Outcome:
-    return _outcome(_judge_one(gate_of(case.runs), case.false_alarm), case.runs)
+    evidence = Evidence("gate", **vars(gate_of(case.runs)))
+    return _outcome(judge(evidence, Settings(case.false_alarm, DETECT, POWER)), case.runs)
 
 
 def _until_decided(case: Case, gate_of: Growing) -> Outcome:
-    return _outcome(*_follow_one(gate_of, case.false_alarm, ANY[case.world].dof or DOF))
+    """The verdict of ``--until-decided``, and the runs it took."""
+    design = sequential_design(ANY[case.world].dof or DOF, DETECT, case.false_alarm, POWER, MOST)
+    return _outcome(*follow(design, lambda runs: Evidence("gate", **vars(gate_of(runs)))))
 
 
 def _betting(case: Case, gate_of: Growing) -> Outcome:

@@ -13,10 +13,3 @@ def row(
         "world": world, "question": question, "ratio": ratio, "runs": runs, "looks": 1, "stated": stated,
         "bound": bound, "gates": gates, "found": found,
     }  # fmt: skip
-
-
-def show(rows: list[dict[str, Any]]) -> None:
-    """Print the rows."""
-    for one in rows:
-        share = 100 * one["found"] / one["gates"]
-        print(f"{one['question']}, {one['world']}, x{one['ratio']:.3g}: {share:.2f} % ({one['bound']} {one['stated']})")

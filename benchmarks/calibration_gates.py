@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy import signal
 
 from consistency.referee.types import Array
 
@@ -100,6 +101,12 @@ def first_order(draw: Draw, correlation: Array | np.float64, n: int) -> Array:
     for k in range(1, draw.steps):
         w[:, k] = correlation * w[:, k - 1] + fresh * w[:, k]
     return w
+
+
+def stationary(noise: Array, correlation: float, axis: int = 0) -> Array:
+    """White noise made a stationary first-order autoregression of its variance along an axis; it is overwritten."""
+    np.moveaxis(noise, axis, 0)[1:] *= np.sqrt(1.0 - correlation**2)
+    return np.asarray(signal.lfilter([1.0], [1.0, -correlation], noise, axis=axis))
 
 
 def random_walk_filter(draw: Draw, start: float, process: float, noise: float, n: int) -> tuple[Array, Array]:

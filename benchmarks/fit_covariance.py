@@ -24,6 +24,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.defaults import DETECT
+from consistency.referee.diagnostics.statistics.intervals import binomial_interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive, drive_of
@@ -205,8 +206,8 @@ def recovery_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         for term in terms:
             inside, cover = share_within(term.ratios), int(term.covered.sum())
             least, possible = surely(inside, draws), surely(term.best, draws) >= SHARE
-            low, high = binomial(cover, draws, SURE / tests)
-            held &= (least >= SHARE or draws < 200) and low <= COVERED[1] and high >= COVERED[0]
+            low, high = binomial_interval(cover, draws, 1.0 - SURE / tests)
+            held &= bool((least >= SHARE or draws < 200) and low <= COVERED[1] and high >= COVERED[0])
             five, rest = np.quantile(term.ratios, [0.05, 0.95])
             print(
                 f"| {road}{number} | {term.name} | {five:.2f} to {rest:.2f} | {inside:.3f}, at least {least:.3f} "
@@ -294,7 +295,7 @@ def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         ratio = np.array([each[1] for each in found])
         outside = (ratio < 1 / DETECT) | (ratio > DETECT)
         wrong = sum(status == "consistent" and out for (status, _, _), out in zip(found, outside, strict=True))
-        held &= binomial(wrong, draws, 2 * SURE / tests)[0] <= WRONG
+        held &= bool(binomial_interval(wrong, draws, 1.0 - 2 * SURE / tests)[0] <= WRONG)
         statuses = ", ".join(
             f"{word} {count / draws:.2f}" for word, count in Counter(f[0] for f in found).most_common()
         )
@@ -304,13 +305,6 @@ def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         spread = "{:.2f} to {:.2f}".format(*np.quantile(known, [0.05, 0.95])) if len(known) else "-"
         print(f"| {case.name} | {statuses} | {spread} | {wrong / draws:.3f} | {said} |", flush=True)
     return held
-
-
-def binomial(count: int, draws: int, alpha: float) -> tuple[float, float]:
-    """Exact interval of a share (Clopper & Pearson 1934)."""
-    low = float(stats.beta.ppf(alpha / 2, count, draws - count + 1)) if count else 0.0
-    high = float(stats.beta.isf(alpha / 2, count + 1, draws - count)) if count < draws else 1.0
-    return low, high
 
 
 def main() -> int:

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy import signal
+from calibration_gates import stationary
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
@@ -95,8 +95,7 @@ def covariance(rng: np.random.Generator, sigma: Array, correlated: bool) -> Arra
 
 def noise(rng: np.random.Generator, steps: int, n: int, rho: float, tails: bool) -> Array:
     w = rng.standard_t(4, (steps, n)) / np.sqrt(2.0) if tails else rng.normal(size=(steps, n))
-    w[1:] *= np.sqrt(1.0 - rho**2)
-    return np.asarray(signal.lfilter([1.0], [1.0, -rho], w, axis=0))
+    return stationary(w, rho)
 
 
 def run_of(rng: np.random.Generator, kind: str, convention: str, e: Array, P: Array) -> Poses:

@@ -19,9 +19,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from relative_poses import exp
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Verdict, judge
+from consistency.referee.geometry.groups import composed, vectors
 from consistency.referee.readers.formats.geodetic import axes_at, centred, geodetic
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.read_files import read_recordings
@@ -187,16 +189,13 @@ def rates(at: Path, s: Study) -> Drawn:
     L = np.linalg.cholesky(s.P[:3, :3]) * 0.1
     e = np.sqrt(_ratio(s)) * s.rng.normal(size=(n, 3)) @ L.T
     t, v, w = 0.1 * np.arange(n), s.rng.uniform(0.5, 1.5, n), s.rng.normal(0.0, 0.3, n)
-    pose, true = np.zeros(3), [np.zeros(3)]
-    for k in range(n - 1):
-        arc = np.array([v[k] * dt * np.sinc(w[k] * dt / np.pi), v[k] * dt * _versine(w[k] * dt), w[k] * dt])
-        pose = _moved(_moved(pose, arc), _exp(e[k]))
-        true.append(pose)
+    arcs = exp(dt * np.column_stack([v, np.zeros(n), w])) @ exp(e)
+    true = vectors(composed(np.concatenate([np.eye(3)[None], arcs[:-1]])))
     P = L @ L.T
     header = "t,v,omega,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh"
     numbers = [np.full(n, P[i, j]) for i, j in zip(*np.triu_indices(3), strict=True)]
     est = write(at / "odometry.csv", [t, v, w, *numbers], header, ",")
-    truth = write(at / "truth.csv", [t, *np.array(true).T], "t,x,y,heading", ",")
+    truth = write(at / "truth.csv", [t, *true.T], "t,x,y,heading", ",")
     return est, {"truth": truth, "motions": True, "relative": 10, "error": "left"}
 
 
@@ -346,21 +345,6 @@ def _with_body_rotation(s: Study, P: Array) -> Study:
         own[run, :, :7] = np.column_stack([s.true[:, :3] - e[run, :, :3], turn.as_quat()])
         own[run, :, 7 : 1 + len(P)] = s.true[:, 7 : 1 + len(P)] - e[run, :, 6:]
     return Study(s.true, own, P, e, s.rng)
-
-
-def _versine(angle: float) -> float:
-    return float((1.0 - np.cos(angle)) / angle) if angle else 0.0
-
-
-def _exp(e: Array) -> Array:
-    """Of SE(2)."""
-    a, b = np.sinc(e[2] / np.pi), _versine(e[2])
-    return np.array([a * e[0] - b * e[1], b * e[0] + a * e[1], e[2]])
-
-
-def _moved(pose: Array, step: Array) -> Array:
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.array([pose[0] + c * step[0] - s * step[1], pose[1] + s * step[0] + c * step[1], pose[2] + step[2]])
 
 
 def verdicts(row: str, rng: np.random.Generator, ratio: float) -> list[tuple[bool, bool]]:

@@ -17,12 +17,13 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from calibration_compare import summary
 from calibration_gates import Draw, first_order
 from calibration_monitor import Monitors, Velocity
 from calibration_windows import undoubted, windows_of
 from scipy import stats
 
-from consistency.referee.diagnostics import Evidence, RunSummary, Verdict, compare, e_process, judge
+from consistency.referee.diagnostics import Evidence, Verdict, compare, e_process, judge
 from consistency.referee.readers.formats.numpy_archive import record_of_arrays
 from consistency.referee.types import Array
 
@@ -107,13 +108,8 @@ HEAVY: dict[str, Callable[[Rng, int], Array]] = {
 def worse(candidate: Callable[[Rng, int], Array], reference: Callable[[Rng, int], Array], runs: int,
           gates: int, rng: Rng) -> int:  # fmt: skip
     """Comparisons in which the candidate is called less consistent."""
-    both = ((_summary(candidate(rng, runs)), _summary(reference(rng, runs))) for _ in range(gates))
+    both = ((summary(candidate(rng, runs), DOF), summary(reference(rng, runs), DOF)) for _ in range(gates))
     return sum(compare(a, b, RATE).worse for a, b in both)
-
-
-def _summary(means: Array) -> RunSummary:
-    none = np.empty((len(means), 0))
-    return RunSummary(np.arange(len(means)), DOF, means, none, none)
 
 
 def slow_sizes(gates: int, rng: Rng) -> int:

@@ -17,7 +17,8 @@ import sys
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import signal, stats
+from calibration_gates import stationary
+from scipy import stats
 
 from consistency.referee.diagnostics import Evidence, Settings, judge
 from consistency.referee.diagnostics.planning.single_log import within
@@ -36,9 +37,7 @@ SETTINGS = Settings(RATE)
 
 def errors(rng: np.random.Generator, rho: float, steps: int, n: int) -> Array:
     """Standard normal errors (steps, n), neighbours correlated by ``rho``."""
-    noise = rng.normal(size=(steps, n))
-    noise[1:] *= np.sqrt(1.0 - rho**2)
-    return np.asarray(signal.lfilter([1.0], [1.0, -rho], noise, axis=0))
+    return stationary(rng.normal(size=(steps, n)), rho)
 
 
 def coverage(draws: int, seed: int) -> Iterator[tuple[str, bool]]:

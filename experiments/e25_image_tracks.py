@@ -106,7 +106,9 @@ def figure_6_of(study: cs.Study, walls: list[Array], name: str) -> cs.Finding:
     sd = np.array([errors.std(axis=0) for errors in walls])
     mean = np.sqrt((sd**2).mean(axis=0))
     low, high = sd.min(axis=0), sd.max(axis=0)
-    tails = bootstrap(generator(study, 6), walls, lambda drawn: stats.kurtosis((drawn - drawn.mean(0)) / drawn.std(0)))
+    tails = drives.bootstrap(
+        generator(study, 6), walls, lambda drawn: stats.kurtosis((drawn - drawn.mean(0)) / drawn.std(0)), DRAWS, LEVEL
+    )
     ratio = np.maximum(mean / (SD_U, SD_V), (SD_U, SD_V) / mean)
     shaken = name == "fig6-shake"
     return study.finding(
@@ -350,16 +352,6 @@ def budget_finding(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
         measured=f"{'. '.join(texts)}. The sum misses the whole by up to {miss:.0%}",
         accept=f"the sum is within {ADDS:.0%} of the whole for u, v and d, standing and moving",
     )
-
-
-def bootstrap(rng: np.random.Generator, parts: list[Array], statistic: Callable[[Array], Array]) -> tuple[float, float]:
-    """Interval of the least entry of a statistic of all parts together, from drawing parts with replacement."""
-    drawn = [
-        np.min(statistic(np.concatenate([parts[k] for k in rng.integers(0, len(parts), len(parts))])))
-        for _ in range(DRAWS)
-    ]
-    low, high = np.quantile(drawn, [LEVEL / 2, 1 - LEVEL / 2])
-    return float(low), float(high)
 
 
 if __name__ == "__main__":

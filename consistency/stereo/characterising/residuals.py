@@ -99,18 +99,22 @@ def select(data: Residuals, sensor: PicturedSensor, regressors: Array) -> RowSel
     centred = data.r - np.column_stack(fits)
     scale = np.column_stack([_spread(centred[:, 0]), _spread(centred[:, 1]), _local_spread(centred[:, 2], data)])
     rough = np.array([_spread(centred[:, k])[0] for k in range(3)])
-    inside = np.ones(len(data), bool)
-    expected = data.ideal + np.column_stack(fits)
-    if sensor.disparity is not None:
-        low, high = sensor.disparity
-        margin = MARGIN * scale[:, 2]
-        inside &= (expected[:, 2] >= low + margin) & (expected[:, 2] <= high - margin)
-    if sensor.image is not None:
-        for k, (size, middle) in enumerate(zip(sensor.image, sensor.centre, strict=True)):
-            margin = MARGIN * scale[:, k]
-            inside &= (expected[:, k] >= margin - middle) & (expected[:, k] <= size - middle - margin)
+    inside = within_limits(data.ideal + np.column_stack(fits), MARGIN * scale, sensor)
     gross = inside & (np.abs(centred) > GROSS * scale).any(axis=1)
     return RowSelection(data.keep(inside & ~gross), int(gross.sum()), int((~inside).sum()), rough)
+
+
+def within_limits(place: Array, margin: Array, sensor: PicturedSensor) -> Array:
+    """Rows (N,) whose u, v, d (N, 3) are by ``margin``, (N, 3) or (3,), within search range and image."""
+    inside = np.ones(len(place), bool)
+    if sensor.disparity is not None:
+        low, high = sensor.disparity
+        inside &= (place[:, 2] >= low + margin[..., 2]) & (place[:, 2] <= high - margin[..., 2])
+    if sensor.image is not None:
+        for k, (size, middle) in enumerate(zip(sensor.image, sensor.centre, strict=True)):
+            edge = margin[..., k]
+            inside &= (place[:, k] >= edge - middle) & (place[:, k] <= size - middle - edge)
+    return inside
 
 
 def _robust(r: Array, X: Array) -> Array:

@@ -70,19 +70,13 @@ def characterise_source(source: Path, options: SourceOptions) -> Measured:
 
 
 def _of_sequence(source: Path, options: SourceOptions) -> Measured:
-    from consistency.stereo.characterising.from_pairs import Sources, characterise_images
+    from consistency.stereo.characterising.from_pairs import characterise_images
 
     if options.distortion is not None:
         raise InputError("--distortion: goes with --board; other images bring their calibration")
     if options.grid is not None:
         raise InputError("--grid: goes with a log or with --board; images of an unknown scene give no bias map")
-    o = options
-    return Measured(
-        characterise_images(
-            source, Sources(o.calibration, o.truth, o.format, o.left, o.right, o.at_rest, o.free_poses, o.seed or 0)
-        ),
-        {},
-    )
+    return Measured(characterise_images(source, options), {})
 
 
 def counts(text: str, option: str, least: int) -> tuple[int, int]:

@@ -28,15 +28,21 @@ class Correspondence(Protocol):
         """Disparities (N,) of places ``uv`` (N, 2), px from the middle of the left image; NaN where there is none."""
 
 
-def _searched(search: tuple[int, int]) -> int:
-    low, high = search
-    if not 0 <= low < high:
+def _require_range(search: tuple[int, int]) -> None:
+    if not 0 <= search[0] < search[1]:
         raise InputError(f"search: {search}, allowed is (low, high) in px with 0 <= low < high")
-    return -(-(high - low + 1) // STEP) * STEP
+
+
+def _searched(image: Array, search: tuple[int, int], block: int) -> int:
+    """How many disparities a matcher searches in an image that is large enough for it."""
+    _require_range(search)
+    count = -(-(search[1] - search[0] + 1) // STEP) * STEP
+    require_size(image, block + count + search[0], f"blocks of {block} px and the search")
+    return count
 
 
 def _at(places: Array, disparities: Array, search: tuple[int, int]) -> Array:
-    """Values (N,) of a disparity image in sixteenths at the nearest pixels, px.
+    """Values (N,) of a disparity image (h, w) in sixteenths at the nearest pixels, px.
 
     NaN outside the search and at its ends, where the best match is no minimum.
     """
@@ -59,17 +65,12 @@ class BlockMatching:
     texture: int = 10  # least texture of a block
 
     def measure(self, left: Array, right: Array, uv: Array) -> Array:
-        return _at(to_columns(left, uv), self.disparities(left, right), self.search)
-
-    def disparities(self, left: Array, right: Array) -> Array:
-        """Disparity image (h, w) in sixteenths of a px; below the search where there is none."""
-        count = _searched(self.search)
-        require_size(left, self.block + count + self.search[0], f"blocks of {self.block} px and the search")
+        count = _searched(left, self.search, self.block)
         matcher: Any = opencv().StereoBM_create(count, self.block)
         matcher.setMinDisparity(self.search[0])
         matcher.setUniquenessRatio(self.uniqueness)
         matcher.setTextureThreshold(self.texture)
-        return np.asarray(matcher.compute(left, right))
+        return _at(to_columns(left, uv), matcher.compute(left, right), self.search)
 
 
 @dataclass(frozen=True)
@@ -81,17 +82,12 @@ class SemiGlobal:
     uniqueness: int = 10  # %
 
     def measure(self, left: Array, right: Array, uv: Array) -> Array:
-        return _at(to_columns(left, uv), self.disparities(left, right), self.search)
-
-    def disparities(self, left: Array, right: Array) -> Array:
-        """Disparity image (h, w) in sixteenths of a px; below the search where there is none."""
-        count = _searched(self.search)
-        require_size(left, self.block + count + self.search[0], f"blocks of {self.block} px and the search")
+        count = _searched(left, self.search, self.block)
         area = self.block**2
         matcher: Any = opencv().StereoSGBM_create(
             self.search[0], count, self.block, 8 * area, 32 * area, 1, 31, self.uniqueness
         )
-        return np.asarray(matcher.compute(left, right))
+        return _at(to_columns(left, uv), matcher.compute(left, right), self.search)
 
 
 @dataclass(frozen=True)
@@ -104,7 +100,7 @@ class KltAcross:
     rows: float = 1.5
 
     def measure(self, left: Array, right: Array, uv: Array) -> Array:
-        _searched(self.search)
+        _require_range(self.search)
         tracker = Klt(self.window, self.levels)
         there, found = tracker.follow(left, right, uv, uv)
         d = uv[:, 0] - there[:, 0]

@@ -57,7 +57,10 @@ def bridged(found: Sequence[RelativeMotion | InputError], t: Array) -> list[Rela
         P = missed.T @ missed / len(missed)
         P = np.diag(np.diag(P)) if len(missed) < FULL else P
         pose = RelativePose.from_vector(dt[k] * (share @ speed[around]))
-        motions[k] = _bridge(pose, dt[k] ** 2 * P, str(fault))
+        none, rows = np.empty((0, 4)), np.empty((0, 2), np.int64)
+        motions[k] = RelativeMotion(
+            pose, dt[k] ** 2 * P, np.empty(0, bool), 0.0, 0, none, none, none, none, rows, str(fault)
+        )
     return [motions[k] for k in range(len(found))]
 
 
@@ -79,11 +82,3 @@ def _missed(speed: Array, offsets: Indices, share: Array) -> Array:
     at = np.arange(max(0, -offsets.min()), min(T, T - offsets.max()))
     missed = speed[at] - sum(part * speed[at + offset] for part, offset in zip(share, offsets, strict=True))
     return np.asarray(missed[np.isfinite(missed).all(axis=1)])
-
-
-def _bridge(pose: RelativePose, covariance: Array, fault: str) -> RelativeMotion:
-    none, rows = np.empty((0, 4)), np.empty((0, 2), np.int64)
-    return RelativeMotion(
-        pose=pose, covariance=covariance, inliers=np.empty(0, bool), chi2=0.0, dof=0, far_share=0.0,
-        uv0=none, uv1=none, sigma0=none, sigma1=none, rows=rows, fault=fault,
-    )  # fmt: skip

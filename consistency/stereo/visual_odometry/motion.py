@@ -228,7 +228,7 @@ def estimate_motion(
     Raises
     ------
     InputError
-        Shapes do not fit, or OpenCV is not installed.
+        OpenCV is not installed.
     ConsensusError, DegenerateError, ConvergenceError
         As :func:`relative_motion`.
     """

@@ -71,7 +71,8 @@ def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
         grown = F @ P[-1] @ F.T + G @ motion.covariance @ G.T
         P.append(0.5 * (grown + grown.T))
         t.append(t[-1] + arm)
-        R.append(_orthonormal(R[-1] @ motion.pose.R))
+        U, _, Vt = np.linalg.svd(R[-1] @ motion.pose.R)
+        R.append(U @ Vt)
     return np.array(R), np.array(t), np.array(P)
 
 
@@ -84,8 +85,3 @@ def motion_covariances(motions: Ordered[RelativeMotion]) -> Array:
     G[:, :3, :3] = np.eye(3)
     G[:, 3:, 3:] = [angular(motion.pose) for motion in motions]
     return carried(G, np.array([motion.covariance for motion in motions]))
-
-
-def _orthonormal(R: Array) -> Array:
-    U, _, Vt = np.linalg.svd(R)
-    return np.asarray(U @ Vt)

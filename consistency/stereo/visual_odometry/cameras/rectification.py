@@ -49,10 +49,9 @@ def rectify(calibration: Calibration, image_size: tuple[int, int]) -> Rectificat
         The images have another size than the calibration says, or OpenCV is not installed and needed.
     """
     c = calibration
-    if c.image_size not in (None, image_size):
-        raise InputError(
-            f"{c.source}: is for images of {_size_text(c.image_size)}, but the images have {_size_text(image_size)}"
-        )
+    if c.image_size is not None and c.image_size != image_size:
+        stated, found = (f"{width} x {height} px" for width, height in (c.image_size, image_size))
+        raise InputError(f"{c.source}: is for images of {stated}, but the images have {found}")
     raw = StereoRig(c.K_left, c.K_right, c.R.T, -c.R.T @ c.T, image_size)
     if not c.D_left.any() and not c.D_right.any() and is_rectified(raw):
         return Rectification(raw, np.eye(3), None)
@@ -78,7 +77,3 @@ def rectify(calibration: Calibration, image_size: tuple[int, int]) -> Rectificat
     baseline = np.array([-P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
     rig = StereoRig(P_left[:, :3], P_right[:, :3], np.eye(3), baseline, image_size)
     return Rectification(rig, np.asarray(turn_left), (tuple(maps[0]), tuple(maps[1])))
-
-
-def _size_text(size: tuple[int, int] | None) -> str:
-    return "unknown size" if size is None else f"{size[0]} x {size[1]} px"

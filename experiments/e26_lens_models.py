@@ -26,8 +26,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.characterising.bias import GRID
-from consistency.stereo.characterising.board_images import MODELS, find_corners
-from consistency.stereo.characterising.board_residuals import of_model
+from consistency.stereo.characterising.boards import MODELS, find_corners, of_model
 from consistency.stereo.characterising.characterise import Characterisation
 from consistency.stereo.characterising.writing import sensor_text
 from consistency.stereo.visual_odometry.features import opencv
@@ -81,7 +80,7 @@ def sensors(folder: Path) -> dict[str, Characterisation]:
     Raises
     ------
     InputError
-        As :func:`consistency.stereo.characterising.board_images.find_corners`.
+        As :func:`consistency.stereo.characterising.boards.find_corners`.
     """
     corners = find_corners(folder, BOARD, SQUARE)
     return {model: of_model(corners, model, DATA, GRID) for model in MODELS}

@@ -17,8 +17,7 @@ from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
 from consistency.stereo.characterising.coordinate_fit import Levels
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
-from consistency.stereo.characterising.piecewise_linear import octaves
-from consistency.stereo.characterising.residuals import Residuals, RowSelection, select
+from consistency.stereo.characterising.residuals import Residuals, RowSelection, octaves, select
 from consistency.stereo.characterising.tails import ResidualTails, rate, ratios, tails
 
 NAMES = ("u", "v", "d")

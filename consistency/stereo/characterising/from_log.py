@@ -33,6 +33,29 @@ REST = "Only the parts at rest are used: noise while moving may be larger."
 
 
 @dataclass(frozen=True)
+class SourceOptions:
+    """What is known of a source beside its files."""
+
+    grid: tuple[int, int] | None = None
+    at_rest: bool = False
+    free_poses: bool = False
+    calibration: Path | None = None
+    truth: Path | None = None
+    format: str | None = None
+    left: str | None = None
+    right: str | None = None
+    board: tuple[int, int] | None = None  # inner corners across and down
+    square: float | None = None  # m
+    distortion: str | None = None
+    seed: int | None = None
+
+    def of_images(self) -> list[str]:
+        """Options that are given and mean nothing for a log."""
+        names = ("calibration", "truth", "format", "left", "right", "board", "square", "distortion", "seed")
+        return [f"--{name}" for name in names if getattr(self, name) is not None]
+
+
+@dataclass(frozen=True)
 class Measured:
     """A characterisation and what of the source's file stays as it was."""
 

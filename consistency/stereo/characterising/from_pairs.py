@@ -10,10 +10,9 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation
-from consistency.stereo.characterising.from_log import EXACT, FREE, REST
+from consistency.stereo.characterising.from_log import EXACT, FREE, REST, SourceOptions
 from consistency.stereo.characterising.known_poses import characterise_posed
 from consistency.stereo.characterising.residuals import MAD
-from consistency.stereo.characterising.sources import SourceOptions
 from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
 from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
 from consistency.stereo.frontend.planar_log import CAMERA, observations

@@ -20,8 +20,7 @@ from consistency.stereo.characterising.characterise import (
     DisparityNoise,
 )
 from consistency.stereo.characterising.coordinate_fit import LAGS, Levels
-from consistency.stereo.characterising.piecewise_linear import octaves
-from consistency.stereo.characterising.residuals import MARGIN, within_limits
+from consistency.stereo.characterising.residuals import MARGIN, octaves, within_limits
 from consistency.stereo.characterising.tails import rate, ratios, tails
 from consistency.stereo.characterising.unknown_landmarks import Fitted, Seen, fit_points, without_gross
 

@@ -12,12 +12,29 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.node_tables import hats
 from consistency.bench.types import Trial
 from consistency.referee.types import Array, Indices
-from consistency.stereo.characterising.piecewise_linear import FEW, octaves
 
+APART = 1.25  # factor between neighbouring nodes of disparity at least
+FEW = 30  # rows that a node takes
+ENDS = 0.005  # of the data lies beyond the first and beyond the last node of disparity
 MARGIN = 4.0  # standard deviations from a limit within which the noise decides whether a row is there at all
 GROSS = 6.0  # robust standard deviations: a Gaussian error is beyond in 2 of 10^9
 MAD = 1.482602218505602  # standard deviation of a Gaussian over its median absolute deviation
 HUBER = 1.345  # standard deviations beyond which a row counts less, Huber (1964)
+
+
+def octaves(d: Array) -> Array:
+    """Nodes (m,) of disparity: the ends of the data and the powers of two between them, px.
+
+    Powers of two are left out until each node has ``FEW`` rows around it; a node by itself is the median.
+    """
+    low, high = np.quantile(d, [ENDS, 1.0 - ENDS])
+    if high < APART * low:
+        return np.array([float(np.median(d))])
+    powers = 2.0 ** np.arange(np.ceil(np.log2(low * APART)), np.floor(np.log2(high / APART)) + 1)
+    nodes = np.array([low, *powers, high])
+    while len(nodes) > 2 and (rows := hats(d, nodes).sum(axis=0)).min() < FEW:
+        nodes = np.delete(nodes, np.clip(rows.argmin(), 1, len(nodes) - 2))
+    return nodes if hats(d, nodes).sum(axis=0).min() >= FEW else np.array([float(np.median(d))])
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What is known of a sensor, in sentences."""
+"""What is known of a sensor, in sentences, and what a terminal shows of it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import numpy as np
 
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.sentences import p_text
+from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Text, table
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
 
 GAUSSIAN = 1e-3  # p-value of normality below which a distribution is called other than Gaussian
+HEADS = ("noise px", "correlation", "offset share", "1/nu", "kurtosis", "pooled px")
 
 
 def interval(estimate: Interval, digits: int = 4, factor: float = 1.0) -> str:
@@ -102,3 +104,20 @@ def counted(of: Characterisation) -> str:
     """The data and what was left out."""
     left = ", ".join(f"{count} {reason}" for reason, count in of.left_out.items() if count)
     return f"{of.rows} observations of {of.tracks} tracks of {of.source}" + (f"; left out: {left}" if left else "")
+
+
+def blocks(of: Characterisation) -> tuple[Block, ...]:
+    """One row a coordinate, then a sentence for each answer."""
+    rows: list[tuple[Cell, ...]] = [
+        (
+            c.name, interval(c.sigma), _or_dash(c.correlation), _or_dash(c.offset), _or_dash(c.tails.weight),
+            f"{c.tails.excess_kurtosis:.2f}", Quantity(c.pooled, digits=".4g"),
+        )
+        for c in of.coordinates
+    ]  # fmt: skip
+    columns = (Column(""), *(Column(head, number=True) for head in HEADS))
+    return Text(counted(of)), table(columns, rows, "Estimates of the sensor"), *map(Text, sentences(of))
+
+
+def _or_dash(estimate: Interval | None) -> Cell:
+    return Quantity(None) if estimate is None else interval(estimate, 2)

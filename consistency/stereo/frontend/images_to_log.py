@@ -1,4 +1,7 @@
-"""A sequence of stereo pairs as a log folder: controls, observations of few landmarks, truth, trajectory."""
+"""A sequence of stereo pairs as a log folder: controls, observations of few landmarks, truth, trajectory.
+
+Trajectories are texts that `consistency analyse` and the usual tools read.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from consistency.bench.scenario import Belief
 from consistency.bench.store.folder_tables import write_folder
@@ -18,7 +22,6 @@ from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of
-from consistency.stereo.frontend.tum_output import covariance_text, motions_text, trajectory_text
 from consistency.stereo.visual_odometry.features import opencv
 from consistency.stereo.visual_odometry.matching import is_rectified
 from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion
@@ -194,3 +197,31 @@ def trajectory_files(
         back = true_R[0].T
         files["truth.tum"] = trajectory_text(sequence.t, back @ true_R, (true_t - true_t[0]) @ back.T)
     return files
+
+
+def trajectory_text(stamps: Array, R: Array, t: Array) -> str:
+    """Lines ``t tx ty tz qx qy qz qw`` of poses (n, 3, 3), (n, 3)."""
+    quaternion = Rotation.from_matrix(R).as_quat(canonical=True)
+    return _lines(stamps, np.column_stack([t, quaternion]))
+
+
+def covariance_text(stamps: Array, P: Array) -> str:
+    """Lines of t and 36 numbers of covariances (n, 6, 6), translation first; a start known exactly has none."""
+    known = P.any(axis=(1, 2))
+    return _lines(stamps[known], P[known].reshape(-1, 36))
+
+
+def motions_text(stamps: Array, R: Array, t: Array, P: Array) -> str:
+    """Lines of t, the motion since the line before (7 numbers) and 36 of its covariance, translation first.
+
+    The first line is where the motions (T, 3, 3), (T, 3), (T, 6, 6) start, for T + 1 stamps.
+    """
+    quaternion = Rotation.from_matrix(R).as_quat(canonical=True)
+    rows = np.column_stack([t, quaternion, P.reshape(-1, 36)])
+    start = np.concatenate([np.zeros((1, 6)), np.ones((1, 1)), np.zeros((1, 36))], axis=1)
+    return _lines(stamps, np.concatenate([start, rows]))
+
+
+def _lines(stamps: Array, values: Array) -> str:
+    rows = (" ".join([f"{t:.9f}", *(f"{x:.17g}" for x in row)]) for t, row in zip(stamps, values, strict=True))
+    return "\n".join(rows) + "\n"

@@ -15,8 +15,7 @@ from consistency.referee.parsing import HUGE, is_file, read_text, reading
 from consistency.referee.readers.formats.kitti_files import NANO, place_of, read_times
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
-from consistency.stereo.visual_odometry.cameras.camera_pair import Calibration
-from consistency.stereo.visual_odometry.cameras.rectification import Rectification, rectify
+from consistency.stereo.visual_odometry.cameras.camera_pair import Calibration, Rectification, rectify
 from consistency.stereo.visual_odometry.features import opencv
 
 FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")

@@ -22,8 +22,7 @@ from consistency.stereo.characterising.bias import estimate_bias, grid_of, shrun
 from consistency.stereo.characterising.characterise import Characterisation, characterise
 from consistency.stereo.characterising.coordinate_fit import Levels
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Parameters, Rows, fit, regress
-from consistency.stereo.characterising.piecewise_linear import octaves
-from consistency.stereo.characterising.residuals import Residuals, residuals_of, select
+from consistency.stereo.characterising.residuals import Residuals, octaves, residuals_of, select
 from consistency.stereo.characterising.tails import rate, ratios, tails
 
 LEVEL = 1e-7

@@ -49,7 +49,6 @@ def white(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
 
 
 def first_order(rng: np.random.Generator, shape: tuple[int, ...], correlation: float) -> Array:
-    """Stationary, along the second axis."""
     w = rng.standard_normal(shape) * np.sqrt(1.0 - correlation**2)
     w[:, 0] /= np.sqrt(1.0 - correlation**2)
     return np.asarray(signal.lfilter([1.0], [1.0, -correlation], w, axis=1))
@@ -190,7 +189,6 @@ def displaced(rng: np.random.Generator, runs: Sequence[Poses], mode: str) -> lis
 
 
 def verdict(runs: Sequence[Poses], mode: str) -> Verdict:
-    """As ``analyse FILES --align mode`` says, with all questions."""
     if mode == "offset":
         shift, _, found = clocks_and_frames("bench", runs, "estimate", None, range(3))
     else:
@@ -267,7 +265,6 @@ def kept(row: Row, confidence: float) -> bool:
 
 
 def said(row: Row) -> str:
-    """A row as a line."""
     statuses = ", ".join(f"{status} {row.counts[status]}" for status in FAULTS if row.counts.get(status))
     fault, low, high = row.share("fault")
     return (
@@ -278,7 +275,6 @@ def said(row: Row) -> str:
 
 
 def write_docs(rows: Sequence[Row], path: Path) -> None:
-    """Replace the table of a document."""
     lines = ["| errors | covariance ratio | runs x steps | mode | found at fault | of these | consistent | draws |"]
     lines.append("| --- " * 8 + "|")
     for row in rows:

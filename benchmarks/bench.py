@@ -247,7 +247,6 @@ def start(effort: Effort) -> Iterator[Row]:
 
 
 def vision(effort: Effort) -> Iterator[Row]:
-    """The stereo front-end."""
     points, samples = effort.cloud
     s = front_end.covariance_and_simulation(points, samples, effort.growth_repeats)
     note = f"{_us(s['simulate'])}, sample by sample / {_us(s['propagate'])}"
@@ -275,7 +274,6 @@ GROUPS: dict[str, Callable[[Effort], Iterator[Row]]] = {
 
 
 def document(rows: list[Row], wall: float) -> dict[str, Any]:
-    """The JSON document."""
     versions = {name: metadata.version(name) for name in ("numpy", "scipy", "numba", "filterpy")}
     machine = {"cores": os.cpu_count(), "architecture": platform.machine(), "load": os.getloadavg()[0]}
     return {
@@ -288,7 +286,6 @@ def document(rows: list[Row], wall: float) -> dict[str, Any]:
 
 
 def line(row: Row) -> str:
-    """One row as text."""
     value = "-" if row.value is None else f"{row.value:.3g} {row.unit}".strip()
     target = "" if row.target is None else f"{'<=' if row.at_most else '>='} {row.target:g}"
     return f"{row.what:<72} {value:>10}  {target:<8} {row.verdict:<7} {row.note}".rstrip()
@@ -299,7 +296,6 @@ def _us(seconds: float) -> str:
 
 
 def main(arguments: list[str] | None = None) -> list[Row]:
-    """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("reports/bench.json"), help="JSON file to write")
     parser.add_argument(

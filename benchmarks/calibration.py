@@ -193,7 +193,6 @@ def is_kept_so_far(row: Row) -> bool:
 
 
 def rows_of_case(case: Case, outcomes: Sequence[Outcome]) -> list[Row]:
-    """One row for each claim of a case."""
     took = np.array([outcome.runs for outcome in outcomes])
     return [
         Row(
@@ -301,7 +300,6 @@ def _measured(options: argparse.Namespace, seed: int) -> tuple[list[Row], dict[s
 
 
 def said(row: Row) -> str:
-    """A row as a line."""
     runs = f"{row.runs} runs" if row.looks == 1 else f"{row.mean_runs:.0f} runs, 95 %: {row.late_runs:.0f}"
     return (
         f"{row.question:<28} {row.world:<24} x{row.ratio:<5.3g} {runs:<20} "

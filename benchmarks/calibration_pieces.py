@@ -67,7 +67,6 @@ def applied(pose: Array, e: Array, convention: str) -> Array:
 
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
-    """Rows of the calibration table."""
     table, gates = [], QUICK_GATES if quick else GATES
     for k, constant in enumerate(CONSTANT[:1] if quick else CONSTANT):
         world = f"one log, {100 * constant:g} % constant"

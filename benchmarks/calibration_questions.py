@@ -71,7 +71,6 @@ ABOUT = {
 
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
-    """Rows of the calibration table."""
     return [*_nis_rows(quick, seed), *_gap_rows(quick, seed), *_shape_rows(quick, seed)]
 
 

@@ -71,7 +71,6 @@ def errors_of_truth(rng: np.random.Generator, kind: str) -> Array:
 
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
-    """Rows of the calibration table."""
     table, gates = [], QUICK_GATES if quick else GATES
     for k, s in enumerate(SHARES[:1] if quick else SHARES):
         for kind in (*DECLARED, SIGNS):

@@ -47,7 +47,6 @@ class DeadReckoning(Compiled):
         return True
 
     def outlook(self, trial: Any, belief: Any) -> Outlook:
-        """There is nothing to compile."""
         return Outlook(self.name, is_ready=True, is_shared=True, seconds=0.0)
 
     def run(self, trial: Any, belief: Any, halt: Any = None) -> Estimates:
@@ -73,7 +72,6 @@ def opponents(name: str) -> tuple[Any, Any]:
 
 
 def main() -> None:
-    """Search, count, and compare with the stated rate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--searches", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each search")

@@ -135,7 +135,6 @@ def drive(rng: np.random.Generator, world: World = World(), name: str = "drive",
 
 
 def drives(rng: np.random.Generator, number: int, world: World = World(), length: float = LENGTH) -> list[Drive]:
-    """Several drives, by name."""
     return [drive(rng, world, f"drive {i + 1}", length) for i in range(number)]
 
 
@@ -233,7 +232,6 @@ class Case:
 
     @property
     def later(self) -> World:
-        """Of the judged drives."""
         return replace(self.world, times=self.times)
 
 

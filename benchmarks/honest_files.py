@@ -75,7 +75,6 @@ def write(path: Path, columns: Sequence[Array], header: str = "", separator: str
 
 
 def runs(at: Path, s: Study, columns: Callable[[Array], list[Array]], header: str = "", suffix: str = "txt") -> Path:
-    """A folder with a file for each run."""
     separator = " " if suffix == "txt" else ","
     for run, own in enumerate(s.own):
         write(at / "est" / f"{run}.{suffix}", columns(own), header, separator)
@@ -200,7 +199,6 @@ def rates(at: Path, s: Study) -> Drawn:
 
 
 def planar(at: Path, s: Study) -> Drawn:
-    """A table of all runs."""
     P = s.P[np.ix_([0, 1, 5], [0, 1, 5])]
     e = s.e[..., [0, 1, 5]].reshape(-1, 3)
     true = np.tile(np.column_stack([s.true[:, :2], s.true[:, 7]]), (RUNS, 1))
@@ -280,7 +278,6 @@ def px4(at: Path, s: Study) -> Drawn:
 
 
 def ardupilot(at: Path, s: Study) -> Drawn:
-    """Innovations of body odometry."""
     Flight = runpy.run_path(str(HELPERS / "dataflash_log.py"))["Flight"]
     log, variance = Flight("XKFD"), np.exp(s.rng.normal(size=(400, 3)))
     own = np.sqrt(_ratio(s) * variance) * s.rng.normal(size=(400, 3))

@@ -131,7 +131,6 @@ def found_axes(n: int, ratio: float, runs: int, gates: int, rng: Rng) -> int:
 
 
 def limits() -> Iterator[Limit]:
-    """All rows, in the order of the table."""
     for runs in (21, 50, 100):
         yield Limit("runs of two hidden types", "any fault", runs, partial(faults, typed, runs))
     yield Limit("runs of two hidden types", "e-process ever at 20", 100, partial(bets, typed, 100))
@@ -154,7 +153,6 @@ def limits() -> Iterator[Limit]:
 
 
 def table(gates: int, seed: int, only: str = "") -> Iterator[str]:
-    """The lines of the table."""
     yield "| world | what is counted | runs | share |"
     yield "| --- | --- | --- | --- |"
     for number, limit in enumerate(limits()):
@@ -167,7 +165,6 @@ def table(gates: int, seed: int, only: str = "") -> Iterator[str]:
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gates", type=int, default=GATES, help="of a row")
     parser.add_argument("--seed", type=int, default=SEED)

@@ -118,7 +118,6 @@ def answer(scenario: cs.Scenario, package: Path | None, seed: int, runs: int, jo
 
 
 def row(name: str, found: Answer) -> str:
-    """A line of the table."""
     v = found.verdict
     low, high = (math.nan, math.nan) if v is None else v.inflation_interval
     told = " | | " if v is None else f"{v.status} | {v.inflation:.2f} [{low:.2f}, {high:.2f}] | {found.bias:.2f}"

@@ -146,7 +146,6 @@ class Row:
         return float(stats.binom.cdf(self.found, self.draws, self.stated))
 
     def line(self) -> str:
-        """A row of the table in docs/files.md."""
         low, high = stats.binomtest(self.found, self.draws).proportion_ci(0.95, "exact")
         bound = "≤" if self.ratio == 1.0 else "≥"
         share = f"{self.found / self.draws:.1%} [{low:.1%}, {high:.1%}]"
@@ -201,7 +200,6 @@ def first_order(draws: int, seed: int) -> Iterator[str]:
 
 
 def main() -> None:
-    """Measure, print, and compare with what is promised."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=500, help="logs a row")
     parser.add_argument("--seed", type=int, default=60607)

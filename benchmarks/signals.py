@@ -71,8 +71,6 @@ COMMANDS = {
 
 @dataclass
 class Ended:
-    """How one command ended."""
-
     seconds: float = 0.0
     faults: list[str] = field(default_factory=list)
     was_done: bool = False
@@ -84,7 +82,6 @@ def as_in_a_terminal() -> None:
 
 
 def session(leader: int) -> list[str]:
-    """Processes of a session, by their command."""
     left = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:

@@ -91,7 +91,6 @@ def _name(rho: float) -> str:
 
 
 def main() -> None:
-    """Measure, print, and compare with what is promised."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=2000, help="logs a row")
     parser.add_argument("--seed", type=int, default=80808)

@@ -113,8 +113,6 @@ def white_twin(trial: Trial, belief: Any, rng: np.random.Generator) -> Trial:
 
 @dataclass(frozen=True)
 class Measured:
-    """One filter on one log."""
-
     nees: float  # mean per degree of freedom after SETTLED; infinite if the filter failed
     above: int  # steps after SETTLED with NEES above the bound for all steps at once
     covered: Array  # (3,), share of the steps after SETTLED within 2 sigma
@@ -188,7 +186,6 @@ def run_all(logs: dict[str, Log], jobs: int) -> dict[str, Results]:
 
 
 def measure(study: cs.Study, logs: dict[str, Log], drive: str) -> list[cs.Finding]:
-    """Run everything, keep it in ``study`` and say what was found."""
     results = run_all(logs, study.jobs)
     study.kept |= {f"{drive}{name}": each for name, each in results.items()}
     on = {name: measured(results[MAIN], name) for name in results[MAIN].filters}

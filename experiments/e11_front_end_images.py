@@ -168,7 +168,6 @@ def floored(errors: Array, covariances: Array) -> tuple[Array, Array]:
 
 
 def measure(study: cs.Study, cases: dict[str, Case]) -> tuple[list[cs.Finding], dict[str, bytes]]:
-    """Run everything; findings, and figures by file name."""
     study.tables["motions"] = pd.concat([table_of(case) for case in cases.values()], ignore_index=True)
     rng = np.random.default_rng(study.seed)
     simulations, pictures = monte_carlo(study, cases, rng)
@@ -177,7 +176,6 @@ def measure(study: cs.Study, cases: dict[str, Case]) -> tuple[list[cs.Finding], 
 
 
 def found(study: cs.Study, holds: bool, name: str, **text: str) -> cs.Finding:
-    """A finding of this script."""
     text = {"source": OURS, "published": "not asked", "id": f"front-end-{name}", "accept": ACCEPT[name]} | text
     return study.finding(bool(holds), scenario="none", **text)
 

@@ -84,8 +84,6 @@ def measure(study: cs.Study, logs: dict[str, Drive]) -> list[cs.Finding]:
 
 
 class Row(NamedTuple):
-    """What a filter said of one drive."""
-
     log: str
     filter: str
     status: str
@@ -96,7 +94,6 @@ class Row(NamedTuple):
 
 
 def row(name: str, filter_: str, verdict: cs.Verdict, c: cs.Record) -> Row:
-    """Averages over one drive."""
     assert c.error is not None
     assert c.nees is not None
     nees = np.inf if c.failures else float(np.nanmean(c.nees)) / 3
@@ -108,7 +105,6 @@ def row(name: str, filter_: str, verdict: cs.Verdict, c: cs.Record) -> Row:
 
 
 def finding(study: cs.Study, name: str, drive: Drive, rows: Sequence[Row]) -> cs.Finding:
-    """What all filters said of one robot."""
     found, trial = drive.found, drive.log.trials[0]
     each = "; ".join(
         f"{r.filter} {r.status}, NEES/3 {r.nees:.2f}, NIS/dof {r.nis:.2f}, RMSE {r.position:.2f} m" for r in rows

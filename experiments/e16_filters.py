@@ -108,7 +108,6 @@ def map_finding(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
 
 
 def cost_finding(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
-    """Does a consistent pose cost much more than the EKF?"""
     right = table[(table["status"] == "consistent") & (table["realisable"] == "yes")].sort_values("cost")
     parts = [
         f"{r['filter']} {r['cost']:.2f} times {REFERENCE}, RMSE {r['rmse']:.3f} m" for r in right.to_dict("records")

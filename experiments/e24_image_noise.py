@@ -111,7 +111,6 @@ def centred(tracks: Tracks) -> Array:
 
 
 def figure_4(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
-    """Enough features at each stop."""
     least = int(table["features"].min())
     return study.finding(
         least >= KEPT and len(table) == 101,
@@ -128,7 +127,6 @@ def figure_4(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
 
 
 def figure_5a(study: cs.Study, tracks: Tracks) -> cs.Finding:
-    """Errors about track means: autocorrelation and tails."""
     kept = whole(tracks.kept)
     errors = centred(kept).reshape(-1, IMAGES + 1)
     study.tables["images_fig5a"] = histogram(errors.ravel())
@@ -160,7 +158,6 @@ def figure_5a(study: cs.Study, tracks: Tracks) -> cs.Finding:
 
 
 def figure_5b(study: cs.Study, table: pd.DataFrame, both: pd.DataFrame) -> cs.Finding:
-    """Pooled sd over the sd about track means."""
     ratio = table["pooled"] / table["within"]
     low, high = drives.bootstrap(generator(study, 6), list(np.log(ratio.to_numpy())[:, None]), np.mean, DRAWS, LEVEL)
     totals = [
@@ -182,7 +179,6 @@ def figure_5b(study: cs.Study, table: pd.DataFrame, both: pd.DataFrame) -> cs.Fi
 
 
 def figure_5c(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
-    """Rank correlation of noise and disparity."""
     found = stats.spearmanr(table["disparity"], table["within"], alternative="greater")
     p, rank = float(found.pvalue), float(found.statistic)
     ends = [part["within"].mean() for part in (table.nsmallest(10, "disparity"), table.nlargest(10, "disparity"))]

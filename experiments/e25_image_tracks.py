@@ -179,7 +179,6 @@ def figure_9_of(study: cs.Study, table: pd.DataFrame, column: str, name: str, cl
 
 
 def above(table: pd.DataFrame, column: str) -> float:
-    """Chance that a junction has the greater value."""
     junction = table["junction"].to_numpy(bool)
     values = table[column].to_numpy()
     found = stats.mannwhitneyu(values[junction], values[~junction]).statistic
@@ -285,7 +284,6 @@ def mean_squares(tracks: Tracks) -> Array:
 
 
 def by_frame(tracks: Tracks, name: str) -> pd.DataFrame:
-    """Survivors and rms errors in each image."""
     rows = []
     for frame in range(IMAGES):
         own = tracks.take(tracks.frame == frame)

@@ -60,7 +60,6 @@ def main(study: cs.Study) -> list[cs.Finding]:
 
 
 def judged(study: cs.Study, known: dict[str, Characterisation]) -> list[cs.Finding]:
-    """Findings on the sensors of the lens models."""
     camera = known[FULL].sensor
     cameras = {model: replace(of, sensor=camera) for model, of in known.items()}
     worlds = {(model, text): world for model, of in cameras.items() for text, world in beliefs(model, of).items()}
@@ -182,7 +181,6 @@ def with_noise(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
 
 
 def said(table: pd.DataFrame) -> str:
-    """Lens model by lens model."""
     parts = []
     for model, part in table.groupby("model", sort=False):
         texts = (f"{row.filter} {row.status} {row.anees:.2f}, {row.rmse_position_m:.3f} m" for row in part.itertuples())

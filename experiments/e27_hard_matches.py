@@ -61,7 +61,6 @@ class Matches:
     truth: RelativePose
 
     def keep(self, rows: Array) -> Matches:
-        """Those of ``rows``."""
         return Matches(self.uv0[rows], self.uv1[rows], self.sigma0[rows], self.sigma1[rows], self.truth)
 
 
@@ -145,7 +144,6 @@ def table_of(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def measure(study: cs.Study, folder: Path) -> list[cs.Finding]:
-    """The table on all data, and the finding."""
     rows = []
     for case in drives(folder):
         motions = [

@@ -128,7 +128,6 @@ def log_of(data: Factors) -> tuple[Trial, Belief]:
 
 
 def main() -> None:
-    """Write the log."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name, text in (("factors", "frame, landmark, u left, u right, v, x, y, z in each line"),
                        ("poses", "frame and 4 x 4 matrix in each line, by visual odometry"),

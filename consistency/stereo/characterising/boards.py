@@ -189,7 +189,6 @@ def of_model(corners: Corners, model: str, source: str, grid: Size) -> Character
 
 
 def _line(model: str, of: Characterisation) -> str:
-    """One model in a line."""
     sigma = " ".join(f"{c.name} {c.sigma.value:.3f}" for c in of.coordinates)
     assert of.bias is not None
     known = of.bias.believed[:, of.bias.grid.known]

@@ -71,7 +71,6 @@ def characterise_posed(
 
 
 def _hidden(coordinates: tuple[Coordinate, ...]) -> tuple[str, ...]:
-    """A note on correlated noise."""
     if all(c.white is not False for c in coordinates):
         return ()
     return ("Where noise is correlated along a track, the fitted points take part of it: sigma is then a lower limit.",)

@@ -101,7 +101,6 @@ def _ratio(of: Characterisation) -> list[str]:
 
 
 def counted(of: Characterisation) -> str:
-    """The data and what was left out."""
     left = ", ".join(f"{count} {reason}" for reason, count in of.left_out.items() if count)
     return f"{of.rows} observations of {of.tracks} tracks of {of.source}" + (f"; left out: {left}" if left else "")
 

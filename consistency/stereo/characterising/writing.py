@@ -135,7 +135,6 @@ def require_free_file(path: Path, overwrite: bool) -> None:
 
 
 def write_sensor(path: Path, text: str) -> None:
-    """Write the file whole or not at all."""
     with writing(path):
         write_whole(path, text.encode("utf-8"))
 

@@ -113,7 +113,6 @@ class Summary:
 
 
 def _motion_lines(motion: RelativeMotion, out: Path) -> list[str]:
-    """A single motion with its standard deviations."""
     scale = np.repeat([1e3, 180.0 / np.pi], 3)
     values, sigmas = scale * motion.pose.vector, scale * np.sqrt(np.diagonal(motion.covariance))
     said = [f"{name} {value:+.2f} +- {sigma:.2g}" for name, value, sigma in zip(AXES, values, sigmas, strict=True)]

@@ -52,7 +52,6 @@ class Plane:
 
     @property
     def leaving(self) -> int:
-        """Motions that tilt by more than LEAVES."""
         return int((self.tilts > LEAVES).sum())
 
     @property
@@ -68,7 +67,6 @@ class Plane:
 
     @property
     def fields(self) -> dict[str, object]:
-        """Entries of a manifest."""
         tilts = np.rad2deg(self.tilts)
         return {
             "holds": self.holds, "sigma_px": self.sigma, "limit_px": self.limit, "motions": len(tilts),

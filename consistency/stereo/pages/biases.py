@@ -30,7 +30,6 @@ def shares(beliefs: pd.DataFrame) -> Table:
 
 
 def over_steps(curves: pd.DataFrame) -> Figure:
-    """Mean NEES over steps by belief."""
     tips, keys, lines = (("step", "@x"), ("ANEES", "@y{0.00}")), [], []
     for k, (belief, part) in enumerate(groups(curves, "belief")):
         lines.append(Line(part["step"].to_numpy(), part["nees"].to_numpy(), style(k), tips=tips))
@@ -43,7 +42,6 @@ def over_steps(curves: pd.DataFrame) -> Figure:
 
 
 def of_map(nodes: pd.DataFrame) -> Figure:
-    """The bias that is taken for noise, as fig. 8."""
     keys, panel = _rows(nodes)
     caption = (
         "The bias of disparity that makes up the pooled standard deviation of the chapter, by place in the image; "
@@ -72,7 +70,6 @@ def _rows(
 
 
 def survivors(filters: pd.DataFrame) -> Table:
-    """Each filter with noise and with a bias of the same size."""
     heads = {
         "filter": ("Filter", ""), "status_noise": ("White noise", STATUS), "anees_noise": ("Mean NEES", ".2f"),
         "status_bias": ("A bias of that size, believed to be such noise", STATUS), "anees_bias": ("Mean NEES", ".2f"),
@@ -104,7 +101,6 @@ def sensors(rows: pd.DataFrame) -> Table:
 
 
 def lens_maps(nodes: pd.DataFrame) -> Figure:
-    """Bias maps of disparity, lens model by lens model."""
     reach = 1.15 * max(float(nodes["bias_d"].abs().max()), 0.1)
     drawn = [_rows(part, f"lens model: {model}", (-reach, reach)) for model, part in groups(nodes, "model")]
     caption = (

@@ -19,7 +19,6 @@ BINS, REACH = 80, 5.0  # of a histogram, and the standard deviations that it spa
 
 
 def tracking(errors: pd.DataFrame) -> Figure:
-    """Errors of u and v, fig. 6."""
     panels = tuple(
         _histogram(
             part[name].to_numpy(),
@@ -90,7 +89,6 @@ def survival(frames: pd.DataFrame) -> Figure:
 
 
 def ratios(noise: pd.DataFrame) -> Table:
-    """Noise parameters of a moving camera over those at rest."""
     heads = {
         "coordinate": ("Coordinate", ""), "moving": ("Moving (px)", ".3f"), "at_rest": ("At rest (px)", ".3f"),
         "ratio": ("Ratio", ".2f"), "low": ("from", ".2f"), "high": ("to", ".2f"),
@@ -103,7 +101,6 @@ def ratios(noise: pd.DataFrame) -> Table:
 
 
 def spread(errors: pd.DataFrame) -> Table:
-    """Standard deviations and tails of u and v."""
     rows = [
         (f"{np.rad2deg(float(str(shake))):.1f} degrees", name, part[name].std(), stats.kurtosis(part[name]))
         for shake, part in errors.groupby("shake")
@@ -118,7 +115,6 @@ def spread(errors: pd.DataFrame) -> Table:
 
 
 def medians(features: pd.DataFrame) -> Table:
-    """Junctions beside points."""
     rows = [
         (name, len(part), part["residual"].median(), part["dissimilarity"].median())
         for kind, name in ((0.0, "points"), (1.0, "junctions"))
@@ -133,7 +129,6 @@ def medians(features: pd.DataFrame) -> Table:
 
 
 def budget(stages: pd.DataFrame) -> Table:
-    """What each stage adds."""
     rms = {name: (f"rms of {name} (px)", ".2f") for name in "uvd"}
     heads = {"motion": ("Motion", ""), "stage": ("Errors of", ""), **rms, "kept": ("Kept", ".1%")}
     caption = "Noise budget of the chain of Herath et al. (2007) fig. 3: one stage with its errors, then all"

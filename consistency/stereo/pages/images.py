@@ -38,7 +38,6 @@ def protocol(stops: pd.DataFrame) -> Figure:
 
 
 def growth(stops: pd.DataFrame) -> Figure:
-    """Noise of disparity over disparity, fig. 5c."""
     marks: list[Line | Rule] = [Rule("y", float(stops["sigma"].iloc[0]), LIMIT)]
     keys = [Key("sec. 4.5", LIMIT)]
     for k, (residual, part) in enumerate(stops.sort_values("disparity").groupby("residual")):
@@ -62,7 +61,6 @@ def growth(stops: pd.DataFrame) -> Figure:
 
 
 def pooled(bins: pd.DataFrame) -> Figure:
-    """Errors of disparity about the means of their tracks, fig. 5a."""
     sd, edges = float(bins["sd"].iloc[0]), np.append(bins["low"].to_numpy(), bins["high"].iloc[-1])
     x = np.linspace(edges[0], edges[-1], 201)
     gauss = np.exp(-0.5 * (x / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
@@ -80,7 +78,6 @@ def pooled(bins: pd.DataFrame) -> Figure:
 
 
 def biases(features: pd.DataFrame) -> Figure:
-    """Mean error of each feature, fig. 8."""
     marks, keys = [], []
     for k, (left, part) in enumerate(features.groupby("left", sort=False)):
         look = replace(style(k), size=3.0)

@@ -55,7 +55,6 @@ def figures(found: pd.DataFrame) -> tuple[Figure, ...]:
 
 
 def caption(found: pd.DataFrame) -> str:
-    """What the figure of scenes shows."""
     same = found.iloc[0]
     percent = f"{100 * same['confidence']:g} %"
     return (

@@ -101,7 +101,6 @@ def local_spread(of: Characterisation) -> tuple[Array, Array]:
 
 
 def _bias_map(of: Characterisation) -> Figure:
-    """Bias of u, v, d along the rows of nodes, as fig. 8."""
     assert of.bias is not None
     grid = of.bias.grid
     reach = 1.15 * max(float(np.nanmax(np.abs(of.bias.value) + of.bias.half)), 0.1)

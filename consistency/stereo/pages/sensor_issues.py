@@ -44,7 +44,6 @@ def first_run(steps: pd.DataFrame) -> Figure:
 
 
 def guards(rows: pd.DataFrame) -> Table:
-    """Each guard against what the same filter does on clean data."""
     heads = {
         "filter": ("Filter", ""), "guard": ("Guard", ""), "rmse_ratio": ("RMSE over clean", ".2f"),
         "clean": ("Clean", STATUS), "clean_anees": ("Mean NEES", ".2f"), "guarded": ("Guarded", STATUS),
@@ -55,7 +54,6 @@ def guards(rows: pd.DataFrame) -> Table:
 
 
 def lenses(rows: pd.DataFrame) -> Figure:
-    """Heading and consistency over the field of view."""
     keys, heading, nees = [], list[Line | Points](), list[Line | Points]()
     cases = rows.groupby(["filter", "k1"], sort=False)
     for k, (case, part) in enumerate(cases):
@@ -93,7 +91,6 @@ def of_lenses(rows: pd.DataFrame) -> Table:
 
 
 def counts(rows: pd.DataFrame) -> Figure:
-    """Errors over the number of features."""
     x, panels = rows["count"].to_numpy(), []
     for column, label, tip in (("rmse_position_m", "RMSE of position (m)", "@y{0.000} m"),
                                ("rmse_heading_deg", "RMSE of heading (deg)", "@y{0.00} deg")):  # fmt: skip

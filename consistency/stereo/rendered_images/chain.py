@@ -211,7 +211,6 @@ def _follow(chain: Chain, state: _State, frame: StereoFrame, camera: StereoCamer
 
 
 def _observed(chain: Chain, state: _State, number: int, frame: StereoFrame, camera: StereoCamera) -> Tracks:
-    """Rows of one frame."""
     real = camera.real(to_camera(frame.pose, state.anchors))
     d = _disparities(chain, frame, state.uv, real)
     now = patches(frame.left, state.uv, np.where(np.isfinite(d * state.d), d / state.d, 1.0))

@@ -58,7 +58,6 @@ class Klt:
         return there, found
 
     def flow(self, before: Array, after: Array, uv: Array) -> tuple[Array, Array]:
-        """One way only."""
         if not len(uv):
             return uv, np.zeros(0, bool)
         cv2 = opencv()

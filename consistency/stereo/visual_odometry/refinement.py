@@ -223,7 +223,6 @@ def _minimum(
 def _cost(
     frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None, c: float
 ) -> tuple[float, Array, Array]:
-    """The cost, and rho' and rho'' of each point."""
     rho, weight, bend = loss(robust, frames.squared(pose, q), c)
     return 0.5 * float(rho.sum()), weight, bend
 

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy import signal, stats
+from script_options import options_of
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.geometry import wrap
@@ -318,15 +319,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Measure verdicts on aligned files.")
-    parser.add_argument("--quick", action="store_true", help="few draws of right runs, with fresh random numbers")
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    parser.add_argument("--docs", type=Path, help="document whose table to replace")
-    parser.add_argument("--only", default="", help="cases whose world or modes contain this text")
-    parser.add_argument("--draws", type=int, help="of each case at most")
-    parser.add_argument("--seed", type=int)
-    parser.add_argument("--workers", type=int, default=2)
-    return parser.parse_args(arguments)
+    return options_of(
+        "Measure verdicts on aligned files.",
+        arguments,
+        quick=(False, "few draws of right runs, with fresh random numbers"),
+        out=(Path, "JSON file to write"),
+        docs=(Path, "document whose table to replace"),
+        only=("", "cases whose world or modes contain this text"),
+        draws=(int, "of each case at most"),
+        seed=(int, None),
+        workers=(2, None),
+    )
 
 
 if __name__ == "__main__":

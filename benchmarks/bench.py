@@ -7,7 +7,6 @@ read it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -27,6 +26,7 @@ from bench_models import WARM, Peer
 from bench_peers import FilterpyEkf, FilterpyUkf, stone_soup
 from bench_trials import LANDMARKS, SEEN, Case, Work, growing, grown, interleaved, require_equal, steady
 from scipy.linalg import blas, lapack
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter
@@ -296,13 +296,13 @@ def _us(seconds: float) -> str:
 
 
 def main(arguments: list[str] | None = None) -> list[Row]:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("reports/bench.json"), help="JSON file to write")
-    parser.add_argument(
-        "--full", action="store_true", help="measure the memory of 10,000 runs instead of extrapolating"
+    chosen = options_of(
+        (__doc__ or "").splitlines()[0],
+        arguments,
+        out=(Path("reports/bench.json"), "JSON file to write"),
+        full=(False, "measure the memory of 10,000 runs instead of extrapolating"),
+        only=(str, "groups of rows", {"nargs": "+", "choices": GROUPS, "default": list(GROUPS)}),
     )
-    parser.add_argument("--only", nargs="+", choices=GROUPS, default=list(GROUPS), help="groups of rows")
-    chosen = parser.parse_args(arguments)
     started, effort, rows = time.monotonic(), Effort(), []
     for group in chosen.only:
         for row in memory(effort, chosen.full) if group == "memory" else GROUPS[group](effort):

@@ -31,6 +31,7 @@ from calibration_cases import DETECT, MOST, POWER, QUICK_FAILURE, Case, cases, q
 from calibration_gates import DOF, SEED, STEPS, Draw, Gate, joined
 from calibration_rows import CONFIDENCE, Row, document, kept, merged, write_docs
 from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
@@ -308,16 +309,18 @@ def said(row: Row) -> str:
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Measure the rates of the referee.")
-    parser.add_argument("--quick", action="store_true", help="fewer gates of fewer rows, with fresh random numbers")
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    parser.add_argument("--docs", type=Path, help="document whose table to replace")
-    parser.add_argument("--only", default="", help="rows whose world or question contains this text")
-    parser.add_argument("--module", action="append", choices=MODULES, help="rows of this module alone, put into --out")
-    parser.add_argument("--gates", type=int, default=10**9, help="of a row, at most")
-    parser.add_argument("--seed", type=int)
-    parser.add_argument("--workers", type=int, default=2)
-    return parser.parse_args(arguments)
+    return options_of(
+        "Measure the rates of the referee.",
+        arguments,
+        quick=(False, "fewer gates of fewer rows, with fresh random numbers"),
+        out=(Path, "JSON file to write"),
+        docs=(Path, "document whose table to replace"),
+        only=("", "rows whose world or question contains this text"),
+        module=(str, "rows of this module alone, put into --out", {"action": "append", "choices": MODULES}),
+        gates=(10**9, "of a row, at most"),
+        seed=(int, None),
+        workers=(2, None),
+    )
 
 
 if __name__ == "__main__":

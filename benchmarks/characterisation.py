@@ -11,12 +11,12 @@ is wider than 5 % of its value, or if the bias map is off by more than 0.1 px rm
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.models import point, stereo
@@ -159,11 +159,12 @@ def repeat(truth: Real, repetitions: int, runs: int, seed: int) -> Outcome:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repetitions", type=int, default=100)
-    parser.add_argument("--runs", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0, help="of the first repetition")
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        repetitions=(100, None),
+        runs=(10, None),
+        seed=(0, "of the first repetition"),
+    )
     good = True
     for name, truth in {"plain": Real(None, None), "real": real()}.items():
         outcome = repeat(truth, options.repetitions, options.runs, options.seed)

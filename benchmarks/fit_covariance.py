@@ -12,7 +12,6 @@ rows together).
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
+from script_options import options_of
 
 from consistency.referee.defaults import DETECT
 from consistency.referee.diagnostics.statistics.intervals import binomial_interval
@@ -306,11 +306,12 @@ def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="rows with this in their names; the numbers are the same")
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__,
+        draws=(200, None),
+        seed=(0, None),
+        only=("", "rows with this in their names; the numbers are the same"),
+    )
     draws, seed, only, tests = arguments.draws, arguments.seed, arguments.only, len(CASES) + ROWS
     roads = any(only in f"known noise, {road}{number} drives" for road, _ in ROADS for number in (1, 10))
     held = recovery_rows(draws, seed, tests, only) if roads else True

@@ -12,7 +12,6 @@ status 1 if more than 6 of 1,200 honest logs get a hint (as large a share of ano
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 from calibration_gates import stationary
 from scipy.spatial.transform import Rotation
+from script_options import options_of
 
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.formats.sheet import Places
@@ -231,11 +231,12 @@ def smallest(rng: np.random.Generator, name: str, cells: int) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--logs", type=int, default=1200, help="Honest logs.")
-    parser.add_argument("--cells", type=int, default=20, help="Logs of each mix-up and factor; 0 for none.")
-    parser.add_argument("--seed", type=int, default=5)
-    given = parser.parse_args()
+    given = options_of(
+        __doc__.splitlines()[0] if __doc__ else "",
+        logs=(1200, "Honest logs."),
+        cells=(20, "Logs of each mix-up and factor; 0 for none."),
+        seed=(5, None),
+    )
     for number, name in enumerate(MIXED if given.cells else ()):
         print(f"{name:<36} {smallest(np.random.default_rng((given.seed, number)), name, given.cells)}", flush=True)
     found: dict[str, int] = dict.fromkeys((f"{k}, {w}" for k, w in itertools.product(AXES, WRONG)), 0)

@@ -7,7 +7,6 @@ several verdicts of is counted by the verdict that is at fault most often.
 
 from __future__ import annotations
 
-import argparse
 import runpy
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 from relative_poses import exp
 from scipy.spatial.transform import Rotation
+from script_options import options_of
 
 from consistency.referee.diagnostics import Verdict, judge
 from consistency.referee.geometry.groups import composed, vectors
@@ -369,11 +369,12 @@ def counted(row: str, draws: int, seed: int) -> tuple[int, int, int]:
 
 def main() -> int:
     """Print the table; 1 if a row has more faults than 5 % allows, or x2 in P is missed."""
-    parser = argparse.ArgumentParser(description="Honest files of every kind.")
-    parser.add_argument("--draws", type=int, default=100)
-    parser.add_argument("--only", default="", help="rows whose name contains this text")
-    parser.add_argument("--seed", type=int, default=20070101)
-    options = parser.parse_args()
+    options = options_of(
+        "Honest files of every kind.",
+        draws=(100, None),
+        only=("", "rows whose name contains this text"),
+        seed=(20070101, None),
+    )
     print("| file | honest, at fault | x2 in P, overconfident |\n| --- | --- | --- |")
     broken = 0
     for row in ROWS:

@@ -11,7 +11,6 @@ the rate may be there.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +21,7 @@ from calibration_gates import Draw, first_order
 from calibration_monitor import Monitors, Velocity
 from calibration_windows import undoubted, windows_of
 from scipy import stats
+from script_options import options_of
 
 from consistency.referee.diagnostics import Evidence, Verdict, compare, e_process, judge
 from consistency.referee.readers.formats.numpy_archive import record_of_arrays
@@ -165,11 +165,12 @@ def table(gates: int, seed: int, only: str = "") -> Iterator[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--gates", type=int, default=GATES, help="of a row")
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--only", default="", help="rows with this in their worlds; the numbers are the same")
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        gates=(GATES, "of a row"),
+        seed=(SEED, None),
+        only=("", "rows with this in their worlds; the numbers are the same"),
+    )
     for line in table(options.gates, options.seed, options.only):
         print(line, flush=True)
 

@@ -11,7 +11,6 @@ Exit status 1 if a promise is broken (binomial, 1 % for all rows together).
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 from scipy.linalg import expm
+from script_options import options_of
 
 from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.planning.number_of_runs import power_of
@@ -200,10 +200,11 @@ def first_order(draws: int, seed: int) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=500, help="logs a row")
-    parser.add_argument("--seed", type=int, default=60607)
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        draws=(500, "logs a row"),
+        seed=(60607, None),
+    )
     print("| log | windows | ratio | promised | found |\n| --- | --- | --- | --- | --- |", flush=True)
     measured = []
     for row in rows(options.draws, options.seed):

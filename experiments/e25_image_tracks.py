@@ -21,11 +21,14 @@ from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, joined
-from consistency.stereo.rendered_images.correspondence import KnownDisparity
-from consistency.stereo.rendered_images.filtering import LeftRightCheck, TrackResidual
 from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand
-from consistency.stereo.rendered_images.selection import Spread
-from consistency.stereo.rendered_images.tracking import KnownProjection
+from consistency.stereo.rendered_images.stages import (
+    KnownDisparity,
+    KnownProjection,
+    LeftRightCheck,
+    Spread,
+    TrackResidual,
+)
 from consistency.stereo.visual_odometry.features import opencv
 
 drives = sibling(__file__, "image_drives")

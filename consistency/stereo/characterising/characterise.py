@@ -15,10 +15,9 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
-from consistency.stereo.characterising.coordinate_fit import Levels
+from consistency.stereo.characterising.coordinate_fit import Levels, ResidualTails, rate, ratios, tails
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
 from consistency.stereo.characterising.residuals import Residuals, RowSelection, octaves, select
-from consistency.stereo.characterising.tails import ResidualTails, rate, ratios, tails
 
 NAMES = ("u", "v", "d")
 RATE = 0.01  # chance that any interval misses

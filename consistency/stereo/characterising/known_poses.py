@@ -19,9 +19,8 @@ from consistency.stereo.characterising.characterise import (
     Coordinate,
     DisparityNoise,
 )
-from consistency.stereo.characterising.coordinate_fit import LAGS, Levels
+from consistency.stereo.characterising.coordinate_fit import LAGS, Levels, rate, ratios, tails
 from consistency.stereo.characterising.residuals import MARGIN, octaves, within_limits
-from consistency.stereo.characterising.tails import rate, ratios, tails
 from consistency.stereo.characterising.unknown_landmarks import Fitted, Seen, fit_points, without_gross
 
 FREE = 0.1  # share of a value that the fits must leave for it to tell of the shape of the noise

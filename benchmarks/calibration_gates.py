@@ -1,4 +1,4 @@
-"""What the worlds of the calibration are made of: records of draws, gates and worlds, and errors that several need."""
+"""Records of draws, gates and worlds of the calibration, errors that several worlds need, and counted rows."""
 
 from __future__ import annotations
 
@@ -143,3 +143,13 @@ def with_innovations(rows: Sequence[tuple[Array, float, Array, float]]) -> Gate:
     error, innovation = (np.stack([row[i] for row in rows], axis=1) for i in (0, 2))
     P, S = (np.array([row[i] for row in rows])[:, None, None] * np.eye(2) for i in (1, 3))
     return Gate(error, shared(P, error), innovations=innovation, innovation_covariances=shared(S, innovation))
+
+
+def row(
+    world: str, question: str, ratio: float, runs: int, stated: float, bound: str, gates: int, found: int
+) -> dict[str, Any]:
+    """``found`` of ``gates`` gates, and the share that is ``stated`` with its ``bound``, "<=" or ">="."""
+    return {
+        "world": world, "question": question, "ratio": ratio, "runs": runs, "looks": 1, "stated": stated,
+        "bound": bound, "gates": gates, "found": found,
+    }  # fmt: skip

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from calibration_count import row
+from calibration_gates import row
 from numpy.typing import NDArray
 
 from consistency.referee.diagnostics.monitoring.monitor import (

@@ -9,8 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from calibration_count import row
-from calibration_gates import stationary
+from calibration_gates import row, stationary
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Evidence, judge

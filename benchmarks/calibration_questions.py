@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from calibration_count import row
+from calibration_gates import row
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Evidence, Verdict, judge, mean_shape

@@ -10,8 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from calibration_count import row
-from calibration_gates import stationary
+from calibration_gates import row, stationary
 from scipy import stats
 
 from consistency.referee.diagnostics import Evidence, judge

@@ -35,8 +35,7 @@ class Screened:
     """Trials in which landmarks begin anew where they leave the common motion, and how often they do."""
 
     trials: list[Trial]
-    gate: Array  # (s,), in units of z
-    scale: Array  # (s,), standard deviation of the misfits by their median: what a gate should be some times of
+    scale: Array  # (s,), in units of z, standard deviation of the misfits by their median: a gate is some times it
     offered: int  # observations
     judged: int  # of these, whose landmark was seen in the step before
     broken: int  # of these, that leave the common motion
@@ -63,7 +62,7 @@ def screened(trials: Sequence[Trial], belief: Belief, gate: Array) -> Screened:
     scale = MAD * np.median(every, axis=0) if len(every) else np.zeros(len(gate))
     broken = [rows[1][(e > gate).any(axis=1)] for rows, e in zip(pairs, misfits, strict=True)]
     offered = sum(len(trial.z) for trial in trials)
-    return Screened(_begun_anew(trials, broken), gate, scale, offered, len(every), sum(map(len, broken)))
+    return Screened(_begun_anew(trials, broken), scale, offered, len(every), sum(map(len, broken)))
 
 
 def _pairs(trial: Trial) -> tuple[Indices, Indices]:

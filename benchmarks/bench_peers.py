@@ -31,8 +31,6 @@ class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
 
 
 class FilterpyEkf(Peer):
-    """filterpy's ExtendedKalmanFilter."""
-
     def prepare(self) -> None:
         self.ekf = _Ekf(dim_x=self.n, dim_z=len(self.R))
         self.ekf.F, self.ekf.Q, self.ekf.R = np.eye(self.n), np.zeros((self.n, self.n)), self.R

@@ -92,8 +92,6 @@ class Look(_Quiet, MeasurementModel):  # type: ignore[misc]
 
 
 class StoneSoupEkf(Peer):
-    """ExtendedKalmanPredictor and ExtendedKalmanUpdater."""
-
     def prepare(self) -> None:
         self.drive, self.look = Drive(), Look(ndim_state=self.n, mapping=None)
         self.drive.models = self.look.models = self.models
@@ -102,7 +100,6 @@ class StoneSoupEkf(Peer):
         self.pair()
 
     def pair(self) -> None:
-        """Make predictor and updater."""
         self.predictor = ExtendedKalmanPredictor(self.drive)
         self.updater = ExtendedKalmanUpdater(self.look)
 
@@ -116,8 +113,6 @@ class StoneSoupEkf(Peer):
 
 
 class StoneSoupUkf(StoneSoupEkf):
-    """UnscentedKalmanPredictor and UnscentedKalmanUpdater."""
-
     filter = "ukf-uvd"
     reorders = True
 

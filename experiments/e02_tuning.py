@@ -77,7 +77,6 @@ def bound(curves: cs.Record, side: str) -> np.ndarray:
 
 
 def shares(curves: cs.Record) -> str:
-    """The shares and their one-sided bounds in words."""
     rows = zip(
         ("x", "y", "heading"), inside(curves).mean(axis=0), bound(curves, "lower"), bound(curves, "upper"), strict=True
     )

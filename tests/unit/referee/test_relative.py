@@ -339,7 +339,7 @@ def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[objec
 
 def test_motions_of_the_front_end_are_read_and_right(tmp_path: Path, rng: np.random.Generator) -> None:
     """Without images: 400 motions with large turns; x1.5 is found in all but 1e-5 of all draws."""
-    from consistency.stereo.frontend.tum_output import motions_text
+    from consistency.stereo.frontend.images_to_log import motions_text
     from consistency.stereo.visual_odometry.odometry import motion_covariances
 
     motions, truth = simulated_motions(rng, 400)

@@ -19,8 +19,13 @@ from consistency.bench.scenario import Mount, PicturedSensor
 from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.characterising.board_images import Calibrated, Corners, calibrate, find_corners
-from consistency.stereo.characterising.board_residuals import residuals_about_boards
+from consistency.stereo.characterising.boards import (
+    Calibrated,
+    Corners,
+    calibrate,
+    find_corners,
+    residuals_about_boards,
+)
 from consistency.stereo.characterising.from_log import seen_of as seen_of_log
 from consistency.stereo.characterising.known_poses import characterise_posed, correlations, log_interval
 from consistency.stereo.characterising.unknown_landmarks import Seen, fit_points, without_gross

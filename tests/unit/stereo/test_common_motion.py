@@ -15,9 +15,8 @@ from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, M
 from consistency.bench.store.log import Log
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
-from consistency.stereo.frontend.log_screening import screened_log, screening_line
 from consistency.stereo.visual_odometry import common_motion
-from consistency.stereo.visual_odometry.common_motion import screened
+from consistency.stereo.visual_odometry.common_motion import screened, screened_log, screening_line
 
 STEPS, COUNT = 12, 14
 MOTION = BelievedMotion(sigma_v=0.1, sigma_omega=0.02)

@@ -24,7 +24,7 @@ from consistency.stereo.visual_odometry import (
     register_weighted,
     registration_covariance,
 )
-from consistency.stereo.visual_odometry.consensus import squared_distances
+from consistency.stereo.visual_odometry.registration import squared_distances
 
 Array = np.ndarray[Any, Any]
 BOTH = pytest.mark.parametrize("register", [register_svd, register_horn])

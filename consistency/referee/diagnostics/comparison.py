@@ -13,7 +13,6 @@ from consistency.referee.diagnostics.questions.scale import run_means
 from consistency.referee.diagnostics.records.array_blocks import by_runs
 from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.diagnostics.records.symmetric import Symmetric
-from consistency.referee.diagnostics.records.whitening import entries
 from consistency.referee.diagnostics.statistics.log_ratio import Contrast, contrast, margin
 from consistency.referee.types import Array, Indices
 
@@ -106,7 +105,7 @@ def summary(
     means, _ = run_means(nees)
     squared = covered = np.empty((len(nees), 0))
     if error is not None and covariance is not None:
-        both = by_runs(_squared_and_covered, np.asarray(nees), np.asarray(error), entries(covariance))
+        both = by_runs(_squared_and_covered, np.asarray(nees), np.asarray(error), Symmetric.of(covariance))
         squared, covered = both[:, 0], both[:, 1]
     numbers = np.arange(len(nees)) if runs is None else runs
     return RunSummary(numbers, dof, means / dof, squared, covered)

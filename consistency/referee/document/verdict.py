@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.verdict.as_dictionary import flat
+from consistency.referee.diagnostics.verdict.as_dictionary import whole
 from consistency.referee.diagnostics.words.sentences import (
     UNCERTAIN,
     p_text,
@@ -277,7 +277,7 @@ def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = T
 
 def data(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
     """Status, reasons and statistics by filter."""
-    return {name: {"status": v.status, "reasons": v.reasons, "statistics": flat(v)} for name, v in verdicts.items()}
+    return {name: whole(v) for name, v in verdicts.items()}
 
 
 def _overview(verdicts: Mapping[str, Verdict]) -> Table:

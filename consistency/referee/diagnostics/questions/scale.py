@@ -9,6 +9,7 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.records.array_blocks import by_runs, by_steps
+from consistency.referee.diagnostics.records.whitening import mean_and_count
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.intervals import anees_interval
 from consistency.referee.diagnostics.verdict.parts import Interval
@@ -81,7 +82,7 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
     ratio = float(means.mean())
     nu, spread = float(dof), float("inf")
     if runs >= FEW and (steps > 1 or not gaussian) and means.min() > 0:
-        log_nu, variance = _log_nu(means)
+        log_nu, variance = _log_nu(means, -1.0)
         log_nu = min(log_nu, float(np.log(dof * steps)))
         if log_nu > np.log(dof) or not gaussian:
             nu, spread = float(np.exp(log_nu)), 2.0 / variance
@@ -95,12 +96,7 @@ def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
     Either estimate of nu (:func:`scale_test`) lies more than ``errors`` standard errors below; not asked of fewer than
     20 runs.
     """
-    if len(means) < FEW or not means.min() > 0:
-        return False
-    by_spread, left_out = _log_nu_of_means(means)
-    _, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
-    by_likelihood, error = _log_nu_of_gamma(means)
-    return bool(min(by_spread + errors * np.sqrt(variance), by_likelihood + errors * error) < np.log(dof))
+    return len(means) >= FEW and bool(means.min() > 0) and bool(_log_nu(means, errors)[0] < np.log(dof))
 
 
 def spreads_more_in_steps(nees: Array, dof: int) -> bool:
@@ -124,10 +120,7 @@ def run_means(nees: Array) -> tuple[Array, Array]:
 
 def means_and_counts(nees: Array) -> Array:
     """Means and counts of :func:`run_means` as one array, (runs, steps) -> (runs, 2)."""
-    present = np.isfinite(nees)
-    count = present.sum(axis=1)
-    total = np.where(present, nees, 0.0).sum(axis=1)
-    return np.stack([np.where(count > 0, total / np.maximum(count, 1), np.nan), count], axis=-1)
+    return np.stack(mean_and_count(nees, 1), axis=-1)
 
 
 def acceptance(test: MeanTest, dof: int, false_alarm: float, allow: str | None = None) -> tuple[float, float]:
@@ -168,12 +161,12 @@ def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -
     return Interval(ratio, ratio * k / low, ratio * k / max(high, 1e-300))
 
 
-def _log_nu(means: Array) -> tuple[float, float]:
-    """The smaller of both estimates of log nu on the safe side, and the variance of the first."""
+def _log_nu(means: Array, errors: float) -> tuple[float, float]:
+    """The smaller of both estimates of log nu, ``errors`` standard errors higher, and the variance of the first."""
     by_spread, left_out = _log_nu_of_means(means)
     by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
     by_likelihood, error = _log_nu_of_gamma(means)
-    return min(by_spread - float(np.sqrt(variance)), float(by_likelihood - error)), variance
+    return min(by_spread + errors * float(np.sqrt(variance)), float(by_likelihood + errors * error)), variance
 
 
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:

@@ -25,8 +25,8 @@ class Symmetric:
         """Matrices of an array (..., n, n), which is not copied."""
         if isinstance(matrices, Symmetric):
             return matrices
-        n = matrices.shape[-1]
-        return cls([[matrices[..., i, j] for j in range(n)] for i in range(n)])
+        P = np.asarray(matrices, float)
+        return cls([[P[..., i, j] for j in range(P.shape[-1])] for i in range(P.shape[-1])])
 
     @classmethod
     def filled(cls, shape: tuple[int, ...], n: int, value: float = np.nan) -> Symmetric:

@@ -11,7 +11,7 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.records.array_blocks import by_runs, of_runs
 from consistency.referee.diagnostics.records.symmetric import Symmetric
-from consistency.referee.diagnostics.records.whitening import entries, spread_steps, squared_length
+from consistency.referee.diagnostics.records.whitening import spread_steps, squared_length
 from consistency.referee.diagnostics.statistics.intervals import binomial_interval
 from consistency.referee.types import Array
 
@@ -23,7 +23,7 @@ def coverage(error: Array, covariance: Array | Symmetric, bound: float = 2.0, co
 
     Shapes (..., n) and (..., n, n) -> (n,); rows with NaN, or not ``counted`` (...), do not count.
     """
-    error, P = np.asarray(error, float), entries(covariance)
+    error, P = np.asarray(error, float), Symmetric.of(covariance)
     n = error.shape[-1]
     inside, count = np.zeros(n, np.int64), np.zeros(n, np.int64)
     if error.ndim == 1:
@@ -78,7 +78,7 @@ def coverage_interval(
     not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2); rows with NaN, or not ``counted`` (runs, steps),
     are not drawn.
     """
-    error, P = np.asarray(error, float), entries(covariance)
+    error, P = np.asarray(error, float), Symmetric.of(covariance)
     there = by_runs(_usable, error, P)
     steps = spread_steps(there if counted is None else there & counted)
     rows = np.flatnonzero(steps >= 0)

@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.diagnostics.records.array_blocks import by_steps
 from consistency.referee.diagnostics.records.validity import asymmetric
-from consistency.referee.diagnostics.records.whitening import spread_steps, whiten
+from consistency.referee.diagnostics.records.whitening import mean_and_count, spread_steps, whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
 
@@ -59,7 +59,10 @@ def anees(values: Array) -> Array:
     A NaN is a run that has no value in that step (rank-deficient covariance, or failed earlier); where
     no run has one the average is NaN.
     """
-    return by_steps(_mean_over_runs, np.asarray(values, float))
+    return by_steps(lambda block: mean_and_count(block, 0)[0], np.asarray(values, float))
+
+
+_half_width = lru_cache(distributions.kolmogorov.isf)
 
 
 @dataclass(frozen=True)
@@ -100,21 +103,9 @@ def kolmogorov(u: Array) -> tuple[float, float]:
     return distance, float(distributions.kolmogorov.sf(distance, N))
 
 
-def _mean_over_runs(values: Array) -> Array:
-    present = np.isfinite(values)
-    count = present.sum(axis=0)
-    total = np.where(present, values, 0.0).sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
 def _require(good: Array, what: str, last: int) -> None:
     """Raise ValueError, with the first index of the batch, unless all is true over the ``last`` axes."""
     if not good.all():
         bad = ~good.all(axis=tuple(range(-last, 0)))
         index = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0])
         raise ValueError(f"{what} at index {index if np.ndim(bad) else ()}")
-
-
-@lru_cache
-def _half_width(false_alarm: float, N: int) -> float:
-    return float(distributions.kolmogorov.isf(false_alarm, N))

@@ -11,7 +11,8 @@ from consistency.referee.diagnostics.questions.equivalence import worst
 from consistency.referee.diagnostics.questions.lost_runs import lost_of
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.sample import names_of
-from consistency.referee.diagnostics.records.whitening import entries, squared_length, whiten
+from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.verdict.answers import SCALE, SHARES
 from consistency.referee.diagnostics.verdict.parts import Answer, Settings, Verdict
 from consistency.referee.diagnostics.verdict.verdict import judge_alone
@@ -54,7 +55,7 @@ def _part(record: Record, index: Sequence[int], names: tuple[str, ...]) -> Recor
     assert record.error is not None
     assert record.covariance is not None
     return replace(
-        record, error=record.error[..., list(index)], covariance=entries(record.covariance).part(index),
+        record, error=record.error[..., list(index)], covariance=Symmetric.of(record.covariance).part(index),
         dof=len(index), axes=tuple(names[i] for i in index), parts=(), nis=None, nis_dof=None, innovations=None,
         innovation_covariances=None, optimal_gain=False,
     )  # fmt: skip

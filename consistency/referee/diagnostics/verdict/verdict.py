@@ -22,7 +22,7 @@ from consistency.referee.diagnostics.questions.scale import acceptance, pointwis
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.sample import Sample, impossible, innovations_of, sample_of
 from consistency.referee.diagnostics.records.sample import shape_of as shape_of_arrays
-from consistency.referee.diagnostics.records.whitening import entries
+from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.diagnostics.statistics.intervals import chi2_mean_interval
 from consistency.referee.diagnostics.statistics.nees import anees
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, JOINT, MAIN, SHARES, STEP, answers
@@ -164,7 +164,7 @@ def _with_records(verdict: Verdict, evidence: Record, sample: Sample, tests: Tes
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
         return replace(verdict, scale=scale, location=location, tails=tails_of(tests, evidence.run_numbers))
     odd = impossible(evidence, sample.counted)
-    there = entries(evidence.covariance).where_all(np.isfinite)
+    there = Symmetric.of(evidence.covariance).where_all(np.isfinite)
     return replace(
         verdict,
         scale=scale,

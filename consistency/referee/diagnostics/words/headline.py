@@ -45,7 +45,10 @@ def status_of(verdict: Verdict, sample: Sample | None, tests: Tests | None, join
         shown = verdict.equivalence
         return "consistent" if shown is not None and shown.shown and few_lost(verdict) else "undecided"
     if sample is None or tests is None:
-        return _by_innovations(verdict, faults)
+        assert verdict.innovations is not None
+        if "innovation scale" not in faults:
+            return "inconsistent"
+        return "overconfident" if verdict.innovations.ratio > 1.0 else "conservative"
     if not faults & set(BIAS):
         status = _with_joint(at_share(verdict), faults, sample, tests, joint)
     else:
@@ -102,13 +105,6 @@ def _with_joint(settings: Settings, faults: set[str], sample: Sample, tests: Tes
         return together
     apart = _by_errors(settings, faults, sample, tests)
     return "inconsistent" if {apart, together} == {"overconfident", "conservative"} else apart
-
-
-def _by_innovations(verdict: Verdict, faults: set[str]) -> str:
-    assert verdict.innovations is not None
-    if "innovation scale" not in faults:
-        return "inconsistent"
-    return "overconfident" if verdict.innovations.ratio > 1.0 else "conservative"
 
 
 def _without_bias(verdict: Verdict, sample: Sample) -> tuple[Sample, Tests, set[str]]:

@@ -80,12 +80,3 @@ def _chief(joint: JointNees, labels: Indices | None) -> tuple[int, ...]:
     total, dof = np.where(here, parts, 0.0).sum(axis=0), np.maximum(joint.width * here.sum(axis=0), 1)
     p = 2.0 * np.minimum(distributions.chi2.sf(total, dof), distributions.chi2.cdf(total, dof)) * len(labels)
     return tuple(int(labels[j]) for j in np.argsort(p, kind="stable") if p[j] <= SURE and here[:, j].any())
-
-
-def near(test: JointTest, settings: Settings) -> bool:
-    """Whether two one-sided chi-square tests at 1 - ``power`` show the ratio to lie within the tolerance."""
-    if settings.tolerance is None or not test.score.runs:
-        return False
-    R, D, level = settings.tolerated, test.score.dof, 1.0 - settings.power
-    low = settings.one_sided or distributions.chi2.sf(test.nees * R, D) <= level
-    return bool(low and distributions.chi2.cdf(test.nees / R, D) <= level)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.sample import ATTITUDE
 from consistency.referee.diagnostics.verdict.answers import SHARES
 from consistency.referee.diagnostics.verdict.parts import Settings, Verdict
 from consistency.referee.diagnostics.verdict.verdict import DEFAULT, judge_alone
@@ -13,8 +14,6 @@ from consistency.referee.diagnostics.words.sentences import plain
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning.early_stopping import Design
-
-POSES = {"heading", "yaw", "pitch", "roll"}  # components that a pose has beside its position
 
 
 def judge(record: Record, settings: Settings = DEFAULT) -> Verdict:
@@ -137,7 +136,7 @@ def _unshown(verdict: Verdict, why: str) -> Verdict:
 def _other_ways(verdict: Verdict, r: Record) -> list[str]:
     """What else would decide on a single log of poses."""
     is_log = len(r.run_numbers) == 1 and r.window is None and r.align and r.convention
-    if verdict.status != "undecided" or not is_log or not POSES & set(r.axes):
+    if verdict.status != "undecided" or not is_log or not ATTITUDE & set(r.axes):
         return []
     return [
         "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances, "

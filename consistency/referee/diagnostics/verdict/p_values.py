@@ -75,18 +75,17 @@ def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: fl
             matrix, shape_step = _shape(w, in_steps, p)
     distribution = pit(sample.nees, sample.dof)
     if not settings.one_sided:
-        p["distribution"] = _distribution(sample, settings, distribution)
-    band = _band(sample, settings, dict(also) | p)
+        p["distribution"] = distribution.p_value
+        if settings.tolerated > 1.0:  # the largest over the ratios that are tolerated
+            ratios = np.geomspace(1.0 / settings.tolerated, settings.tolerated, GRID)
+            others = (pit(sample.nees / ratio, sample.dof).p_value for ratio in ratios)
+            p["distribution"] = max(distribution.p_value, *others)
+    among = dict.fromkeys([q for q, value in (dict(also) | p).items() if np.isfinite(value)] + [STEP], 1.0)
+    rate = answers(among, 0.5)[STEP].share * settings.false_alarm
+    band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
     if sample.nees.shape[1] > 1:
         p[STEP] = band.p_value
     return Tests(p, main, band, distribution, axes, largest, outlier, matrix, bias_step, shape_step)
-
-
-def _band(sample: Sample, settings: Settings, p_values: Mapping[str, float]) -> Band:
-    """The band over all steps at the share of the false-alarm rate that it has among the questions asked."""
-    among = dict.fromkeys([q for q, p in p_values.items() if np.isfinite(p)] + [STEP], 1.0)
-    rate = answers(among, 0.5)[STEP].share * settings.false_alarm
-    return simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
 
 
 def _bias(whitened: Array, in_steps: Moments, p: dict[str, float]) -> int | None:
@@ -117,11 +116,3 @@ def least(p_values: Array) -> tuple[float, int | None]:
     if not count:
         return float("nan"), None
     return min(1.0, float(np.nanmin(p_values)) * count), int(np.nanargmin(p_values)) + 1
-
-
-def _distribution(sample: Sample, settings: Settings, at_one: Pit) -> float:
-    """p value of the distribution; with a tolerance the largest over the ratios that it allows."""
-    if settings.tolerated == 1.0:
-        return at_one.p_value
-    ratios = np.geomspace(1.0 / settings.tolerated, settings.tolerated, GRID)
-    return max(at_one.p_value, *(pit(sample.nees / ratio, sample.dof).p_value for ratio in ratios))

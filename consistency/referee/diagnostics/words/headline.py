@@ -126,21 +126,17 @@ def _by_errors(settings: Settings, faults: set[str], sample: Sample, tests: Test
         return "inconsistent" if AXIS in faults and _contradicted(settings, sample, tests) else side
     heavy = "outliers" in faults or (STEP in faults and _heavy_steps(sample, tests))
     if STEP in faults and not heavy:
-        opposite = AXIS in faults and _by_axis(settings, tests) == "inconsistent"
-        return "inconsistent" if opposite else _by_step(sample, tests)
+        if AXIS in faults and _by_axis(settings, tests) == "inconsistent":
+            return "inconsistent"
+        curve = anees(sample.nees)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            above, below = np.nanmax(curve / tests.band.high), np.nanmax(tests.band.low / curve)
+        return "overconfident" if above >= below else "conservative"  # where the ANEES is farthest from its band
     if AXIS in faults or DIRECTION in faults:
         if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
             return _by_axis(settings, tests)
         heavy = True
     return "heavy-tailed" if heavy else "inconsistent"
-
-
-def _by_step(sample: Sample, tests: Tests) -> str:
-    """The side on which the ANEES is farthest from its band."""
-    curve, band = anees(sample.nees), tests.band
-    with np.errstate(divide="ignore", invalid="ignore"):
-        above, below = np.nanmax(curve / band.high), np.nanmax(band.low / curve)
-    return "overconfident" if above >= below else "conservative"
 
 
 def _heavy_steps(sample: Sample, tests: Tests) -> bool:

@@ -50,7 +50,8 @@ def reasons(v: Verdict) -> list[str]:
     if v.answers:
         lines.append(_questions(v, faults))
     lines += _first_steps(v)
-    return [f"{v.status}: {lines[0]}{_without_first(v)}", *lines[1:]]
+    first = "" if v.skipped is None else f"; without {v.skipped.skip.text} of each {_whole(v)}"
+    return [f"{v.status}: {lines[0]}{first}", *lines[1:]]
 
 
 # --- the sentence ------------------------------------------------------------------------------------
@@ -75,10 +76,6 @@ def _failures(v: Verdict) -> list[str]:
             f"runs, first run {v.joint.not_definite[0]}"
         )
     return lines
-
-
-def _without_first(v: Verdict) -> str:
-    return "" if v.skipped is None else f"; without {v.skipped.skip.text} of each {_whole(v)}"
 
 
 def _whole(v: Verdict) -> str:
@@ -110,7 +107,12 @@ def _sentence(v: Verdict, faults: Faults) -> str:
     if not faults:
         return _no_fault(v)
     if v.parts:
-        return _of_parts(v)
+        named = [(name, part) for name, part in v.parts.items() if part.faults]
+        texts = [
+            f"{name}: {part.reasons[0].removeprefix(f'{part.status}: ').removesuffix('; no bias found')}"
+            for name, part in named[:MOST]
+        ]
+        return "; ".join(texts + [f"and {len(named) - MOST} more"] * (len(named) > MOST))
     parts = []
     if any(q in faults for q in BIAS):
         parts.append(bias_text(v, "bias" not in faults))
@@ -130,26 +132,10 @@ def _sentence(v: Verdict, faults: Faults) -> str:
         parts.append(f"innovations {'larger' if v.innovations.ratio > 1 else 'smaller'} than stated")
     if "innovation whiteness" in faults:
         parts.append("innovations correlated over steps")
-    if any(q in faults for q in SCALE) and v.status != "heavy-tailed" and _no_bias(v):
+    sought = any(a.question in BIAS for a in v.answers) and not set(v.faults) & set(BIAS)
+    if any(q in faults for q in SCALE) and v.status != "heavy-tailed" and sought:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
-
-
-def _of_parts(v: Verdict) -> str:
-    """The parts at fault, each with its sentence."""
-    named = {name: part for name, part in v.parts.items() if part.faults}
-    texts = [f"{name}: {_own_sentence(part)}" for name, part in [*named.items()][:MOST]]
-    more = f"; and {len(named) - MOST} more" if len(named) > MOST else ""
-    return f"{'; '.join(texts)}{more}"
-
-
-def _own_sentence(part: Verdict) -> str:
-    return part.reasons[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
-
-
-def _no_bias(v: Verdict) -> bool:
-    """A bias was looked for and not found."""
-    return any(a.question in BIAS for a in v.answers) and not set(v.faults) & set(BIAS)
 
 
 def _no_fault(v: Verdict) -> str:
@@ -159,18 +145,14 @@ def _no_fault(v: Verdict) -> str:
     tolerated = [a.question for a in v.answers if a.tolerated]
     none = "no fault beyond the tolerance" if tolerated else "no fault found"
     size = "covariance ratio of every part" if v.parts else f"covariance ratio {plain(v.scale.inflation)}"
-    axis, lost = _worst_axis(v), _lost(v)
+    axis = "" if (worst := v.worst_axis) is None else f" (worst axis: {worst[0]}, {plain(worst[1])})"
     if shown.shown:
-        return f"{none} in {runs}, and the {size} is shown to be {_within(v, shown)}{axis}{lost}"
+        return f"{none} in {runs}, and the {size} is shown to be {_within(shown)}{axis}{_lost(v)}"
     advice, asked = "", 0 if v.lost is None or v.settings.lost is None else v.lost.needed or 0
     if shown.runs is not None and shown.runs <= MUCH:
         advice = f"; {max(shown.runs, v.runs + 1, asked)} such {v.unit}s would probably decide"
-    return f"{none}, but {runs} {_do(v.runs)} not show the {size} to be {_within(v, shown)}{axis}{advice}"
-
-
-def _worst_axis(v: Verdict) -> str:
-    worst = v.worst_axis
-    return "" if worst is None else f" (worst axis: {worst[0]}, {plain(worst[1])})"
+    do = "does" if v.runs == 1 else "do"
+    return f"{none}, but {runs} {do} not show the {size} to be {_within(shown)}{axis}{advice}"
 
 
 def _lost(v: Verdict) -> str:
@@ -178,7 +160,7 @@ def _lost(v: Verdict) -> str:
     if (lost := v.lost) is None:
         return ""
     asked, unit, runs = v.settings.lost, v.unit, plural(v.runs, v.unit)
-    some = f"{plural(lost.count, unit)} of {lost.runs} {_is(lost.count)} lost" if lost.count else ""
+    some = f"{plural(lost.count, unit)} of {lost.runs} {'is' if lost.count == 1 else 'are'} lost" if lost.count else ""
     if asked is not None and lost.upper <= asked:
         return f"; lost {unit}s are shown to be at most {percent(asked)} of all ({some or f'none of {lost.runs} is'})"
     found = f"; {some}, and" if some else ";" if asked is None else ", but"
@@ -190,18 +172,10 @@ def _lost(v: Verdict) -> str:
     return f"{text}, and {percent(asked)} is asked for{more}"
 
 
-def _is(count: int) -> str:
-    return "is" if count == 1 else "are"
-
-
-def _within(v: Verdict, shown: Equivalence) -> str:
+def _within(shown: Equivalence) -> str:
     if shown.one_sided:
         return f"below {short(shown.factor)}"
     return f"between {short(1.0 / shown.factor)} and {short(shown.factor)}"
-
-
-def _do(runs: int) -> str:
-    return "does" if runs == 1 else "do"
 
 
 # --- the figures behind it -----------------------------------------------------------------------------
@@ -344,7 +318,7 @@ def _without_truth(v: Verdict, faults: Faults) -> str:
     shown = v.innovations.equivalence
     if not faults and shown is not None:
         is_shown = "is shown to be" if shown.shown else "is not shown to be"
-        parts.append(f"their NIS {is_shown} {_within(v, shown)} times its degrees of freedom")
+        parts.append(f"their NIS {is_shown} {_within(shown)} times its degrees of freedom")
         if v.settings.lost is not None:
             parts.append("they cannot show what share of runs is lost")
     return "; ".join(parts)

@@ -11,7 +11,7 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.planning.single_log import APART, MOST, correlation_time
 from consistency.referee.diagnostics.questions.independence import independence
 from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.record import Record, arrays_of
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.errors import InputError
@@ -97,15 +97,19 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
     parts = whitened[log.start : end].reshape(pieces, length, -1)
     arrays = {
         name: array[0, log.start : end].reshape(pieces, length, *array.shape[2:])
-        for name in ("error", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "path")
-        if (array := getattr(record, name)) is not None
+        for name, array in arrays_of(record).items()
+        if name not in ("covariance", "times", "truth_covariance")
     }
     clock = record.times[0] if record.times is not None else record.t
     times = clock[log.start : end].reshape(pieces, length) if len(clock) else None
-    notes = (*record.notes, _note(record.name, memory, pieces, length))
+    note = (
+        f"{record.name}: the log is cut into {pieces} pieces of {length} steps, which stand as runs; its errors go on "
+        f"over {memory.time:.3g} steps"
+    )
     return replace(
         record, **arrays, covariance=P[0, log.start : end].reshape(pieces, length, *P.shape[2:]), times=times,
-        t=np.full(length, np.nan), runs=np.arange(1, pieces + 1), unit="piece", caption=CAPTION, notes=notes,
+        t=np.full(length, np.nan), runs=np.arange(1, pieces + 1), unit="piece", caption=CAPTION,
+        notes=(*record.notes, note),
         unavailable=BIAS, unshown=_unshown(memory, pieces, length, parts),
     )  # fmt: skip
 
@@ -119,17 +123,12 @@ def _require_steady(record: Record, P: Array) -> None:
     names = record.axes or [f"axis {i}" for i in range(medians.shape[1])]
     for axis, values in zip(names, medians.T, strict=True):
         ratio = float(values[-1] / max(values[1], np.finfo(float).tiny))
-        if ratio > GROWTH and _rises(values) > STEADY:
+        signs = np.sign(values[None, :] - values[:, None])[np.triu_indices(len(values), 1)]
+        if ratio > GROWTH and signs.mean() > STEADY:  # rank correlation with the order (Kendall 1938)
             raise InputError(
                 f"--split: the stated variance of {axis} grows by x{ratio:.3g} over the log, so that its pieces are "
                 "not alike; judge motions over windows: --relative 10s"
             )
-
-
-def _rises(values: Array) -> float:
-    """Rank correlation of a series with its order, of which equal values are no part (Kendall 1938)."""
-    signs = np.sign(values[None, :] - values[:, None])
-    return float(signs[np.triu_indices(len(values), 1)].mean())
 
 
 def _unshown(memory: Memory, pieces: int, length: int, parts: Array) -> str:
@@ -145,10 +144,3 @@ def _unshown(memory: Memory, pieces: int, length: int, parts: Array) -> str:
     if independence(mean_of_runs(parts), run_means(squared_length(parts))[0]).doubtful:
         return f"{pieces} pieces of {length} steps do not seem to be independent"
     return ""
-
-
-def _note(name: str, memory: Memory, pieces: int, length: int) -> str:
-    return (
-        f"{name}: the log is cut into {pieces} pieces of {length} steps, which stand as runs; its errors go on over "
-        f"{memory.time:.3g} steps"
-    )

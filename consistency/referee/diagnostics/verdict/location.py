@@ -9,6 +9,7 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.questions.band import Band
 from consistency.referee.diagnostics.questions.bias import hotelling
+from consistency.referee.diagnostics.questions.outliers import Outlier
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
 from consistency.referee.diagnostics.records.array_blocks import blocks, by_runs
 from consistency.referee.diagnostics.records.sample import ATTITUDE, POSITION, Errors, Sample
@@ -54,7 +55,9 @@ def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = Tr
     since, lasting = None, False
     if first is not None and faulty and ordered:
         sign = 1 if band.above[first] else -1
-        lasting = _lasting(sample, first, sign)
+        curve, steps = anees(sample.nees)[first:], pointwise_band(sample.counted.sum(axis=0), sample.dof)[first:]
+        beyond = curve > steps[:, 1] if sign > 0 else curve < steps[:, 0]
+        lasting = bool(beyond[np.isfinite(curve)].mean() > 0.5)  # in most steps from there on
         since = first + 1 if lasting and _absent_before(sample, first, sign) else None
     late = slice(0 if since is None else since - 1, None)
     return Location(
@@ -70,13 +73,6 @@ def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = Tr
         else None,
         until=until(sample, band, detect) if ordered and _any(answers, (*SCALE, *BIAS)) else None,
     )
-
-
-def _lasting(sample: Sample, first: int, sign: int) -> bool:
-    """Whether the ANEES is on that side of its pointwise band in most steps from ``first`` on."""
-    curve, band = anees(sample.nees)[first:], pointwise_band(sample.counted.sum(axis=0), sample.dof)[first:]
-    beyond = curve > band[:, 1] if sign > 0 else curve < band[:, 0]
-    return bool(beyond[np.isfinite(curve)].mean() > 0.5)
 
 
 def _absent_before(sample: Sample, first: int, sign: int) -> bool:
@@ -191,7 +187,11 @@ def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
 def bias_of(sample: Sample, step: int | None, location: Location, answers: Answers) -> Bias:
     """Mean error of each axis, clearest in ``step``, and the scale without it."""
     errors, late = _errors(sample), _late(location)
-    of_runs = by_runs(_standard_means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
+
+    def means(error: Array, covariance: Symmetric, counted: Array) -> Array:
+        return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
+
+    of_runs = by_runs(means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
     by_axis = {}
     if len(of_runs) > sample.dof:
@@ -199,24 +199,13 @@ def bias_of(sample: Sample, step: int | None, location: Location, answers: Answe
         by_axis = {a: Interval(test.mean[i], *test.interval[i]) for i, a in enumerate(errors.names)}
     if not _any(answers, BIAS):
         return Bias(by_axis, step, None, None, None)
-    without = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
-    return Bias(by_axis, step, *_axis_in_step(sample, step), without)
-
-
-def _standard_means(error: Array, covariance: Symmetric, counted: Array) -> Array:
-    """Mean of the standardised errors of each run, (runs, n)."""
-    return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
-
-
-def _axis_in_step(sample: Sample, step: int | None) -> tuple[str | None, float | None]:
-    """The component whose mean stands out most in a step, and that mean in stated standard deviations."""
-    if step is None:
-        return None, None
-    errors = _errors(sample)
-    at = standardise(errors.error[:, step - 1], errors.covariance[:, step - 1])[sample.counted[:, step - 1]]
-    mean = at.mean(axis=0)
-    chief = int(np.argmax(np.abs(mean) / at.std(axis=0, ddof=1).clip(1e-300)))
-    return errors.names[chief], float(mean[chief])
+    axis = size = None
+    if step is not None:
+        at = standardise(errors.error[:, step - 1], errors.covariance[:, step - 1])[sample.counted[:, step - 1]]
+        mean = at.mean(axis=0)
+        chief = int(np.argmax(np.abs(mean) / at.std(axis=0, ddof=1).clip(1e-300)))  # what stands out most
+        axis, size = errors.names[chief], float(mean[chief])
+    return Bias(by_axis, step, axis, size, ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE))
 
 
 def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float) -> Shape | None:
@@ -236,9 +225,7 @@ def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float)
 
 def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
     """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
-    odd = tests.outlier
-    if odd is None:
-        return Tails(-1, 0, float("nan"), tests.pit.values, tests.pit.half_width)
+    odd = tests.outlier or Outlier(float("nan"), -1, -1, float("nan"))
     run = int(run_numbers[odd.run]) if odd.run >= 0 else odd.run
     return Tails(run, odd.step + 1, odd.distance, tests.pit.values, tests.pit.half_width)
 

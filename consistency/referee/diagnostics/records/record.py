@@ -39,9 +39,9 @@ class MapRecord(NamedTuple):
     dof: int  # of a landmark: 3, or 2 in the plane
     record: Callable[[Array | None], Record | None]  # what is judged, of the last NEES of the pose of each run, (runs,)
 
-    def of_runs(self, runs: int | None) -> MapRecord:
-        """Those of runs 0 to ``runs`` - 1, or of all."""
-        some = self.run < (np.inf if runs is None else runs)
+    def of_runs(self, runs: int) -> MapRecord:
+        """Those of runs 0 to ``runs`` - 1."""
+        some = self.run < runs
         return self._replace(run=self.run[some], nees=self.nees[some])
 
 

@@ -66,6 +66,12 @@ class Sample:
     dof: int
     errors: Errors | None = None
 
+    @property
+    def known_errors(self) -> Errors:
+        """Errors of a sample that has them."""
+        assert self.errors is not None
+        return self.errors
+
     @cached_property
     def counted(self) -> Array:
         """(N, T) of bool."""
@@ -83,8 +89,7 @@ class Sample:
 
     def group_means(self, index: Sequence[int], steps: slice = slice(None), centre: Centre | None = None) -> Array:
         """Mean NEES of a group of components alone, of errors about the ``centre``, over its number of components."""
-        assert self.errors is not None
-        e, index = self.errors, list(index)
+        e, index = self.known_errors, list(index)
         centre = e.centre if centre is None else centre
         centre = None if centre is None else Centre(centre.mean[steps], centre.factor[steps])
 
@@ -97,9 +102,8 @@ class Sample:
 
     def centre(self) -> Centre:
         """Mean error over runs in each step."""
-        assert self.errors is not None
-        N = self.counted.sum(axis=0)[:, None]
-        total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), self.errors.error, self.counted)
+        error, N = self.known_errors.error, self.counted.sum(axis=0)[:, None]
+        total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), error, self.counted)
         factor = np.sqrt(N / np.maximum(N - 1, 1))
         return Centre(total / np.maximum(N, 1), np.where(N > 1, factor, np.nan))
 
@@ -112,8 +116,7 @@ class Sample:
 
         Overwrites this sample's NEES and whitened errors in place; do not use it afterwards.
         """
-        assert self.errors is not None
-        e, centre = self.errors, self.centre()
+        e, centre = self.known_errors, self.centre()
         for here in of_runs(self.counted):
             w = whiten(centre.about(e.error[here], self.counted[here]), e.covariance[here])
             e.whitened[here], self.nees[here] = w, squared_length(w)

@@ -60,9 +60,8 @@ def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | No
     if record.truth_covariance is not None:
         from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import uncertain_truth
 
-        truth = uncertain_truth(record)
-    if truth is not None:
-        runs, record = truth.evidence, replace(record, unshown=record.unshown or truth.unjudged)
+        if (truth := uncertain_truth(record)) is not None:
+            runs, record = truth.evidence, replace(record, unshown=record.unshown or truth.unjudged)
     if record.unshown:
         runs = replace(runs, unavailable=tuple(SHARES))
     world = None if record.world is None else judge_alone(record.in_world, settings)
@@ -93,11 +92,13 @@ def with_map(verdict: Verdict, ends: Record, settings: Settings, design: Design 
         return verdict
     from consistency.referee.diagnostics.maps.map_score import map_score
 
-    runs = None if design is None else 1 + int(ends.run_numbers[: verdict.runs].max(initial=-1))
-    record = None if runs is not None else landmarks.record(None if ends.nees is None else ends.nees[:, 0])
-    some = landmarks.of_runs(runs)
-    score = map_score(some.run, some.nees, landmarks.dof)
-    return replace(verdict, map=replace(score, verdict=None if record is None else judge_alone(record, settings)))
+    of_map = None
+    if design is not None:
+        landmarks = landmarks.of_runs(1 + int(ends.run_numbers[: verdict.runs].max(initial=-1)))
+    elif (record := landmarks.record(None if ends.nees is None else ends.nees[:, 0])) is not None:
+        of_map = judge_alone(record, settings)
+    score = map_score(landmarks.run, landmarks.nees, landmarks.dof)
+    return replace(verdict, map=replace(score, verdict=of_map))
 
 
 def _beside(verdict: Verdict, r: Record, world: Verdict | None, runs: int | None = None) -> Verdict:

@@ -12,7 +12,7 @@ from consistency.referee.diagnostics.questions.bias import hotelling
 from consistency.referee.diagnostics.questions.outliers import Outlier
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
 from consistency.referee.diagnostics.records.array_blocks import blocks, by_runs
-from consistency.referee.diagnostics.records.sample import ATTITUDE, POSITION, Errors, Sample
+from consistency.referee.diagnostics.records.sample import ATTITUDE, POSITION, Sample
 from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
 from consistency.referee.diagnostics.statistics import distributions
@@ -138,8 +138,7 @@ def chief_axes(sample: Sample, steps: slice, as_whole: bool) -> str | None:
     Bonferroni over axes. None where no axis stands out, or all do, or with fewer than 8 runs. Where the whole is at
     fault (``as_whole``), an axis that errs in the other direction does not carry it.
     """
-    assert sample.errors is not None
-    names, n = sample.errors.names, sample.dof
+    names, n = sample.known_errors.names, sample.dof
     if n == 1 or np.isfinite(sample.nees[:, steps]).any(axis=1).sum() < FEWEST:
         return None
     Y = np.stack([sample.group_means([j], steps) for j in range(n)], axis=-1)
@@ -171,7 +170,7 @@ def _stands_out(own: Array, others: Array, axes: int) -> bool:
 
 def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
     """Inflation of each component and group, since the fault began."""
-    errors = _errors(sample)
+    errors = sample.known_errors
     late, confidence = _late(location), 1.0 - (1.0 - CONFIDENCE) / len(errors.groups)
     inflation = {
         key: ratio_interval(sample.group_means(index, late), len(index), confidence)
@@ -186,7 +185,7 @@ def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
 
 def bias_of(sample: Sample, step: int | None, location: Location, answers: Answers) -> Bias:
     """Mean error of each axis, clearest in ``step``, and the scale without it."""
-    errors, late = _errors(sample), _late(location)
+    errors, late = sample.known_errors, _late(location)
 
     def means(error: Array, covariance: Symmetric, counted: Array) -> Array:
         return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
@@ -212,7 +211,7 @@ def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float)
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
     if tests.matrix is None or sample.dof == 1:
         return None
-    errors = _errors(sample)
+    errors = sample.known_errors
     in_step = not _any(answers, ("shape",)) and tests.shape_step is not None
     here = slice(tests.shape_step - 1, tests.shape_step) if in_step and tests.shape_step else slice(None)
     counted = sample.counted[:, here]
@@ -232,7 +231,7 @@ def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
 
 def accuracy_of(sample: Sample) -> Accuracy:
     """Coverage, RMSE and the noncredibility index."""
-    errors = _errors(sample)
+    errors = sample.known_errors
     index, inclination = noncredibility(errors.error, sample.nees)
     counted = sample.counted
     inside, interval = coverage_interval(errors.error, errors.covariance, counted=counted)
@@ -251,11 +250,6 @@ def accuracy_of(sample: Sample) -> Accuracy:
         nci=float(np.nanmean(index)) if np.isfinite(index).any() else float("nan"),
         inclination=float(np.nanmean(inclination)) if np.isfinite(inclination).any() else float("nan"),
     )
-
-
-def _errors(sample: Sample) -> Errors:
-    assert sample.errors is not None
-    return sample.errors
 
 
 def _late(location: Location) -> slice:

@@ -156,8 +156,7 @@ def _robust(means: Array, dof: int, steps: int, settings: Settings, questions: i
 
 
 def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
-    assert sample.errors is not None
-    groups = sample.errors.groups
+    groups = sample.known_errors.groups
     return any(
         _robust(sample.group_means(groups[key]), len(groups[key]), sample.longest, settings, len(groups))
         for key, test in tests.axes.items()

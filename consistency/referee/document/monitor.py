@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from consistency.referee.diagnostics import Alarm, Monitor
 from consistency.referee.diagnostics.monitoring.monitor import CAVEAT, accepted_scales
-from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
+from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Text, table
 
 
 def monitor_document(name: str, monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -> Document:
@@ -21,13 +19,17 @@ def monitor_document(name: str, monitor: Monitor, alarm: Alarm | None, t: float,
     alarm : its steps as the file numbers them
     t, since_t : s, of the alarm and of the beginning of the fault; NaN where they are not known
     """
-    sentence = _sentence(monitor, alarm, t, since_t)
-    return Document(
-        name, "", (), (_table(name, monitor), Text(""), Text(sentence)), _data(name, monitor, alarm, t, since_t)
-    )
-
-
-def _table(name: str, m: Monitor) -> Table:
+    m = monitor
+    data = {
+        "innovations": name, "steps": m.steps, "measurements": m.measurements, "rejected": m.rejections,
+        "judged": m.innovations, "nis_ratio": m.ratio, "scale": m.scale, "evidence": m.evidence,
+        "largest_evidence": m.largest, "threshold": m.threshold, "false_alarm": m.false_alarm,
+        "tolerance": m.tolerance, "gate": m.gate, "mission": m.mission, "note": CAVEAT,
+        "alarm": None if alarm is None else {
+            "step": alarm.step, "since": alarm.since, "t": t, "since_t": since_t, "direction": alarm.direction,
+            "evidence": alarm.evidence, "scale": alarm.scale, "sentence": str(alarm),
+        },
+    }  # fmt: skip
     cells: list[tuple[str, Cell]] = [("steps", str(m.steps)), ("judged", str(m.innovations))]
     if m.gate is not None:
         cells.append(("rejected", str(m.rejections)))
@@ -36,7 +38,8 @@ def _table(name: str, m: Monitor) -> Table:
         cells.append(("scale", Quantity(m.scale, digits=".3f")))
     cells += [("e-value", f"{m.evidence:.3g}"), ("largest", f"{m.largest:.3g}"), ("alarm at", f"{m.threshold:.4g}")]
     columns = (Column("innovations"), *(Column(head, number=True) for head, _ in cells))
-    return table(columns, [(name, *(cell for _, cell in cells))], f"Monitor of {name}")
+    shown = table(columns, [(name, *(cell for _, cell in cells))], f"Monitor of {name}")
+    return Document(name, "", (), (shown, Text(""), Text(_sentence(m, alarm, t, since_t))), data)
 
 
 def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -> str:
@@ -52,17 +55,3 @@ def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -
             f"(designed for {100 * (1 - monitor.gate):.2g} %), which is not judged."
         )
     return sentence
-
-
-def _data(name: str, monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -> dict[str, Any]:
-    return {
-        "innovations": name, "steps": monitor.steps, "measurements": monitor.measurements,
-        "rejected": monitor.rejections, "judged": monitor.innovations, "nis_ratio": monitor.ratio,
-        "scale": monitor.scale, "evidence": monitor.evidence, "largest_evidence": monitor.largest,
-        "threshold": monitor.threshold, "false_alarm": monitor.false_alarm, "tolerance": monitor.tolerance,
-        "gate": monitor.gate, "mission": monitor.mission, "note": CAVEAT,
-        "alarm": None if alarm is None else {
-            "step": alarm.step, "since": alarm.since, "t": t, "since_t": since_t, "direction": alarm.direction,
-            "evidence": alarm.evidence, "scale": alarm.scale, "sentence": str(alarm),
-        },
-    }  # fmt: skip

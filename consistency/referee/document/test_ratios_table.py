@@ -30,33 +30,26 @@ HEADS = (
 def ratios_document(name: str, ratios: Sequence[GateRatios]) -> Document:
     """A row for each sensor, and the numbers as data."""
     columns = (Column("sensor"), *(Column(head, number=True) for head in HEADS))
-    rows = [_row(each) for each in ratios]
+    rows: list[tuple[Cell, ...]] = []
+    sensors = {}
+    for each in ratios:
+        (begin, share), known = each.over_time(each.unusual), not np.isnan(each.gate)
+        rejected, unusual, largest = each.above(1.0), each.above(each.unusual), float(each.ratio.max())
+        most = int(np.nanargmax(share)) if known else 0
+        of_gate = (
+            f"≤ {each.rejected:.1g}", f"{each.unusual:.2f}", f"{unusual:.1%}", f"≤ {RARE:.0%}",
+            f"{share[most]:.1%} from {begin[most]:.4g} s",
+        )  # fmt: skip
+        rows.append((
+            each.sensor, f"{each.gate:g} sigma" if known else "", str(len(each.ratio)), f"{largest:.2f}",
+            "" if np.isnan(rejected) else f"{rejected:.1%}", *(of_gate if known else [""] * len(of_gate)),
+        ))  # fmt: skip
+        sensors[each.sensor] = {
+            "gate": each.gate, "messages": len(each.ratio), "largest": largest,
+            "above_1": rejected, "above_1_of_a_right_filter": each.rejected, "unusual_above": each.unusual,
+            "unusual": unusual, "unusual_of_a_right_filter": RARE,
+            "over_time": [{"t": float(t), "unusual": float(s)} for t, s in zip(begin, share, strict=True)],
+        }  # fmt: skip
     shown = table(columns, rows, f"Test ratios of {name}")
-    data = {"log": name, "note": NO_NIS, "sensors": {each.sensor: _data(each) for each in ratios}}
+    data = {"log": name, "note": NO_NIS, "sensors": sensors}
     return Document(name, "", (), (shown, Text(""), Text(NO_NIS)), data)
-
-
-def _row(each: GateRatios) -> tuple[Cell, ...]:
-    known = not np.isnan(each.gate)
-    begin, share = each.over_time(each.unusual)
-    most = int(np.nanargmax(share)) if known else 0
-    return (
-        each.sensor, f"{each.gate:g} sigma" if known else "", str(len(each.ratio)), f"{each.ratio.max():.2f}",
-        _share(each.above(1.0)), f"≤ {each.rejected:.1g}" if known else "", f"{each.unusual:.2f}" if known else "",
-        _share(each.above(each.unusual)), f"≤ {RARE:.0%}" if known else "",
-        f"{share[most]:.1%} from {begin[most]:.4g} s" if known else "",
-    )  # fmt: skip
-
-
-def _share(value: float) -> str:
-    return "" if np.isnan(value) else f"{value:.1%}"
-
-
-def _data(each: GateRatios) -> dict[str, object]:
-    begin, share = each.over_time(each.unusual)
-    return {
-        "gate": each.gate, "messages": len(each.ratio), "largest": float(each.ratio.max()),
-        "above_1": each.above(1.0), "above_1_of_a_right_filter": each.rejected, "unusual_above": each.unusual,
-        "unusual": each.above(each.unusual), "unusual_of_a_right_filter": RARE,
-        "over_time": [{"t": float(t), "unusual": float(s)} for t, s in zip(begin, share, strict=True)],
-    }  # fmt: skip

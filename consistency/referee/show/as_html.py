@@ -75,7 +75,11 @@ def block(of: Block) -> str:
         case Heading():
             return f"<h{of.level}>{escape(of.text)}</h{of.level}>"
         case Reasons():
-            return "".join(_reason(entry) for entry in of.entries)
+            return "".join(
+                f"<p><strong>{escape(entry.name)}</strong> is {escape(entry.sentence)}</p>"
+                + (_list(entry.others) if entry.others else "")
+                for entry in of.entries
+            )
         case Facts():
             rows = "".join(f"<tr>{_left('th', name)}{_left('td', value)}</tr>" for name, value in of.rows)
             return f"<table>{rows}</table>"
@@ -98,11 +102,6 @@ def _left(tag: str, text: str) -> str:
 
 def _list(texts: Iterable[str]) -> str:
     return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>"
-
-
-def _reason(entry: Reason) -> str:
-    others = _list(entry.others) if entry.others else ""
-    return f"<p><strong>{escape(entry.name)}</strong> is {escape(entry.sentence)}</p>{others}"
 
 
 def _table(of: Table) -> str:

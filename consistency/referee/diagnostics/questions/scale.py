@@ -82,8 +82,11 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
     ratio = float(means.mean())
     nu, spread = float(dof), float("inf")
     if runs >= FEW and (steps > 1 or not gaussian) and means.min() > 0:
-        log_nu, variance = _log_nu(means, -1.0)
-        log_nu = min(log_nu, float(np.log(dof * steps)))
+        by_spread, left_out = _log_nu_of_means(means)
+        by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / runs)
+        by_likelihood, error = _log_nu_of_gamma(means)
+        safe = by_spread - float(np.sqrt(variance)), float(by_likelihood - error)
+        log_nu = min(*safe, float(np.log(dof * steps)))
         if log_nu > np.log(dof) or not gaussian:
             nu, spread = float(np.exp(log_nu)), 2.0 / variance
     above, below = _tails(ratio, runs * nu, spread)
@@ -96,7 +99,12 @@ def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
     Either estimate of nu (:func:`scale_test`) lies more than ``errors`` standard errors below; not asked of fewer than
     20 runs.
     """
-    return len(means) >= FEW and bool(means.min() > 0) and bool(_log_nu(means, errors)[0] < np.log(dof))
+    if len(means) < FEW or not means.min() > 0:
+        return False
+    by_spread, left_out = _log_nu_of_means(means)
+    _, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
+    by_likelihood, error = _log_nu_of_gamma(means)
+    return bool(min(by_spread + errors * np.sqrt(variance), by_likelihood + errors * error) < np.log(dof))
 
 
 def spreads_more_in_steps(nees: Array, dof: int) -> bool:
@@ -159,14 +167,6 @@ def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -
     z, k = float(distributions.t.isf(tail, spread)), len(means) * nu
     low, high = (float(distributions.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
     return Interval(ratio, ratio * k / low, ratio * k / max(high, 1e-300))
-
-
-def _log_nu(means: Array, errors: float) -> tuple[float, float]:
-    """The smaller of both estimates of log nu, ``errors`` standard errors higher, and the variance of the first."""
-    by_spread, left_out = _log_nu_of_means(means)
-    by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
-    by_likelihood, error = _log_nu_of_gamma(means)
-    return min(by_spread + errors * float(np.sqrt(variance)), float(by_likelihood + errors * error)), variance
 
 
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:

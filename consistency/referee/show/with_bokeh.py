@@ -168,13 +168,10 @@ def _line(chart: Any, mark: Line, _: Panel, limit: int) -> Any:
     source = _source(**columns)
     edges = []
     if mark.bound is not None:
-        edge: dict[str, Any] = {
-            "line_color": mark.look.colour,
-            "line_width": 1.3,
-            "line_dash": [5, 4],
-            "line_alpha": 1.0,
-        }
-        edges = [chart.add_glyph(source, glyphs.Line(x="x", y=side, **edge)) for side in ("bound", "below")]
+        edge: dict[str, Any] = {"line_color": mark.look.colour, "line_width": 1.3, "line_dash": [5, 4]}
+        edges = [
+            chart.add_glyph(source, glyphs.Line(x="x", y=side, line_alpha=1.0, **edge)) for side in ("bound", "below")
+        ]
     stroke = _stroke(mark.look)
     curve = glyphs.Step(x="x", y="y", mode="after", **stroke) if mark.steps else glyphs.Line(x="x", y="y", **stroke)
     line = chart.add_glyph(source, curve)

@@ -85,7 +85,7 @@ def _rows(document: Document) -> list[tuple[int, int]]:
 def points_a_line(document: Document) -> int:
     """Points that a line may have so that the file stays below its greatest size."""
     rows = _rows(document)
-    room = MAXIMUM - SCRIPT - CHART * sum(len(figure.panels) for figure in document.figures)
+    room: float = MAXIMUM - SCRIPT - CHART * sum(len(figure.panels) for figure in document.figures)
 
     def size(limit: int) -> float:
         return POINT * sum(columns * min(length, limit) for length, columns in rows)

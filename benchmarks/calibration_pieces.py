@@ -14,7 +14,7 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.diagnostics.records.log_pieces import in_pieces
+from consistency.referee.diagnostics.planning.single_log import in_pieces
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.geometry.space_errors import spatial_error

@@ -11,9 +11,8 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
 from consistency.referee.diagnostics.records.record import numbered_axes
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.diagnostics.statistics.log_ratio import Contrast, contrast, margin
 from consistency.referee.types import Array, Indices
 

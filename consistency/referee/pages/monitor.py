@@ -9,8 +9,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
 from consistency.referee.document.colours import EXPECTED, LIMIT, style
-from consistency.referee.document.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span
-from consistency.referee.document.fewer_points import thin
+from consistency.referee.document.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span, thin
 from consistency.referee.show import with_matplotlib
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitor_sources import Watched

@@ -15,8 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from consistency.referee.document.blocks import Block, Document
-from consistency.referee.document.drawing import Figure, numbers
-from consistency.referee.document.fewer_points import LIMIT
+from consistency.referee.document.drawing import LIMIT, Figure, numbers
 from consistency.referee.document.wording import written
 from consistency.referee.show.with_bokeh import Screen
 

@@ -17,6 +17,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from consistency.referee.document.drawing import (
+    LIMIT,
     Axis,
     Band,
     Bars,
@@ -32,7 +33,6 @@ from consistency.referee.document.drawing import (
     Tiles,
     kept,
 )
-from consistency.referee.document.fewer_points import LIMIT
 from consistency.referee.show.legends import (
     SMALL,
     dots,

@@ -14,8 +14,7 @@ from consistency.bench.filters import get_filter
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.diagnostics import Evidence, JointNees, Settings, Verdict, judge
-from consistency.referee.diagnostics.maps.joint_nees import joint_test
-from consistency.referee.diagnostics.maps.map_score import joint_nees
+from consistency.referee.diagnostics.maps.map_nees import joint_nees, joint_test
 from consistency.referee.diagnostics.questions.equivalence import is_tolerated
 from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
 from consistency.referee.geometry.conventions import planar_error, planar_map_error

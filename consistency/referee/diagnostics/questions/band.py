@@ -9,7 +9,7 @@ from scipy import optimize, special
 
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.diagnostics.questions.scale import FEW
-from consistency.referee.diagnostics.records.array_blocks import blocks
+from consistency.referee.diagnostics.records.large_arrays import blocks
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import anees
 from consistency.referee.types import Array

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.large_arrays import by_runs
 from consistency.referee.diagnostics.records.whitening import all_finite, whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array

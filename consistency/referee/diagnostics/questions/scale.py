@@ -8,10 +8,10 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.records.array_blocks import by_runs, by_steps
+from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps
 from consistency.referee.diagnostics.records.whitening import mean_and_count
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.intervals import anees_interval
+from consistency.referee.diagnostics.statistics.nees import anees_interval
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.types import Array, Indices
 

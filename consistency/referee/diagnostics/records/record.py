@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped, without_first
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 

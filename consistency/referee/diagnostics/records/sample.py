@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
-from consistency.referee.diagnostics.records.array_blocks import by_runs, by_steps, of_runs
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs, by_steps, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.diagnostics.records.validity import negative
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, subset, whiten
 from consistency.referee.diagnostics.verdict.parts import Settings

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.types import Array
 
 FORMS = "a whole number of steps (20) or seconds (2s)"

@@ -7,8 +7,7 @@ import operator
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.array_blocks import by_runs
-from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
 from consistency.referee.types import Array
 
 FEW = 7  # components that NumPy adds one after the other; sums over so short an axis are slow

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.sample import ATTITUDE
 from consistency.referee.diagnostics.verdict.answers import SHARES
-from consistency.referee.diagnostics.verdict.parts import Settings, Verdict
+from consistency.referee.diagnostics.verdict.parts import Guess, Scale, Settings, Verdict
 from consistency.referee.diagnostics.verdict.verdict import DEFAULT, judge_alone
-from consistency.referee.diagnostics.words.sentences import plain
+from consistency.referee.diagnostics.words.sentences import percent, plain
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning.early_stopping import Design
@@ -53,9 +55,7 @@ def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | No
 
         return of_look(*follow(design, record.first_runs, len(record.run_numbers)), record, design)
     if record.guesses:
-        from consistency.referee.diagnostics.verdict.guessed_convention import judge_guesses
-
-        return replace(judge_guesses(record, settings, judge_runs), notes=tuple(record.notes))
+        return _judge_guesses(record, settings)
     runs, truth = record.as_runs, None
     if record.truth_covariance is not None:
         from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import uncertain_truth
@@ -90,7 +90,7 @@ def with_map(verdict: Verdict, ends: Record, settings: Settings, design: Design 
     landmarks = None if ends.map is None else ends.map()
     if landmarks is None:
         return verdict
-    from consistency.referee.diagnostics.maps.map_score import map_score
+    from consistency.referee.diagnostics.maps.map_nees import map_score
 
     of_map = None
     if design is not None:
@@ -127,11 +127,15 @@ def _unshown(verdict: Verdict, why: str) -> Verdict:
     """Undecided, for that reason; as it was without one, or where a window failed."""
     if not why or verdict.scale is None or verdict.status == "failed":
         return verdict
-    scale = replace(verdict.scale, equivalence=replace(verdict.scale.equivalence, p_value=float("nan"), runs=None))
+    scale = _not_shown(verdict.scale)
     provided = "" if verdict.truth is not None else " if they are"
     ratio = f"the covariance ratio would be {plain(scale.inflation)}{provided}, reported and not judged"
     reasons = (f"undecided: {why}; {ratio}", *verdict.reasons[1:])
     return replace(verdict, status="undecided", scale=scale, reasons=reasons)
+
+
+def _not_shown(scale: Scale) -> Scale:
+    return replace(scale, equivalence=replace(scale.equivalence, p_value=float("nan"), runs=None))
 
 
 def _other_ways(verdict: Verdict, r: Record) -> list[str]:
@@ -143,3 +147,49 @@ def _other_ways(verdict: Verdict, r: Record) -> list[str]:
         "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances, "
         "or poses with cross-covariances (docs/files.md)"
     ]
+
+
+# --- errors whose convention nobody declared ---------------------------------------------------------
+
+
+def _judge_guesses(record: Record, settings: Settings) -> Verdict:
+    """Undecided, with every convention that is not rejected at ``settings.false_alarm``, and its ratio.
+
+    The right convention is rejected with that probability at most, whichever it is. The intervals of the ratio hold
+    together with that of the rest: of K conventions, each at 1 - false_alarm / K (Bonferroni).
+
+    Parameters
+    ----------
+    record : with the same runs under each convention (:attr:`Record.guesses`); the first is the default of the files
+    """
+    verdicts = {kind: judge_runs(one, settings) for kind, one in record.guesses.items()}
+    confidence = 1.0 - settings.false_alarm / len(verdicts)
+    found = {kind: _guess(record.guesses[kind], v, confidence) for kind, v in verdicts.items()}
+    first = next(iter(verdicts.values()))
+    return replace(
+        first, status="undecided", scale=None if first.scale is None else _not_shown(first.scale), answers=(),
+        guesses=found, convention=None, notes=tuple(record.notes),
+        reasons=(f"undecided: {_sentence(found, settings)}", *(f"if the error is {kind}: {v.reasons[0]}"
+                                                               for kind, v in verdicts.items())),
+    )  # fmt: skip
+
+
+def _guess(record: Record, verdict: Verdict, confidence: float) -> Guess:
+    runs = record.as_runs
+    assert runs.nees is not None
+    means, counts = run_means(runs.nees)
+    ratio = ratio_interval(means[counts > 0] / runs.dof, runs.dof, confidence)
+    return Guess(verdict.status, verdict.faults, ratio, not verdict.faults and verdict.status != "failed")
+
+
+def _sentence(found: Mapping[str, Guess], settings: Settings) -> str:
+    left = [f"{kind} (covariance ratio {plain(guess.ratio)})" for kind, guess in found.items() if guess.possible]
+    rate = percent(settings.false_alarm)
+    if not left:
+        return f"no error is declared, and at a rate of {rate} each all are rejected: {', '.join(found)}"
+    gone = [kind for kind, guess in found.items() if not guess.possible]
+    rest = f"; rejected: {', '.join(gone)}" if gone else ""
+    return (
+        f"no error is declared; not rejected at a rate of {rate}: {', '.join(left)}{rest}. The filter's documentation "
+        "says which it is; declare it with --error"
+    )

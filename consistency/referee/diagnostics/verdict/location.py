@@ -11,16 +11,13 @@ from consistency.referee.diagnostics.questions.band import Band
 from consistency.referee.diagnostics.questions.bias import hotelling
 from consistency.referee.diagnostics.questions.outliers import Outlier
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
-from consistency.referee.diagnostics.records.array_blocks import blocks, by_runs
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, blocks, by_runs
 from consistency.referee.diagnostics.records.sample import ATTITUDE, POSITION, Sample
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.coverage import coverage, coverage_interval, rmse
-from consistency.referee.diagnostics.statistics.credibility import noncredibility
+from consistency.referee.diagnostics.statistics.accuracy import coverage, coverage_interval, noncredibility, rmse
 from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, SHAPE, STEP
-from consistency.referee.diagnostics.verdict.p_values import Tests
+from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, SHAPE, STEP, Tests
 from consistency.referee.diagnostics.verdict.parts import (  # fmt: skip
     Accuracy,
     Answer,

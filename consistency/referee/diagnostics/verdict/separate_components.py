@@ -9,9 +9,9 @@ import numpy as np
 
 from consistency.referee.diagnostics.questions.equivalence import worst
 from consistency.referee.diagnostics.questions.lost_runs import lost_of
+from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.sample import names_of
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.verdict.answers import SCALE, SHARES
 from consistency.referee.diagnostics.verdict.parts import Answer, Settings, Verdict

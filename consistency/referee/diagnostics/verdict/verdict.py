@@ -11,22 +11,30 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.planning.number_of_runs import detectable_ratio
 from consistency.referee.diagnostics.questions.band import simultaneous_band
-from consistency.referee.diagnostics.questions.early_ending import early_ends
 from consistency.referee.diagnostics.questions.equivalence import (
     equivalence,
     equivalence_by_betting,
     equivalence_of_total,
     is_tolerated,
 )
-from consistency.referee.diagnostics.questions.lost_runs import lost_of
+from consistency.referee.diagnostics.questions.lost_runs import early_ends, lost_of
 from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
+from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.sample import Sample, impossible, innovations_of, sample_of
 from consistency.referee.diagnostics.records.sample import shape_of as shape_of_arrays
-from consistency.referee.diagnostics.records.symmetric import Symmetric
-from consistency.referee.diagnostics.statistics.intervals import chi2_mean_interval
-from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, JOINT, MAIN, SHARES, STEP, answers
+from consistency.referee.diagnostics.statistics.nees import anees, chi2_mean_interval
+from consistency.referee.diagnostics.verdict.answers import (
+    AXIS,
+    DIRECTION,
+    JOINT,
+    MAIN,
+    SHARES,
+    STEP,
+    Tests,
+    answers,
+    ask,
+)
 from consistency.referee.diagnostics.verdict.location import (
     accuracy_of,
     axes_of,
@@ -35,7 +43,6 @@ from consistency.referee.diagnostics.verdict.location import (
     shape_of,
     tails_of,
 )
-from consistency.referee.diagnostics.verdict.p_values import Tests, ask
 from consistency.referee.diagnostics.verdict.parts import (
     Answer,
     Equivalence,
@@ -50,7 +57,7 @@ from consistency.referee.diagnostics.words.headline import at_share, deciding_ax
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import UncertainTruth
-    from consistency.referee.diagnostics.maps.joint_nees import JointTest
+    from consistency.referee.diagnostics.maps.map_nees import JointTest
 
 DEFAULT = Settings()
 
@@ -79,7 +86,7 @@ def judge_alone(
     joint: JointTest | None = None
     excused, tests = set[str](), None
     if evidence.joint is not None:
-        from consistency.referee.diagnostics.maps.joint_nees import joint_test
+        from consistency.referee.diagnostics.maps.map_nees import joint_test
 
         joint = joint_test(evidence.joint, settings, evidence.run_numbers, evidence.landmarks)
         p_values |= joint.p_values

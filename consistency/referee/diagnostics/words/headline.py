@@ -20,14 +20,15 @@ from consistency.referee.diagnostics.verdict.answers import (
     SCALE,
     SHARES,
     STEP,
+    Tests,
     answers,
+    ask,
 )
-from consistency.referee.diagnostics.verdict.p_values import Tests, ask
 from consistency.referee.diagnostics.verdict.parts import TINY, Interval, Settings, Verdict
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.maps.joint_nees import JointTest
+    from consistency.referee.diagnostics.maps.map_nees import JointTest
 
 CERTAIN = 0.999  # false-alarm rate, at most
 SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones

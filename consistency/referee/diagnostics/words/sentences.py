@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.referee.diagnostics.statistics.coverage import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, JOINT, SCALE, SHAPE
 from consistency.referee.diagnostics.verdict.parts import Equivalence, Verdict
 from consistency.referee.diagnostics.words.faults import (

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.symmetric import diagonal
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.sheet import Lines, read_numbers
 from consistency.referee.types import Array

@@ -276,13 +276,7 @@ def numbers(mark: Mark) -> tuple[int, int]:
             return 0, 0
         case Bars():
             return len(mark.height), 3
-        case Tiles():
-            return len(mark.x), 6 + len(mark.columns)
         case Band():
             return len(mark.x), 3
-        case Intervals():
-            return len(mark.x), 4 + len(mark.columns)
-        case Line():
-            return len(mark.x), 2 + len(mark.columns) + 2 * (mark.bound is not None)
-        case _:
-            return len(mark.x), 2 + len(mark.columns)
+    own = {Tiles: 6, Intervals: 4}.get(type(mark), 2) + 2 * (isinstance(mark, Line) and mark.bound is not None)
+    return len(mark.x), own + len(mark.columns)

@@ -20,7 +20,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.pages import axes, questions, verdicts
 from consistency.referee.pages.clock import Clock, clock_of
 from consistency.referee.pages.judged import Estimator, Judged, wide
-from consistency.referee.pages.one_step import errors_of_runs, has_one_step, nees_of_runs
+from consistency.referee.pages.one_step import columns_of, errors_of_runs, figure_of_errors, has_one_step, nees_of_runs
 from consistency.referee.pages.provenance import facts
 from consistency.referee.pages.trajectory import shown_run, trajectory
 from consistency.referee.types import Array
@@ -114,7 +114,7 @@ def record_sheet(record: Evidence, verdict: Verdict | None = None) -> Sheet:
     first, *others = found
     own = (replace(panel, keys=figure.keys) for figure in others for panel in figure.panels)
     panels = (*first.panels, *own)
-    columns = _columns(len(panels))
+    columns = columns_of(len(panels))
     return Sheet(panels, 0.3 + 1.6 * -(-len(panels) // columns), columns=columns, keys=first.keys, title=record.name)
 
 
@@ -134,7 +134,7 @@ def _errors(record: Evidence) -> Figure | None:
         return None
     if has_one_step(record):
         units = [unit_of(name) for name in record.axes[:MOST_PANELS]]
-        return errors_of_runs(record, units, _columns(len(units)))
+        return errors_of_runs(record, units)
     clock, row = clock_of(record.t), shown_run(record)
     others = [i for i in np.linspace(0, len(record.run_numbers) - 1, MOST_RUNS + 1).astype(int) if i != row]
     names = record.axes[:MOST_PANELS]
@@ -144,21 +144,13 @@ def _errors(record: Evidence) -> Figure | None:
         Key("2-sigma bounds", replace(SHOWN, dash=(4.0, 3.0), width=0.8)),
     ]
     keys += [Key("other runs", OTHERS)] if others else []
-    left_out = len(record.axes) - len(names)
     meaning = "truth minus estimate" if record.window is None else f"of the motion over each window of {record.window}"
     caption = (
         f"Error ({meaning}) of run {record.run_numbers[row]} with the 2-sigma bounds that the estimator "
         "states (dashed). Honest errors stay inside about 95 % of the time."
-        + (f" {plural(left_out, 'further component')} not drawn." if left_out else "")
-        + clock.note
     )
-    columns = _columns(len(panels))
-    sheet = Sheet(panels, 0.3 + 1.4 * -(-len(panels) // columns), columns=columns, keys=tuple(keys))
-    return Figure("Errors and stated bounds", caption, panels, (sheet,), tuple(keys))
-
-
-def _columns(panels: int) -> int:
-    return 2 if panels in (2, 4) else min(3, panels)
+    figure = figure_of_errors(record, caption, panels, tuple(keys))
+    return replace(figure, caption=figure.caption + clock.note)
 
 
 def _error_panel(record: Evidence, clock: Clock, row: int, others: list[int], i: int) -> Panel:

@@ -18,8 +18,7 @@ from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, SIGMAS,
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
 from consistency.referee.errors import InputError
 from consistency.referee.pages import axes, questions, verdicts
-from consistency.referee.pages.clock import Clock, clock_of
-from consistency.referee.pages.judged import Estimator, Judged, wide
+from consistency.referee.pages.judged import Clock, Estimator, Judged, clock_of, wide
 from consistency.referee.pages.one_step import columns_of, errors_of_runs, figure_of_errors, has_one_step, nees_of_runs
 from consistency.referee.pages.provenance import facts
 from consistency.referee.pages.trajectory import shown_run, trajectory

@@ -45,7 +45,7 @@ from consistency.referee.document.drawing import Figure, Intervals, Line, Points
 from consistency.referee.document.verdict import FURTHER, factor, page, shown_inside
 from consistency.referee.document.wording import written
 from consistency.referee.pages import axes, questions, verdicts
-from consistency.referee.pages.clock import clock_of
+from consistency.referee.pages.judged import clock_of
 from consistency.referee.show import html, pdf
 from consistency.referee.types import Failure
 from consistency.stereo.pages import scenes, stereo_noise

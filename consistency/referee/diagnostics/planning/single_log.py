@@ -10,7 +10,6 @@ from scipy import special
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.planning.number_of_runs import MARGIN
 from consistency.referee.diagnostics.questions.equivalence import deciding_runs
-from consistency.referee.diagnostics.questions.independence import independence
 from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest, run_means
 from consistency.referee.diagnostics.records.record import Record, arrays_of
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, squared_length, whiten
@@ -202,6 +201,8 @@ def _unshown(memory: Memory, pieces: int, length: int, parts: Array) -> str:
             f"{pieces} pieces of {length} steps are not shown to be independent: errors go on over {memory.time:.3g} "
             f"steps (up to {memory.upper:.3g}), about zero or in size, and pieces should be {whole}"
         )
+    from consistency.referee.diagnostics.questions.independence import independence
+
     if independence(mean_of_runs(parts), run_means(squared_length(parts))[0]).doubtful:
         return f"{pieces} pieces of {length} steps do not seem to be independent"
     return ""

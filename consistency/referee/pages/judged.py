@@ -54,7 +54,6 @@ def clock_of(t: Array) -> Clock:
     return Clock(t - t[0], "time (s)", "s", f" Time 0 is {t[0]:.2f} s.")
 
 
-SINGLE_RUN = 1
 DECADE = 10.0  # values that span more are drawn on a log axis
 
 
@@ -102,7 +101,7 @@ class Judged:
     @property
     def single(self) -> bool:
         """One run: the curve is a NEES, no average."""
-        return self.runs == SINGLE_RUN
+        return self.runs == 1
 
     @property
     def statistic(self) -> str:

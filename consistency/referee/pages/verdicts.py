@@ -83,12 +83,7 @@ def method(studies: Sequence[Judged]) -> str:
     )
     if tracks:
         text += _consistent(tracks[0])
-    return text + "".join(sentence for applies, sentence in _conditions(studies) if applies)
-
-
-def _conditions(studies: Sequence[Judged]) -> tuple[tuple[bool, str], ...]:
-    """Sentences of the method, and whether the report needs them."""
-    return (
+    conditions = (
         (
             any(study.has_truth for study in studies),
             " Half of the false-alarm rate belongs to the mean NEES of whole runs, for which the number of runs is "
@@ -112,6 +107,7 @@ def _conditions(studies: Sequence[Judged]) -> tuple[tuple[bool, str], ...]:
             "part of their share.",
         ),
     )
+    return text + "".join(sentence for applies, sentence in conditions if applies)
 
 
 def _consistent(track: Estimator) -> str:

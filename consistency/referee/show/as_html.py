@@ -35,25 +35,20 @@ def render(document: Document) -> str:
     parts = [f"<p>{escape(document.answer)}</p>"] if document.answer else []
     parts += map(block, document.opening)
     for chapter in document.chapters:
-        inside = "\n".join(map(block, chapter.blocks))
-        parts.append(f"<section>\n{inside}\n</section>" if chapter.title else inside)
-    return page(document.title, *parts)
-
-
-def page(title: str, *body: str) -> str:
-    """One page of HTML ``body``."""
-    inside = "\n".join(body)
+        blocks = "\n".join(map(block, chapter.blocks))
+        parts.append(f"<section>\n{blocks}\n</section>" if chapter.title else blocks)
+    title, inside = escape(document.title), "\n".join(parts)
     return f"""<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
+<title>{title}</title>
 <style>{STYLE}</style>
 </head>
 <body class="static">
 <main>
-<h1>{escape(title)}</h1>
+<h1>{title}</h1>
 {inside}
 </main>
 </body>

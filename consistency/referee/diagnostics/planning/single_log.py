@@ -77,6 +77,9 @@ def correlation_time(series: Array) -> tuple[float, int]:
     return max(1.0, float(tau[lag])), max(lag, 1)
 
 
+# --- pieces that stand as runs -----------------------------------------------------------------------
+
+
 FEWEST = 20  # pieces
 GROWTH = 2.0  # of a stated variance over the log, beyond which pieces are not alike, if it grows steadily
 STEADY = 0.8  # rank correlation of a variance with the time, above which it grows steadily

@@ -18,6 +18,7 @@ from consistency.referee.diagnostics.statistics.nees import Pit, pit
 from consistency.referee.diagnostics.verdict.parts import Answer, Settings
 from consistency.referee.types import Array
 
+GRID = 9  # ratios within the tolerance at which the distribution is compared
 MAIN, STEP, AXIS, DIRECTION = "scale", "scale in some step", "scale of an axis", "scale in some direction"
 SCALE = (MAIN, STEP, AXIS, DIRECTION)
 BIAS = ("bias", "bias in some step")
@@ -86,9 +87,6 @@ def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answ
         result[question] = Answer(question, by_question[question], share[question], least, least <= false_alarm)
         left -= share[question]
     return {q: result[q] for q in by_question}
-
-
-GRID = 9  # ratios within the tolerance at which the distribution is compared
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from calibration_gates import row, stationary
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.diagnostics.records.log_pieces import in_pieces
+from consistency.referee.diagnostics.planning.single_log import in_pieces
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.geometry.groups import spatial_error

@@ -7,7 +7,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.findings import script
-from consistency.referee.diagnostics.statistics.coverage import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 
 FINDINGS = ("fig2b", "fig2c")
 KERNELS = {"herath2007-xyz": ("ekf-xyz",)}

@@ -76,15 +76,15 @@ def changed(path: Path, old: str, new: str) -> None:
 
 
 def test_the_question_of_the_document_is_asked(copy: Path) -> None:
-    """Three files; runs whose errors grow are found at fault, the same runs in random order are not."""
+    """Two files; runs whose errors grow are found at fault, the same runs in random order are not."""
     statistic, table, line = code("Add a question of the verdict")
     folder = copy / "consistency/referee/diagnostics"
     (folder / "questions/trend.py").write_text(statistic, encoding="utf-8")
     changed(folder / "verdict/answers.py", "\n\ndef answers(", f"{table}\n\ndef answers(")
     first = "    distribution = pit(sample.nees, sample.dof)\n"
-    changed(folder / "verdict/p_values.py", first, f"    {line.strip()}\n{first}")
+    changed(folder / "verdict/answers.py", first, f"    {line.strip()}\n{first}")
     changed(
-        folder / "verdict/p_values.py", "from consistency.referee.diagnostics.records.whitening",
+        folder / "verdict/answers.py", "from consistency.referee.diagnostics.records.whitening",
         "from consistency.referee.diagnostics.questions.trend import trend\n"
         "from consistency.referee.diagnostics.records.whitening",
     )  # fmt: skip

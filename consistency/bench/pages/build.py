@@ -20,7 +20,7 @@ from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.errors import InputError
-from consistency.referee.pages.clock import clock_of
+from consistency.referee.pages.judged import clock_of
 from consistency.referee.pages.section import OPENING, STUDY, Section
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.system.progress import Advance

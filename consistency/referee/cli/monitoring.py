@@ -86,7 +86,7 @@ def _show_ratios(
     path: Path, sensor: str | None, core: int | None, plot: Path | None, overwrite: bool, as_json: bool
 ) -> None:
     """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
-    from consistency.referee.document.test_ratios_table import ratios_document
+    from consistency.referee.document.monitor import ratios_document
     from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
     from consistency.referee.readers.formats.ardupilot_log import read_ratios
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
@@ -16,7 +16,7 @@ from consistency.referee.show import rendered
 from consistency.referee.system.atomic import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from consistency.referee.diagnostics import Evidence, Verdict
     from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
@@ -78,33 +78,27 @@ def write_file_reports(
     from consistency.referee.system.folders import write_folder
     from consistency.referee.system.provenance import manifest_of
 
-    manifest = manifest_of(kind="verdict", source=title)
-    write = _static_page(records, judged, title) if missing("report") else _pages(records, judged, title, manifest)
+    manifest, is_static = manifest_of(kind="verdict", source=title), missing("report")
+    if is_static:
+        from consistency.referee.pages.core_page import compose_plain
+
+        document = compose_plain(records, judged, title)
+    else:
+        from consistency.referee.pages.files_report import compose_files
+
+        document = compose_files(records, judged, title, manifest)
 
     def contents(at: Path) -> None:
-        write(at)
+        html = at / "report.html"
+        if is_static:
+            write_file(html, rendered(document, html).encode("utf-8"))
+        else:
+            write_document(document, html, at / "report.pdf")
         write_file(at / "verdict.json", data.encode("utf-8"))
 
     write_folder(folder, manifest, contents, overwrite)
     names = ("report.html", "report.pdf", "verdict.json")
     return [path for path in (folder / name for name in names) if path.exists()]
-
-
-def _pages(
-    records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str, manifest: dict[str, Any]
-) -> Callable[[Path], None]:
-    from consistency.referee.pages.files_report import compose_files
-
-    document = compose_files(records, judged, title, manifest)
-    return lambda at: write_document(document, at / "report.html", at / "report.pdf")
-
-
-def _static_page(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
-    from consistency.referee.pages.core_page import compose_plain
-    from consistency.referee.show.as_html import render
-
-    text = render(compose_plain(records, judged, title))
-    return lambda at: write_file(at / "report.html", text.encode("utf-8"))
 
 
 def write_text_file(document: Document, path: Path, overwrite: bool) -> Path:

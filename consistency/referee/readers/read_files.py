@@ -192,7 +192,7 @@ def _declared(records: list[Evidence], r: Reading, over: Relative | None) -> lis
         return less_shared(records, others, r.shared)
     if pieces is None:
         return records
-    from consistency.referee.diagnostics.records.log_pieces import in_pieces
+    from consistency.referee.diagnostics.planning.single_log import in_pieces
 
     return [in_pieces(record, pieces or None) for record in records]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special, stats
 
-from consistency.referee.diagnostics.statistics.intervals import binomial_interval
+from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.diagnostics.statistics.normality import normality
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.types import Array

@@ -18,9 +18,9 @@ import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Evidence, Settings, judge, summary
-from consistency.referee.diagnostics.records import array_blocks
+from consistency.referee.diagnostics.records import large_arrays
+from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.sample import sample_of
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
@@ -80,8 +80,8 @@ def test_small_blocks_say_what_large_ones_do(settings: Settings, monkeypatch: py
     given.error[::7, 11:] = np.nan
     given.error[40:, 15:] *= 3.0
     whole = judge(given, settings)
-    monkeypatch.setattr(array_blocks, "ROWS", 400)
-    monkeypatch.setattr(array_blocks, "FEWER", 100)
+    monkeypatch.setattr(large_arrays, "ROWS", 400)
+    monkeypatch.setattr(large_arrays, "FEWER", 100)
     parts = judge(given, settings)
     assert parts.reasons == whole.reasons
     np.testing.assert_allclose(numbers(parts.statistics), numbers(whole.statistics), rtol=1e-12)

@@ -11,7 +11,7 @@ from scipy.spatial.distance import mahalanobis
 
 import consistency as cs
 from consistency.referee.diagnostics import chi2_mean_interval, detectable_ratio, normality, rmse
-from consistency.referee.diagnostics.statistics.coverage import coverage
+from consistency.referee.diagnostics.statistics.accuracy import coverage
 from consistency.referee.types import Array
 
 # exact 95 % intervals of chi-square(3 N) / N, computed outside this project

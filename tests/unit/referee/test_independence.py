@@ -8,8 +8,8 @@ import pytest
 from scipy import signal, stats
 
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.diagnostics.questions.early_ending import early_ends
 from consistency.referee.diagnostics.questions.independence import ALIKE, ENOUGH, FEWEST, RATE, SIZES, independence
+from consistency.referee.diagnostics.questions.lost_runs import early_ends
 from consistency.referee.diagnostics.verdict.as_dictionary import flat
 from consistency.referee.types import Array
 

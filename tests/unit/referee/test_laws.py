@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from consistency.referee.diagnostics.questions import early_ending
+from consistency.referee.diagnostics.questions import lost_runs
 from consistency.referee.diagnostics.statistics import distributions as laws
 
 DOF = np.array([1.0, 2.0, 2.5, 3.0, 6.0, 15.0, 1e3, 1e5])[:, None]
@@ -65,4 +65,4 @@ def test_a_gate_does_not_load_scipy_stats() -> None:
 
 def test_ranks_share_the_mean_of_equal_values() -> None:
     values = np.random.default_rng(2).integers(0, 9, 40).astype(float)
-    np.testing.assert_array_equal(early_ending._ranks(values), stats.rankdata(values))
+    np.testing.assert_array_equal(lost_runs._ranks(values), stats.rankdata(values))

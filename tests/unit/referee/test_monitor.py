@@ -72,9 +72,9 @@ def test_alternatives_are_outside_the_tolerance_on_both_sides() -> None:
     for tolerance in (1.0, 1.2, 3.0):
         pairs = alternatives(tolerance)
         above, below = pairs[: len(RATIOS)], pairs[len(RATIOS) :]
-        assert all(pair.edge == tolerance and pair.scale > tolerance for pair in above)
-        assert all(pair.edge == 1 / tolerance and pair.scale < 1 / tolerance for pair in below)
-        np.testing.assert_allclose([a.scale * b.scale for a, b in zip(above, below, strict=True)], 1.0)
+        assert all(edge == tolerance and scale > tolerance for scale, edge in above)
+        assert all(edge == 1 / tolerance and scale < 1 / tolerance for scale, edge in below)
+        np.testing.assert_allclose([a * b for (a, _), (b, _) in zip(above, below, strict=True)], 1.0)
 
 
 def test_shares_add_up_to_one() -> None:

@@ -15,8 +15,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.diagnostics import Record, Settings, gate_runs, judge
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone
-from consistency.referee.diagnostics.records.symmetric import diagonal
 from consistency.referee.gating.session import needed_at
 from consistency.referee.gating.watch import Entry, Watch, watching
 from consistency.referee.types import Array

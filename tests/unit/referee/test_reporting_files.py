@@ -17,14 +17,8 @@ import consistency as cs
 from consistency.referee import cli
 from consistency.referee.document.blocks import Table, Text
 from consistency.referee.document.drawing import Band, Figure, Line, Points
-from consistency.referee.pages.files_report import (
-    clock_of,
-    compose_files,
-    observed_coverage,
-    record_figures,
-    shown_run,
-    unit_of,
-)
+from consistency.referee.pages.files_report import clock_of, compose_files, observed_coverage, record_figures, unit_of
+from consistency.referee.pages.trajectory import shown_run
 from consistency.referee.verdicts.sources import analyse
 
 RUNS, STEPS = 30, 25

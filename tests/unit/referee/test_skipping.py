@@ -15,8 +15,8 @@ from recorded import read_recordings
 import consistency as cs
 from consistency.referee.cli import main as command
 from consistency.referee.diagnostics import Record
+from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped, skip_of, without_first
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline

@@ -37,7 +37,7 @@ def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> 
 
 
 def ellipses(one: Evidence) -> list[Line]:
-    figure = trajectory(one, 0)
+    figure = trajectory(one)
     assert figure is not None
     (panel,) = figure.panels
     return [mark for mark in panel.marks if isinstance(mark, Line) and mark.look == ELLIPSE]
@@ -45,7 +45,7 @@ def ellipses(one: Evidence) -> list[Line]:
 
 def test_ellipses_stand_where_the_errors_are_largest() -> None:
     one = record()
-    figure = trajectory(one, 0)
+    figure = trajectory(one)
     assert figure is not None
     (panel,) = figure.panels
     assert (panel.x.label, panel.y.label, panel.equal) == ("x (m)", "z (m)", True)
@@ -76,18 +76,18 @@ def test_an_ellipse_holds_95_percent() -> None:
 def test_no_ellipse_of_errors_about_other_axes() -> None:
     one = record("left")
     assert not ellipses(one)
-    figure = trajectory(one, 0)
+    figure = trajectory(one)
     assert figure is not None
     assert figure.caption.endswith("No ellipses: the stated covariance is not about the axes of the world.")
 
 
 def test_only_what_is_judged_is_drawn() -> None:
-    figure = trajectory(record(axes=("x", "y")), 0)
+    figure = trajectory(record(axes=("x", "y")))
     assert figure is not None
     assert figure.panels[0].y.label == "y (m)"
-    assert trajectory(record(axes=("z",)), 0) is None
+    assert trajectory(record(axes=("z",))) is None
     bare = record()
-    assert trajectory(Evidence("est", bare.error, bare.covariance, axes=bare.axes), 0) is None
+    assert trajectory(Evidence("est", bare.error, bare.covariance, axes=bare.axes)) is None
 
 
 def test_units() -> None:
@@ -132,4 +132,4 @@ def test_tables_keep_it_too(tmp_path: Path) -> None:
     (one,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
     assert one.path is not None
     np.testing.assert_array_equal(one.path[0, 3], [[5.0, 8.0], [4.0, 8.0]])
-    assert trajectory(one, 0) is not None
+    assert trajectory(one) is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from consistency.referee.diagnostics.records.array_blocks import FEWER as ROWS
+from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
 from consistency.referee.diagnostics.records.validity import (  # fmt: skip
     DEFICIENT,
     EXACT,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.large_arrays import by_runs
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.world_frames import (

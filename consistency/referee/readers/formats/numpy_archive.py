@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Evidence, Record
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone, numbered_axes
-from consistency.referee.diagnostics.records.symmetric import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics.records.symmetric import diagonal
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.readers.file_kinds import is_solution
 from consistency.referee.readers.formats.geodetic import read_solution

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone
-from consistency.referee.diagnostics.records.symmetric import diagonal
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.records.symmetric import diagonal
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.readers.file_kinds import TABLES, is_drive, trajectory_files

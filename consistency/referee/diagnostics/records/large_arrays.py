@@ -1,8 +1,9 @@
-"""Arrays of symmetric matrices, stored by entry: a covariance of three components in six numbers, not nine."""
+"""Large arrays in little memory: symmetric matrices stored by entry, and work done block by block."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,8 @@ class Symmetric:
         """Matrices of an array (..., n, n), which is not copied."""
         if isinstance(matrices, Symmetric):
             return matrices
-        n = matrices.shape[-1]
-        return cls([[matrices[..., i, j] for j in range(n)] for i in range(n)])
+        P = np.asarray(matrices, float)
+        return cls([[P[..., i, j] for j in range(P.shape[-1])] for i in range(P.shape[-1])])
 
     @classmethod
     def filled(cls, shape: tuple[int, ...], n: int, value: float = np.nan) -> Symmetric:
@@ -94,3 +95,40 @@ def diagonal(deviations: Array) -> Array:
     """Covariances of standard deviations without cross terms, (..., n) -> (..., n, n); indefinite of a negative one."""
     sigma = np.asarray(deviations, float)
     return np.asarray((sigma * np.abs(sigma))[..., None] * np.eye(sigma.shape[-1]))
+
+
+ROWS = 2**18  # pairs of run and step in a block
+FEWER = 2**16  # in a block of whole runs, which lies together in memory: what is worked out of it stays in the cache
+
+
+def blocks(count: int, each: int, rows: int | None = None) -> Iterator[slice]:
+    """Slices of an axis of ``count`` places with ``each`` rows at a place; at least one slice, which may be empty."""
+    size = max((ROWS if rows is None else rows) // max(each, 1), 1)
+    return (slice(k, k + size) for k in range(0, max(count, 1), size))
+
+
+def of_runs(array: Array) -> Iterator[slice]:
+    """Slices of the runs of an array (runs, steps, ...), or of the rows of one (rows, n)."""
+    return blocks(len(array), math.prod(array.shape[1:2]), FEWER)
+
+
+def by_runs(function: Callable[..., Array], first: Array, *others: Array | Symmetric) -> Array:
+    """Apply ``function``, which works on each run separately, to arrays (runs, ...) block by block."""
+    runs = len(first)
+    parts = list(of_runs(first))
+    if len(parts) == 1:
+        return function(first, *others)
+    out: Array | None = None
+    for here in parts:
+        part = function(first[here], *(array[here] for array in others))
+        if out is None:
+            out = np.empty((runs, *part.shape[1:]), part.dtype)
+        out[here] = part
+    assert out is not None
+    return out
+
+
+def by_steps(function: Callable[..., Array], *arrays: Array) -> Array:
+    """Apply ``function``, which works on each step separately, to arrays (runs, steps, ...) block by block."""
+    runs, steps = arrays[0].shape[:2]
+    return np.concatenate([function(*(array[:, here] for array in arrays)) for here in blocks(steps, runs)])

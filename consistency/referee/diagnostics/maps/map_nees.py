@@ -1,20 +1,53 @@
-"""Pose and map together: the NEES of a joint error whose dimension differs from run to run."""
+"""NEES of a map, whose landmarks share the errors of one run: by itself, and together with the pose."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.maps.map_score import POSE
 from consistency.referee.diagnostics.questions.scale import ratio_interval
 from consistency.referee.diagnostics.records.record import JointNees
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import kolmogorov
 from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
-from consistency.referee.diagnostics.verdict.parts import JointScore, Settings
+from consistency.referee.diagnostics.verdict.parts import JointScore, MapScore, Settings
 from consistency.referee.types import Array, Indices
+
+POSE, POINT = 3, 3  # degrees of freedom of a pose in the plane, and of a landmark in space
+
+
+def map_score(run: Indices, nees: Array, dof: int = POINT) -> MapScore:
+    """Mean NEES over ``dof`` of landmarks (M,), with an interval from the spread between their runs (M,).
+
+    Landmarks of one run share the error of its pose, so each run counts once, by the mean of its landmarks.
+    """
+    judged = np.isfinite(nees)
+    _, place = np.unique(run[judged], return_inverse=True)
+    counts = np.bincount(place)
+    means = np.bincount(place, nees[judged]) / np.maximum(counts, 1) / dof
+    return MapScore(ratio_interval(means, dof), len(counts), int(judged.sum()), int((~judged).sum()))
+
+
+def joint_nees(error: Array, covariance: Array, dof: int = POINT) -> Array:
+    """Parts (1 + K,) of the NEES of a joint error (3 + ``dof`` K,) of a pose and K landmarks, with its covariance.
+
+    L^-1 error with L L' = covariance has independent standard normal components if the covariance is right. So each
+    part is chi-square with as many degrees of freedom as it has components, independent of the others: that of its
+    components given those before. Their sum is the joint NEES. All are infinite if the covariance is not positive
+    definite.
+    """
+    count = 1 + (len(error) - POSE) // dof
+    try:
+        L = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return np.full(count, np.inf)
+    squares = np.square(solve_triangular(L, error, lower=True, check_finite=False))
+    parts = np.append(squares[:POSE].sum(), squares[POSE:].reshape(-1, dof).sum(axis=1))
+    return parts if np.isfinite(parts).all() else np.full(count, np.inf)
+
 
 SURE = 0.04  # false-alarm rate of naming a landmark that does not stand out
 
@@ -80,12 +113,3 @@ def _chief(joint: JointNees, labels: Indices | None) -> tuple[int, ...]:
     total, dof = np.where(here, parts, 0.0).sum(axis=0), np.maximum(joint.width * here.sum(axis=0), 1)
     p = 2.0 * np.minimum(distributions.chi2.sf(total, dof), distributions.chi2.cdf(total, dof)) * len(labels)
     return tuple(int(labels[j]) for j in np.argsort(p, kind="stable") if p[j] <= SURE and here[:, j].any())
-
-
-def near(test: JointTest, settings: Settings) -> bool:
-    """Whether two one-sided chi-square tests at 1 - ``power`` show the ratio to lie within the tolerance."""
-    if settings.tolerance is None or not test.score.runs:
-        return False
-    R, D, level = settings.tolerated, test.score.dof, 1.0 - settings.power
-    low = settings.one_sided or distributions.chi2.sf(test.nees * R, D) <= level
-    return bool(low and distributions.chi2.cdf(test.nees / R, D) <= level)

@@ -174,7 +174,6 @@ def test_every_step_of_a_right_world_is_as_stated(name: str) -> None:
 def test_heavy_tails_have_the_stated_covariance(name: str) -> None:
     """Means of squares over 6,000 runs, whose standard error is worked out from the sample: 6 of them."""
     gate = worlds.HEAVY[name].draw(Draw(np.random.default_rng(20070), 6000, 4))
-    assert gate.error is not None
     products = np.einsum("rti,rtj->rij", gate.error, gate.error).reshape(6000, 9) / 4
     away = products.mean(axis=0) - np.eye(3).ravel()
     assert (np.abs(away) < 6 * products.std(axis=0) / np.sqrt(6000)).all()
@@ -193,11 +192,9 @@ def test_worlds_depend_over_steps_as_they_say() -> None:
     assert np.quantile(of_run, 0.1) < 0.3 < 0.8 < np.quantile(of_run, 0.9)
     assert np.std(neighbours("period of the run")) > 0.5
     slow = worlds.WORLDS["20 % slow, n = 1"].draw(Draw(rng, 1000)).error
-    assert slow is not None
     share = (slow == slow[:, :1]).all(axis=(1, 2)).mean()
     assert stats.binomtest(round(1000 * share), 1000, 0.2).pvalue > 1e-6
     dependent = worlds.WORLDS["fully dependent"].draw(Draw(rng, 3)).error
-    assert dependent is not None
     assert (dependent == dependent[:, :1]).all()
 
 
@@ -205,7 +202,6 @@ def test_innovations_of_a_gain_that_is_not_optimal_are_not_white() -> None:
     for name in ("Schmidt-Kalman", "fixed gain"):
         gate = worlds.WORLDS[name].draw(Draw(np.random.default_rng(20070), 400))
         u = gate.innovations
-        assert u is not None
         assert (u[:, 1:] * u[:, :-1]).mean() > 0.1 * np.square(u).mean()
 
 
@@ -279,7 +275,6 @@ def test_a_gate_depends_on_its_number_and_not_on_how_it_is_drawn() -> None:
     at_once, grown = calibration.Growing(case, 3, 1), calibration.Growing(case, 3, 1)
     for runs in (5, 5, 12, 30, 8):
         part = grown(runs)
-        assert part.error is not None
         assert len(part.error) == len(part.covariance) == runs
     np.testing.assert_array_equal(grown(30).first(12).error, grown(12).error)
     assert not np.array_equal(at_once(5).error, calibration.Growing(case, 4, 1)(5).error)
@@ -340,8 +335,6 @@ def test_the_e_process_stops_where_it_crosses(monkeypatch: pytest.MonkeyPatch) -
 
 def test_means_of_runs_take_the_steps_that_a_run_has() -> None:
     gate = worlds.WORLDS["ragged"].draw(Draw(np.random.default_rng(2), 5, 10))
-    assert gate.error is not None
-    assert gate.covariance is not None
     for run, mean in enumerate(calibration.run_means(gate)):
         there = np.isfinite(gate.error[run, :, 0])
         pairs = zip(gate.error[run, there], gate.covariance[run, there], strict=True)

@@ -372,7 +372,6 @@ def test_the_frame_is_found(angle: float, rng: np.random.Generator) -> None:
             p.truth[:, : len(shift)] = p.estimate[:, : len(shift)]
         frame = WorldTransform.about_z(angle, shift)
         found = fitted_frame([moved(p, frame) for p in runs])
-        assert found is not None
         assert found.heading == pytest.approx(-angle, abs=1e-9)
         back = moved(moved(runs[0], frame), found)
         np.testing.assert_allclose(back.estimate[:, : len(shift)], runs[0].estimate[:, : len(shift)], atol=1e-9)
@@ -422,7 +421,6 @@ def plane_pose(own: Array, e: Array, kind: str) -> Array:
 @pytest.mark.parametrize("arm", [np.zeros(3), 1e-6 * ARM])
 def test_a_body_that_is_hardly_another_is_not_named(arm: Array, rng: np.random.Generator) -> None:
     found = fitted_body([on_body(p, BodyTransform(Rotation.identity(), arm)) for p in spatial(rng)])
-    assert found is not None
     assert found.turn.magnitude() < 0.01
     assert fitted_body([]) is None
 

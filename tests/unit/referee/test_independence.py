@@ -134,7 +134,6 @@ def test_runs_that_end_lost_are_named_and_others_are_not(rng: np.random.Generato
     nees = runs(rng, 100, 60)
     ended = np.cumsum(nees > stats.chi2.isf(0.05, 3), axis=1) - (nees > stats.chi2.isf(0.05, 3)) > 0
     verdict = judge(Evidence("f", nees=np.where(ended, np.nan, nees), dof=3))
-    assert verdict.ends is not None
     assert verdict.ends.lost
     assert "that end early have a larger NEES in their last step than" in verdict.reasons[1]
     assert flat(verdict)["early_ends"]["lost"]

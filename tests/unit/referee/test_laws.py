@@ -19,10 +19,7 @@ VALUES = np.concatenate([np.geomspace(1e-6, 1e4, 80), [-1.0, 0.0, np.inf, np.nan
 
 @pytest.mark.parametrize("name", ["cdf", "sf"])
 def test_chi_square_and_student(name: str) -> None:
-    for ours, theirs, x in (
-        (laws.chi2, stats.chi2, VALUES),
-        (laws.t, stats.t, np.append(VALUES, -VALUES)),
-    ):
+    for ours, theirs, x in ((laws.chi2, stats.chi2, VALUES), (laws.t, stats.t, np.append(VALUES, -VALUES))):
         np.testing.assert_array_equal(getattr(ours, name)(x, DOF), getattr(theirs, name)(x, DOF))
 
 

@@ -137,7 +137,6 @@ def test_a_run_beyond_the_bound_is_lost() -> None:
         nees = right(60)
         nees[7] = factor * bound
         lost = verdict_on(nees).lost
-        assert lost is not None
         assert (lost.count, lost.runs) == (count, 60)
         assert lost.bound == pytest.approx(bound)
         assert lost.upper == pytest.approx(share_limit(count, 60))
@@ -153,7 +152,6 @@ def test_a_lost_run_takes_more_runs() -> None:
     assert "(1 run of 93 is lost)" in asked.reasons[0]
     fewer = verdict_on(np.delete(nees, 0, axis=0), lost=0.05)
     assert fewer.status == "undecided"
-    assert fewer.lost is not None
     assert fewer.lost.needed == 93
 
 
@@ -162,7 +160,6 @@ def test_failed_runs_are_lost_and_runs_without_a_value_are_none(rng: np.random.G
     nees[3], nees[5] = np.nan, np.nan
     evidence = Evidence("f", nees=nees, dof=3, failures=(Failure("f", 13, 2, "broke"),), runs=np.arange(60) + 10)
     lost = lost_of(evidence, nees, 3, Settings())
-    assert lost is not None
     assert (lost.count, lost.runs) == (1, 59)
     assert lost_of(Evidence("f", nees=np.full((2, 3), np.nan), dof=3), np.full((2, 3), np.nan), 3, Settings()) is None
 
@@ -205,15 +202,12 @@ def test_until_decided_goes_on_until_the_share_is_excluded() -> None:
     asked, more = follow(Design(3, max_runs=400, lost=0.05), lambda n: Evidence("f", nees=nees[:n], dof=3))
     assert (free.status, asked.status) == ("consistent", "consistent")
     assert runs < more == 96
-    assert asked.lost is not None
     assert asked.lost.upper <= 0.05
     assert asked.reasons[0].count("lost runs") == 1
     early = look(Design(3, lost=0.05), Evidence("f", nees=nees[:48], dof=3), 0.1)
-    assert early.lost is not None
     assert early.lost.upper > 0.05
     assert early.lost.bound == pytest.approx(float(lost_bound(3, 0.05 / (48 * 49))))
     needed = early.lost.needed
-    assert needed is not None
     assert lost_evidence(np.zeros(needed, bool), 0.05)[-1] >= 20.0 > lost_evidence(np.zeros(needed - 1, bool), 0.05)[-1]
 
 

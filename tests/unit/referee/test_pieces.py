@@ -39,11 +39,8 @@ def of(array: Array, name: str = "log") -> Evidence:
 def test_pieces_are_rows_of_the_log() -> None:
     one = log(np.random.default_rng(1), 1003)
     r = in_pieces(one, 25)
-    assert one.error is not None
-    assert r.error is not None
     assert (r.error.shape, r.unit, len(r.run_numbers)) == ((25, 40, N), "piece", 25)
     np.testing.assert_array_equal(r.error.reshape(-1, N), one.error[0, :1000])
-    assert r.times is not None
     assert (r.times[3, 0], r.run_numbers[0]) == (120.0, 1)
     assert set(r.unavailable) == set(BIAS)
     assert not r.unshown
@@ -55,8 +52,6 @@ def test_pieces_are_rows_of_the_log() -> None:
 def test_the_advised_number_does_not_depend_on_the_size_of_the_errors() -> None:
     one = log(np.random.default_rng(1), 4000, 0.5)
     a, b = (in_pieces(of(scale * np.asarray(one.error))) for scale in (1.0, 7.0))
-    assert a.error is not None
-    assert b.error is not None
     assert a.error.shape == b.error.shape
     m = memory_of(np.asarray(one.error)[0])
     assert m.pieces == min(4000 // m.piece, MOST)
@@ -146,8 +141,6 @@ def test_steps_before_the_first_covariance_are_in_no_piece() -> None:
     P = np.asarray(one.covariance).copy()
     P[0, :10] = np.nan
     r = in_pieces(Evidence("log", one.error, P), 25)
-    assert r.error is not None
-    assert one.error is not None
     np.testing.assert_array_equal(r.error.reshape(-1, N), one.error[0, 10:])
 
 
@@ -180,7 +173,6 @@ def test_options(tmp_path: Path, options: dict[str, str], message: str) -> None:
     with pytest.raises(cs.InputError, match=message):
         read_recordings(*files, **options)
     (r,) = read_recordings(*files, split="25")
-    assert r.error is not None
     assert r.error.shape == (25, 24, 3)
     assert any("the log is cut into 25 pieces of 24 steps, which stand as runs" in note for note in r.notes)
     auto = cs.judge(cs.read(*files, split="auto"))

@@ -182,8 +182,6 @@ def write_trajectories(at: Path, convention: str, order: str = "translation-rota
 
 def mean_nees(at: Path, convention: str | None, order: str | None = None) -> float:
     [recording] = read_recordings(at / "est", at / "truth", at / "P", convention, covariance_order=order)
-    assert recording.error is not None
-    assert recording.covariance is not None
     assert recording.error.shape == (RUNS, STEPS, 6)
     return float(nees(recording.error, recording.covariance).mean())
 
@@ -229,8 +227,6 @@ def test_layouts_of_one_line(tmp_path: Path) -> None:
     position, rotation = read_recordings(tmp_path / "20.txt", truth)
     assert (position.axes, rotation.axes) == (("x", "y", "z"), ("roll", "pitch", "yaw"))
     assert (position.name, rotation.name) == ("20 position", "20 rotation")
-    assert whole.error is not None
-    assert whole.covariance is not None
     np.testing.assert_allclose(position.error, whole.error[..., :3])
     np.testing.assert_allclose(rotation.error, whole.error[..., 3:])
     np.testing.assert_allclose(rotation.covariance, whole.covariance[..., 3:, 3:], rtol=1e-12)
@@ -241,7 +237,6 @@ def test_runs_of_different_lengths_and_gaps(tmp_path: Path) -> None:
     shorten(tmp_path / "est/run1.txt", slice(0, 50))
     shorten(tmp_path / "truth/run2.txt", slice(20, None))
     [r] = read_recordings(tmp_path / "est", tmp_path / "truth", tmp_path / "P")
-    assert r.covariance is not None
     there = np.isfinite(r.covariance[:, :, 0, 0])
     assert there[1].tolist() == [True] * 50 + [False] * 30
     assert there[2].tolist() == [False] * 20 + [True] * 60  # a common clock keeps the steps in place
@@ -278,7 +273,6 @@ def test_a_failing_trajectory_and_warnings(tmp_path: Path) -> None:
     assert [(f.run, f.step) for f in r.failures] == [(3, 21)]
     assert r.failures[0].reason.startswith("estimate is not finite (")
     assert r.failures[0].reason.endswith("run3.txt, line 21)")
-    assert r.error is not None
     assert np.isnan(r.error[3, 20:]).all()
     assert any("degrees in the median" in note for note in r.notes)
     assert any("give a truth of a higher rate" in note for note in r.notes)
@@ -306,8 +300,6 @@ def test_a_planar_robot_in_messages_of_six(spatial_kind: str, planar_kind: str, 
     files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
     [r] = read_recordings(*files, spatial_kind, axes=["x", "y", "yaw"])
     assert r.axes == ("x", "y", "yaw")
-    assert r.error is not None
-    assert r.covariance is not None
     np.testing.assert_allclose(r.error[0], planar_error(true, own, planar_kind), atol=1e-12)
     np.testing.assert_allclose(r.covariance[0], P3, rtol=1e-12)
     hint = r"variance zero: z, roll, pitch\); judge only what the filter estimates: --axes x,y,yaw for a trajectory"

@@ -98,7 +98,6 @@ def test_joint_covariance_of_two_poses_makes_up_that_of_a_window(group: str, rng
             return log(inverse(inverse(T[k - 1]) @ T[k])[None] @ (inverse(moved[0]) @ moved[1]))[0]
 
         J = numerical(window, 2 * n)
-        assert stretch.cross is not None
         joint = np.block(
             [[stretch.covariance[k - 1], stretch.cross[k]], [stretch.cross[k].T, stretch.covariance[k]]]
         )  # fmt: skip
@@ -114,7 +113,6 @@ def test_windows_in_steps_seconds_and_metres() -> None:
 
     def cut(text: str) -> list[tuple[int, int]]:
         relative = relative_of(text)
-        assert relative is not None
         first, last, _ = windows(t, place, rows, relative, "f")
         return list(zip(first.tolist(), last.tolist(), strict=True))
 
@@ -158,7 +156,6 @@ def test_sizes_that_are_none(text: str) -> None:
 )
 def test_sizes_as_they_are_shown(text: str, shown: str) -> None:
     relative = relative_of(text)
-    assert relative is not None
     assert relative.text == shown
 
 
@@ -250,7 +247,6 @@ def test_windows_too_wide_for_first_order_are_named(rng: np.random.Generator) ->
 
 def test_a_cross_covariance_that_is_not_finite_breaks_the_window_that_ends_there(rng: np.random.Generator) -> None:
     stretch = pose_stretch(rng, "SE(2)", 8, 5, 1.0, 0)
-    assert stretch.cross is not None
     whole = windows_of(stretch, Relative(1, "step"))
     stretch.cross[4, 2, 0] = np.inf
     found = windows_of(stretch, Relative(1, "step"))
@@ -296,13 +292,11 @@ def test_runs_have_windows_by_their_times_where_those_are_known(rng: np.random.G
     late = replace(second, rows=second.rows[4:], truth=second.truth[4:])
     record = recorded([first, late], "2", True)
     np.testing.assert_allclose(record.t, first.t[[2, 4, 6, 8, 10, 12]])
-    assert record.error is not None
     np.testing.assert_array_equal(np.isnan(record.error[:, :, 0]).sum(axis=1), [0, 2])
     assert np.isnan(record.error[1, :2]).all()
     timeless = [replace(each, t=np.full(13, np.nan)) for each in (first, late)]
     record = recorded(timeless, "2", True)
     assert np.isnan(record.t).all()
-    assert record.error is not None
     assert np.isnan(record.error[1, 4:]).all()
 
 

@@ -95,7 +95,6 @@ def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive: Path
     record = read_recordings(archive)[0]
     panels = figures(document(archive))["Errors and stated bounds"].panels
     assert [panel.y.label for panel in panels] == ["x (m)", "yaw (deg)"]
-    assert record.error is not None
     for panel, factor, variance, error in zip(panels, (1.0, 180 / np.pi), (0.1, 0.2), record.error[0].T, strict=True):
         line = panel.marks[-1]
         assert isinstance(line, Line)

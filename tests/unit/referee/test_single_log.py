@@ -39,7 +39,6 @@ def test_effective_dof_of_gaussian_errors(rng: np.random.Generator) -> None:
     """The NEES of AR(rho) decorrelates as rho^2: nu = n T / tau; ten percent are more than five standard errors."""
     steps, n, rho = 200_000, 2, 0.7
     found = within(np.square(errors(rng, rho, steps, n)).sum(axis=1), n, SETTINGS, 1.5)
-    assert found is not None
     tau = (1.0 + rho**2) / (1.0 - rho**2)
     assert found.correlation == pytest.approx(tau, rel=0.1)
     assert found.effective_dof == pytest.approx(n * steps / tau, rel=0.1)
@@ -51,7 +50,6 @@ def test_effective_dof_of_gaussian_errors(rng: np.random.Generator) -> None:
 def test_intervals_are_those_of_a_variance(rng: np.random.Generator) -> None:
     """Of chi-square with few degrees of freedom: farther up than down, whatever the draw."""
     found = within(np.square(errors(rng, 0.0, 100, 1))[:, 0], 1, SETTINGS, 1.5)
-    assert found is not None
     assert found.ratio.high / found.ratio.value > found.ratio.value / found.ratio.low > 1.0
 
 
@@ -87,7 +85,6 @@ def test_a_single_log_says_its_ratio_and_what_would_decide(rng: np.random.Genera
     verdict = log_of(rng, 0.9, 600)
     assert verdict.status == "undecided"
     found = verdict.scale.within if verdict.scale is not None else None
-    assert found is not None
     assert found.steps is not None
     assert found.pieces is not None
     line = next(reason for reason in verdict.reasons if "decorrelate" in reason)
@@ -103,9 +100,7 @@ def test_a_single_log_says_its_ratio_and_what_would_decide(rng: np.random.Genera
 def test_a_long_log_is_to_be_cut(rng: np.random.Generator) -> None:
     """And cut as it says it decides: consistent, at rates of 1e-5."""
     verdict = log_of(rng, 0.5, 20_000)
-    assert verdict.scale is not None
     found = verdict.scale.within
-    assert found is not None
     assert found.pieces is not None
     assert found.pieces == 50
     assert any("cut into 50 runs, this log would then probably decide" in reason for reason in verdict.reasons)
@@ -115,9 +110,6 @@ def test_a_long_log_is_to_be_cut(rng: np.random.Generator) -> None:
 
 def test_pieces_are_ten_correlation_times_long(rng: np.random.Generator) -> None:
     found = within(np.square(errors(rng, 0.9, 3000, 3)).sum(axis=1), 3, SETTINGS, 1.5)
-    assert found is not None
-    assert found.steps is not None
-    assert found.pieces is not None
     assert found.pieces >= 20
     assert max(found.steps, 3000) / found.pieces >= 10.0 * found.correlation
 
@@ -125,7 +117,6 @@ def test_pieces_are_ten_correlation_times_long(rng: np.random.Generator) -> None
 def test_several_runs_have_no_such_line(rng: np.random.Generator) -> None:
     e = errors(rng, 0.5, 400, 3).reshape(2, 200, 3)
     verdict = judge(Evidence("two", e, np.broadcast_to(np.eye(3), (2, 200, 3, 3))), Settings(SURE))
-    assert verdict.scale is not None
     assert verdict.scale.within is None
     assert not any("decorrelate" in reason for reason in verdict.reasons)
 

@@ -113,7 +113,6 @@ def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherw
     """The error that all runs share has s = .3: an honest filter is biased if the truth is said to be independent."""
     rng = np.random.default_rng(5)
     one = record(rng, "common", 0.3, errors="independent")
-    assert one.error is not None
     wrong = judge(Evidence("est", one.error + 1.5, one.covariance, truth_covariance=one.truth_covariance,
                            truth_errors="independent"))  # fmt: skip
     assert "bias" in wrong.faults
@@ -124,13 +123,11 @@ def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherw
 def test_a_bias_beyond_the_truth_is_found(errors: str | None) -> None:
     rng = np.random.default_rng(8)
     one = record(rng, "common", 0.2, errors=errors)
-    assert one.error is not None
     far = 6.0 * np.sqrt(np.diag(truth_of_share(0.2)))
     v = judge(Evidence("est", one.error + far, one.covariance, axes=one.axes, truth_covariance=one.truth_covariance,
                        truth_errors=errors))  # fmt: skip
     assert v.status == "biased"
     assert {"bias", "bias in some step"} <= set(v.faults)
-    assert v.bias is not None
     assert min(v.bias.by_axis["x"].value, v.bias.by_axis["y"].value) > 1.0
 
 
@@ -150,13 +147,10 @@ def test_the_ratio_is_that_of_the_estimate() -> None:
     rng = np.random.default_rng(3)
     one = record(rng, "white", 0.499, 2.0, "independent", runs=2000, steps=1)
     v = judge(one)
-    assert v.scale is not None
-    assert v.truth is not None
     assert v.scale.mean_anees / N == pytest.approx(1.5, abs=0.06)
     assert v.scale.inflation.value == pytest.approx(2.0, abs=0.12)
     assert v.truth.share == pytest.approx(0.499, abs=1e-6)
     assert v.scale.inflation.value == pytest.approx((v.scale.mean_anees / N - 0.499) / 0.501, rel=1e-6)
-    assert v.axes is not None
     for axis, interval in v.axes.inflation.items():
         assert interval.low < interval.value < interval.high
         assert v.truth.by_axis[axis] > 0.1
@@ -166,7 +160,6 @@ def test_a_share_of_an_axis_is_of_that_axis() -> None:
     one = record(np.random.default_rng(3), "white", 0.2, 1.0, "independent")
     truth = uncertain_truth(one)
     T = truth_of_share(0.2)
-    assert truth is not None
     assert truth.share("y") == pytest.approx(T[1, 1] / (P + T)[1, 1], rel=1e-9)
     assert truth.share("position" if "position" in truth.by_group else "x") == pytest.approx(T[0, 0] / (P + T)[0, 0])
 
@@ -175,8 +168,6 @@ def test_consistent_needs_the_interval_of_the_estimate() -> None:
     """At s = .45 the sum lies in [1 / 1.5, 1.5] where P is off by x1.7."""
     v = judge(record(np.random.default_rng(1), "white", 0.45, 1.0, "independent", runs=30, steps=1))
     plain = judge(Evidence("est", *_sum(record(np.random.default_rng(1), "white", 0.45, 1.0, runs=30, steps=1))))
-    assert v.equivalence is not None
-    assert plain.equivalence is not None
     assert v.equivalence.p_value > plain.equivalence.p_value
     sure = judge(record(np.random.default_rng(1), "white", 0.2, 1.0, "independent", runs=200))
     assert sure.status == "consistent"
@@ -184,7 +175,6 @@ def test_consistent_needs_the_interval_of_the_estimate() -> None:
 
 def _sum(one: Evidence) -> tuple[Array, Array]:
     assert one.error is not None
-    assert one.truth_covariance is not None
     return one.error, np.asarray(one.covariance) + one.truth_covariance
 
 
@@ -225,8 +215,6 @@ def test_pictures_are_of_both_covariances() -> None:
     one = record(np.random.default_rng(2), "white", 0.2, errors="independent")
     v = judge(one)
     drawn = of_both(one)
-    assert drawn.nees is not None
-    assert v.scale is not None
     np.testing.assert_allclose(drawn.nees.mean(axis=0), v.scale.anees)
     figures = record_figures(replace(one, t=np.arange(float(STEPS)), dof=N), v)
     assert {figure.title for figure in figures} == {"Errors and stated bounds", "NEES", "Coverage"}
@@ -281,7 +269,6 @@ def test_the_bound_holds_for_any_dependence_of_the_truth() -> None:
 
 def test_common_to_a_single_run_is_bounded() -> None:
     truth = uncertain_truth(record(np.random.default_rng(2), "common", 0.2, errors="common", runs=1))
-    assert truth is not None
     assert truth.bounded
     assert judge(record(np.random.default_rng(2), "common", 0.2, errors="common", runs=1)).status == "undecided"
 
@@ -320,7 +307,6 @@ def test_a_trajectory_whose_truth_states_its_covariance(tmp_path: Path) -> None:
     est, truth, stated = write_tum(tmp_path, 3)
     for source in ("columns", str(stated)):
         (one,) = read_recordings(est, truth, truth_covariance=source, axes=["x", "y", "z"], truth_errors="per-run")
-        assert one.truth_covariance is not None
         np.testing.assert_allclose(one.truth_covariance, np.broadcast_to(np.eye(3) / 400.0, (3, 40, 3, 3)))
         assert (one.truth_errors, one.truth_shared) == ("per-run", False)
     (ignored,) = read_recordings(est, truth, axes=["x", "y", "z"])
@@ -336,7 +322,6 @@ def test_estimates_without_a_covariance_of_the_truth_are_left_out(tmp_path: Path
     (one,) = read_recordings(est, truth, truth_covariance=str(stated), axes=["x", "y", "z"], truth_errors="per-run")
     assert "est: 10 estimates whose truth has no covariance are left out" in one.notes
     v = judge(one)
-    assert v.scale is not None
     assert v.scale.judged_steps == 30
 
 
@@ -387,7 +372,6 @@ def test_interpolated_truth_has_the_covariance_of_the_nearer_sample(tmp_path: Pa
     (tmp_path / "truth.csv").write_text("t,a,P_a_a\n" + "".join(f"{k},0,{k}\n" for k in range(1, 5)))
     files = tmp_path / "est.csv", tmp_path / "truth.csv"
     (one,) = read_recordings(*files, state=["a"], truth_covariance="columns", max_dt=0.5)
-    assert one.truth_covariance is not None
     np.testing.assert_array_equal(one.truth_covariance[0, :, 0, 0], [1.0, 3.0])
 
 
@@ -401,7 +385,6 @@ def test_a_table_and_an_archive_state_it(tmp_path: Path) -> None:
     (tmp_path / "truth.csv").write_text("\n".join(true) + "\n")
     files = tmp_path / "est.csv", tmp_path / "truth.csv"
     (one,) = read_recordings(*files, state=["a", "b"], truth_covariance="columns")
-    assert one.truth_covariance is not None
     np.testing.assert_array_equal(one.truth_covariance[2, 1], [[3.0, 0.5], [0.5, 3.0]])
     with pytest.raises(cs.InputError, match="for tables it is 'columns'"):
         read_recordings(*files, state=["a", "b"], truth_covariance="other.csv")
@@ -414,5 +397,4 @@ def test_a_table_and_an_archive_state_it(tmp_path: Path) -> None:
     with pytest.raises(cs.InputError, match=r"bad: the covariance of the truth in run 0, step 1 is no covariance"):
         read_recordings(tmp_path / "bad.npz")
     in_memory = cs.judge(v, P2, truth_covariances=one.truth_covariance, truth_errors="common")
-    assert in_memory.truth is not None
     assert in_memory.truth.errors == "common"

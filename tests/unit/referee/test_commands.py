@@ -232,11 +232,10 @@ def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pyt
 
 @pytest.mark.parametrize("words", [["plan", "linear-gaussian", "--filter", "kf"], ["analyse", "results"]])
 def test_arguments_that_need_the_bench(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], inside: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "results").mkdir()
-    (tmp_path / "results" / "manifest.json").write_text("{}")
-    monkeypatch.chdir(tmp_path)
+    (inside / "results").mkdir()
+    (inside / "results" / "manifest.json").write_text("{}")
     loaded = {
         n: m
         for n, m in sys.modules.items()

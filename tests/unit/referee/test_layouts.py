@@ -202,10 +202,7 @@ TRUTHS: dict[str, tuple[Callable[[Drive], str], str]] = {
 
 
 @pytest.mark.parametrize("name", TRUTHS)
-def test_truth_as_it_is_written(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_truth_as_it_is_written(name: str, inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
     d = drive()
     write, said = TRUTHS[name]
     truth = write(d)
@@ -361,10 +358,7 @@ ESTIMATES: dict[str, tuple[Callable[[Drive], str], str]] = {
 
 
 @pytest.mark.parametrize("name", ESTIMATES)
-def test_estimates_as_they_are_written(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_estimates_as_they_are_written(name: str, inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
     d = drive()
     write, said = ESTIMATES[name]
     path = write(d)
@@ -377,8 +371,7 @@ def test_estimates_as_they_are_written(
     assert said in capsys.readouterr().err
 
 
-def test_steps_stand_for_times_where_both_have_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_steps_stand_for_times_where_both_have_none(inside: Path) -> None:
     d = drive(start=0.0)
     Path("a").mkdir()
     truth = lines("a/truth.txt", "", matrices(d.true), " ")
@@ -390,9 +383,8 @@ def test_steps_stand_for_times_where_both_have_none(tmp_path: Path, monkeypatch:
     assert any("the first one the number of the step" in note for note in record.notes)
 
 
-def test_two_blocks_of_cnspy_are_judged_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_blocks_of_cnspy_are_judged_apart(inside: Path) -> None:
     """PosOrientWithCov: triangles of position and rotation; which error they are of, the format does not say."""
-    monkeypatch.chdir(tmp_path)
     d = drive()
     names = ["t", *(f"t{a}" for a in SPACE), *(f"q{a}" for a in W_LAST)]
     upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
@@ -438,10 +430,7 @@ def deviated_names(d: Drive) -> str:
 
 
 @pytest.mark.parametrize("write", [deviated_tum, deviated_names])
-def test_deviations_are_judged_axis_by_axis(
-    write: Callable[[Drive], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_deviations_are_judged_axis_by_axis(write: Callable[[Drive], str], inside: Path) -> None:
     d = drive()
     path, truth = write(d), lines("truth.tum", "", [d.t, *d.true.T], " ")
     record = cs.read(path, truth=truth)
@@ -461,8 +450,7 @@ def test_deviations_are_judged_axis_by_axis(
 
 
 @pytest.mark.parametrize("names", ["sigma_a,sigma_b", "std_a,std_b", "sa,sb", "P_a_a,P_b_b"])
-def test_deviations_of_a_state(names: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_deviations_of_a_state(names: str, inside: Path) -> None:
     rng = np.random.default_rng()
     step, e, sigma = np.arange(1, STEPS + 1), rng.normal(size=(STEPS, 2)), 1.0 + rng.random((STEPS, 2))
     stated = sigma**2 if names.startswith("P") else sigma
@@ -547,10 +535,7 @@ REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_read_is_one_line(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_what_cannot_be_read_is_one_line(name: str, inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
     d = drive()
     write, said = REFUSED[name]
     truth = write(d)
@@ -568,10 +553,9 @@ def test_what_cannot_be_read_is_one_line(
 @pytest.mark.parametrize("fields", [2, 1])
 @pytest.mark.parametrize("file", ["est.tum", "truth.tum", "t.csv"])
 def test_a_last_line_that_is_cut_short_is_left_out(
-    file: str, fields: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    file: str, fields: int, inside: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A field less, or the last one cut to its first digit: a variance or a part of a quaternion that is 0."""
-    monkeypatch.chdir(tmp_path)
     d = drive()
     truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
     if file == "t.csv":
@@ -591,8 +575,7 @@ def test_a_last_line_that_is_cut_short_is_left_out(
     assert "has no end and is left out" in capsys.readouterr().err
 
 
-def test_whole_files_without_a_final_newline_are_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_whole_files_without_a_final_newline_are_read_whole(inside: Path) -> None:
     d = drive()
     lines("truth.csv", NAMES, [d.t, *d.true.T], end="")
     Path("est.tum").write_text(Path(tum(d)).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8")
@@ -601,9 +584,8 @@ def test_whole_files_without_a_final_newline_are_read_whole(tmp_path: Path, monk
     assert not any("has no end" in note for note in record.notes)
 
 
-def test_a_last_line_of_nan_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_last_line_of_nan_is_a_failure(inside: Path) -> None:
     """It was written so; one that is not positive definite may be cut in its last number."""
-    monkeypatch.chdir(tmp_path)
     d = drive()
     truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
     own, P = d.own.copy(), d.P.copy()
@@ -619,8 +601,7 @@ def test_a_last_line_of_nan_is_a_failure(tmp_path: Path, monkeypatch: pytest.Mon
     assert [failure.step for failure in cs.read("est.tum", truth=truth).failures] == [STEPS]
 
 
-def test_a_file_of_one_broken_line_is_refused_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_file_of_one_broken_line_is_refused_for_it(inside: Path) -> None:
     d = drive()
     Path("t.tum").write_text("1.0 2.0", encoding="utf-8")
     with pytest.raises(cs.InputError, match=r"t\.tum, line 1: has 2 columns"):
@@ -656,9 +637,8 @@ def millimetres(d: Drive) -> tuple[str, str]:
     ],
 )
 def test_a_mix_up_that_can_be_read_gets_a_hint(
-    write: Callable[[Drive], tuple[str, str]], mend: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    write: Callable[[Drive], tuple[str, str]], mend: str, inside: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     estimates, truth = write(many())
     record = cs.read(estimates, truth=truth)
     assert [note for note in record.notes if re.search(mend, note)], record.notes

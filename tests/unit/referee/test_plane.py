@@ -45,9 +45,8 @@ def speeds(path: str, name: str = "t,v,omega") -> tuple[Array, Array, Array]:
     return t, v, omega
 
 
-def test_speeds_are_motions_with_their_covariances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_speeds_are_motions_with_their_covariances(inside: Path) -> None:
     """Windows of one motion: the NEES is that of the motions, worked out from the speeds."""
-    monkeypatch.chdir(tmp_path)
     t, v, omega = speeds("odo.csv")
     root = 0.1 * np.random.default_rng().normal(size=(3, 3))
     C = root @ root.T + 0.001 * np.eye(3)
@@ -84,8 +83,7 @@ def log(M: Array) -> Array:
     return np.append(np.linalg.solve(np.array([[a, -b], [b, a]]), M[:2, 2]), turn)
 
 
-def test_packed_speeds_and_other_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_packed_speeds_and_other_names(inside: Path) -> None:
     t, v, omega = speeds("odo.dat", "# Time [s]    forward velocity [m/s]    angular velocity[rad/s]")
     Path("odo.dat").write_text(Path("odo.dat").read_text().replace(",", "\t "))
     Path("odo.dat.gz").write_bytes(gzip.compress(Path("odo.dat").read_bytes()))
@@ -103,9 +101,8 @@ def test_packed_speeds_and_other_names(tmp_path: Path, monkeypatch: pytest.Monke
     np.testing.assert_allclose(sheet.data["heading"], motions_of(t, v, omega)[:, 2], atol=1e-12)
 
 
-def test_planar_estimates_against_a_truth_in_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planar_estimates_against_a_truth_in_space(inside: Path) -> None:
     """The heading is that of the x axis, whatever roll and pitch are."""
-    monkeypatch.chdir(tmp_path)
     t, heading = EPOCH + 0.25 * np.arange(STEPS), np.linspace(-3.0, 3.0, STEPS)
     half, zero = heading / 2, np.zeros(STEPS)
     true = np.column_stack([np.cos(heading), np.sin(heading), zero + 5.0, zero, zero, np.sin(half), np.cos(half)])
@@ -138,8 +135,7 @@ def test_the_robots_of_mrclam_as_they_are() -> None:
     assert 0.002 < np.std(error) < 0.05
 
 
-def test_speeds_without_a_covariance_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_speeds_without_a_covariance_are_refused(inside: Path) -> None:
     t, *_ = speeds("odo.csv")
     lines("truth.csv", "t,x,y,heading", [t, t, t, 0 * t])
     with pytest.raises(cs.InputError, match=r"odo\.csv: column 'P_xx' is missing"):

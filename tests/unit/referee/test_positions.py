@@ -73,11 +73,9 @@ def gnss(d: Drive, point: Array) -> str:
 @pytest.mark.parametrize("write", [leica, bare, gnss])
 def test_the_point_of_a_prism(
     write: Callable[[Drive, Array], str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    inside: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     d = drive()
     R, true = (np.array([matrix(q) for q in pose[:, 3:]]) for pose in (d.own, d.true))
     truth = write(d, d.true[:, :3] + true @ ARM)
@@ -96,9 +94,8 @@ def test_the_point_of_a_prism(
     assert "no orientation" in err or "without orientations" in err
 
 
-def test_the_origin_needs_no_rotation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_origin_needs_no_rotation(inside: Path) -> None:
     """Deviations alone do for it, and so do two blocks; a lever arm would need their cross terms."""
-    monkeypatch.chdir(tmp_path)
     d = drive()
     truth = bare(d, d.true[:, :3])
     sigma = np.sqrt(np.diagonal(d.P, axis1=1, axis2=2))
@@ -120,8 +117,7 @@ def test_the_origin_needs_no_rotation(tmp_path: Path, monkeypatch: pytest.Monkey
         cs.read(blocks, truth=truth, error="right")
 
 
-def test_a_broken_estimate_fails_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_broken_estimate_fails_there(inside: Path) -> None:
     d = drive()
     truth = bare(d, d.true[:, :3])
     d.own[5] = np.nan
@@ -129,9 +125,8 @@ def test_a_broken_estimate_fails_there(tmp_path: Path, monkeypatch: pytest.Monke
     assert [failure.step for failure in record.failures] == [6]
 
 
-def test_a_frame_is_fitted_to_positions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_is_fitted_to_positions(inside: Path) -> None:
     """Estimates in a world that is turned about z and shifted: the same errors, to what the fit takes of them."""
-    monkeypatch.chdir(tmp_path)
     d = drive()
     P = 1e-10 * d.P  # as good as no errors, so that the frame is the one put in
     own = np.column_stack([d.true[:, :3] - 1e-5 * (d.true - d.own)[:, :3], d.true[:, 3:]])
@@ -157,20 +152,14 @@ def test_a_frame_is_fitted_to_positions(tmp_path: Path, monkeypatch: pytest.Monk
         ({"lever_arm": [1.0, 2.0, float("nan")]}, "--lever-arm: must be three numbers x,y,z, in m"),
     ],
 )
-def test_what_needs_an_orientation_is_refused(
-    options: dict[str, object], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_what_needs_an_orientation_is_refused(options: dict[str, object], said: str, inside: Path) -> None:
     d = drive()
     bare(d, d.true[:, :3])
     with pytest.raises(cs.InputError, match=said):
         cs.read(tum(d), truth="prism.txt", **options)  # type: ignore[arg-type]
 
 
-def test_positions_are_no_estimates_and_poses_need_no_arm(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_positions_are_no_estimates_and_poses_need_no_arm(inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
     d = drive()
     lines("truth.txt", "", [d.t, *d.true.T], " ")
     with pytest.raises(cs.InputError, match=r"prism\.txt, line 1: has 4 columns"):

@@ -606,7 +606,7 @@ def example(word: str) -> str:
     ],
 )
 def test_the_filterpy_filter_of_the_manual(
-    change: tuple[str, str] | None, status: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    change: tuple[str, str] | None, status: str, inside: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     """The manual's seed, so no false alarm of its own; the three wrong filters are the negative control."""
@@ -614,8 +614,7 @@ def test_the_filterpy_filter_of_the_manual(
     if change:
         assert change[0] in text
         text = text.replace(*change)
-    (tmp_path / "make.py").write_text(text)
-    monkeypatch.chdir(tmp_path)
+    (inside / "make.py").write_text(text)
     runpy.run_path("make.py")
     arguments = ("analyse", "estimates.csv", "--truth", "truth.csv", "--state", "px,py,vx,vy")
     code, out, err = consistency(*arguments, "--json", "--fail-on", "inconsistent", capsys=capsys)
@@ -626,20 +625,16 @@ def test_the_filterpy_filter_of_the_manual(
     assert "error convention vector" in err
 
 
-def test_the_notebook_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "make.py").write_text(example("KalmanFilter("))
-    (tmp_path / "notebook.py").write_text(example("record.plot("))
-    monkeypatch.chdir(tmp_path)
+def test_the_notebook_of_the_manual(inside: Path) -> None:
+    (inside / "make.py").write_text(example("KalmanFilter("))
+    (inside / "notebook.py").write_text(example("record.plot("))
     runpy.run_path("make.py")
     assert runpy.run_path("notebook.py")["verdict"].status == "consistent"
-    assert (tmp_path / "mine.png").read_bytes().startswith(b"\x89PNG")
+    assert (inside / "mine.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_archive_of_the_manual(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "make.py").write_text(example("errors.npz"))
-    monkeypatch.chdir(tmp_path)
+def test_the_archive_of_the_manual(inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (inside / "make.py").write_text(example("errors.npz"))
     runpy.run_path("make.py")
     code, out, _ = consistency("analyse", "errors.npz", "--json", capsys=capsys)
     assert code == 0
@@ -908,13 +903,10 @@ BAD: dict[str, tuple[Callable[[Path], Any], tuple[str, ...], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input(case: str, inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Exit 2 and one line that names what is wrong."""
     make, arguments, expected = BAD[case]
-    make(tmp_path)
-    monkeypatch.chdir(tmp_path)
+    make(inside)
     code, out, err = consistency("analyse", *arguments, capsys=capsys)
     assert (code, out) == (2, "")
     assert expected in err
@@ -922,11 +914,8 @@ def test_bad_input(
     assert len(err) < 400
 
 
-def test_results_folders_take_no_truth(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/manifest.json").write_text("{}")
-    monkeypatch.chdir(tmp_path)
+def test_results_folders_take_no_truth(inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (inside / "out").mkdir()
+    (inside / "out/manifest.json").write_text("{}")
     code, _, err = consistency("analyse", "out", "--error", "so2", capsys=capsys)
     assert (code, err) == (2, "consistency: --error: does not go with out, a folder of 'consistency run'\n")

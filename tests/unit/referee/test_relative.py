@@ -368,8 +368,7 @@ def test_a_real_sequence_from_images_to_windows(tmp_path: Path, name: str, truth
     assert (verdict.runs, verdict.status) == (count, "overconfident")
 
 
-def test_the_example_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_example_of_the_manual(inside: Path) -> None:
     (example,) = (block.text for block in blocks("docs/files.md", "python") if "wheels" in block.text)
     names: dict[str, Evidence] = {}
     exec(example, names)

@@ -29,8 +29,7 @@ def test_the_unit_that_makes_times_overlap_is_named(unit: int, name: str) -> Non
 
 
 @pytest.mark.parametrize("heading", ["heading", "theta"])
-def test_a_lower_triangle_is_a_covariance(heading: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_lower_triangle_is_a_covariance(heading: str, inside: Path) -> None:
     e = np.random.default_rng().normal(size=(len(T), 3)) * [0.2, 0.3, 0.1]
     places = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
     names = ",".join(f"P_{'xyh'[i]}{'xyh'[j]}" for i, j in places)
@@ -67,10 +66,7 @@ def test_a_lower_triangle_is_a_covariance(heading: str, tmp_path: Path, monkeypa
         ),
     ],
 )
-def test_a_refusal_names_the_remedy(
-    name: str, header: str, rows: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_refusal_names_the_remedy(name: str, header: str, rows: str, said: str, inside: Path) -> None:
     Path("d").mkdir()
     Path(name).write_text(f"{header}\n{rows}")
     lines("truth.csv", "t,x,y,heading", [T, T, T, T])
@@ -96,8 +92,7 @@ def test_a_list_in_a_cell() -> None:
     assert fields_of('"t" "x"') == ["t", "x"]
 
 
-def test_a_solution_of_positions_is_called_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_solution_of_positions_is_called_so(inside: Path) -> None:
     head = "%  UTC latitude(deg) longitude(deg) height(m) Q sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m)\n"
     rows = (f"2023/11/14 22:13:2{k}.000 47.4 8.5 488.0 1 0.1 0.1 0.2 0 0 0\n" for k in range(3))
     Path("a.pos").write_text(head + "".join(rows))

@@ -99,10 +99,9 @@ SOURCES: dict[str, Make] = {
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_one_command_to_a_verdict_with_a_picture(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, inside: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Nothing is found in errors that have the stated covariance: false-alarm rate 1e-5 for each verdict."""
-    monkeypatch.chdir(tmp_path)
     command = ["analyse", *SOURCES[name](monkeypatch), "--report", "look", "--json", *RATE]
     with pytest.raises(SystemExit) as end:
         main(command)

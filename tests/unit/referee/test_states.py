@@ -89,8 +89,7 @@ def nees(e: Array, P: Array) -> Array:
         *(("right", form, n) for form in ("upper", "full") for n in (9, 15)),
     ],
 )
-def test_states_in_a_table(kind: str, form: str, n: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_states_in_a_table(kind: str, form: str, n: int, inside: Path) -> None:
     arrays, e, P = states(kind, n)
     e, P = e[0][:, PLACES[:n]], P[0][:, PLACES[:n]][:, :, PLACES[:n]]
     record = cs.read(table(arrays, P, form), truth=named(arrays), error=kind)
@@ -102,11 +101,10 @@ def test_states_in_a_table(kind: str, form: str, n: int, tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize("write", [euroc, euroc_bare])
 def test_the_truth_of_euroc_has_velocity_and_biases(
-    write: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    write: object, inside: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With the rotation first in the covariance; one command."""
     assert callable(write)
-    monkeypatch.chdir(tmp_path)
     arrays, e, P = states("left")
     first = table(arrays, P[0], "full")  # the columns have no labels, so that the order is declared
     record = cs.read(first, truth=write(arrays), error="left", covariance_order="rotation-translation")
@@ -117,10 +115,7 @@ def test_the_truth_of_euroc_has_velocity_and_biases(
     assert "error convention left: Log(estimate^-1 truth)" in capsys.readouterr().err
 
 
-def test_deviations_of_states_are_judged_component_by_component(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_deviations_of_states_are_judged_component_by_component(inside: Path) -> None:
     arrays, e, P = states("so3")
     e, P = e[0][:, PLACES], P[0][:, PLACES][:, :, PLACES]
     record = cs.read(table(arrays, P, "deviations"), truth=named(arrays), error="so3")
@@ -129,8 +124,7 @@ def test_deviations_of_states_are_judged_component_by_component(
     assert record.axes == tuple(LABELS)
 
 
-def test_the_true_velocity_between_two_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_true_velocity_between_two_samples(inside: Path) -> None:
     arrays, _, P = states("so3", 9)
     truth = columns(arrays, true=True)
     late = lines("truth.csv", ",".join(["t", *POSE, *MOVING[:3]]), [100.0 + 0.1 * np.arange(STEPS), *truth])
@@ -147,8 +141,7 @@ def test_the_true_velocity_between_two_samples(tmp_path: Path, monkeypatch: pyte
         np.testing.assert_allclose(record.error[0, :, record.axes.index(f"v{axis}")], true - own[7 + i], atol=1e-9)
 
 
-def test_without_a_true_velocity_the_pose_is_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_without_a_true_velocity_the_pose_is_judged(inside: Path) -> None:
     arrays, e, P = states("so3")
     e, P = e[0][:, PLACES], P[0][:, PLACES][:, :, PLACES]
     est = table(arrays, P, "named")
@@ -169,17 +162,13 @@ def test_without_a_true_velocity_the_pose_is_judged(tmp_path: Path, monkeypatch:
         ({"error": "left", "axes": ["bgx"]}, r"--axes bgx: 'bgx' is not one of x, y, z, roll, pitch, yaw, vx, vy, vz$"),
     ],
 )
-def test_what_has_to_be_declared(
-    options: dict[str, object], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_what_has_to_be_declared(options: dict[str, object], said: str, inside: Path) -> None:
     arrays, _, P = states("left", 9)
     with pytest.raises(cs.InputError, match=said):
         cs.read(table(arrays, P[0], "full"), truth=named(arrays), **options)  # type: ignore[arg-type]
 
 
-def test_the_additive_error_is_of_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_additive_error_is_of_states(inside: Path) -> None:
     arrays, _, P = states("left", 9)
     alone: Sequence[Array] = columns(arrays)[:7]
     est = lines(

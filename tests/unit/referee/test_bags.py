@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command import consistency
 from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
@@ -54,13 +55,9 @@ def test_a_bag_is_read_to_the_last_digits(tmp_path: Path, ros: int, kind: str, t
 
 
 def test_one_command_from_bag_to_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from consistency.referee.cli import main
-
     bag = write(tmp_path / "drive.bag", 1, "pose", Drive())
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", str(bag), "--truth-topic", "/vicon", "--report", str(tmp_path / "out")])
-    assert not end.value.code
-    assert "drive is " in capsys.readouterr().out
+    out, _ = consistency(capsys, "analyse", bag, "--truth-topic", "/vicon", "--report", tmp_path / "out")
+    assert "drive is " in out
     assert "Errors and stated bounds" in (tmp_path / "out" / "report.html").read_text()
 
 

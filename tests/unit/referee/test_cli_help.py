@@ -8,9 +8,10 @@ import sys
 
 import pytest
 import typer
+from command import consistency, refused
 from documents import parsed
 
-from consistency.referee.cli.app import app, main
+from consistency.referee.cli.app import app
 from consistency.referee.cli.commands import COMMANDS as ROWS
 
 ROOT = typer.main.get_command(app)
@@ -47,18 +48,13 @@ def test_completion_is_offered() -> None:
 def test_help_alone_is_that_of_typer(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     shown = []
     for words in ([name, "--help"], [name, "--help", "--help"]):  # the second goes through typer
-        with pytest.raises(SystemExit) as end:
-            main(words)
-        assert not end.value.code
-        shown.append(capsys.readouterr().out)
+        shown.append(consistency(capsys, *words)[0])
     assert f"Usage: consistency {name} " in shown[0]
     assert [text.partition(f" {name} ")[2] for text in shown] == [shown[0].partition(f" {name} ")[2]] * 2
 
 
-def test_help_of_no_command_is_refused() -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["runn", "--help"])
-    assert end.value.code == 2
+def test_help_of_no_command_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    refused(capsys, "runn", "--help")
 
 
 def test_help_imports_nothing_that_checks_values() -> None:

@@ -14,11 +14,12 @@ from pathlib import Path
 
 import pytest
 import typer
+from command import consistency, refused
 
 import consistency as cs
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.referee import extras
-from consistency.referee.cli.app import app, main
+from consistency.referee.cli.app import app
 from consistency.referee.cli.commands import COMMANDS
 from consistency.referee.extras import EXTRAS, MissingPackageError, explained, missing, packages, remedy, require
 from consistency.referee.shipped import summaries
@@ -190,13 +191,6 @@ def test_another_module_that_is_missing_is_not_explained() -> None:
 # --- commands --------------------------------------------------------------------------------------
 
 
-def status_of(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as end:
-        main(list(words))
-    out, err = capsys.readouterr()
-    return int(end.value.code or 0), out, err
-
-
 @pytest.mark.parametrize("name", [name for name, row in COMMANDS.items() if row.extras])
 def test_a_command_without_its_packages(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -204,21 +198,20 @@ def test_a_command_without_its_packages(
     """Whatever its options are; its help is there."""
     module = "bokeh" if name == "report" else "numba"
     without(monkeypatch, module)
-    status, out, err = status_of(capsys, name, "--no-such-option")
-    assert (status, out) == (2, "")
+    err = refused(capsys, name, "--no-such-option")
     assert err.startswith(f"consistency: '{name}' needs {module}: pip install ")
     assert SENTENCE.fullmatch(err)
     for words in ([name, "--help"], [name, "--help", "--help"]):  # the second goes through typer
-        status, out, err = status_of(capsys, *words)
-        assert (status, err) == (0, "")
+        out, err = consistency(capsys, *words)
+        assert err == ""
         assert re.match(rf"Usage: .* {name} ", out)
 
 
 def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    _, before, _ = status_of(capsys, "--help")
+    before, _ = consistency(capsys, "--help")
     assert "[bench]" not in before
     without(monkeypatch, "numba", "bokeh")
-    _, after, _ = status_of(capsys, "--help")
+    after, _ = consistency(capsys, "--help")
     lines = dict(re.findall(r"^  ([a-z-]+) +(\S.*)$", after, re.MULTILINE))
     assert set(COMMANDS) <= set(lines)
     for name, row in COMMANDS.items():
@@ -226,8 +219,7 @@ def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pyt
         assert lines[name].startswith(mark), name
         assert row.extras or not lines[name].startswith("[")
     assert "[report,bench,vision]: needs bokeh, numba: pip install " in after
-    _, alone, _ = status_of(capsys, "-h")
-    assert alone == after
+    assert consistency(capsys, "-h")[0] == after
 
 
 @pytest.mark.parametrize("words", [["plan", "linear-gaussian", "--filter", "kf"], ["analyse", "results"]])
@@ -246,8 +238,7 @@ def test_arguments_that_need_the_bench(
         monkeypatch.setattr(parents[name], name.rpartition(".")[2], module)  # to be what it was after this test
         monkeypatch.delitem(sys.modules, name)
     without(monkeypatch, "pandas")
-    status, out, err = status_of(capsys, *words)
-    assert (status, out) == (2, "")
+    err = refused(capsys, *words)
     assert err.startswith(f"consistency: '{words[0]}' with these arguments needs pandas: pip install ")
 
 
@@ -287,10 +278,10 @@ def test_the_list_says_what_the_files_say() -> None:
 
 
 def test_the_list_on_the_core(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    _, before, silent = status_of(capsys, "list")
+    before, silent = consistency(capsys, "list")
     without(monkeypatch, "numba", "pandas")
-    status, after, err = status_of(capsys, "list")
-    assert (status, after, silent) == (0, before, "")
+    after, err = consistency(capsys, "list")
+    assert (after, silent) == (before, "")
     assert err.startswith("consistency: to run what is listed needs numba, pandas: pip install ")
     assert "herath2007-stereo" in after
     assert "parked-ekf-uvd" in after

@@ -9,9 +9,8 @@ import secrets
 from pathlib import Path
 
 import pytest
+from command import consistency
 from documents import blocks, read
-
-from consistency.referee.cli import main
 
 PAGE = read("docs/conventions.md")
 SECTIONS = dict(part.split("\n", 1) for part in PAGE.split("\n## ")[1:])
@@ -41,10 +40,8 @@ def run_example(name: str, at: Path, monkeypatch: pytest.MonkeyPatch, *changes: 
 
 def statuses(command: list[str], capsys: pytest.CaptureFixture[str]) -> set[str]:
     options = ["--time-offset", "0"] if command[1] == "est" else []  # without a look at the clocks, which takes seconds
-    with pytest.raises(SystemExit) as end:
-        main([*command, "--json", *RATE, *options])
-    assert not end.value.code, capsys.readouterr().err
-    return {verdict["status"] for verdict in json.loads(capsys.readouterr().out).values()}
+    out, _ = consistency(capsys, *command, "--json", *RATE, *options)
+    return {verdict["status"] for verdict in json.loads(out).values()}
 
 
 @pytest.mark.parametrize("name", SECTIONS)
@@ -77,9 +74,8 @@ def test_the_notebook_says_what_the_command_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run_example("GTSAM Pose3", tmp_path, monkeypatch)
-    with pytest.raises(SystemExit):
-        main([*commands(SECTIONS["GTSAM Pose3"])[0], "--json"])
-    said = {verdict["status"] for verdict in json.loads(capsys.readouterr().out).values()}
+    out, _ = consistency(capsys, *commands(SECTIONS["GTSAM Pose3"])[0], "--json")
+    said = {verdict["status"] for verdict in json.loads(out).values()}
     (code,) = blocks("docs/conventions.md", "python notebook", part="GTSAM Pose3")
     (tmp_path / "look.py").write_text(code.text)
     runpy.run_path("look.py")

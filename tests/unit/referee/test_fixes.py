@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import consistency
 from test_layouts import STEPS, drive, lines, tum
 
 import consistency as cs
-from consistency.referee.cli import main
 from consistency.referee.readers.formats.geodetic import axes_at, centred, leap_seconds, read_solution
 from consistency.referee.types import Array
 
@@ -116,10 +116,7 @@ def test_a_solution_against_a_solution(inside: Path, capsys: pytest.CaptureFixtu
         turn = axes_at(place[0]) @ axes_at(at).T
         nees.append(each @ np.linalg.solve(turn @ C @ turn.T, each))
     np.testing.assert_allclose(record.nees[0], nees, rtol=1e-6)  # places of 6e6 m hold errors of 0.05 m to 1e-8
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", estimates, "--truth", truth])
-    assert not end.value.code
-    err = capsys.readouterr().err
+    _, err = consistency(capsys, "analyse", estimates, "--truth", truth)
     assert (
         "rover.pos: read as a solution of RTKLIB, 15 columns, times of GPS as UTC, 18 leap seconds less; 12 fixed"
         in err

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import consistency
 from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.cli import main
 from consistency.referee.diagnostics import judge
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.types import Array
@@ -106,10 +106,7 @@ def test_none_fits(tmp_path: Path) -> None:
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     est, truth = write(tmp_path, "so3-body")
-    with pytest.raises(SystemExit) as stop:
-        main(["analyse", str(est), "--truth", str(truth), "--error", "guess", "--json"])
-    assert not stop.value.code
-    said = json.loads(capsys.readouterr().out)["est"]
+    said = json.loads(consistency(capsys, "analyse", est, "--truth", truth, "--error", "guess", "--json")[0])["est"]
     assert said["status"] == "undecided"
     assert set(said["statistics"]["guesses"]) == set(SPATIAL)
     assert said["statistics"]["guesses"]["so3-body"]["possible"] is True

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from command import consistency, refused
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.referee.cli import main
 from consistency.referee.types import Array
 
 DATA = Path(os.environ.get("CONSISTENCY_DATA", Path(__file__).parents[4] / "shared" / "data"))
@@ -208,10 +208,7 @@ def test_truth_as_it_is_written(name: str, inside: Path, capsys: pytest.CaptureF
     truth = write(d)
     record = cs.read(tum(d), truth=truth)
     np.testing.assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", "est.tum", "--truth", truth])
-    assert not end.value.code
-    assert said in capsys.readouterr().err
+    assert said in consistency(capsys, "analyse", "est.tum", "--truth", truth)[1]
 
 
 def test_the_first_rows_of_euroc_judge_themselves(tmp_path: Path) -> None:
@@ -365,10 +362,7 @@ def test_estimates_as_they_are_written(name: str, inside: Path, capsys: pytest.C
     truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
     record = cs.read(path, truth=truth)
     np.testing.assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", path, "--truth", truth])
-    assert not end.value.code
-    assert said in capsys.readouterr().err
+    assert said in consistency(capsys, "analyse", path, "--truth", truth)[1]
 
 
 def test_steps_stand_for_times_where_both_have_none(inside: Path) -> None:
@@ -541,10 +535,7 @@ def test_what_cannot_be_read_is_one_line(name: str, inside: Path, capsys: pytest
     truth = write(d)
     with pytest.raises(cs.InputError, match=said):
         cs.read(tum(d), truth=truth)
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", "est.tum", "--truth", truth])
-    assert end.value.code == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    refused(capsys, "analyse", "est.tum", "--truth", truth)
 
 
 # --- a last line that is cut short -------------------------------------------------------------------
@@ -569,10 +560,7 @@ def test_a_last_line_that_is_cut_short_is_left_out(
     assert "has no end and is left out" in record.notes[0]
     assert not record.failures
     np.testing.assert_allclose(record.nees[0, : STEPS - 1], reference(d.own, d.true, d.P)[:-1], rtol=1e-9)
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", "est.tum", "--truth", truth])
-    assert not end.value.code
-    assert "has no end and is left out" in capsys.readouterr().err
+    assert "has no end and is left out" in consistency(capsys, "analyse", "est.tum", "--truth", truth)[1]
 
 
 def test_whole_files_without_a_final_newline_are_read_whole(inside: Path) -> None:

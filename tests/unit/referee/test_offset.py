@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from command import refused
 from recorded import read_recordings
 from scipy import stats
 
@@ -209,12 +210,8 @@ def test_trajectories_are_read_with_an_offset(tmp_path: Path, rng: np.random.Gen
     ],
 )
 def test_bad_offsets(tables: Path, option: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    from consistency.referee.cli import main
-
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", str(tables / "est.csv"), "--truth", str(tables / "truth.csv"), "--time-offset", option])
-    assert end.value.code == 2
-    assert message in capsys.readouterr().err
+    files = tables / "est.csv", "--truth", tables / "truth.csv"
+    assert message in refused(capsys, "analyse", *files, "--time-offset", option)
 
 
 def test_offsets_need_clocks(tables: Path) -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import consistency
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.referee.cli import main
 from consistency.referee.readers.options import MAX_DT, Reading, flag_of
 from consistency.testing import assert_consistent
 
@@ -64,17 +64,15 @@ def test_windows_are_moved_by_an_offset(tmp_path: Path) -> None:
 
 
 def test_motions_has_no_opposite(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["analyse", "--help"])
-    shown = capsys.readouterr().out
+    shown, _ = consistency(capsys, "analyse", "--help")
     assert "--motions " in shown
     assert "--no-motions" not in shown
 
 
-def test_names_on_the_command_line_may_have_spaces(tables: tuple[Path, Path]) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", str(tables[0]), "--truth", str(tables[1]), "--state", "a, b", "--time-offset", "-0.3"])
-    assert not end.value.code
+def test_names_on_the_command_line_may_have_spaces(
+    tables: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    consistency(capsys, "analyse", tables[0], "--truth", tables[1], "--state", "a, b", "--time-offset", "-0.3")
 
 
 def test_a_step_without_a_measurement_has_no_covariance_to_check(rng: np.random.Generator) -> None:

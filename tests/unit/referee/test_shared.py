@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import consistency
 from recorded import read_recordings
 from scipy.linalg import block_diag
 
 import consistency as cs
-from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, judge
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import (
     KINDS,
@@ -120,10 +120,7 @@ def test_one_command_with_other_drives(tmp_path: Path, capsys: pytest.CaptureFix
     est, truth = written(tmp_path, "new", "by-time", 40, 1)
     old, old_truth = written(tmp_path, "old", "by-time", 200, 2)
     options = ["--truth", truth, "--state", "a,b,c", "--shared", "by-time"]
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", est, *options, "--shared-from", old, "--shared-truth", old_truth])
-    assert not end.value.code
-    out, err = capsys.readouterr()
+    out, err = consistency(capsys, "analyse", est, *options, "--shared-from", old, "--shared-truth", old_truth)
     assert "errors that all share, fitted to other drives: a 0.5" in " ".join(err.split())
     assert "with the errors that all share taken off, and a floor, as fitted to other drives; a bias is not asked" in (
         " ".join(out.split())

@@ -9,11 +9,11 @@ from typing import Any
 import first_steps
 import numpy as np
 import pytest
+from command import consistency, refused
 from draws import autoregression, fully_dependent, identities, independent, verdict_on
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.referee.cli import main as command
 from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped, skip_of, without_first
 from consistency.referee.diagnostics.records.symmetric import Symmetric
@@ -231,25 +231,18 @@ def test_records_of_two_errors() -> None:
         c.without_first(Skip(4))
 
 
-def main(arguments: list[str]) -> int:
-    with pytest.raises(SystemExit) as end:
-        command(arguments)
-    return int(end.value.code or 0)
-
-
 def test_the_command(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["analyse", str(archive), "--skip", "3s", "--fail-on", "inconsistent", "--json"]) == 0
-    (verdict,) = json.loads(capsys.readouterr().out).values()
+    out, _ = consistency(capsys, "analyse", archive, "--skip", "3s", "--fail-on", "inconsistent", "--json")
+    (verdict,) = json.loads(out).values()
     assert verdict["statistics"]["skip"] == "3s"
-    assert main(["analyse", str(archive), "--fail-on", "inconsistent"]) == 1
-    assert "the fault is in the first 8 steps only" in capsys.readouterr().out.replace("\n", " ")
-    assert main(["analyse", str(archive), "--skip", "99"]) == 2
-    assert main(["compare", str(archive), str(archive), "--skip", "x"]) == 2
-    assert main(["compare", str(archive), str(archive), "--skip", "6"]) == 0
-    assert main(["baseline", str(archive), "--skip", "6", "--out", str(tmp_path / "b.json")]) == 0
-    capsys.readouterr()
-    assert main(["compare", str(archive), str(tmp_path / "b.json")]) == 2
-    assert "was written with --skip 6; write it again without --skip" in capsys.readouterr().err
+    out, _ = consistency(capsys, "analyse", archive, "--fail-on", "inconsistent", status=1)
+    assert "the fault is in the first 8 steps only" in out.replace("\n", " ")
+    refused(capsys, "analyse", archive, "--skip", "99")
+    refused(capsys, "compare", archive, archive, "--skip", "x")
+    consistency(capsys, "compare", archive, archive, "--skip", "6")
+    consistency(capsys, "baseline", archive, "--skip", "6", "--out", tmp_path / "b.json")
+    err = refused(capsys, "compare", archive, tmp_path / "b.json")
+    assert "was written with --skip 6; write it again without --skip" in err
 
 
 # --- the hint ---------------------------------------------------------------------------------------

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import consistency
 from drives import write_drive, write_states
 from scipy.spatial.transform import Rotation
 from test_conventions import FAULTS, RATE, run_example
 from test_drives import estimates
 
-from consistency.referee.cli import main
 from consistency.referee.types import Array
 
 STEPS = 80
@@ -102,11 +102,7 @@ def test_one_command_to_a_verdict_with_a_picture(
     name: str, inside: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Nothing is found in errors that have the stated covariance: false-alarm rate 1e-5 for each verdict."""
-    command = ["analyse", *SOURCES[name](monkeypatch), "--report", "look", "--json", *RATE]
-    with pytest.raises(SystemExit) as end:
-        main(command)
-    out, err = capsys.readouterr()
-    assert not end.value.code, err
+    out, _ = consistency(capsys, "analyse", *SOURCES[name](monkeypatch), "--report", "look", "--json", *RATE)
     verdicts = json.loads(out)
     assert verdicts
     for verdict in verdicts.values():

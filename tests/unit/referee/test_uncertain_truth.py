@@ -9,11 +9,11 @@ from pathlib import Path
 import calibration_truth
 import numpy as np
 import pytest
+from command import consistency, refused
 from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
     contrasts,
@@ -327,11 +327,8 @@ def test_estimates_without_a_covariance_of_the_truth_are_left_out(tmp_path: Path
 
 def test_the_verdict_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     est, truth, _ = write_tum(tmp_path, 40, 6, 4.0)
-    arguments = ["analyse", str(est), "--truth", str(truth), "--axes", "x,y,z", "--truth-covariance", "columns"]
-    with pytest.raises(SystemExit) as stop:
-        main([*arguments, "--truth-errors", "independent", "--json"])
-    assert not stop.value.code
-    said = json.loads(capsys.readouterr().out)["est"]
+    options = "--axes", "x,y,z", "--truth-covariance", "columns", "--truth-errors", "independent", "--json"
+    said = json.loads(consistency(capsys, "analyse", est, "--truth", truth, *options)[0])["est"]
     assert said["status"] == "overconfident"
     assert said["statistics"]["truth_share"] == pytest.approx(0.2)
     assert said["statistics"]["ratio"] == pytest.approx(4.0, abs=1.0)
@@ -352,10 +349,7 @@ def test_the_verdict_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[st
 )
 def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str) -> None:
     est, truth, _ = write_tum(tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        main(["analyse", str(est), "--truth", str(truth), *options])
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err
+    assert message in refused(capsys, "analyse", est, "--truth", truth, *options)
 
 
 def test_a_covariance_of_the_truth_that_is_none_is_refused() -> None:

@@ -80,13 +80,6 @@ def test_a_ratio_at_the_end_is_seldom_called_equivalent(ratio: float, runs: int)
     assert shown <= stats.binom.isf(SURE, 500, 0.057)
 
 
-def test_a_right_filter_with_fifty_runs_is_shown() -> None:
-    """Fully dependent, n = 3, ratio 1.5: 95 % of 300 draws (a tail of 1e-5 below 92 %)."""
-    rng = np.random.default_rng(25)
-    shown = sum(equivalence(means_of(rng, 50), 3, 50, Settings()).shown for _ in range(300))
-    assert shown >= stats.binom.ppf(SURE, 300, 0.92)
-
-
 def test_nothing_is_shown_of_nothing() -> None:
     result = equivalence(np.empty(0), 3, 0, Settings())
     assert np.isnan(result.p_value)

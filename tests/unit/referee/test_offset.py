@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from command import refused
 from recorded import read_recordings
 from scipy import stats
 
@@ -199,30 +198,6 @@ def test_trajectories_are_read_with_an_offset(tmp_path: Path, rng: np.random.Gen
     assert early > 6.8
     assert 5.0 < right < 6.8
     assert any("--time-offset 0." in note for note in read_recordings(*files)[0].notes)
-
-
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        ("soon", "--time-offset soon: must be a number of seconds, or 'estimate'"),
-        ("nan", "--time-offset nan: must be a number of seconds, or 'estimate'"),
-        ("1000", "no t of run 0"),
-    ],
-)
-def test_bad_offsets(tables: Path, option: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    files = tables / "est.csv", "--truth", tables / "truth.csv"
-    assert message in refused(capsys, "analyse", *files, "--time-offset", option)
-
-
-def test_offsets_need_clocks(tables: Path) -> None:
-    with pytest.raises(cs.InputError, match="--time-offset needs --truth"):
-        read_recordings(tables / "est.csv", time_offset=1)
-    for name in ("est.csv", "truth.csv"):
-        table = pd.read_csv(tables / name)
-        table["t"] = table.groupby("run").cumcount()
-        table.rename(columns={"t": "step"}).to_csv(tables / name, index=False)
-    with pytest.raises(cs.InputError, match="--time-offset: needs a column t"):
-        read_recordings(tables / "est.csv", tables / "truth.csv", time_offset=1.0)
 
 
 def test_what_has_truth_is_judged_at_every_offset(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,21 +56,6 @@ def test_never_more_than_without_a_pilot() -> None:
     assert gate_runs(3, 1.5, allow="conservative") < gate_runs(3, 1.5)
 
 
-def test_never_fewer_than_twenty() -> None:
-    """With fewer a verdict takes the worst case, and the pilot's dependence is of no use to it."""
-    assert pilot_plan(pilot(40, 500.0), 3, 200, 4.0).runs == 20
-    assert pilot_plan(pilot(40, 3.0), 3, 200, 10.0).runs == 20
-
-
-def test_runs_fall_with_the_degrees_of_freedom_and_rise_with_what_is_asked() -> None:
-    runs = [pilot_plan(pilot(60, nu), 3, 300, 1.2).runs for nu in (4.0, 12.0, 40.0)]
-    assert runs[0] > runs[1] > runs[2]
-    means = pilot()
-    assert pilot_plan(means, 3, 60, 1.2, 0.001).runs > pilot_plan(means, 3, 60, 1.2, 0.05).runs
-    assert pilot_plan(means, 3, 60, 1.2, power=0.99).runs > pilot_plan(means, 3, 60, 1.2, power=0.9).runs
-    assert pilot_plan(means, 3, 60, 1.2).runs > pilot_plan(means, 3, 60, 1.5).runs
-
-
 def test_the_scale_of_the_pilot_does_not_matter() -> None:
     """Many pilots: one that is overconfident by 4 is planned for as a right one is."""
     for seed in range(20):

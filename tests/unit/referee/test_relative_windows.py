@@ -11,8 +11,6 @@ import relative_poses as world
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
-from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, to_left
 from consistency.referee.geometry.space_errors import spatial_error
@@ -352,21 +350,3 @@ def test_independent_windows_are_not_doubted(rng: np.random.Generator) -> None:
     record = recorded([motion_stretch(drive(rng, "SE(2)", 200))], "1", True)
     assert not any("neighbouring" in note for note in record.notes)
     assert record.caption == ""
-
-
-def test_few_windows_that_are_only_declared_decide_nothing(rng: np.random.Generator) -> None:
-    few, enough = (declared(rng, windows) for windows in (ENOUGH - 1, ENOUGH))
-    assert few.unshown == (
-        "149 windows are too few windows to show independence, which takes 150; without --windows independent they are "
-        "steps of their run, however they depend on each other"
-    )
-    assert enough.unshown == ""
-    assert "log: errors of different windows are declared to be independent: each window is a run" in few.notes
-    assert declared(rng, 1).unshown.startswith("1 window is too few windows")
-
-
-def declared(rng: np.random.Generator, windows: int) -> Evidence:
-    """Windows of poses of one run that are independent by declaration only."""
-    relative = replace(Relative(1, "step"), independent=True)
-    run = pose_stretch(rng, "SE(2)", windows + 1, 5, 1.0, 0)
-    return world.relative_recording("log", "log", [run], AXES["SE(2)"], range(3), relative)

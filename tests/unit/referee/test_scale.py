@@ -296,13 +296,6 @@ def test_ratio_interval_of_few_runs() -> None:
     assert ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 6)[2] < ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 1)[2]
 
 
-def test_ratio_interval_of_a_right_filter_says_something() -> None:
-    """20 runs of one component, fully dependent: none in 300 draws from practically 0 to practically infinity."""
-    rng = np.random.default_rng(10)
-    intervals = [ratio_interval(gamma_means(rng, 20, 1.0)) for _ in range(300)]
-    assert max(i.high / max(i.low, 1e-300) for i in intervals) < 1e4
-
-
 def test_ratio_interval_where_there_is_nothing_to_spread() -> None:
     assert np.isnan(ratio_interval(np.empty(0))).all()
     assert ratio_interval(np.zeros(5)) == (0.0, 0.0, 0.0)

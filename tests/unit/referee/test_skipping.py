@@ -10,7 +10,7 @@ import first_steps
 import numpy as np
 import pytest
 from command import consistency, refused
-from draws import autoregression, fully_dependent, identities, independent, verdict_on
+from draws import autoregression, identities, independent, verdict_on
 from recorded import read_recordings
 
 import consistency as cs
@@ -299,8 +299,3 @@ def test_uniform_faults_get_no_hint() -> None:
         rho = (0.0, 0.9, 1.0)[i % 3]
         hints += first_steps.hinted(np.sqrt(1.6) * first_steps.errors(rng, rho, 20, 32, False))[1]
     assert hints < 29
-
-
-def test_constant_errors_of_a_run_get_none(rng: np.random.Generator) -> None:
-    verdict = verdict_on(2.0 * fully_dependent(rng, 40, 32, 3))
-    assert verdict.location.until is None

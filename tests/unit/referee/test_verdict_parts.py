@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import FrozenInstanceError, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,18 +53,6 @@ def test_ratios_below_one_count_as_their_inverse() -> None:
     assert Settings(tolerance=1.25).tolerated == 1.25
     assert Settings().tolerated == 1.0
     assert Settings().factor == 1.5
-
-
-def test_one_side_is_judged_where_the_other_is_allowed() -> None:
-    assert Settings(allow="conservative").one_sided
-    assert not Settings().one_sided
-
-
-def test_records_do_not_change() -> None:
-    verdict = verdict_on(independent(np.random.default_rng(0), 5, 3, 2))
-    for record in (verdict, verdict.settings, verdict.scale, verdict.location, verdict.answers[0]):
-        with pytest.raises(FrozenInstanceError):
-            setattr(record, fields(record)[0].name, 1)  # type: ignore[arg-type]
 
 
 # --- intervals ------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from command import refused
 from drives import write_drive, write_states
 from test_bags import Drive
 from test_bags import write as write_bag
-from test_recording import BAD, ERRORS, EST, LINE, MATRICES, P36, TUM, csv, npz, set_cell, text
+from test_recording import ERRORS, EST, LINE, MATRICES, P36, TUM, csv, npz, set_cell, text
 
 Make = Callable[[Path], Any]
 STATES = ("state_estimate.txt", "--truth", "state_groundtruth.txt", "--covariance", "state_deviation.txt")
@@ -285,7 +285,3 @@ def test_a_wrong_input_is_refused_in_one_line(
     assert expected in err
     assert len(err) < 700
     assert before == sorted(path.name for path in work.iterdir())  # nothing is half written
-
-
-def test_more_than_a_hundred_of_them() -> None:
-    assert len(WRONG | BAD) == len(WRONG) + len(BAD) > 130

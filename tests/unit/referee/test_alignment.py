@@ -26,7 +26,6 @@ from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import (
     _kernels,
     _left,
     _oscillate,
-    _shares,
     _slower,
     inflation_of_mean,
     left_covariances,
@@ -219,18 +218,6 @@ def test_what_is_left_is_that_of_whole_matrices(shared: bool, tangents: list[Arr
         np.testing.assert_allclose(found, _binned(lags, edges), atol=1e-12)
 
 
-def test_shares_are_those_of_the_expected_products(tangents: list[Array]) -> None:
-    bases, kernels, edges = orthonormal(tangents), _kernels(12, True), _bins(12)
-    expected = _expected(bases, kernels, edges, True).sum(axis=0)
-    shares = np.zeros((3, len(kernels)))
-    shares[:, 0], shares[:, 1] = 0.4, 0.6
-    pairs = np.arange(3.0, 3.0 + len(edges) - 1)
-    found = _shares(7.0 * np.einsum("ambj,bj->am", expected, shares), expected, pairs)
-    again = np.einsum("ambj,bj->am", expected, found - shares)
-    np.testing.assert_allclose(again, 0.0, atol=1e-2)
-    np.testing.assert_allclose(found.sum(axis=1), 1.0)
-
-
 @pytest.fixture
 def sure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors are called oscillating by chance in one of ten million tests."""
@@ -332,13 +319,6 @@ def test_a_product_that_is_too_small_counts_and_one_too_large_does_not(
     noise = (noise - noise.mean()) / noise.std(ddof=1)
     seen[:, 1, 2] += 0.01 * (noise + side * 4.0 / np.sqrt(40))
     assert _oscillate(seen, expected, pairs) is told
-
-
-def test_slower_exponentials_reach_beyond_the_run() -> None:
-    found = _slower(200)
-    times = -1.0 / np.log(found[:, 1])
-    np.testing.assert_allclose(times, 20.0 * 2.0 ** np.arange(1, 6))
-    np.testing.assert_array_equal(found[:, 0], 1.0)
 
 
 def test_most_that_a_fit_takes_is_that_of_a_wave_it_follows() -> None:

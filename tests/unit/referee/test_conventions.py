@@ -1,4 +1,4 @@
-"""docs/conventions.md: the example of each library, with right options and wrong ones; sources to a verdict and a page."""
+"""docs/conventions.md: the example of each library, with right options and wrong ones; sources to verdict and page."""
 
 from __future__ import annotations
 

@@ -84,12 +84,6 @@ def test_a_right_filter_is_not_found(world: Callable[..., Array], n: int) -> Non
     assert found <= stats.binom.isf(SURE, 100, 0.05)
 
 
-def test_one_that_is_too_large_everywhere_is_not_found() -> None:
-    """100 draws of 50 runs, fully dependent, n = 2, each with half of the stated variance."""
-    rng = np.random.default_rng(47)
-    assert not any(largest_direction(np.sqrt(0.5) * fully_dependent(rng, 50, 1, 2)).p_value < 0.05 for _ in range(100))
-
-
 # --- in a verdict that allows what is conservative ----------------------------------------------------------
 
 
@@ -122,12 +116,6 @@ def test_an_oblique_fault_is_found(fault: Callable[[Array], Array], n: int, worl
     if fault is correlated:
         assert {v.status for v in found} == {"overconfident"}
         assert any("in the direction" in v.reasons[0] for v in found)
-
-
-def test_an_oblique_fault_beside_small_errors_is_overconfident() -> None:
-    rng = np.random.default_rng(52)
-    verdicts = [verdict_on(oblique(independent(rng, 100, 60, 6)), allow="conservative") for _ in range(10)]
-    assert {v.status for v in verdicts} == {"overconfident"}
 
 
 def test_the_sentence_on_an_oblique_fault_names_what_is_too_small() -> None:

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable
 
 import numpy as np
 import pytest
-from draws import autoregression, fully_dependent, independent, slow_axis
 from scipy import integrate, stats
 
 from consistency.referee.diagnostics import e_process, ever
@@ -98,26 +96,6 @@ def test_one_number_of_degrees_of_freedom_serves_all_runs() -> None:
     means = np.array([0.5, 1.5, 0.8])
     assert e_process(means, 3).down == pytest.approx(e_process(means, np.array([3, 3, 3])).down)
     assert e_process(means, 1).down != pytest.approx(e_process(means, 3).down)
-
-
-WORLDS = [independent, autoregression, fully_dependent, slow_axis]
-
-
-@pytest.mark.parametrize("world", WORLDS)
-@pytest.mark.parametrize("n", [1, 3])
-def test_averages_over_dependent_steps_win_nothing(world: Callable[..., Array], n: int) -> None:
-    """The mean of every bet over 500 runs of a right filter: at most 1, and upwards exactly 1."""
-    rng = np.random.default_rng(12)
-    means = np.square(world(rng, 500, 12, n)).sum(axis=-1).mean(axis=1) / n
-    bets = [e_process(means[i : i + 1], n) for i in range(len(means))]
-    for side in ("up", "down"):
-        value = np.array([getattr(b, side)[0] for b in bets])
-        error = value.std(ddof=1) / np.sqrt(len(value))
-        assert value.mean() <= 1.0 + SIGMAS * error
-        if side == "up" or world is fully_dependent:
-            assert abs(value.mean() - 1.0) <= SIGMAS * error
-        if side == "down" and world is independent:
-            assert value.mean() < 1.0 - SIGMAS * error
 
 
 def ever_reaches(rng: np.random.Generator, side: str, ratio: float, n: int, sequences: int, runs: int = 200) -> float:

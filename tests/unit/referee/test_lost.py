@@ -57,16 +57,6 @@ def test_the_bound_is_the_mean_beyond_the_quantile(dof: int, rate: float) -> Non
     assert float(lost_bound(dof, rate)) > q
 
 
-def test_a_dependence_that_exceeds_the_quantile_keeps_the_bound(rng: np.random.Generator) -> None:
-    """Two steps whose upper tails exclude each other: the mean exceeds a lower quantile more often, not the bound."""
-    u = rng.random(400_000)
-    tail = 0.05
-    other = np.where(u > 1.0 - tail, 2.0 - tail - u, u)  # the tail is turned round
-    mean = 0.5 * (stats.chi2.ppf(u, 1) + stats.chi2.ppf(other, 1))
-    assert (mean > float(stats.chi2.isf(tail, 1)) * 1.2).mean() > 0.045  # a whole tail of means just below the bound
-    assert (mean > float(lost_bound(1, tail))).mean() <= tail
-
-
 # --- the share -------------------------------------------------------------------------------------------
 
 
@@ -186,14 +176,6 @@ def test_the_bet_against_a_share() -> None:
     assert lost_evidence(one, 0.05)[-1] == pytest.approx(
         np.mean([q / 0.05 * ((1.0 - q) / 0.95) ** 99 for q in (0.0, 0.00625, 0.0125, 0.025)])
     )
-
-
-def test_the_bet_is_fair() -> None:
-    """The mean of the e-value after 12 runs of which each is lost with the share in question: 1, exactly."""
-    rows = np.array([[bool(k >> i & 1) for i in range(12)] for k in range(2**12)])
-    weight = np.prod(np.where(rows, 0.2, 0.8), axis=1)
-    values = np.array([lost_evidence(row, 0.2)[-1] for row in rows])
-    assert float(weight @ values) == pytest.approx(1.0)
 
 
 def test_until_decided_goes_on_until_the_share_is_excluded() -> None:

@@ -305,24 +305,6 @@ def test_the_scale_of_an_alarm_allows_for_the_gate() -> None:
     assert "larger than a gate lets see" in str(hidden)
 
 
-# --- rates ---------------------------------------------------------------------------------------------
-
-
-def alarm_share(scale: float, tolerance: float, missions: int, steps: int) -> float:
-    rng = np.random.default_rng()
-    values = scale * rng.chisquare(2, (missions, steps))
-    return sum(bool(fed(cs.Monitor(0.2, tolerance), row, 2)) for row in values.tolist()) / missions
-
-
-def test_alarms_of_right_filters_are_no_more_than_stated() -> None:
-    """200 missions of 200 steps at 20 %, the limit is passed by chance with 1e-6; a scale of 2 is the control."""
-    limit = stats.binom.ppf(1 - 1e-6, 200, 0.2) / 200
-    assert alarm_share(1.0, 1.0, 200, 200) <= limit
-    assert alarm_share(1.2, 1.2, 200, 200) <= limit
-    assert alarm_share(1 / 1.2, 1.2, 200, 200) <= limit
-    assert alarm_share(2.0, 1.2, 40, 200) > limit
-
-
 # --- limits --------------------------------------------------------------------------------------------
 
 

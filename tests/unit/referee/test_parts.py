@@ -148,11 +148,6 @@ def test_misuse_is_refused(rng: np.random.Generator) -> None:
         each_alone(Record("f", nees=np.ones((3, 2)), dof=2))
 
 
-def test_rows_that_are_runs(rng: np.random.Generator) -> None:
-    error = correlated(rng, 300, 1)[:, 0]
-    assert cs.judge(error, deviations=np.ones(error.shape), independent=True, false_alarm=SURE).runs == 300
-
-
 # --- gates -----------------------------------------------------------------------------------------
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from draws import autoregression
 from scipy import stats
 
 from consistency.referee.diagnostics import gate_runs, pilot_plan, power_of, required_runs
@@ -79,20 +78,6 @@ def test_the_scale_of_the_pilot_does_not_matter() -> None:
 def test_what_cannot_be_planned_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         pilot_plan(**{"means": pilot(), "dof": 3, "steps": 60, "detect": 1.5, **options})
-
-
-def test_planned_runs_find_the_fault() -> None:
-    """AR(.95), x1.2: pilots of 40 runs, and 20 tests with the runs of each; 95 % of 200 on average, here above 90 %."""
-    rng, found, tests = np.random.default_rng(93), 0, 0
-    for _ in range(10):
-        means = np.square(autoregression(rng, 40, 60, 3)).sum(axis=-1).mean(axis=1) / 3
-        runs = pilot_plan(means, 3, 60, 1.2).runs
-        assert 40 < runs < 301
-        for _ in range(20):
-            gate = 1.2 * np.square(autoregression(rng, runs, 60, 3)).sum(axis=-1).mean(axis=1) / 3
-            found += scale_test(gate, 3, 60).p_value <= 0.025
-            tests += 1
-    assert found >= stats.binom.ppf(1e-5, tests, 0.93)
 
 
 def test_power_of_fractional_degrees_of_freedom() -> None:

@@ -831,11 +831,6 @@ BAD: dict[str, tuple[Callable[[Path], Any], tuple[str, ...], str]] = {
     ),
     "npz keys": (npz(errors=ERRORS), ("a.npz",), "a.npz: needs errors and covariances; or"),
     "npz unknown key": (npz(errors=ERRORS, covariances=MATRICES, noise=1), ("a.npz",), "key 'noise' does not go with"),
-    "npz shape": (
-        npz(errors=ERRORS, covariances=MATRICES[:1]),
-        ("a.npz",),
-        "'covariances' has shape (1, 3, 2, 2), needs (2, 3, 2, 2)",
-    ),
     "truth values": (
         csv(lambda table: table.assign(P_xx=True)),
         EST,
@@ -867,9 +862,6 @@ BAD: dict[str, tuple[Callable[[Path], Any], tuple[str, ...], str]] = {
         ("a.npz",),
         "a.npz, run 0, step 1: the covariance is not symmetric",
     ),
-    "npz dof": (npz(nees=np.ones((2, 3)), dof=2.5), ("a.npz",), "key 'dof' must be one whole number"),
-    "npz dof without end": (npz(nees=np.ones((2, 3)), dof=np.inf), ("a.npz",), "key 'dof' must be one whole number"),
-    "npz negative": (npz(nees=-np.ones((2, 3)), dof=2), ("a.npz",), "key 'nees', run 0, step 1: -1 is negative"),
     "npz convention": (
         npz(errors=ERRORS, covariances=MATRICES),
         ("a.npz", "--error", "left"),

@@ -378,17 +378,6 @@ def test_portmanteau_of_one_series_is_that_of_statsmodels(fresh: np.random.Gener
     assert found.p_value == pytest.approx(stats.chi2.sf(found.statistic, 10))
 
 
-def test_portmanteau_rates_and_its_blindness_to_scale(fresh: np.random.Generator) -> None:
-    C = np.broadcast_to(np.eye(2), (20, 40, 2, 2))
-    count = 0
-    for _ in range(1500):
-        u = 3.0 * fresh.standard_normal((20, 40, 2))
-        count += whiteness(u, C).p_value <= 0.05
-    assert within(count, 1500, 0.05)
-    assert whiteness(autoregression(fresh, 20, 40, 2, 0.3), C).p_value < 1e-5
-    assert np.isnan(whiteness(u[:1, :40], C[:1]).p_value)  # too few values
-
-
 def test_total_nis_by_hand() -> None:
     nis, dof = np.array([[3.0, np.nan, 8.0]]), np.array([[2, 0, 6]])
     test = nis_test(nis, dof)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from draws import autoregression, fully_dependent
+from draws import autoregression
 from scipy import optimize, special, stats
 
 from consistency.referee.diagnostics import mean_test, ratio_interval
@@ -173,25 +173,6 @@ def test_a_right_filter_has_p_values_near_uniform_at_full_dependence() -> None:
         count = int((p <= level).sum())
         assert count <= stats.binom.isf(SURE, draws, level)
         assert count >= (stats.binom.ppf(SURE, draws, level) if runs < 20 else 1)
-
-
-def test_steps_that_are_the_same_are_one_step() -> None:
-    """Whatever the number of steps, the run means of full dependence are those of one step."""
-    rng = np.random.default_rng(3)
-    error = fully_dependent(rng, 19, 30, 3)
-    nees = np.square(error).sum(axis=-1)
-    many, one = mean_test(nees, 3), mean_test(nees[:, :1], 3)
-    assert (many.above, many.below) == pytest.approx((one.above, one.below))
-
-
-def test_effective_dof_does_not_depend_on_the_unit_far_from_one() -> None:
-    """Where the mean is farther from 1 than chance carries it, on the same side."""
-    rng = np.random.default_rng(4)
-    means = gamma_means(rng, 50, 10.0)
-    for a, b in ((10.0, 1e6), (0.1, 1e-6)):
-        one, other = scale_test(means * a, 2, 100), scale_test(means * b, 2, 100)
-        assert one.effective_dof == pytest.approx(other.effective_dof, rel=1e-9)
-        assert one.spread == pytest.approx(other.spread, rel=1e-9)
 
 
 def test_effective_dof_of_known_worlds() -> None:

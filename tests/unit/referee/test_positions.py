@@ -58,19 +58,19 @@ def test_derivatives_are_those_of_differences(convention: str) -> None:
             np.testing.assert_allclose(rows[:, i], slope, atol=1e-8)
 
 
-def leica(d: Drive, point: Array) -> str:
-    return lines("data.csv", "#timestamp [ns]," + ",".join(POSE[:3]), [nanoseconds(d.t), *point.T])
-
-
 def bare(d: Drive, point: Array) -> str:
     return lines("prism.txt", "", [d.t, *point.T], " ")
 
 
-def gnss(d: Drive, point: Array) -> str:
-    return lines("fixes.csv", "t,x,y,z,fix", [d.t, *point.T, ["RTK"] * STEPS])
-
-
-@pytest.mark.parametrize("write", [leica, bare, gnss])
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda d, point: lines("data.csv", "#timestamp [ns]," + ",".join(POSE[:3]), [nanoseconds(d.t), *point.T]),
+        bare,
+        lambda d, point: lines("fixes.csv", "t,x,y,z,fix", [d.t, *point.T, ["RTK"] * STEPS]),
+    ],
+    ids=["Leica", "bare", "GNSS"],
+)
 def test_the_point_of_a_prism(
     write: Callable[[Drive, Array], str],
     inside: Path,

@@ -404,16 +404,6 @@ def test_without_run_and_step(tmp_path: Path) -> None:
     assert several.convention == "so2"
 
 
-@pytest.mark.parametrize("convention", ["left", "right"])
-def test_invariant_errors_of_planar_poses(convention: str, tmp_path: Path) -> None:
-    est, true = poses()
-    r = one(*write(tmp_path), error=convention)
-    one_, two = true[["x", "y", "heading"]].to_numpy()[7], est[["x", "y", "heading"]].to_numpy()[7]
-    X, Y = matrix(one_), matrix(two)
-    T = np.linalg.inv(Y) @ X if convention == "left" else X @ np.linalg.inv(Y)
-    np.testing.assert_allclose(r.error[1, 2], vee(np.real(logm(T))), atol=1e-9)
-
-
 def test_filters_are_recordings(tmp_path: Path) -> None:
     est, truth = write(tmp_path, lambda e: pd.concat([e.assign(filter="a"), e.assign(filter="b", x=e["x"] + 9)]))
     assert [r.name for r in read_recordings(est, truth)] == ["a", "b"]
@@ -624,13 +614,6 @@ def test_the_notebook_of_the_manual(inside: Path) -> None:
     runpy.run_path("make.py")
     assert runpy.run_path("notebook.py")["verdict"].status == "consistent"
     assert (inside / "mine.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_archive_of_the_manual(inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (inside / "make.py").write_text(example("errors.npz"))
-    runpy.run_path("make.py")
-    out, _ = consistency(capsys, "analyse", "errors.npz", "--json")
-    assert json.loads(out)["errors"]["status"] == "consistent"
 
 
 # --- refusals ----------------------------------------------------------------------------------------

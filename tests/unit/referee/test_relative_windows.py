@@ -255,16 +255,6 @@ def test_a_cross_covariance_that_is_not_finite_breaks_the_window_that_ends_there
     assert recorded([stretch], "1", False).failures[0].reason == "covariance is not finite (row 4)"
 
 
-def test_a_broken_estimate_has_no_error(rng: np.random.Generator) -> None:
-    stretch = motion_stretch(drive(rng, "SE(2)", 9))
-    stretch.estimate[7, 1] = np.nan
-    found = windows_of(stretch, Relative(3, "step", True))
-    assert (found.track.t.tolist(), found.t.tolist()) == (stretch.t[[0, 3, 6]].tolist(), stretch.t[[3, 6, 7]].tolist())
-    assert np.isfinite(found.error[:2]).all()
-    assert np.isnan(found.error[2]).all()
-    assert np.isnan(found.covariance[2]).all()
-
-
 def test_the_first_row_of_motions_is_only_where_they_start(rng: np.random.Generator) -> None:
     stretch = motion_stretch(drive(rng, "SE(3)", 12))
     whole = windows_of(stretch, Relative(4, "step", True))
@@ -343,10 +333,3 @@ def test_the_rotation_of_a_window_is_that_of_its_widest_axis(rng: np.random.Gene
         near, far = (next(n for n in recorded([each], "1", True).notes if "first order" in n) for each in large)
         assert "has a sigma of 0.12 rad in the median; beyond 0.1 a covariance" in near
         assert "has a sigma of 1.2 rad in the median" in far
-
-
-def test_independent_windows_are_not_doubted(rng: np.random.Generator) -> None:
-    """Right ones in fewer than 0.5 % of all draws, where the seed is another."""
-    record = recorded([motion_stretch(drive(rng, "SE(2)", 200))], "1", True)
-    assert not any("neighbouring" in note for note in record.notes)
-    assert record.caption == ""

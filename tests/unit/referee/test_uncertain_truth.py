@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from command import consistency, refused
 from recorded import read_recordings
-from scipy import stats
 
 import consistency as cs
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
@@ -21,7 +20,6 @@ from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
     uncertain_truth,
     upper_weights,
 )
-from consistency.referee.diagnostics.questions.shape import weighted_chi_square_tail
 from consistency.referee.document.drawing import Line
 from consistency.referee.pages.files_report import record_figures
 from consistency.referee.types import Array
@@ -246,25 +244,13 @@ def test_contrasts_do_not_have_what_runs_share() -> None:
     np.testing.assert_allclose(product, np.eye(4), atol=0.05)
 
 
-def test_the_bound_holds_for_any_dependence_of_the_truth() -> None:
-    """The tail of the mean NEES, whatever v does: shares beyond the 1 % point, 4,000 draws; 4.3 sigma at each of 6."""
-    rng, runs, s = np.random.default_rng(6), 10, 0.3
-    T = truth_of_share(s)
+def test_the_weights_of_the_bound_by_hand() -> None:
+    runs, T = 10, truth_of_share(0.3)
     L = np.linalg.cholesky(P + T)
     values = np.linalg.eigvalsh(np.linalg.solve(L, np.linalg.solve(L, T).T))[::-1]
     weights = upper_weights(np.broadcast_to(values, (runs, N)))
     assert weights.sum() == pytest.approx(1.0)
     assert weights[0] == pytest.approx(values[0] / N + (1.0 - values[-1]) / (N * runs))
-    bar = 1.0 + 4.0 * weights.max()
-    while weighted_chi_square_tail(bar, weights) > 0.01:
-        bar += 0.01
-    for kind in ("white", "AR", "per run", "common", "signs"):
-        count = 0
-        for _ in range(4000):
-            e = rng.standard_normal((runs, 1, N)) @ np.linalg.cholesky(P).T
-            d = (e + errors_of_truth(rng, kind, runs, 1) @ np.linalg.cholesky(T).T)[:, 0]
-            count += float(np.square(np.linalg.solve(L, d.T)).sum() / (N * runs)) > bar
-        assert count <= stats.binom.isf(1e-5, 4000, 0.01)
 
 
 def test_common_to_a_single_run_is_bounded() -> None:

@@ -1,4 +1,4 @@
-"""Files of every format that the core reads, and what it refuses."""
+"""Files of every format that the core reads, what it refuses, and truth between its samples against known motions."""
 
 from __future__ import annotations
 

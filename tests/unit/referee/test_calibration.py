@@ -109,13 +109,6 @@ def test_the_quick_rows_of_a_referee_that_keeps_its_promises_fail_less_than_once
     assert 2e-6 < chance < 2e-4
 
 
-def test_every_case_counts_something_and_can_be_answered() -> None:
-    for case in [*calibration_cases.cases(), *calibration_cases.quick_cases()]:
-        assert case.world in calibration.ANY
-        assert all(claim.counted in calibration.COUNTED for claim in case.claims)
-        assert all(claim.question in calibration_rows.QUESTIONS for claim in case.claims)
-
-
 # --- worlds -------------------------------------------------------------------------------------------------
 
 
@@ -188,16 +181,6 @@ def test_gates_take_their_own_runs_of_the_pool() -> None:
     grown = calibration.Growing(case, 2, 1)
     grown(10)
     np.testing.assert_array_equal(grown(43).error, gates[2])
-
-
-def test_runs_of_the_pool_are_all_taken_before_any_is_taken_again() -> None:
-    pool, _ = worlds.POOL["linear-gaussian"]
-    rng = np.random.default_rng(0)
-    taken = [worlds.linear_gaussian(Draw(rng, 43, first=43 * gate)).error for gate in range(14)]
-    first, second = np.concatenate(taken[:7]), np.concatenate(taken[7:])
-    for turn in (first, second):
-        assert len(np.unique(turn[:, 0, 0])) == len(pool)
-    assert (first != second).any()
 
 
 # --- planar poses -------------------------------------------------------------------------------------------

@@ -73,7 +73,8 @@ def test_the_right_convention_is_the_one_that_is_left(tmp_path: Path, convention
     assert v.guesses[convention].ratio.holds(1.0)
 
 
-def test_the_declared_error_has_its_own_status(tmp_path: Path) -> None:
+def test_the_declared_error_has_its_own_status_and_intervals_hold_together(tmp_path: Path) -> None:
+    """Bonferroni over four conventions: wider than the interval of one."""
     files = write(tmp_path, "left")
     (right,), (wrong,), (guess,) = (read_recordings(*files, error=kind) for kind in ("left", "so3", "guess"))
     assert judge(wrong).status not in ("consistent", "undecided")
@@ -83,12 +84,6 @@ def test_the_declared_error_has_its_own_status(tmp_path: Path) -> None:
     assert v.convention is None
     assert not v.answers
     assert not v.equivalence.shown
-
-
-def test_intervals_hold_together(tmp_path: Path) -> None:
-    """Bonferroni over four conventions: wider than that of one."""
-    (guess,) = read_recordings(*write(tmp_path, "left"), error="guess")
-    v = judge(guess)
     alone = judge(guess.guesses["left"])
     value, low, high = v.guesses["left"].ratio
     assert value == pytest.approx(alone.scale.inflation.value)

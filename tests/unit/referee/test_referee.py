@@ -210,22 +210,6 @@ def test_p_value_of_the_curve_is_where_it_would_leave_its_band(
         assert not simultaneous_band(nees, 3, min(p * 0.999, 0.99), method, allow).outside.any()
 
 
-@pytest.mark.parametrize("coefficient", [0.0, 0.7, 0.95, 0.995])
-def test_the_band_bounds_the_maximum_of_a_gaussian_process(fresh: np.random.Generator, coefficient: float) -> None:
-    """ANEES of many runs is such a process, with the squared correlation; simulated 20,000 times."""
-    steps, level, draws = 60, 0.1, 20_000
-    nees = np.square(autoregression(fresh, 4000, steps, 3, coefficient)).sum(axis=-1)
-    bound, bonferroni = (simultaneous_band(nees, 3, level, method) for method in ("max", "bonferroni"))
-    assert (bound.high <= bonferroni.high * (1 + 1e-12)).all()
-    assert (bound.low >= bonferroni.low * (1 - 1e-12)).all()
-    c = stats.norm.isf(stats.chi2.sf(bound.high[0] * 4000, 12_000))
-    z = autoregression(fresh, draws, steps, 1, coefficient**2)[..., 0]
-    outside = int((np.abs(z).max(axis=1) > c).sum())
-    assert outside <= draws * level + 5 * np.sqrt(draws * level * (1 - level))
-    if coefficient < 0.99:  # where it is not far too wide either
-        assert outside >= 0.5 * draws * level
-
-
 # --- bias ----------------------------------------------------------------------------------------------
 
 # Johnson & Wichern (2007) Table 5.1: sweat rate, sodium, potassium of 20 women; Example 5.3: T^2 = 9.74
@@ -640,29 +624,3 @@ def test_nothing_but_nan_is_failed(fresh: np.random.Generator, what: str) -> Non
     verdict = judge("f", **arrays)
     assert verdict.status == "failed"
     assert "no step has a covariance of full rank" in verdict.reasons[0]
-
-
-@pytest.mark.parametrize("zero", [slice(0, 1), slice(0, 30)])
-def test_a_covariance_of_zero_is_left_out(fresh: np.random.Generator, zero: slice) -> None:
-    e = fresh.standard_normal((20, 30, 3))
-    C = stated(e.shape)
-    C[:, zero] = 0.0
-    verdict = judge("f", e, C, false_alarm=FALSE_ALARM)
-    assert verdict.status == ("failed" if zero.stop == 30 else "consistent")
-    assert verdict.statistics["left_out_steps"] == list(range(1, zero.stop + 1))
-
-
-@pytest.mark.parametrize("what", ["covariance", "error"])
-def test_what_no_filter_may_say_is_not_consistent(fresh: np.random.Generator, what: str) -> None:
-    """A fifth of the runs go wrong in the second half, with a negative variance or an infinite error to hide it."""
-    e = fresh.standard_normal((30, 20, 3))
-    C = stated(e.shape)
-    if what == "covariance":
-        e[:6, 10:] *= 100.0
-        C[:6, 10:] *= -1.0
-    else:
-        e[:6, 10:] = np.inf
-    verdict = judge("f", e, C, false_alarm=FALSE_ALARM)
-    assert verdict.status == "failed"
-    assert "6 of 30 runs" in verdict.reasons[0]
-    assert "step 11" in verdict.reasons[0]

@@ -1,4 +1,4 @@
-"""The test of run means against computations of its own: a likelihood maximised, runs left out one by one.
+"""The test of run means, equivalence and plans against computations of their own, such as a likelihood maximised.
 
 Everything random has a fixed seed that was not chosen, and no assertion here depends on luck but the counts, which have
 limits at 1e-5.
@@ -393,13 +393,6 @@ def test_level_is_one_less_the_power() -> None:
     at_stake = equivalence(means, 3, 50, Settings()).p_value
     assert equivalence(means, 3, 50, Settings(power=1 - 1.01 * at_stake)).shown
     assert not equivalence(means, 3, 50, Settings(power=1 - 0.99 * at_stake)).shown
-
-
-def test_another_factor_than_that_of_the_settings() -> None:
-    means = means_of(np.random.default_rng(23), 15)
-    result = equivalence(means, 3, 50, Settings(detect=1.5), 3.0)
-    assert result.factor == 3.0
-    assert result.p_value == pytest.approx(equivalence(means, 3, 50, Settings(detect=3.0)).p_value)
 
 
 @pytest.mark.parametrize("ratio", [1.5, 1 / 1.5])

@@ -98,12 +98,6 @@ def test_a_long_log_is_to_be_cut(rng: np.random.Generator) -> None:
     assert judge(Evidence("cut", cut, np.broadcast_to(np.eye(3), (50, 400, 3, 3))), Settings(SURE)).consistent
 
 
-def test_pieces_are_ten_correlation_times_long(rng: np.random.Generator) -> None:
-    found = within(np.square(errors(rng, 0.9, 3000, 3)).sum(axis=1), 3, SETTINGS, 1.5)
-    assert found.pieces >= 20
-    assert max(found.steps, 3000) / found.pieces >= 10.0 * found.correlation
-
-
 def test_several_runs_have_no_such_line(rng: np.random.Generator) -> None:
     e = errors(rng, 0.5, 400, 3).reshape(2, 200, 3)
     verdict = judge(Evidence("two", e, np.broadcast_to(np.eye(3), (2, 200, 3, 3))), Settings(SURE))

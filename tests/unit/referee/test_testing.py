@@ -380,11 +380,6 @@ def test_unusable_arguments_say_what_is_wrong(arguments: dict[str, Any], said: s
 # --- two filters -----------------------------------------------------------------------------------
 
 
-def test_a_filter_is_not_worse_than_itself(rng: np.random.Generator) -> None:
-    data = sample(rng)
-    assert not assert_not_worse(*data, *data, false_alarm=RARE).worse  # p is 1: no chance in it
-
-
 @pytest.mark.parametrize("true", [2.0, 0.5])
 def test_a_less_consistent_filter_is_worse(rng: np.random.Generator, true: float) -> None:
     errors, covariances = sample(rng)

@@ -150,27 +150,6 @@ def test_false_alarms_stay_below_the_stated_rate() -> None:
 # --- steps and runs left out -----------------------------------------------------------------------
 
 
-def test_rank_deficient_steps_are_left_out_by_name() -> None:
-    case = make()
-    case.nees[:, :3] = np.nan
-    verdict = case.verdict()
-    assert verdict.status == "consistent"
-    assert verdict.statistics["left_out_steps"] == [1, 2, 3]
-    assert verdict.statistics["judged_steps"] == STEPS - 3
-    assert np.isnan(verdict.statistics["band"][:3]).all()
-    assert np.isnan(verdict.statistics["anees"][:3]).all()
-
-
-def test_one_failed_run_makes_a_consistent_filter_failed() -> None:
-    case = broken(make(), run=3, step=12)
-    verdict = case.verdict((BROKE,))
-    assert case.verdict().status == "consistent"
-    assert verdict.status == "failed"
-    assert not verdict.consistent
-    assert verdict.reasons[0] == "failed: 1 of 50 runs failed, first run 3 in step 12: LinAlgError: singular"
-    assert verdict.statistics["failures"] == [[3, 12, "LinAlgError: singular"]]
-
-
 def test_a_run_that_fails_midway_counts_only_before() -> None:
     s = broken(make(), run=3, step=12).verdict((BROKE,)).statistics
     assert np.array_equal(s["alive"], [RUNS] * 11 + [RUNS - 1] * (STEPS - 11))

@@ -56,23 +56,6 @@ def test_a_trajectory_in_another_world(align: str, tmp_path: Path) -> None:
     assert np.nanmax(np.abs(cs.read(est, truth=true, covariance=cov, align=align).error)) < 1.0
 
 
-def test_an_archive(tmp_path: Path) -> None:
-    record = cs.read(inputs.archive(tmp_path, 2.0))
-    np.testing.assert_array_equal(record.error.ravel(), 2.0 * inputs.normal(inputs.RUNS * inputs.STEPS, 2).ravel())
-    assert cs.judge(record).status == "overconfident"
-
-
-def test_nees_alone(tmp_path: Path) -> None:
-    np.savez(tmp_path / "nees.npz", nees=np.square(inputs.normal(200, 3)).sum(axis=1)[:, None], dof=3)
-    assert cs.judge(cs.read(tmp_path / "nees.npz")).status == "consistent"
-
-
-def test_windows_of_motions(tmp_path: Path) -> None:
-    est, true = inputs.drive(tmp_path)
-    record = cs.read(est, truth=true, relative=20, motions=True)
-    assert cs.judge(record).status == "consistent"
-
-
 def test_a_state_of_other_columns(tmp_path: Path) -> None:
     lines = [[k, float(e), 1.0] for k, e in enumerate(inputs.normal(50, 1)[:, 0])]
     inputs.rows(tmp_path / "est.csv", "step,bias,P_bias_bias", lines)

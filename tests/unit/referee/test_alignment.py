@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from draws import autoregression
 from scipy import linalg
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
@@ -229,9 +230,7 @@ def residuals_of(
 ) -> tuple[list[Array], list[Array]]:
     bases, left = [], []
     for _ in range(runs):
-        w = rng.normal(size=(steps, 3))
-        for k in range(1, steps):
-            w[k] = correlation * w[k - 1] + np.sqrt(1 - correlation**2) * w[k]
+        (w,) = autoregression(rng, 1, steps, 3, correlation)
         A = np.zeros((steps, 3, 3))
         A[:, range(3), range(3)] = 1.0
         (Q,) = orthonormal([A])

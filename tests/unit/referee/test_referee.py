@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from draws import autoregression
 from hypothesis import given
 from hypothesis import strategies as st
 from referee import judge
@@ -49,13 +50,6 @@ AXES = ("x", "y", "heading")
 RUNS, STEPS, DOF = 100, 40, 3
 FALSE_ALARM = 1e-5
 P = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.003]])  # m^2, m rad, rad^2
-
-
-def autoregression(rng: np.random.Generator, runs: int, steps: int, n: int, coefficient: float) -> Array:
-    w = rng.standard_normal((runs, steps, n))
-    for k in range(1, steps):
-        w[:, k] = coefficient * w[:, k - 1] + np.sqrt(1 - coefficient**2) * w[:, k]
-    return w
 
 
 def within(count: int, total: int, rate: float, sigmas: float = 5.0) -> bool:

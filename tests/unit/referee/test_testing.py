@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from draws import autoregression
 
 import consistency as cs
 from consistency.referee.diagnostics import gate_runs
@@ -32,9 +33,7 @@ def sample(
     """Errors that follow each other (AR(1), 0.8), and covariances that are theirs over ``true``; of mixed units."""
     A = rng.normal(size=(n, n)) + 2.0 * np.eye(n)
     A[0] *= 1e-3
-    z = rng.normal(size=(runs, steps, n))
-    for k in range(1, steps):
-        z[:, k] = 0.8 * z[:, k - 1] + 0.6 * z[:, k]
+    z = autoregression(rng, runs, steps, n, 0.8)
     P = np.broadcast_to(A @ A.T / true, (runs, steps, n, n))
     return z @ A.T, 0.5 * (P + np.swapaxes(P, -1, -2))
 

@@ -10,6 +10,7 @@ import calibration_truth
 import numpy as np
 import pytest
 from command import consistency, refused
+from draws import autoregression
 from recorded import read_recordings
 
 import consistency as cs
@@ -43,18 +44,11 @@ def truth_of_share(s: float) -> Array:
     return low * Q
 
 
-def autoregressive(rng: np.random.Generator, rho: float, shape: tuple[int, int, int]) -> Array:
-    w = rng.standard_normal(shape)
-    for k in range(1, shape[1]):
-        w[:, k] = rho * w[:, k - 1] + np.sqrt(1.0 - rho**2) * w[:, k]
-    return w
-
-
 def errors_of_truth(rng: np.random.Generator, kind: str, runs: int, steps: int) -> Array:
     if kind == "white":
         return rng.standard_normal((runs, steps, N))
     if kind == "AR":
-        return autoregressive(rng, 0.9, (runs, steps, N))
+        return autoregression(rng, runs, steps, N, 0.9)
     shape = (1 if kind in ("common", "signs") else runs, 1, N)
     v = np.broadcast_to(rng.standard_normal(shape), (runs, steps, N))
     return v * rng.choice([-1.0, 1.0], (runs, 1, 1)) if kind == "signs" else v
@@ -66,7 +60,7 @@ def record(
 ) -> Evidence:  # fmt: skip
     """Errors of a filter whose covariance is wrong by ``ratio``, against a truth of the share s."""
     of_truth = truth_of_share(s)
-    e = np.sqrt(ratio) * autoregressive(rng, 0.5, (runs, steps, N)) @ np.linalg.cholesky(P).T
+    e = np.sqrt(ratio) * autoregression(rng, runs, steps, N, 0.5) @ np.linalg.cholesky(P).T
     d = e + errors_of_truth(rng, kind, runs, steps) @ np.linalg.cholesky(of_truth).T
     shape = (runs, steps, N, N)
     return Evidence(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from draws import identities, independent, verdict_on
+from draws import autoregression, identities, independent, verdict_on
 from referee import judge
 from scipy import stats
 
@@ -52,10 +52,7 @@ def make(scale: float = 1.0, bias: float = 0.0, runs: int = RUNS, steps: int = S
     Steps of a run are as dependent as those of a filter: an autoregression with coefficient 0.9.
     """
     rng = np.random.default_rng(5)
-    white, e = rng.normal(size=(runs, steps, 3)), np.empty((runs, steps, 3))
-    e[:, 0] = white[:, 0]
-    for k in range(1, steps):
-        e[:, k] = 0.9 * e[:, k - 1] + np.sqrt(1 - 0.81) * white[:, k]
+    e = autoregression(rng, runs, steps, 3, 0.9)
     P = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.003]])
     error = e @ np.linalg.cholesky(P).T + [bias * 0.2, 0.0, 0.0]
     covariance = np.broadcast_to(P / scale, (runs, steps, 3, 3)).copy()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -252,39 +251,8 @@ def test_refusals() -> None:
 # --- the runs that it takes ------------------------------------------------------------------------
 
 
-Pair = Callable[[np.random.Generator, int], tuple[Array, Array]]
-
-
-def found(rng: np.random.Generator, pair: Pair, runs: int, scale: float, rate: float, ratio: float) -> int:
-    """Of 300 comparisons, those that find a candidate farther off by ``ratio``."""
-    count = 0
-    for _ in range(300):
-        a, b = pair(rng, runs)
-        count += compare(of_runs(scale * ratio * a), of_runs(scale * b), rate).worse
-    return count
-
-
-def independent(rng: np.random.Generator, runs: int) -> tuple[Array, Array]:
-    return gamma(rng, runs, 1.0), gamma(rng, runs, 1.0)
-
-
 def together(rng: np.random.Generator, runs: int) -> tuple[Array, Array]:
     return same_trials(rng, runs, 8)
-
-
-@pytest.mark.parametrize(
-    ("scale", "ratio", "rate"), [(1.0, 1.5, 0.05), (1.0, 1 / 1.5, 1e-3), (2.0, 1.5, 1e-3), (0.5, 1 / 1.5, 0.05)]
-)
-@pytest.mark.parametrize("pair", [independent, together])
-def test_needed_runs_are_what_the_power_takes(
-    rng: np.random.Generator, pair: Pair, scale: float, ratio: float, rate: float
-) -> None:
-    """Power of 300 comparisons at the number planned: 95 %; a third of the runs would not do."""
-    a, b = pair(rng, 4000)
-    needed = compare(of_runs(scale * a), of_runs(scale * b), rate)
-    runs = replace(needed, at_most=np.inf).needed_runs(1.5, 0.95)
-    assert found(rng, pair, runs, scale, rate, ratio) >= stats.binom.ppf(RATE, 300, 0.95)
-    assert found(rng, pair, max(8, runs // 3), scale, rate, ratio) < stats.binom.ppf(RATE, 300, 0.95)
 
 
 def test_a_plan_by_hand() -> None:

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import first_steps
 import numpy as np
 import pytest
 from command import consistency, refused
@@ -290,12 +289,3 @@ def test_no_hint_of_few_runs_or_a_single_step(rng: np.random.Generator) -> None:
             error[:, 8:] /= 3.0
         verdict = verdict_on(error)
         assert verdict.location.until is None
-
-
-def test_uniform_faults_get_no_hint() -> None:
-    """At most 4 % of right ones; 29 of 250 or more come once in 1e5."""
-    rng, hints = np.random.default_rng(27), 0
-    for i in range(250):
-        rho = (0.0, 0.9, 1.0)[i % 3]
-        hints += first_steps.hinted(np.sqrt(1.6) * first_steps.errors(rng, rho, 20, 32, False))[1]
-    assert hints < 29

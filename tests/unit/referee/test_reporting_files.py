@@ -244,7 +244,7 @@ def test_what_a_report_is_not_for(archive: Path, tmp_path: Path, capsys: pytest.
     assert "--overwrite goes with --report" in refused(capsys, "analyse", archive, "--overwrite")
     scenario = cs.load_scenario("linear-gaussian").variant("short", truth__steps=5)
     cs.run_trials(scenario, ["kf"], runs=2, jobs=1).write(tmp_path / "results")
-    err = refused(capsys, "analyse", tmp_path / "results", "--report", tmp_path / "r")
+    _, err = consistency(capsys, "analyse", tmp_path / "results", "--report", tmp_path / "r", status=2)
     assert f"use 'consistency report {tmp_path / 'results'}'" in err
     assert not (tmp_path / "r").exists()
 

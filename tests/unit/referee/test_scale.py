@@ -28,8 +28,11 @@ from consistency.referee.diagnostics import (
     ratio_interval,
     required_runs,
 )
-from consistency.referee.diagnostics.questions import equivalence
-from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting, equivalence_of_innovations
+from consistency.referee.diagnostics.questions.equivalence import (
+    equivalence,
+    equivalence_by_betting,
+    equivalence_of_innovations,
+)
 from consistency.referee.diagnostics.questions.scale import acceptance, run_means, scale_test
 from consistency.referee.types import Array
 

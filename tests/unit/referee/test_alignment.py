@@ -320,6 +320,13 @@ def test_a_product_that_is_too_small_counts_and_one_too_large_does_not(
     assert _oscillate(seen, expected, pairs) is told
 
 
+def test_slower_exponentials_reach_beyond_the_run() -> None:
+    found = _slower(200)
+    times = -1.0 / np.log(found[:, 1])
+    np.testing.assert_allclose(times, 20.0 * 2.0 ** np.arange(1, 6))
+    np.testing.assert_array_equal(found[:, 0], 1.0)
+
+
 def test_most_that_a_fit_takes_is_that_of_a_wave_it_follows() -> None:
     """One frequency in one of three components: a unit vector along it takes half of the sum of its squares."""
     wave = np.zeros((40, 3))

@@ -34,7 +34,6 @@ def begun(work: str, ignored: int | None = None) -> subprocess.Popen[str]:
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True, preexec_fn=as_in_a_terminal,
     )  # fmt: skip
-    assert process.stdout is not None
     process.stdout.readline()
     return process
 

@@ -15,7 +15,7 @@ from scipy.spatial.distance import mahalanobis
 import consistency as cs
 from consistency.referee.diagnostics import chi2_mean_interval, detectable_ratio, normality, rmse
 from consistency.referee.diagnostics.questions import early_ending
-from consistency.referee.diagnostics.records.array_blocks import FEWER as ROWS
+from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
 from consistency.referee.diagnostics.records.validity import (  # fmt: skip
     DEFICIENT,
     EXACT,
@@ -28,7 +28,7 @@ from consistency.referee.diagnostics.records.validity import (  # fmt: skip
     negative,
 )
 from consistency.referee.diagnostics.statistics import distributions as laws
-from consistency.referee.diagnostics.statistics.coverage import coverage
+from consistency.referee.diagnostics.statistics.accuracy import coverage
 from consistency.referee.types import Array
 
 # exact 95 % intervals of chi-square(3 N) / N, computed outside this project

@@ -16,10 +16,17 @@ from single_log import errors
 
 import consistency as cs
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.referee.diagnostics.planning.single_log import APART, MOST, correlation_time, within
-from consistency.referee.diagnostics.questions.early_ending import early_ends
+from consistency.referee.diagnostics.imperfect_truth.shared_errors import LEAST
+from consistency.referee.diagnostics.planning.single_log import (
+    APART,
+    MOST,
+    correlation_time,
+    in_pieces,
+    memory_of,
+    within,
+)
 from consistency.referee.diagnostics.questions.independence import ALIKE, ENOUGH, FEWEST, RATE, SIZES, independence
-from consistency.referee.diagnostics.records.log_pieces import LEAST, in_pieces, memory_of
+from consistency.referee.diagnostics.questions.lost_runs import early_ends
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.diagnostics.verdict.as_dictionary import flat
 from consistency.referee.geometry.conventions import SPATIAL

@@ -37,14 +37,14 @@ def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> 
 
 
 def ellipses(one: Evidence) -> list[Line]:
-    figure = trajectory(one, 0)
+    figure = trajectory(one)
     (panel,) = figure.panels
     return [mark for mark in panel.marks if isinstance(mark, Line) and mark.look == ELLIPSE]
 
 
 def test_ellipses_stand_where_the_errors_are_largest() -> None:
     one = record()
-    figure = trajectory(one, 0)
+    figure = trajectory(one)
     (panel,) = figure.panels
     assert (panel.x.label, panel.y.label, panel.equal) == ("x (m)", "z (m)", True)
     found = ellipses(one)
@@ -73,12 +73,12 @@ def test_an_ellipse_holds_95_percent() -> None:
 def test_no_ellipse_of_errors_about_other_axes() -> None:
     one = record("left")
     assert not ellipses(one)
-    figure = trajectory(one, 0)
+    figure = trajectory(one)
     assert figure.caption.endswith("No ellipses: the stated covariance is not about the axes of the world.")
 
 
 def test_only_what_is_judged_is_drawn() -> None:
-    figure = trajectory(record(axes=("x", "y")), 0)
+    figure = trajectory(record(axes=("x", "y")))
     assert figure.panels[0].y.label == "y (m)"
     assert trajectory(record(axes=("z",)), 0) is None
     bare = record()

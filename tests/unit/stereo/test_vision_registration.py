@@ -12,8 +12,18 @@ from rigs import MOTION
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.stereo.visual_odometry import ConsensusError, ConvergenceError, DegenerateError, RelativePose, register_horn, register_ransac, register_svd, register_weighted, registration_covariance
-from consistency.stereo.visual_odometry import consensus
+from consistency.stereo.visual_odometry import (
+    ConsensusError,
+    ConvergenceError,
+    DegenerateError,
+    RelativePose,
+    consensus,
+    register_horn,
+    register_ransac,
+    register_svd,
+    register_weighted,
+    registration_covariance,
+)
 from consistency.stereo.visual_odometry.registration import squared_distances
 
 Array = np.ndarray[Any, Any]

@@ -472,16 +472,6 @@ def test_a_filter_within_its_limits_has_the_same_bits(world: cs.Scenario, doomed
     pd.testing.assert_frame_equal(limited.estimates, calm, check_exact=True)
 
 
-def test_trials_are_read_only_in_a_process(world: cs.Scenario) -> None:
-    class InPlace(Still):
-        def init(self, problem: Any) -> Any:
-            problem.start += 1.0
-            return problem.start
-
-    failures = cs.run_trials(world, [InPlace("in-place")], runs=1, jobs=1).failures
-    assert "read-only" in failures["reason"][0]
-
-
 # --- where processes cannot be forked --------------------------------------------------------------
 
 

@@ -151,14 +151,6 @@ def test_runs_may_have_any_number_and_length(folder: Path) -> None:
 # --- damage --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["controls", "observations", "truth", "landmarks"])
-def test_file_cut_short(folder: Path, name: str) -> None:
-    path = folder / f"{name}.parquet"
-    path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
-        read_log(folder)
-
-
 @pytest.mark.parametrize("name", ["controls.parquet", "observations.parquet", "sensor.toml"])
 def test_file_missing(folder: Path, name: str) -> None:
     (folder / name).unlink()

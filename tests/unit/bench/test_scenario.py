@@ -62,10 +62,6 @@ def load(tmp_path: Path, *edits: Edit, name: str = "herath2007-stereo") -> cs.Sc
 # --- what is read --------------------------------------------------------------------------------
 
 
-def test_built_in_scenarios_are_known() -> None:
-    assert set(cs.scenario_names()) >= EXPECTED
-
-
 @pytest.mark.parametrize("name", sorted(EXPECTED))
 def test_every_built_in_scenario_loads_and_shows_a_landmark(name: str) -> None:
     scenario = cs.load_scenario(name)
@@ -97,12 +93,6 @@ def test_degrees_reach_into_lists(tmp_path: Path) -> None:
     mount = {"position_m": [0.1, 0.0, 0.2], "rotation_deg": [0.0, -10.0, 90.0]}
     scenario = load(tmp_path, put("belief.sensor.mount", mount))
     assert np.allclose(scenario.belief.sensor.mount.rotation, np.deg2rad([0.0, -10.0, 90.0]))
-
-
-def test_truth_and_belief_are_apart() -> None:
-    optimistic = cs.load_scenario("herath2007-optimistic")
-    assert optimistic.belief.motion.sigma_v == 0.5 * optimistic.truth.motion.sigma_v
-    assert optimistic.truth == cs.load_scenario("herath2007-xyz").truth
 
 
 # --- identity ------------------------------------------------------------------------------------
@@ -224,6 +214,10 @@ BAD: dict[str, tuple[tuple[Edit, ...], str]] = {
     "box reversed": ((put("truth.landmarks.x_m", [8.0, -8.0]),), r"'truth\.landmarks'.*x must be \[low, high\]"),
     "negative disparity": ((put("truth.sensor.disparity_px", [-1.0, 32.0]),), r"'truth\.sensor\.disparity\.0'"),
     "half a linear world": ((put("truth.motion.model", "linear"),), r"'truth'.*'linear' together"),
+    "disparity reversed": ((put("truth.sensor.disparity_px", [32.0, 1.0]),), r"disparity"),
+    "true is no number": ((put("truth.motion.sigma_v", True),), r"truth\.motion\.sigma_v"),
+    "text is no number": ((put("truth.motion.sigma_v", "0.1"),), r"truth\.motion\.sigma_v"),
+    "two mistakes": ((put("truth.steps", -1), put("belief.motion.sigma_v", -1.0)), r"\(and 1 more\)"),
     "name inside": ((put("name", "other"),), r"'name': not allowed here"),
     "corner too round": (
         (
@@ -245,50 +239,31 @@ def test_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str) -> Non
     assert "\n" not in text
 
 
-def test_reversed_disparity_range_is_refused(tmp_path: Path) -> None:
-    """Nothing could ever be found in it."""
-    with pytest.raises(cs.InputError, match=r"disparity"):
-        load(tmp_path, put("truth.sensor.disparity_px", [32.0, 1.0]))
+@pytest.mark.parametrize(
+    ("name", "edit", "complaint"),
+    [
+        ("linear-gaussian", put("truth.motion.noise_on", "odometry"), "noise_on = 'motion'"),
+        ("herath2007-xyz", drop("truth.sensor.f_px"), r"'truth\.sensor'.*image needs f"),
+    ],
+)
+def test_what_another_world_needs(tmp_path: Path, name: str, edit: Edit, complaint: str) -> None:
+    with pytest.raises(cs.InputError, match=complaint):
+        load(tmp_path, edit, name=name)
 
 
-@pytest.mark.parametrize("value", [True, "0.1"])
-def test_a_number_is_neither_true_nor_text(tmp_path: Path, value: object) -> None:
-    with pytest.raises(cs.InputError, match=r"truth\.motion\.sigma_v"):
-        load(tmp_path, put("truth.motion.sigma_v", value))
-
-
-def test_linear_world_needs_noise_on_motion(tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"noise_on = 'motion'"):
-        load(tmp_path, put("truth.motion.noise_on", "odometry"), name="linear-gaussian")
-
-
-def test_image_needs_a_focal_length(tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"'truth\.sensor'.*image needs f"):
-        load(tmp_path, drop("truth.sensor.f_px"), name="herath2007-xyz")
-
-
-def test_more_than_one_mistake_is_counted(tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"\(and 1 more\)"):
-        load(tmp_path, put("truth.steps", -1), put("belief.motion.sigma_v", -1.0))
-
-
-def test_toml_syntax_error_is_said_with_its_line(tmp_path: Path) -> None:
-    path = tmp_path / "broken.toml"
-    path.write_text("summary = 'x'\n[truth\n", encoding="utf-8")
-    with pytest.raises(cs.InputError, match=r"broken\.toml: not valid TOML.*line 2"):
-        cs.load_scenario(path)
-
-
-def test_not_text_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "binary.toml"
-    path.write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(cs.InputError, match=r"binary\.toml: not valid TOML"):
-        cs.load_scenario(path)
-
-
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"nowhere\.toml: cannot be read \(No such file"):
-        cs.load_scenario(tmp_path / "nowhere.toml")
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"summary = 'x'\n[truth\n", "not valid TOML.*line 2"),
+        (b"\xff\xfe\x00\x01", "not valid TOML"),
+        (None, r"cannot be read \(No such file"),
+    ],
+)
+def test_a_file_that_is_no_table(tmp_path: Path, content: bytes | None, complaint: str) -> None:
+    if content is not None:
+        (tmp_path / "broken.toml").write_bytes(content)
+    with pytest.raises(cs.InputError, match=rf"broken\.toml: {complaint}"):
+        cs.load_scenario(tmp_path / "broken.toml")
 
 
 def test_unknown_name_with_a_suggestion() -> None:

@@ -66,6 +66,11 @@ TABLES: list[tuple[str, Edit, str]] = [
     ("estimates", value("run == 5 and filter == 'one'", "run", 10**12), r"run 6 of 'one' is not what comes next"),
     ("estimates", value("filter == 'two' and run == 8", "filter", "three"), r"12 of 211 rows are of no filter"),
     ("estimates", value("filter == 'two' and run == 8", "run", 9), r"run 8 of 'two' is missing"),
+    ("estimates", lambda t: t.drop(columns="P_xh"), r"column 'P_xh' is missing; needed: filter, run"),
+    ("estimates", value("run == 5", "P_xx", np.nan), r"column 'P_xx', row \d+: not a finite number"),
+    ("estimates", value("run == 5", "P_xx", np.inf), r"column 'P_xx', row \d+: not a finite number"),
+    ("estimates", lambda t: t.assign(x="far"), r"estimates\.parquet: column 'x', row 0: not a"),
+    ("truth", lambda t: t.assign(step=t["step"] + 0.5), r"column 'step', row 0: not a whole number \(0\.5\)"),
     ("truth", only("step <= 5"), r"truth\.parquet: run 0 has 5 steps, the scenario 12"),
     ("truth", only("run < 8"), r"counts 9 runs, the tables hold 8"),
     ("truth", twice, r"truth\.parquet: step 0 of run 0 is not what comes next"),
@@ -153,6 +158,9 @@ MANIFESTS: list[tuple[dict[str, Any], str]] = [
     ({"optimal_gain": ["three"]}, r"key 'optimal_gain': 'three' is no filter"),
     ({"scenario_hash": "0" * 16}, r"key 'scenario_hash' is not that of key 'scenario'"),
     ({"kind": "log"}, r"key 'kind'"),
+    ({"contents": []}, r"manifest\.json: key 'contents' must have tables as keys"),
+    ({"contents": {"poses": {}}}, r"key 'contents' must have tables as keys"),
+    ({"contents": "all"}, r"key 'contents' must have tables as keys"),
     ({"versions": 5}, r"key 'versions'"),
 ]
 

@@ -18,7 +18,6 @@ import consistency as cs
 from consistency.bench.filters import usable_names
 from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.compiled import Compiled, problem_for
-from consistency.bench.filters.compiler.dispatch import require_fitting
 from consistency.bench.filters.kernel.gain import linearise_seen
 from consistency.bench.filters.kernel.part_functions import (
     State,
@@ -331,9 +330,3 @@ def test_the_map_is_that_of_the_twin(small: Small, name: str) -> None:
     rows = (3 * rows[:, None] + np.arange(3)).ravel()
     assert close(joint.mean[rows], np.append(filter_.pose(state).mean, ours.mean), 1e-10)
     assert np.abs(ours.joint - joint.covariance[np.ix_(rows, rows)]).max() <= 1e-10 * np.abs(ours.joint).max()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_combinations_fit(small: Small, name: str) -> None:
-    trial, scenario, filter_ = cs.simulate(small(world_of(name))), small(world_of(name)), cs.get_filter(name)
-    require_fitting(filter_.parts(problem_for(filter_, trial, scenario.belief), np.array(trial.controls)))

@@ -19,7 +19,6 @@ from consistency.bench.filters.compiler import compile_time, disk_cache
 from consistency.bench.filters.compiler.compile_time import FIRST
 from consistency.bench.filters.compiler.content_key import Content
 from consistency.bench.filters.compiler.jit import Kernel, Outlook
-from consistency.bench.filters.kernel.part_functions import robot_width
 from consistency.bench.runs import compiling
 from consistency.bench.runs.findings import experiments
 from consistency.bench.runs.montecarlo import resolve_filters
@@ -237,14 +236,6 @@ def test_what_compiling_took_is_kept(cache: Path, monkeypatch: pytest.MonkeyPatc
 def test_the_size_is_that_of_all_functions() -> None:
     sizes = Content(outer, ()).functions
     assert sizes == {f"{__name__}.{f.__name__}": len(f.__code__.co_code) for f in (inner, outer)}
-
-
-def of_a_part(part: Any) -> int:
-    return robot_width(part)
-
-
-def test_what_only_chooses_a_body_has_no_size() -> None:
-    assert set(Content(of_a_part, ()).functions) == {f"{__name__}.of_a_part"}
 
 
 def test_functions_that_were_compiled_before_count_less(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,10 +12,8 @@ import pytest
 import tomli_w
 
 import consistency as cs
-from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.scenario import DisparityGrowth, data_folder
 from consistency.bench.simulation import World
-from consistency.bench.store.log import read_log
 
 Small = Callable[..., cs.Scenario]
 GROWTH = {"disparity": [3.0, 5.0, 12.0], "ratio": [0.5, 1.0, 2.4]}
@@ -71,12 +69,6 @@ def test_the_noise_has_the_same_random_numbers_scaled_at_the_true_disparity(smal
     assert np.ptp(ratio) > 1.0
     assert np.array_equal(b.z[:, :2], a.z[:, :2])
     assert np.allclose(b.z[:, 2] - ideal[:, 2], ratio * (a.z[:, 2] - ideal[:, 2]), rtol=0, atol=1e-12)
-
-
-def test_a_log_carries_the_belief(small: Small, tmp_path: Path) -> None:
-    scenario = small("herath2007-stereo", belief__sensor__disparity_growth=GROWTH)
-    simulate_log(scenario, runs=1, seed=0, out=tmp_path / "log")
-    assert read_log(tmp_path / "log").belief == scenario.belief
 
 
 def load(tmp_path: Path, half: str, name: str = "herath2007-stereo", **growth: Any) -> cs.Scenario:

@@ -131,15 +131,6 @@ def test_smoothers_and_guarded_filters_take_no_guard() -> None:
             cs.guarded(once, "joint")
 
 
-def test_the_command_refuses_a_guard_that_is_not_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match="unknown guard 'wall'"):
-        app(
-            ["run", "herath2007-stereo", "--filter", "ekf-uvd+wall", "--out", str(tmp_path / "out")],
-            standalone_mode=False,
-        )
-    assert not (tmp_path / "out").exists()
-
-
 # --- the belief --------------------------------------------------------------------------------------
 
 
@@ -288,12 +279,6 @@ def test_small_maps_are_guarded_too(wrong: cs.Scenario) -> None:
     assert small.rejected[:joined].tolist() == whole.rejected[:joined].tolist()
     assert small.rejected[:joined].any()
     assert not small.rejected[joined : trial.first[51]].any()
-
-
-def test_an_unguarded_filter_says_nothing_of_rejection(uvd: cs.Scenario) -> None:
-    trial = cs.simulate(uvd)
-    assert run_filter(cs.get_filter("ekf-uvd"), trial, uvd.belief).rejected is None
-    assert step_through(cs.get_filter("ekf-uvd").textbook, trial, uvd.belief).rejected is None
 
 
 def test_what_is_wrong_is_rejected(linear: cs.Scenario, rng: np.random.Generator) -> None:

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -20,7 +19,6 @@ from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import StoredResults, open_results
 from consistency.bench.store.trial_rows import RunOutcome
-from consistency.bench.types import Trial
 from consistency.referee.diagnostics import Record
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
@@ -287,20 +285,3 @@ def test_a_log_whose_runs_are_not_numbered_from_zero(log: Path, tmp_path: Path, 
     assert done == [1, 4, 5]
     assert results.finished_runs(["kf"]) == {1, 4, 5}
     assert results.manifest["runs"] == 3
-
-
-def test_rows_of_a_log_in_any_order(log: Path, tmp_path: Path) -> None:
-    """Trials are those of the runs, however their rows are mixed; of one step they keep their order."""
-    before = read_log(log).trials
-    rng = np.random.default_rng()
-    for name in ("controls", "observations", "truth"):
-        table = pd.read_parquet(log / f"{name}.parquet")
-        table = table.sample(frac=1.0, random_state=int(rng.integers(2**31)))
-        if name == "observations":
-            table = table.sort_values(["step", "landmark"], ascending=[False, True])
-        table.to_parquet(log / f"{name}.parquet", index=False)
-    after = read_log(log).trials
-    for a, b in zip(before, after, strict=True):
-        assert isinstance(b, Trial)
-        for field in ("controls", "first", "landmark", "z", "truth"):
-            assert np.array_equal(getattr(a, field), getattr(b, field)), field

@@ -145,17 +145,6 @@ def test_what_a_planar_sensor_cannot_have(small: Small, case: str) -> None:
         small("esde-xy", **changes)
 
 
-@pytest.mark.parametrize(
-    ("name", "world"), [("ekf-xyz", "esde-xy"), ("ekf-xy", "range-bearing"), ("ri-ekf-rb", "long-loop")]
-)
-def test_a_filter_on_a_sensor_that_it_does_not_fit(name: str, world: str) -> None:
-    with pytest.raises(
-        cs.InputError, match=f"filter '{name}' works on a sensor .*, not .*; filters that fit: "
-    ) as error:
-        cs.run_trials(cs.load_scenario(world), [name], runs=1)
-    assert len(str(error.value).splitlines()) == 1
-
-
 # --- logs and maps ---------------------------------------------------------------------------------
 
 

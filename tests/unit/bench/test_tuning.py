@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from documents import blocks, commands
+from documents import blocks
 from scipy import stats
 
 import consistency as cs
@@ -514,32 +514,6 @@ def test_a_log_is_tuned_to_a_sensor_file(capsys: pytest.CaptureFixture[str], tmp
 
 
 # --- the manual --------------------------------------------------------------------------------------
-
-TYPED = [command for command in commands("docs/tuning.md") if not (command.inline or command.synopsis)]
-COMMANDS = [" ".join(command.words[1:]) for command in TYPED if command.words[1:2] == ["tune"]]
-
-
-def test_the_manual_has_commands() -> None:
-    assert len(COMMANDS) == 5
-
-
-def reached(self: Any, by: str) -> None:
-    raise cs.InputError("reached")
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_commands_of_the_manual_are_taken(
-    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, uvd: cs.Scenario
-) -> None:
-    """Up to the fit: names, options and groups are as they must be; the log is one of its sensor."""
-    sensor = {"model": "range-bearing", "sigma": (0.1, 0.01)}
-    plane = uvd.belief.model_copy(update={"sensor": type(uvd.belief.sensor)(**sensor)})
-    belief = plane if "-rb" in command else uvd.belief
-    trial = cs.simulate(uvd, seed=SEED)
-    monkeypatch.setattr("consistency.bench.store.log.read_log", lambda folder: Log(str(folder), [trial], belief, None))
-    monkeypatch.setattr(tuning_module._Tuner, "fitted", reached)
-    status, out, err = status_of(capsys, *command.split()[1:])
-    assert (status, out, err) == (2, "", "consistency: reached\n")
 
 
 def test_the_filterpy_filter_of_the_manual(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from command import consistency
+from own_process import consistency
 
 FAR = ("--within", "steps=50:100", "--within", "range=6:9", "--trials", "100", "--jobs", "1")
 

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command import COMPILING, begun, size_of
 from forks import LIMIT, Program
+from own_process import COMPILING, begun, size_of
 
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal

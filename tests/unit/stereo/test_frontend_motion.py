@@ -217,19 +217,6 @@ def test_log_of_rendered_images_is_near_the_truth(log: Path) -> None:
     assert read_manifest(log)["opencv"]
 
 
-def test_trajectory_and_truth_are_read_as_recordings(log: Path) -> None:
-    (recording,) = read_recordings(log / "trajectory.tum", log / "truth.tum", log / "covariance.txt", "so3")
-    assert recording.error is not None
-    assert recording.error.shape == (1, FRAMES - 1, 6)
-    assert np.abs(recording.error[..., :3]).max() < 0.003
-
-
-def test_fewer_landmarks_than_one_at_once(images: Path, tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match="--max-landmarks 0"):
-        write_frontend_log(images, tmp_path / "out", FrontendOptions(max_landmarks=0))
-    assert not list(tmp_path.iterdir())
-
-
 def test_nothing_is_left_of_a_log_that_fails(images: Path, tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text("1 2 3\n")
     with pytest.raises(cs.InputError, match=r"poses\.txt"):

@@ -112,6 +112,25 @@ def dense() -> Iterator[None]:
 
 
 @pytest.fixture
+def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], list[int]]:
+    """Has an error raised in the place of a run; gives the list of the runs that are done."""
+
+    def arm(run: int, error: BaseException) -> list[int]:
+        one, done = TrialWork.__call__, list[int]()
+
+        def stopped(self: TrialWork, number: int) -> RunOutcome:
+            if number == run:
+                raise error
+            done.append(number)
+            return one(self, number)
+
+        monkeypatch.setattr(TrialWork, "__call__", stopped)
+        return done
+
+    return arm
+
+
+@pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20070)
 

@@ -6,6 +6,11 @@ import json
 from pathlib import Path
 
 
+def content(folder: Path) -> dict[str, bytes]:
+    """Bytes of the tables in a folder, by name."""
+    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
+
+
 def accept_changes(folder: Path) -> None:
     """Take the digests of the tables out of the manifest."""
     path = folder / "manifest.json"

@@ -554,13 +554,3 @@ def test_a_belief_without_search_range_is_refused(small: Small) -> None:
     scenario = small("herath2007-stereo", belief__sensor__disparity=None)
     with pytest.raises(cs.InputError, match=r"key 'belief.sensor.disparity_px': missing; filter 'parked-ekf-uvd'"):
         cs.run_trials(scenario, ["parked-ekf-uvd"], runs=1)
-
-
-def test_a_search_range_must_be_an_interval(small: Small) -> None:
-    with pytest.raises(ValueError, match=r"disparity must be \[low, high\] with low < high"):
-        small("herath2007-stereo", belief__sensor__disparity=(4.0, 4.0))
-
-
-def test_a_belief_without_search_range_has_the_hash_it_had(small: Small) -> None:
-    content = small("herath2007-stereo", belief__sensor__disparity=None).model_dump(mode="json")
-    assert "disparity" not in content["belief"]["sensor"]

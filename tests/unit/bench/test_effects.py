@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -10,13 +9,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pandas as pd
 import pytest
-import tomli_w
+from scenario_files import load, put
 
 import consistency as cs
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.models import point, stereo
 from consistency.bench.runs.montecarlo import run_log, simulate_log
-from consistency.bench.scenario import data_folder
 from consistency.bench.scenario.effects import EFFECTS, Context, FieldOfView, ListedEffect, Observations
 from consistency.bench.scenario.toml_tables import Count, Positive, Triple
 from consistency.bench.simulation import World, draw_landmarks, planned_controls
@@ -471,20 +469,12 @@ MISTAKES: dict[str, tuple[Any, str]] = {
 def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str) -> None:
     effects, complaint = MISTAKES[case]
     with pytest.raises(cs.InputError, match=r"mine\.toml: key 'truth\.sensor" + complaint) as e:
-        load(tmp_path, effects)
+        load(tmp_path, put("truth.sensor.effects", effects))
     assert "\n" not in str(e.value)
 
 
-def load(tmp_path: Path, effects: Any, **truth: Any) -> cs.Scenario:
-    data = tomllib.loads((data_folder("scenarios") / "herath2007-stereo.toml").read_text(encoding="utf-8"))
-    data["truth"]["sensor"]["effects"] = effects
-    data["truth"] |= truth
-    (tmp_path / "mine.toml").write_text(tomli_w.dumps(data), encoding="utf-8")
-    return cs.load_scenario(tmp_path / "mine.toml")
-
-
 def test_an_effect_is_read_with_units_and_name(tmp_path: Path) -> None:
-    scenario = load(tmp_path, [SHIFT, SHIFT | {"name": "again"}])
+    scenario = load(tmp_path, put("truth.sensor.effects", [SHIFT, SHIFT | {"name": "again"}]))
     assert scenario.truth.sensor.effects == (
         Shift(by=(0.0, 0.0, 1.0)),
         Shift(by=(0.0, 0.0, 1.0), name="again"),

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from edited import accept_changes
+from edited import accept_changes, content
 
 import consistency as cs
 from consistency.bench.runs import gather, trial_work
@@ -58,10 +58,6 @@ class Halts:
         return cs.Gaussian(state["pose"], -np.eye(3) if state["doomed"] and state["steps"] == 5 else np.eye(3))
 
 
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
-
-
 def damage(path: Path) -> None:
     """Flip a bit in the middle of the column y."""
     group = pq.ParquetFile(path).metadata.row_group(0)
@@ -83,23 +79,6 @@ def written(uvd: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("gather") / "memory"
     cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1).write(folder)
     return folder
-
-
-@pytest.fixture
-def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], None]:
-    """What is raised in the place of the trial of that run."""
-
-    def arm(run: int, error: BaseException) -> None:
-        trial = World.trial
-
-        def stopped(self: World, number: int, seed: int) -> Trial:
-            if number == run:
-                raise error
-            return trial(self, number, seed)
-
-        monkeypatch.setattr(World, "trial", stopped)
-
-    return arm
 
 
 # --- the same bytes ----------------------------------------------------------------------------------

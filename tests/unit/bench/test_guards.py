@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from edited import content
 from mismatch import WrongMatch, corrupted
 from scipy import stats
 
@@ -340,10 +341,6 @@ def test_ends_of_the_scale() -> None:
 # --- results -----------------------------------------------------------------------------------------
 
 FILTERS = ["ekf-uvd", "ekf-uvd+gate"]
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
 
 
 def test_rejections_are_kept_streamed_and_resumed(wrong: cs.Scenario, tmp_path: Path) -> None:

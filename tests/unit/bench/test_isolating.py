@@ -19,7 +19,7 @@ import cloudpickle
 import numpy as np
 import pandas as pd
 import pytest
-from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, raises, segfaults
+from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, is_gone, raises, segfaults
 from threadpoolctl import threadpool_info
 
 import consistency as cs
@@ -303,20 +303,6 @@ def kills_once(folder: Path, supervisor: bool) -> Callable[..., None]:
             time.sleep(100)
 
     return act
-
-
-def is_gone(pid: int, patience: float = 10.0) -> bool:
-    """Whether a process ends in good time; it may have to be reaped by others than us."""
-    until = time.monotonic() + patience
-    while time.monotonic() < until:
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except (FileNotFoundError, ProcessLookupError):
-            return True
-        if state == "Z":
-            return True
-        time.sleep(0.05)
-    return False
 
 
 @pytest.mark.parametrize("supervisor", [True, False])

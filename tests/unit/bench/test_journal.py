@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from edited import accept_changes
+from edited import accept_changes, content
 
 import consistency as cs
 from consistency.bench.runs import gather
@@ -35,10 +35,6 @@ from consistency.referee.system.stopping import stoppable
 
 FILTER = ["ekf-uvd"]
 RUNS = 6
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
 
 
 def columns(run: int, rows: int = 5) -> dict[str, Any]:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 import weakref
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
+from edited import content
 
 import consistency as cs
 from consistency.bench.runs import gather, sequential
 from consistency.bench.runs.montecarlo import Interrupted, run_log, simulate_log
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import StoredResults, open_results
 from consistency.bench.store.trial_rows import RunOutcome
@@ -37,29 +36,6 @@ def whole(world: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("looks") / "whole"
     run_until_decided(world, ["kf"], out=out, **OPEN)
     return out
-
-
-@pytest.fixture
-def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], list[int]]:
-    """What is raised in the place of a run; gives the list of the runs that are done."""
-
-    def arm(run: int, error: BaseException) -> list[int]:
-        one, done = TrialWork.__call__, list[int]()
-
-        def stopped(self: TrialWork, number: int) -> RunOutcome:
-            if number == run:
-                raise error
-            done.append(number)
-            return one(self, number)
-
-        monkeypatch.setattr(TrialWork, "__call__", stopped)
-        return done
-
-    return arm
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
 
 
 def plan_in(folder: Path) -> Any:

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from misbehaving import Still, raises
 
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.simulation import World
 from consistency.bench.store.results import joined
 from consistency.bench.types import Control, Gaussian, Observation, Trial
 
 Small = Callable[..., cs.Scenario]
-BROKEN_RUN, BROKEN_STEP = 7, 11
 
 
 class Mine:
@@ -40,36 +39,6 @@ class Mine:
 
     def pose(self, state: Any) -> Gaussian:
         return self.inner.pose(state)
-
-
-class Breaks:
-    """Counts steps, and in one step of one run does what it is told; that run it knows by its first control."""
-
-    def __init__(self, how: str, control: Control) -> None:
-        self.how, self.control, self.name = how, control, f"breaks-{how}"
-
-    def init(self, problem: Any) -> dict[str, Any]:
-        return {"step": 0, "doomed": False, "pose": problem.start}
-
-    def predict(self, state: dict[str, Any], control: Control) -> dict[str, Any]:
-        step = state["step"] + 1
-        return {**state, "step": step, "doomed": control == self.control if step == 1 else state["doomed"]}
-
-    def update(self, state: dict[str, Any], observation: Observation) -> tuple[dict[str, Any], None]:
-        if self.how == "raises" and self._now(state):
-            raise RuntimeError("out of ideas")
-        return state, None
-
-    def pose(self, state: dict[str, Any]) -> Gaussian:
-        mean, P = np.array(state["pose"]), np.eye(3)
-        if self._now(state):
-            mean = mean * np.nan if self.how == "nan" else mean
-            P = {"indefinite": np.diag([1.0, 1.0, -1.0]), "singular": np.diag([1.0, 1.0, 0.0])}.get(self.how, P)
-            P = np.eye(2) if self.how == "shape" else P
-        return Gaussian(mean, P)
-
-    def _now(self, state: dict[str, Any]) -> bool:
-        return bool(state["doomed"] and state["step"] == BROKEN_STEP)
 
 
 def equal(a: cs.Results, b: cs.Results) -> bool:
@@ -142,34 +111,6 @@ def test_a_filter_without_a_name_has_that_of_its_class(xyz: cs.Scenario) -> None
     assert cs.run_trials(xyz, [Nameless()], runs=1, jobs=1).filters == ["Nameless"]
 
 
-REASONS = {
-    "raises": "RuntimeError: out of ideas",
-    "nan": "the estimate is not finite",
-    "indefinite": "the pose covariance is not positive definite",
-    "singular": "the pose covariance is not positive definite",
-    "shape": "ValueError: pose() gave an array of shape (2, 2), not (3, 3)",
-}
-
-
-@pytest.mark.parametrize("how", REASONS)
-def test_a_run_that_breaks_is_a_result(xyz: cs.Scenario, how: str) -> None:
-    doomed = cs.simulate(xyz, BROKEN_RUN, seed=1).control(1)
-    results = cs.run_trials(xyz, [Breaks(how, doomed), "ekf-xyz"], runs=9, seed=1, jobs=1)
-    name = f"breaks-{how}"
-    assert results.failures.to_dict("records") == [
-        {"filter": name, "run": BROKEN_RUN, "step": BROKEN_STEP, "reason": REASONS[how]}
-    ]
-    rows = results.estimates[results.estimates["filter"] == name].groupby("run")["step"].max()
-    assert rows.to_dict() == {run: BROKEN_STEP - 1 if run == BROKEN_RUN else 60 for run in range(9)}
-    assert results.manifest["failures"] == 1
-    verdicts = cs.analyse(results)
-    assert not verdicts[name].consistent
-    assert any("1 of 9 runs failed, first run 7 in step 11" in reason for reason in verdicts[name].reasons)
-    alone = cs.run_trials(xyz, ["ekf-xyz"], runs=9, seed=1, jobs=1)
-    among = results.estimates[results.estimates["filter"] == "ekf-xyz"].reset_index(drop=True)
-    pd.testing.assert_frame_equal(among, alone.estimates, check_exact=True)
-
-
 def test_a_filter_that_breaks_at_once(xyz: cs.Scenario) -> None:
     class Stillborn(Mine):
         name = "stillborn"
@@ -240,27 +181,10 @@ def test_arguments_that_are_refused(xyz: cs.Scenario, options: dict[str, Any], c
 # --- stopped and resumed -------------------------------------------------------------------------
 
 
-@pytest.fixture
-def stop_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
-    """Ctrl-C when the run of that number is begun."""
-
-    def arm(runs: int) -> None:
-        trial = World.trial
-
-        def interrupted(self: World, run: int, seed: int) -> Trial:
-            if run == runs:
-                raise KeyboardInterrupt
-            return trial(self, run, seed)
-
-        monkeypatch.setattr(World, "trial", interrupted)
-
-    return arm
-
-
 def test_stopped_and_resumed_gives_the_same_bits(
-    uvd: cs.Scenario, ten: cs.Results, stop_after: Callable[[int], None], monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+    uvd: cs.Scenario, ten: cs.Results, stop_at: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
-    stop_after(4)
+    stop_at(4, KeyboardInterrupt())
     with pytest.raises(Interrupted) as stop:
         cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=1)
     part = stop.value.results
@@ -278,16 +202,14 @@ def test_stopped_and_resumed_gives_the_same_bits(
     assert "finished_runs" not in resumed.manifest
 
 
-def test_resuming_keeps_failed_runs(
-    xyz: cs.Scenario, stop_after: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    doomed = cs.simulate(xyz, 2, seed=1).control(1)
-    whole = cs.run_trials(xyz, [Breaks("raises", doomed)], runs=6, seed=1, jobs=1)
-    stop_after(4)
+def test_resuming_keeps_failed_runs(xyz: cs.Scenario, stop_at: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    filters = [Still("breaks", raises(RuntimeError("out of ideas")), cs.simulate(xyz, 2, seed=1).control(1))]
+    whole = cs.run_trials(xyz, filters, runs=6, seed=1, jobs=1)
+    stop_at(4, KeyboardInterrupt())
     with pytest.raises(Interrupted) as stop:
-        cs.run_trials(xyz, [Breaks("raises", doomed)], runs=6, seed=1, jobs=1)
+        cs.run_trials(xyz, filters, runs=6, seed=1, jobs=1)
     monkeypatch.undo()
-    resumed = cs.run_trials(xyz, [Breaks("raises", doomed)], runs=6, seed=1, jobs=1, previous=stop.value.results)
+    resumed = cs.run_trials(xyz, filters, runs=6, seed=1, jobs=1, previous=stop.value.results)
     assert len(whole.failures) == 1
     assert equal(resumed, whole)
 
@@ -355,25 +277,3 @@ def test_a_filter_cannot_change_what_the_next_one_is_given(xyz: cs.Scenario) -> 
     pd.testing.assert_frame_equal(both, alone.estimates)
     assert list(results.failures["filter"]) == ["in-place"] * 2
     assert results.failures["reason"].str.contains("read-only").all()
-
-
-@pytest.mark.parametrize(
-    ("covariance", "innovation", "reason"),
-    [
-        (np.array([[1, 1e-3, 0], [0, 1, 0], [0, 0, 1]]), np.eye(3), "pose covariance is not symmetric"),
-        (np.eye(3), -np.eye(3), "innovation covariance is not positive definite"),
-    ],
-)
-def test_a_broken_covariance_is_a_failed_run(xyz: cs.Scenario, covariance: Any, innovation: Any, reason: str) -> None:
-    class Broken(InPlace):
-        def init(self, problem: Any) -> Any:
-            return problem.start
-
-        def update(self, state: Any, observation: Observation) -> Any:
-            return state, cs.Info(np.ones(3), innovation, np.zeros((3, 3)))
-
-        def pose(self, state: Any) -> Gaussian:
-            return Gaussian(state, covariance)
-
-    results = cs.run_trials(xyz, [Broken()], runs=1, jobs=1)
-    assert results.failures[["step", "reason"]].to_numpy().tolist() == [[1, f"the {reason}"]]

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+from edited import content
 from invariant import Invariant
 
 import consistency as cs
@@ -38,10 +39,6 @@ def matrices(table: pd.DataFrame, columns: dict[str, tuple[int, int]]) -> Array:
     for name, (i, j) in columns.items():
         out[:, i, j] = out[:, j, i] = table[name]
     return out
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
 
 
 # --- a step-wise filter --------------------------------------------------------------------------

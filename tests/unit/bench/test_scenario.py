@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import re
-import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import tomli_w
 from pydantic import ValidationError
+from scenario_files import Edit, drop, load, put
 
 import consistency as cs
-from consistency.bench.scenario import data_folder, scenario_text
+from consistency.bench.scenario import scenario_text
 
 EXPECTED = {
     "esde-xy", "iekf-slam-xy", "ocekf-slam-xy", "range-bearing",
@@ -21,42 +19,6 @@ EXPECTED = {
     "long-loop",
     *(f"herath2007-{issue}" for issue in ("bias", "drift", "fov", "growth", "junction", "mismatch", "selection")),
 }  # fmt: skip
-Edit = Callable[[dict], None]
-
-
-def table(name: str = "herath2007-stereo") -> dict:
-    return tomllib.loads((data_folder("scenarios") / f"{name}.toml").read_text(encoding="utf-8"))
-
-
-def put(path: str, value: object) -> Edit:
-    """Set ``a.b.c`` of a file's data."""
-
-    def edit(data: dict) -> None:
-        *parents, key = path.split(".")
-        for parent in parents:
-            data = data[parent]
-        data[key] = value
-
-    return edit
-
-
-def drop(path: str) -> Edit:
-    def edit(data: dict) -> None:
-        *parents, key = path.split(".")
-        for parent in parents:
-            data = data[parent]
-        del data[key]
-
-    return edit
-
-
-def load(tmp_path: Path, *edits: Edit, name: str = "herath2007-stereo") -> cs.Scenario:
-    data = table(name)
-    for edit in edits:
-        edit(data)
-    path = tmp_path / "mine.toml"
-    path.write_text(tomli_w.dumps(data), encoding="utf-8")
-    return cs.load_scenario(path)
 
 
 # --- what is read --------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from estimates import apart
 from mismatch import corrupted
 from scipy import stats
 
@@ -23,7 +24,7 @@ from consistency.bench.filters.kernel import loop
 from consistency.bench.filters.kernel.part_functions import keep_some, make_watch
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.scenario import GuardSettings
-from consistency.bench.types import Estimates, Observation
+from consistency.bench.types import Observation
 from consistency.referee.types import Array, Indices
 
 Small = Callable[..., cs.Scenario]
@@ -166,15 +167,6 @@ INTERPRETED = [
 ]  # fmt: skip
 
 
-def difference(a: Estimates, b: Estimates) -> float:
-    """Largest difference of poses (m, rad), of covariances and of NIS relative to their size."""
-    assert a.failure is None
-    assert b.failure is None
-    size = np.abs(b.covariance).max(axis=(1, 2), keepdims=True)
-    nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
-    return float(max(np.abs(a.pose - b.pose).max(), (np.abs(a.covariance - b.covariance) / size).max(), nis))
-
-
 def first_sightings(trial: cs.Trial) -> Indices:
     """Row of the first observation of each landmark."""
     return np.unique(trial.landmark, return_index=True)[1]
@@ -191,12 +183,12 @@ def agree(name: str, scenario: cs.Scenario, rng: np.random.Generator) -> None:
     assert ours.rejected.tolist() == twin.rejected.tolist()
     assert (ours.rejected & trial.spurious).any()
     assert ours.rejected[first_sightings(trial)].any()  # of landmarks that began anew
-    assert difference(ours, twin) < 1e-7  # rounding, which what is wrong and accepted amplifies; 2e-8 on one processor
+    assert apart(ours, twin) < 1e-7  # rounding, which what is wrong and accepted amplifies; 2e-8 on one processor
     assert ours.nis_dof.tolist() == twin.nis_dof.tolist()
     assert ours.map is not None
     assert twin.map is not None
     assert ours.map.landmarks.tolist() == twin.map.landmarks.tolist()
-    assert difference(filter_.run(cs.simulate(scenario, run=2), scenario.belief), twin) > 1e-6  # negative control
+    assert apart(filter_.run(cs.simulate(scenario, run=2), scenario.belief), twin) > 1e-6  # negative control
 
 
 @pytest.fixture
@@ -270,7 +262,7 @@ def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None
     assert twin.rejected is not None
     assert ours.rejected[wrong].all()
     assert ours.rejected.tolist() == twin.rejected.tolist()
-    assert difference(ours, twin) < 1e-8
+    assert apart(ours, twin) < 1e-8
     assert ours.map is not None
     assert trial.landmarks is not None
     for label in AGAIN:  # where they are: 1e-9 of a chi-square with 3 degrees of freedom lies beyond 45

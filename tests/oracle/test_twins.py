@@ -89,15 +89,6 @@ def test_one_compiled_signature_serves_every_caller(uvd: cs.Scenario) -> None:
     assert len(trial_kernel._entries) == signatures
 
 
-def test_sigma_points_matter(small: Small) -> None:
-    """Negative control: the comparison would see sigma points that are not taken from the belief."""
-    trial = cs.simulate(small("herath2007-stereo"))
-    default, merwe = (
-        compiled("ukf-uvd", trial, small("herath2007-stereo", **changes).belief) for changes in ({}, MERWE)
-    )
-    assert not agree(default, merwe, 1e-6)
-
-
 def test_the_cubature_filter_has_its_points_whatever_the_belief_says(small: Small) -> None:
     trial = cs.simulate(small("herath2007-stereo"))
     default, merwe = (small("herath2007-stereo", **changes).belief for changes in ({}, MERWE))

@@ -201,14 +201,6 @@ def test_a_score_by_hand() -> None:
     assert np.isnan(nothing.ratio.value)
 
 
-def test_the_interval_of_a_score_holds_what_is_right() -> None:
-    """Landmarks of a run share one error: five standard errors below 95 % of 400 intervals hold 1."""
-    rng = np.random.default_rng(3)
-    run = np.repeat(np.arange(30), 8)
-    held = [map_score(run, np.repeat(rng.chisquare(3, 30), 8)).ratio.holds(1.0) for _ in range(400)]
-    assert np.mean(held) > 0.896
-
-
 def test_the_score_is_that_of_the_table(results: cs.Results) -> None:
     table = results.map
     means = table[table["filter"] == "ekf-uvd"].groupby("run")["nees"].mean() / 3.0

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from edited import accept_changes, content
+from edited import accept_changes, change_manifest, content
 
 import consistency as cs
 from consistency.bench.runs import gather
@@ -516,10 +516,7 @@ def test_an_edited_table_is_refused(whole: Path, tmp_path: Path, name: str, edit
 
 def test_a_folder_of_before_has_no_digests(whole: Path, tmp_path: Path) -> None:
     shutil.copytree(whole, tmp_path / "out")
-    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
-    for key in ("contents", "machines"):
-        del manifest[key]
-    (tmp_path / "out" / "manifest.json").write_text(json.dumps(manifest))
+    change_manifest(tmp_path / "out", "contents", "machines")
     assert open_results(tmp_path / "out").finished_runs(FILTER) == set(range(RUNS))
 
 
@@ -534,9 +531,7 @@ def test_another_processor_is_named(uvd: cs.Scenario, whole: Path, tmp_path: Pat
     capsys.readouterr()
     cs.run_trials(uvd, FILTER, RUNS + 1, seed=3, jobs=1, out=out, resume=True)
     assert "last digits" not in capsys.readouterr().err
-    manifest = json.loads((out / "manifest.json").read_text())
-    (out / "manifest.json").write_text(json.dumps(manifest | {"machines": [old]}))
-    accept_changes(out)
+    change_manifest(out, "contents", machines=[old])
     cs.run_trials(uvd, FILTER, RUNS + 2, seed=3, jobs=1, out=out, resume=True)
     assert "Z80 (BLAS: Prescott) computed the runs that are there" in capsys.readouterr().err
     assert open_results(out).manifest["machines"] == [old, here]

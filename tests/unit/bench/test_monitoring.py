@@ -176,19 +176,6 @@ def test_results_of_a_run(tmp_path: Path) -> None:
 # --- watching ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("said", [None, "yes", "Optimal"])
-def test_the_gain_must_be_declared(said: str | None) -> None:
-    with pytest.raises(InputError, match=r"--innovations must be 'optimal'.*no false-alarm rate holds"):
-        make_monitor(said)
-
-
-def test_options_are_named_as_the_command_has_them() -> None:
-    with pytest.raises(InputError, match=r"--false-alarm must lie between 0 and 1, got 2"):
-        make_monitor("optimal", false_alarm=2)
-    with pytest.raises(InputError, match=r"--gate must be a probability"):
-        make_monitor("optimal", gate=0.5)
-
-
 def test_an_alarm_has_the_steps_and_times_of_the_file() -> None:
     watched = changed()
     alarm, monitor = watched.alarm, watched.monitor

@@ -251,27 +251,15 @@ def test_resuming_something_else_is_refused(
         cs.run_trials(scenario, filters, runs=10, seed=seed, jobs=1, previous=cs.read_results(tmp_path / "out"))
 
 
-class InPlace:
-    """A filter that works on what it is given instead of on a copy."""
-
-    name = "in-place"
+class InPlace(Still):
+    """Works on what it is given instead of on a copy."""
 
     def init(self, problem: Any) -> Any:
         problem.start += 1.0
-        return problem.start
-
-    def predict(self, state: Any, control: Control) -> Any:
-        return state
-
-    def update(self, state: Any, observation: Observation) -> Any:
-        return state, None
-
-    def pose(self, state: Any) -> Gaussian:
-        return Gaussian(state, np.eye(3))
 
 
 def test_a_filter_cannot_change_what_the_next_one_is_given(xyz: cs.Scenario) -> None:
-    results = cs.run_trials(xyz, [InPlace(), "ekf-xyz"], runs=2, jobs=1)
+    results = cs.run_trials(xyz, [InPlace("in-place"), "ekf-xyz"], runs=2, jobs=1)
     alone = cs.run_trials(xyz, ["ekf-xyz"], runs=2, jobs=1)
     both = results.estimates[results.estimates["filter"] == "ekf-xyz"].reset_index(drop=True)
     pd.testing.assert_frame_equal(both, alone.estimates)

@@ -12,39 +12,29 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+from misbehaving import Still
 
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.parquet import check_column
-from consistency.bench.types import Control, Gaussian, Observation
+from consistency.bench.types import Gaussian
 from consistency.referee.column_names import COLUMNS
 from consistency.referee.system.folders import require_free
 
 TABLES = ("estimates", "failures", "truth", "landmarks", "map")
 
 
-class Sleepy:
+class Sleepy(Still):
     """Stays where it started, and breaks in step 5."""
 
-    name = "sleepy"
-
-    def init(self, problem: Any) -> dict[str, Any]:
-        return {"pose": problem.start, "steps": 0}
-
-    def predict(self, state: dict[str, Any], control: Control) -> dict[str, Any]:
-        return {**state, "steps": state["steps"] + 1}
-
-    def update(self, state: dict[str, Any], observation: Observation) -> tuple[dict[str, Any], None]:
-        return state, None
-
-    def pose(self, state: dict[str, Any]) -> Gaussian:
-        return Gaussian(state["pose"], np.eye(3) if state["steps"] < 5 else -np.eye(3))
+    def pose(self, state: Any) -> Gaussian:
+        return Gaussian(state, np.eye(3) if self.step < 5 else -np.eye(3))
 
 
 @pytest.fixture(scope="module")
 def results(xyz: cs.Scenario) -> cs.Results:
-    return cs.run_trials(xyz, ["ekf-xyz", Sleepy()], runs=4, seed=2, jobs=1)
+    return cs.run_trials(xyz, ["ekf-xyz", Sleepy("sleepy")], runs=4, seed=2, jobs=1)
 
 
 @pytest.fixture(scope="module")

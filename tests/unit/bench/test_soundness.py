@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from edited import change_manifest
 from hostile import RUNS, write_results
 from mutations import copied
 
@@ -167,18 +167,14 @@ MANIFESTS: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("edit", "said"), MANIFESTS, ids=lambda value: str(value)[:40])
 def test_a_changed_manifest_is_refused(folder: Path, edit: dict[str, Any], said: str) -> None:
-    path = folder / "manifest.json"
-    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | edit), encoding="utf-8")
+    change_manifest(folder, **edit)
     with pytest.raises(cs.InputError, match=said):
         cs.read_results(folder)
 
 
 @pytest.mark.parametrize("key", ["filters", "tables", "runs", "failures", "complete", "seed", "kind"])
 def test_a_manifest_without_a_key_is_refused(folder: Path, key: str) -> None:
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_text(encoding="utf-8"))
-    del manifest[key]
-    path.write_text(json.dumps(manifest), encoding="utf-8")
+    change_manifest(folder, key)
     with pytest.raises(
         cs.InputError, match="holds no estimates" if key == "filters" else f"key '{key}': Field required"
     ):
@@ -187,10 +183,8 @@ def test_a_manifest_without_a_key_is_refused(folder: Path, key: str) -> None:
 
 def test_a_log_without_truth_has_runs_of_any_length(written: Path, folder: Path) -> None:
     """Of a log nothing but its filters says how long a run is."""
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_text(encoding="utf-8"))
-    manifest |= {"scenario": None, "scenario_hash": None, "log": "drive", "tables": ["estimates", "failures", "map"]}
-    path.write_text(json.dumps(manifest), encoding="utf-8")
+    tables = ["estimates", "failures", "map"]
+    change_manifest(folder, scenario=None, scenario_hash=None, log="drive", tables=tables)
     for name in ("truth", "landmarks", "rejections"):
         (folder / f"{name}.parquet").unlink()
     change(folder, "estimates", only("run != 1 or step < 6"))

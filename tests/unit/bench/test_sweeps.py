@@ -79,13 +79,6 @@ def test_a_grid_changes_truth_and_belief_alike() -> None:
     assert cell.text.startswith("baseline 0.6 m, range of landmarks 5 m, density of landmarks ×0.25")
 
 
-def test_the_published_rig_is_a_cell_of_the_regime_map() -> None:
-    """Baseline 9 cm, all landmarks, odometry as published: only the range differs."""
-    sweep = load_sweep("regime")
-    cell = next(c for c in sweep.cells if c.indices == (1, 2, 2, 1))
-    assert cell.scenario.hash == sweep.base.variant("far", truth__sensor__range=(0.5, 5.0)).hash
-
-
 def test_keys_of_the_scenario_are_axes_too(at: Path) -> None:
     path = edited(at, "odometry = [1.0, 2.0]", 'truth.path.radius = [3.0, 4.0]\n"motion.sigma_v" = [0.1]')
     sweep = load_sweep(path)

@@ -149,14 +149,6 @@ def test_seen_is_what_is_in_range_and_in_the_image(small: Small, world: str) -> 
         assert expected != seen_by_hand(scenario, planned_path(scenario.truth), trial.landmarks)
 
 
-def test_observations_are_ordered(uvd: cs.Scenario) -> None:
-    trial = cs.simulate(uvd)
-    assert trial.first[0] == 0
-    assert trial.first[-1] == len(trial.landmark) == len(trial.z)
-    for step in range(1, trial.steps + 1):
-        assert np.all(np.diff(trial.observation(step).landmarks) > 0)
-
-
 def test_nothing_in_view_is_unusable_input(small: Small) -> None:
     scenario = small("herath2007-xyz", truth__landmarks={"layout": "listed", "points": [[500.0, 0.0, 0.0]]})
     with pytest.raises(cs.InputError, match=r"no landmark comes into view.*truth\.sensor.*truth\.landmarks"):

@@ -51,7 +51,6 @@ def export(results: cs.Results, name: str, out: Path) -> tuple[Path, Path]:
     rows = results.estimates[results.estimates["filter"] == name]
     own = rows[list(OWN_COVARIANCE)].rename(columns=lambda column: column.removeprefix("own_"))
     pd.concat([rows[KEYS], own], axis=1).to_parquet(out / f"{name}.parquet", index=False)
-    assert results.truth is not None
     results.truth.to_parquet(out / "truth.parquet", index=False)
     return out / f"{name}.parquet", out / "truth.parquet"
 
@@ -128,8 +127,6 @@ def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results: cs.Re
     v = analyse(replace(results, estimates=table), ["right"])["right"]
     honest = analyse(results)["right"]
     assert (v.status, v.convention) == ("overconfident", "right")
-    assert v.world is not None
-    assert honest.world is not None
     assert v.world.status == honest.world.status != "overconfident"
     assert v.scale.mean_anees == pytest.approx(4.0 * honest.scale.mean_anees)
     assert v.world.scale.mean_anees == honest.world.scale.mean_anees
@@ -169,9 +166,7 @@ def test_until_decided_says_both(uvd: cs.Scenario) -> None:
     v = verdicts["right"]
     c = record_of(results, "right")
     assert (v.convention, v.runs) == ("right", len(c.run_numbers))
-    assert v.world is not None
     assert v.world.scale.mean_anees == pytest.approx(np.nanmean(c.in_world.nees[: v.world.runs]))
-    assert v.map is not None
     assert v.map.runs == v.runs
     again = analyse(results)["right"]
     assert (again.status, again.statistic, again.world.statistic) == (v.status, v.statistic, v.world.statistic)

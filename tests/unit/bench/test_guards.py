@@ -158,7 +158,6 @@ def test_a_log_carries_the_settings(wrong: cs.Scenario, tmp_path: Path) -> None:
     log = read_log(tmp_path / "log")
     assert log.belief.guard == GuardSettings(**settings)  # type: ignore[arg-type]
     results = run_log(log, ["ekf-uvd+gate"], jobs=1)
-    assert results.rejections is not None
     (row,) = results.rejections.itertuples(index=False)
     assert 0 < row.rejected_spurious <= row.spurious == log.trials[0].spurious.sum()
 
@@ -260,8 +259,6 @@ def test_a_filter_of_ones_own_is_guarded_like_one_of_the_bench(wrong: cs.Scenari
         run_filter(mine, trial, wrong.belief),
         run_filter(cs.get_filter("ekf-uvd+gate"), trial, wrong.belief),
     )
-    assert ours.rejected is not None
-    assert compiled.rejected is not None
     assert ours.rejected.tolist() == compiled.rejected.tolist()
     assert np.abs(ours.pose - compiled.pose).max() < 1e-10
 
@@ -274,8 +271,6 @@ def test_small_maps_are_guarded_too(wrong: cs.Scenario) -> None:
         for filter_ in map(cs.get_filter, ("submap-ekf-uvd", "ekf-uvd"))
     )
     assert small.failure is None
-    assert small.rejected is not None
-    assert whole.rejected is not None
     joined = trial.first[50]
     assert small.rejected[:joined].tolist() == whole.rejected[:joined].tolist()
     assert small.rejected[:joined].any()
@@ -286,7 +281,6 @@ def test_what_is_wrong_is_rejected(linear: cs.Scenario, rng: np.random.Generator
     """In a linear world with exact covariances: most of what is wrong, and few of the rest."""
     trial = corrupted(cs.simulate(linear), rng, 0.1)
     rejected = run_filter(cs.guarded(cs.get_filter("kf").textbook, "joint"), trial, linear.belief).rejected
-    assert rejected is not None
     assert (rejected & trial.spurious).sum() > 0.6 * trial.spurious.sum()
 
 
@@ -341,7 +335,6 @@ def test_rejections_are_kept_streamed_and_resumed(wrong: cs.Scenario, tmp_path: 
     assert content(tmp_path / "memory") == content(tmp_path / "stored") == content(tmp_path / "resumed")
     assert "rejections" in stored.manifest["tables"]
     table = cs.read_results(tmp_path / "stored").rejections
-    assert table is not None
     assert table["filter"].unique().tolist() == ["ekf-uvd+gate"]
     for row in table.itertuples(index=False):
         trial = cs.simulate(wrong, run=row.run, seed=1)
@@ -364,7 +357,6 @@ def test_a_failed_run_counts_up_to_its_end(uvd: cs.Scenario) -> None:
             return super().update(state, observation)
 
     results = cs.run_trials(uvd, [cs.guarded(Breaks(), "gate")], runs=1, jobs=1)
-    assert results.rejections is not None
     assert results.rejections["offered"].tolist() == [cs.simulate(uvd).first[3]]
 
 
@@ -375,7 +367,6 @@ def test_verdicts_tell_precision_and_recall(
     verdicts = cs.analyse(cs.read_results(tmp_path / "out"))
     assert verdicts["ekf-uvd"].rejection is None
     score = verdicts["ekf-uvd+gate"].rejection
-    assert score is not None
     assert score.precision != score.recall
     statistics = json.loads(render(document(verdicts)))["ekf-uvd+gate"]["statistics"]
     assert statistics["rejection_recall"] == list(score.recall)
@@ -393,7 +384,6 @@ def test_a_report_has_a_row_for_each_guard(wrong: cs.Scenario, tmp_path: Path) -
     assert isinstance(table, Table)
     ((_, (row,)),) = table.groups
     score = study.tracks[1].verdict.rejection
-    assert score is not None
     assert row[:4] == (
         Name("ekf-uvd+gate", study.tracks[1].look), str(score.offered), str(score.spurious), str(score.rejected)
     )  # fmt: skip
@@ -406,7 +396,6 @@ def test_a_report_has_a_row_for_each_guard(wrong: cs.Scenario, tmp_path: Path) -
 
 def test_a_clean_world_has_a_share_of_rejections_alone(uvd: cs.Scenario) -> None:
     verdict = cs.analyse(cs.run_trials(uvd, ["ekf-uvd+gate"], runs=2, jobs=1))["ekf-uvd+gate"]
-    assert verdict.rejection is not None
     assert verdict.rejection.spurious == 0
     assert "precision" not in str(verdict)
     assert "rejected" in str(verdict)

@@ -220,7 +220,6 @@ def test_the_recording_becomes_a_log_that_is_read_back(tmp_path: Path) -> None:
     trial, belief = log.trials[0], log.belief
     assert (trial.steps, trial.n_landmarks) == (1100, 629)
     assert len(experiment.unlinked_steps(trial)) == 92  # the 91 slips, and step 1: nothing is seen in step 0
-    assert trial.truth is not None
     path = np.hypot(*np.diff(trial.truth[:, :2], axis=0).T).sum()
     assert path == pytest.approx(692.0, abs=1.0)
     write_log(tmp_path / "log", [trial], belief, None, manifest_of(kind="log"), view=(data.size, tuple(data.centre)))

@@ -179,8 +179,6 @@ def test_results_of_a_run(tmp_path: Path) -> None:
 def test_an_alarm_has_the_steps_and_times_of_the_file() -> None:
     watched = changed()
     alarm, monitor = watched.alarm, watched.monitor
-    assert alarm is not None
-    assert monitor.alarm is not None
     assert alarm.since == 211
     assert alarm.step == monitor.alarm.step + 10
     assert watched.since_t == pytest.approx(20.0)
@@ -215,7 +213,6 @@ def test_lines_are_judged_as_they_come() -> None:
         lines("# a log\nk;nis;nis_dof\n\n" + rows, read), "stdin", make_monitor("optimal"),
         lambda alarm: at.append(len(read)),
     )  # fmt: skip
-    assert watched.alarm is not None
     assert watched.alarm.since == 51
     assert at == [watched.alarm.step + 3]  # the lines before the first row
     assert watched.monitor.steps == 200
@@ -323,7 +320,6 @@ def test_a_run_without_any_innovation_can_be_drawn() -> None:
 def test_evidence_is_drawn_with_its_threshold_and_alarm() -> None:
     watched = changed()
     alarm, threshold = watched.alarm, watched.monitor.threshold
-    assert alarm is not None
     axes = with_matplotlib.draw(sheet(watched)).axes[1]
     line = next(line for line in axes.lines if len(line.get_ydata()) == len(watched.evidence))
     np.testing.assert_array_equal(line.get_ydata(), watched.evidence)

@@ -110,8 +110,6 @@ def test_landmarks_on_a_circle_and_in_rings(small: Small) -> None:
 def test_range_and_bearing_of_the_truth_without_noise(small: Small) -> None:
     scenario = small("range-bearing", truth__sensor__sigma=(1e-12, 1e-12))
     trial = cs.simulate(scenario)
-    assert trial.truth is not None
-    assert trial.landmarks is not None
     pose = trial.truth[trial.step]
     offset = (trial.landmarks[trial.landmark, :2] - pose[:, :2]) @ [1.0, 1j]
     assert np.allclose(trial.z[:, 0], np.abs(offset))

@@ -230,8 +230,6 @@ def test_images_come_after_so_many_steps_in_turn() -> None:
 def test_walls_hide_what_is_behind_them_from_where_the_sensor_is() -> None:
     wall, mount = (3.0, -2.0, 5.0, 3.0), {"position": (0.4, -0.6, 0.0), "rotation": (0.0, 0.0, 0.0)}
     plain, trial = pair({"kind": "occlusion", "walls": [wall]}, truth__sensor__mount=mount)
-    assert plain.truth is not None
-    assert plain.landmarks is not None
     step = plain.step
     heading = plain.truth[step, 2]
     c, s = np.cos(heading), np.sin(heading)

@@ -265,7 +265,6 @@ def test_a_cell_has_the_verdict_of_a_run_until_decided(at: Path) -> None:
     verdict, found = verdicts["kf"], folder.results()[2, "kf"]
     assert (found.status, found.runs) == (verdict.status, verdict.runs)
     assert found.ratio == pytest.approx(verdict.inflation, rel=1e-4)
-    assert verdict.accuracy is not None
     assert found.rmse_position == pytest.approx(verdict.accuracy.rmse_position, rel=1e-4)
     runs = pd.read_csv(folder.place(CellWork(cell, "kf")) / "runs.csv")
     assert list(runs["run"]) == list(range(verdict.runs))

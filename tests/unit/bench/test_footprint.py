@@ -167,6 +167,12 @@ def test_rows_are_touched_for_what_is_known(parts: Slam) -> None:
     assert touched.touched(parts, seen([[0, 1, 2], [3, 4]]), 18, 0) == 0, "nothing known is seen"
 
 
+def test_half_a_matrix_is_whole_pages() -> None:
+    assert touched.half(9) == 81
+    assert touched.half(512) == 512**2
+    assert touched.half(5120) == 5120 * (5120 + 512) // 2
+
+
 def test_a_local_base_grows_until_it_is_due(parts: Slam) -> None:
     slam = parts._replace(covariance=Locally(60))
     every = list(range(40))

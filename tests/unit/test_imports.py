@@ -69,7 +69,6 @@ def imported(source: str) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "relative imports hide the room"
-            assert node.module is not None
             room = node.module.split(".")[0] == "consistency" and node.module.count(".") < 3  # or a module in one
             yield from {f"{node.module}.{alias.name}" if room else node.module for alias in node.names}
 

@@ -59,16 +59,6 @@ def test_a_trial_fills_its_covariance_and_outcome(
     assert module._working(parts, data, 18) == 18_001 + 8 * (19**2 + 5 * (3 + 2 * 9 + 3) + 12 * 7)
 
 
-def test_it_grows_by_the_square_of_the_landmarks(linear: cs.Scenario) -> None:
-    def bytes_of(count: int) -> int:
-        changes = {"truth__landmarks__count": count, "truth__sensor__range": (0.0, 50.0), "truth__steps": 2}
-        world = linear.variant("many", **changes)
-        return trial_bytes([compiled("kf")], cs.simulate(world), world.belief)
-
-    few, many = bytes_of(200), bytes_of(800)
-    assert 12.0 < many / few < 24.0  # four times as many, of which the camera sees not quite so many
-
-
 def test_maps_of_filters_before_are_held(linear: cs.Scenario) -> None:
     trial, filter_ = cs.simulate(linear), compiled("kf")
     one = footprint(filter_, trial, linear.belief)

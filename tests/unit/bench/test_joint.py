@@ -234,10 +234,7 @@ def test_landmarks_in_a_plane_have_two_dimensions_in_the_joint_error() -> None:
     trial = cs.simulate(scenario, run=0)
     estimates = get_filter("ekf-xy").run(trial, scenario.belief)
     m, (outcome,) = estimates.map, outcome_of(trial, [estimates]).maps.values()
-    assert m is not None
     assert m.joint is not None
-    assert trial.truth is not None
-    assert trial.landmarks is not None
     error, P = planar_map_error(
         trial.truth[-1], trial.landmarks[m.landmarks], estimates.pose[-1], m.mean, m.joint, estimates.error
     )

@@ -186,9 +186,7 @@ def test_numbers_of_landmarks_that_are_known_and_of_things() -> None:
     assert (first.landmark[(trial.landmark == 0) & (step < 6)] == COUNT + 1).all()
     np.testing.assert_array_equal(first.spurious, known.spurious)
     assert set(first.things) == {COUNT + 1, *range(COUNT + 2, COUNT + 9)}
-    assert after.landmarks is not None
     np.testing.assert_array_equal(after.landmarks.set_index("landmark").loc[114], trial.landmarks[1])  # type: ignore[index]
-    assert after.screening is not None
     assert after.screening["broken"] == 16
     assert "screen: 16 of 308 observations" in screening_line(after)
     assert ("Screened", "16 of 308 observations leave the common motion") in facts({"screening": after.screening})

@@ -142,7 +142,6 @@ def test_images_between_packets_and_beyond_them(tmp_path: Path) -> None:
     sequence = read_sequence(folder)
     R, t = read_truth(folder, sequence)
     body = sequence.calibration.body_from_left
-    assert body is not None
     t = t - R @ body[:3, :3].T @ body[:3, 3]  # of camera 0
     np.testing.assert_allclose(t[[1, 3]], poses[[0, -1], :3, 3], atol=1e-9)
     np.testing.assert_allclose(t[2], poses[:2, :3, 3].mean(axis=0), atol=1e-6)
@@ -179,7 +178,6 @@ def test_the_camera_before_rectification_is_where_its_calibration_puts_it(tmp_pa
     path = tmp_path / "calib_cam_to_cam.txt"
     path.write_text(cam_to_cam(T_00="0.1 0.2 0.3"))
     body = read_calibration(path, "image_00", "image_01", FULL).body_from_left
-    assert body is not None
     point = np.array([1.0, -2.0, 5.0])
     np.testing.assert_allclose(body[:3, :3] @ (R_0 @ point + [0.1, 0.2, 0.3]) + body[:3, 3], point, atol=1e-9)
     P_0 = K @ np.column_stack([np.eye(3), [0.06, 0.004, -0.003]])

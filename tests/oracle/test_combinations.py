@@ -19,7 +19,6 @@ import consistency as cs
 from consistency.bench.filters import usable_names
 from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.compiled import Compiled, problem_for
-from consistency.bench.filters.kernel.gain import linearise_seen
 from consistency.bench.filters.kernel.part_functions import (
     State,
     insert_error,
@@ -31,9 +30,10 @@ from consistency.bench.filters.kernel.part_functions import (
     retract,
     stands_apart,
 )
+from consistency.bench.filters.kernel.update_steps import linearise_seen
 from consistency.bench.filters.kernel.work_arrays import make_work
 from consistency.bench.filters.motion.unicycle import Unicycle
-from consistency.bench.filters.point.truth import AtTruth
+from consistency.bench.filters.point.at_known import AtTruth
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState

@@ -16,8 +16,8 @@ import forks
 import pytest
 
 from consistency.bench.filters.compiler import compile_time, disk_cache
-from consistency.bench.filters.compiler.compile_time import FIRST
 from consistency.bench.filters.compiler.content_key import Content
+from consistency.bench.filters.compiler.disk_cache import FIRST
 from consistency.bench.filters.compiler.jit import Kernel, Outlook
 from consistency.bench.runs import compiling
 from consistency.bench.runs.findings import experiments

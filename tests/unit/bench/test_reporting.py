@@ -42,12 +42,11 @@ from consistency.referee.diagnostics.verdict.answers import DIRECTION, STEP
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.sentences import short
 from consistency.referee.document.blocks import Document
-from consistency.referee.document.drawing import Figure, Intervals, Line, Points, Span
-from consistency.referee.document.fewer_points import thin
+from consistency.referee.document.drawing import Figure, Intervals, Line, Points, Span, thin
 from consistency.referee.document.verdict import FURTHER, page, shown_inside
 from consistency.referee.document.wording import written
 from consistency.referee.pages import axes, questions, verdicts
-from consistency.referee.pages.clock import clock_of
+from consistency.referee.pages.judged import clock_of
 from consistency.referee.show import html, pdf
 from consistency.referee.types import Failure
 from consistency.stereo.pages import scenes, stereo_noise

@@ -14,7 +14,7 @@ from scipy.spatial.distance import mahalanobis
 
 import consistency as cs
 from consistency.referee.diagnostics import chi2_mean_interval, detectable_ratio, normality, rmse
-from consistency.referee.diagnostics.questions import early_ending
+from consistency.referee.diagnostics.questions import lost_runs
 from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
 from consistency.referee.diagnostics.records.validity import (  # fmt: skip
     DEFICIENT,
@@ -282,7 +282,7 @@ def test_a_gate_does_not_load_scipy_stats() -> None:
 
 def test_ranks_share_the_mean_of_equal_values() -> None:
     values = np.random.default_rng(2).integers(0, 9, 40).astype(float)
-    np.testing.assert_array_equal(early_ending._ranks(values), stats.rankdata(values))
+    np.testing.assert_array_equal(lost_runs._ranks(values), stats.rankdata(values))
 
 
 # --- what can be judged as a covariance -----------------------------------------------------------------------

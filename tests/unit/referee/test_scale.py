@@ -22,7 +22,6 @@ from consistency.referee.diagnostics import (
     gate_runs,
     judge,
     mean_test,
-    nis_test,
     pilot_plan,
     power_of,
     ratio_interval,
@@ -31,7 +30,7 @@ from consistency.referee.diagnostics import (
 from consistency.referee.diagnostics.questions.equivalence import (
     equivalence,
     equivalence_by_betting,
-    equivalence_of_innovations,
+    equivalence_of_total,
 )
 from consistency.referee.diagnostics.questions.scale import acceptance, run_means, scale_test
 from consistency.referee.types import Array
@@ -457,16 +456,14 @@ def test_by_betting(allow: str | None, ratio: float) -> None:
 
 def test_of_innovations() -> None:
     rng = np.random.default_rng(31)
-    nis, dof = 1.05 * rng.chisquare(2, (10, 20)), np.full((10, 20), 2)
-    test = nis_test(nis, dof)
-    d, total = 1.2, nis.sum()
+    d, total = 1.2, float((1.05 * rng.chisquare(2, (10, 20))).sum())
     expected = stats.chi2.cdf(total / d, 400), stats.chi2.sf(total * d, 400)
-    both = equivalence_of_innovations(test, Settings(detect=d))
+    both = equivalence_of_total(total, 400, Settings(), d)
     assert both.p_value == pytest.approx(max(expected), rel=1e-9)
-    one = equivalence_of_innovations(test, Settings(detect=d, allow="conservative", power=0.9))
+    one = equivalence_of_total(total, 400, Settings(allow="conservative", power=0.9), d)
     assert one.p_value == pytest.approx(expected[0], rel=1e-9)
     assert one.level == pytest.approx(0.1)
-    nothing = equivalence_of_innovations(nis_test(nis * np.nan, dof), Settings())
+    nothing = equivalence_of_total(float("nan"), 0, Settings(), d)
     assert np.isnan(nothing.p_value)
     assert not nothing.shown
 

@@ -17,11 +17,11 @@ from consistency.stereo.visual_odometry import (
     ConvergenceError,
     DegenerateError,
     RelativePose,
-    consensus,
     register_horn,
     register_ransac,
     register_svd,
     register_weighted,
+    registration,
     registration_covariance,
 )
 from consistency.stereo.visual_odometry.registration import squared_distances
@@ -190,9 +190,9 @@ def test_all_inliers_know_more_than_three(rng: np.random.Generator, monkeypatch:
         p2 = scene(rng, 300)
         p1 = MOTION.apply(p2) + rng.normal(0, 0.05, (300, 3))
         counts = []
-        for refits in (consensus.REFITS, 0):
+        for refits in (registration.REFITS, 0):
             with monkeypatch.context() as patch:
-                patch.setattr(consensus, "REFITS", refits)
+                patch.setattr(registration, "REFITS", refits)
                 same = np.random.default_rng(7)
                 counts.append(int(register_ransac(p1, p2, threshold=0.08, rng=same)[1].sum()))
         gained.append(counts[0] - counts[1])
@@ -202,17 +202,17 @@ def test_all_inliers_know_more_than_three(rng: np.random.Generator, monkeypatch:
 def test_few_inliers_take_many_draws(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """20 % inliers: one draw in 125 has three, and log(0.001) / log(1 - 0.2^3) = 861 draws are 14 rounds of 64."""
     rounds = []
-    motions = consensus.rigid_motions
+    motions = registration.rigid_motions
 
     def counted(*points: Array) -> Any:
         rounds.append(len(points[0]))
         return motions(*points)
 
-    monkeypatch.setattr(consensus, "rigid_motions", counted)
+    monkeypatch.setattr(registration, "rigid_motions", counted)
     p2 = scene(rng, 100)
     p1 = np.where(np.arange(100)[:, None] < 20, MOTION.apply(p2), scene(rng, 100))
     register_ransac(p1, p2, threshold=1e-3, rng=rng)
-    assert rounds.count(consensus.ROUND) >= 14
+    assert rounds.count(registration.ROUND) >= 14
 
 
 def test_points_of_a_line_agree_on_no_motion(rng: np.random.Generator) -> None:

@@ -34,8 +34,7 @@ def variance_at(z: Array, sensor: BelievedSensor) -> Array:
         return np.diag(np.square(sensor.sigma))
     sigma = np.tile(sensor.sigma, (len(z), 1))
     sigma[:, 2] = disparity_sigma(z[:, 2], sensor)
-    variance: Array = np.square(sigma)[:, None] * np.eye(3)
-    return variance
+    return np.asarray(np.square(sigma)[:, None] * np.eye(3))
 
 
 def disparity_sigma(d: Array, sensor: BelievedSensor) -> Array | float:
@@ -48,5 +47,4 @@ def point_noise(z: Array, variance: Array, sensor: BelievedSensor) -> Array:
     """Noise (M, 3, 3) of the points of eq. 21 at pixels z (M, 3) that have a ``variance`` (3, 3) or (M, 3, 3), m^2."""
     entries = stereo.triangulate_jacobian(z[:, 0], z[:, 1], z[:, 2], sensor.f or 0.0, sensor.B or 0.0)
     J = np.stack(np.broadcast_arrays(*entries), axis=-1).reshape(-1, 3, 3)
-    noise: Array = J @ variance @ np.swapaxes(J, 1, 2)
-    return noise
+    return np.asarray(J @ variance @ np.swapaxes(J, 1, 2))

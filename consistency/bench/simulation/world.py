@@ -13,7 +13,7 @@ from consistency.bench.scenario import (
     Truth,
     UvdSensor,
 )
-from consistency.bench.scenario.effects import Context, FieldOfView, Observations
+from consistency.bench.scenario.effects import Context, FieldOfView
 from consistency.bench.simulation.path import planned_controls, start_pose
 from consistency.bench.simulation.sensing import MOTION_NOISE, EffectChain, effects_of, generator
 from consistency.bench.types import Trial
@@ -50,7 +50,12 @@ class World:
         """Truth, controls and observations of run ``run``, as :func:`simulate`."""
         true_path, controls = self._drive(generator(seed, run, MOTION_NOISE))
         context = self.context(true_path)
-        observations = self._chain.rest(self._begin(context), context, self._number, run, seed)
+        begun = self._shared
+        if begun is None:
+            begun = context.ideal()
+        elif self.linear:
+            begun = context.at(begun.step, begun.landmark)
+        observations = self._chain.rest(begun, context, self._number, run, seed)
         first = np.searchsorted(observations.step, self._ends)
         return Trial(
             run,
@@ -64,12 +69,6 @@ class World:
             self.landmarks,
             None if np.array_equal(observations.sources, observations.landmark) else observations.source,
         )
-
-    def _begin(self, context: Context) -> Observations:
-        """The observations of a run after the effects that are the same in every run."""
-        if self._shared is None:
-            return context.ideal()
-        return context.at(self._shared.step, self._shared.landmark) if self.linear else self._shared
 
     def _drive(self, rng: np.random.Generator) -> tuple[Array, Array]:
         """True poses (T + 1, 3) and the controls (T, 3) that the filter is told."""

@@ -171,8 +171,9 @@ def key(monkeypatch: pytest.MonkeyPatch) -> Keys:
 
     def of(module: str = "rules", old: str = "", new: str = "", kind: str = "Single") -> str:
         assert not old or TEXTS[module].count(old) == 1
-        for name in ("PARTS", "_named_bodies"):
-            monkeypatch.setattr(dispatch, name, {})
+        parts: dict[str, type] = {}
+        for owner, name in ((dispatch, "PARTS"), (content_key, "PARTS"), (dispatch, "_named_bodies")):
+            monkeypatch.setattr(owner, name, parts if name == "PARTS" else {})
         for name, text in TEXTS.items():
             loaded = ModuleType(name)
             monkeypatch.setitem(sys.modules, name, loaded)

@@ -1,1 +1,1 @@
-"""Guards: which observations a filter is given. The kinds are in ``settings``, what a guard decides in ``deciding``."""
+"""Guards: which observations a filter is given. ``plain_rules`` has the kinds, and what a guard of each decides."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -74,15 +74,11 @@ class Guarded:
         begins = [int(i) for i in np.flatnonzero(keep) if i in anew or labels[i] not in state.known]
         begun |= {labels[i]: first + i for i in begins}
         known_now = state.known.union(observation.landmarks[keep].tolist())
-        inner = self._without(state.inner, [labels[i] for i in anew])
+        inner, forgetful = state.inner, cast(Any, self.filter)
+        for i in anew:
+            inner = forgetful.forget(inner, labels[i])
         inner, info = self.filter.update(inner, Observation(observation.landmarks[keep], observation.z[keep]))
         return replace(state, inner=inner, known=known_now, misses=misses, begun=begun, rejected=rejected), info
-
-    def _without(self, inner: Any, labels: list[int]) -> Any:
-        forgetful: Any = self.filter
-        for label in labels:
-            inner = forgetful.forget(inner, label)
-        return inner
 
     def _is_offered(self, state: GuardedState, label: int) -> bool:
         """Whether the track is old enough, and the landmark not given up."""

@@ -25,7 +25,7 @@ placed and linearised at the estimate, so that l_i = a_k + l_i,k|k - p_k|k. Head
 constraint, and are linearised at the estimate.
 
 Were every l*_i held at its first estimate, the same constraint would leave one choice, p*_k|k = p_k|k-1: that is the
-filter of ``first_estimate``.
+filter of ``fej``.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The EKF linearises one variable at several estimates, and the linearised system then seems to tell the heading of
 robot and map together, which no relative observation does. With every Jacobian at first estimates
-(``point/first_estimate.py``) its unobservable directions are as many as those of SLAM. The price is a linearisation
+(``methods/fej.py``) its unobservable directions are as many as those of SLAM. The price is a linearisation
 at estimates that are not the best ones.
 """
 

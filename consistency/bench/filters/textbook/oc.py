@@ -1,7 +1,7 @@
 """EKF-SLAM under observability constraints (OC), after Huang, Mourikis & Roumeliotis (2010), IJRR 29(5).
 
 As many directions stay unobserved as in SLAM, and the Jacobians are taken as near to the estimates as that allows
-(``point/observability_constrained.py`` has the derivation). First estimates keep the same directions and are far from
+(``methods/oc.py`` has the derivation). First estimates keep the same directions and are far from
 the best estimates; these points follow them where robot and map move together.
 """
 

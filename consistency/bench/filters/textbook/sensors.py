@@ -48,8 +48,7 @@ class PointSensor:
         return np.array(point.to_world(pose[0], pose[1], pose[2], *body)), d_pose, robot_to_world @ self.turn @ J
 
     def less(self, z: Array, about: Array) -> Array:
-        difference: Array = z - about
-        return difference
+        return np.asarray(z - about)
 
 
 class PlanarSensor:

@@ -25,9 +25,10 @@ from consistency.bench.scenario import (
     toml_text,
 )
 from consistency.bench.scenario.toml_tables import SIGMA_UNITS
-from consistency.bench.store.data_frames import controls_table, observations_table, truth_of
+from consistency.bench.store.data_frames import controls_table, observations_table, stacked_table
 from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.log_tables import read_table_file, require_format, table_file
+from consistency.bench.store.trial_rows import truth_columns
 from consistency.bench.types import Trial
 from consistency.referee.column_names import COLUMNS, POSE
 from consistency.referee.errors import InputError
@@ -137,7 +138,8 @@ def write_log(
     require_format(form)
     tables = {"controls": controls_table(trials), "observations": observations_table(trials)}
     if trials[0].truth is not None:
-        tables["truth"] = truth_of(trials)
+        parts = [("", truth_columns(t, t.truth)) for t in trials if t.truth is not None]
+        tables["truth"] = stacked_table("truth", parts)
     if landmarks is not None:
         tables["landmarks"] = landmarks
     texts = {"sensor.toml": tomli_w.dumps(_sensor_file(belief, trials[0].start, view)), **files}

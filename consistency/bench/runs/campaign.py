@@ -56,8 +56,12 @@ class Campaign:
         self._fields |= {"error": errors} if errors else {}
 
     def so_far(self, runs: int) -> SoFar:
-        """Runs 0 to ``runs`` - 1."""
-        return self.gathered.so_far(runs, self._fields, self.landmarks)
+        """Runs 0 to ``runs`` - 1 of what is there, to be read while more come."""
+        failures, rejections = self.gathered.noted()
+        return SoFar(
+            self.gathered, runs, self._fields, failures[failures["run"] < runs], self.landmarks,
+            None if rejections is None else rejections[rejections["run"] < runs],
+        )  # fmt: skip
 
     def finish(self, rounds: Iterable[Sequence[int]]) -> Results | StoredResults:
         """Do the runs of each round that are not there, one round after the other, and hand over the results.

@@ -186,7 +186,7 @@ def reproduce(
         An unknown id, a number out of range, or an output folder that cannot be written.
     """
     scripts = experiments()
-    only = _without_scripts(scripts, only or ())
+    only = [finding for name in only or () for finding in (scripts[name].FINDINGS if name in scripts else (name,))]
     selection = _selection(scripts, only, long)
     require_free(out, overwrite, "findings")
     study, started = Study(runs, seed, jobs, only=only), time.monotonic()
@@ -201,11 +201,6 @@ def _compile(selection: Sequence[tuple[ModuleType, Sequence[str]]], jobs: int) -
     needs = [need for module, _ in selection for need in getattr(module, "KERNELS", {}).items()]
     pairs = [(get_filter(name), load_scenario(world)) for world, names in needs for name in names]
     compile_all(first_trials(pairs), jobs)
-
-
-def _without_scripts(scripts: Mapping[str, ModuleType], only: Sequence[str]) -> list[str]:
-    """The ids in ``only``, those of a script's findings in place of its name."""
-    return [finding for name in only for finding in (scripts[name].FINDINGS if name in scripts else (name,))]
 
 
 def _selection(

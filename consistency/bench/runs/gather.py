@@ -99,14 +99,6 @@ class Gathered:
         machines = [*before, *(noted or [this_machine()])]
         return [machine for i, machine in enumerate(machines) if machine not in machines[:i]]
 
-    def so_far(self, runs: int, manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> SoFar:
-        """Runs 0 to ``runs`` - 1 of what is there, to be read while more come."""
-        failures, rejections = self._noted()
-        return SoFar(
-            self, runs, manifest, failures[failures["run"] < runs], landmarks,
-            None if rejections is None else rejections[rejections["run"] < runs],
-        )  # fmt: skip
-
     def pieces(self, table: str, filter_name: str = "") -> Iterator[Columns]:
         """Rows of ``estimates`` or ``map`` of a filter, or of ``truth``, run by run in order of the runs."""
         part = f"{table} {filter_name}" if filter_name else table
@@ -116,7 +108,7 @@ class Gathered:
 
     def results(self, manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> Results | StoredResults:
         """The results; a folder is written and put in its place, unless no run is finished."""
-        failures, rejections = self._noted()
+        failures, rejections = self.noted()
         manifest = manifest | {"failures": len(failures)}
         if self.new is not None and self.finished:
             with undisturbed():
@@ -178,7 +170,7 @@ class Gathered:
                 if run in self.kept:
                     yield run, {name: values[start:end] for name, values in batch.items()}
 
-    def _noted(self) -> tuple[pd.DataFrame, pd.DataFrame | None]:
+    def noted(self) -> tuple[pd.DataFrame, pd.DataFrame | None]:
         """Failures, and rejections where a filter has a guard, of before and of now, by filter and run."""
         rank, tables = {name: i for i, name in enumerate(self.filters)}, []
         for key, kind in (("failures", Failure), ("rejections", Rejected)):

@@ -41,11 +41,6 @@ class ResultsPlace:
         more = self.journal is not None and self.journal.runs
         return self.previous is not None and bool(self.previous.manifest["complete"]) and not more
 
-    @property
-    def finished(self) -> set[int]:
-        """Runs that need not be done again."""
-        return set(self.kept) if self.journal is None else self.journal.runs | self.kept
-
 
 @contextmanager
 def place_for(
@@ -79,14 +74,14 @@ def place_for(
             try:
                 yield place
             except InputError as error:
-                raise _with_rest(error, place) from error.__cause__
+                finished = len(place.kept | unfinished.journal.runs)
+                if new.is_placed or not finished or not isinstance(error.__cause__, OSError):
+                    raise
+                raise InputError(
+                    f"{error}; {finished} finished runs are kept, and the same command with --resume goes on"
+                ) from error.__cause__
             finally:
                 unfinished.is_over = new.is_placed
-
-
-def place_with(journal: Journal) -> ResultsPlace:
-    """Results stay in memory, and the finished runs in ``journal``."""
-    return ResultsPlace(None, journal, None, frozenset(), [this_machine()])
 
 
 def _place(
@@ -106,16 +101,6 @@ def _place(
         )
     kept = frozenset() if previous is None else frozenset(previous.finished_runs(study["filters"]))
     return ResultsPlace(new, journal, previous, kept, [*others, here])
-
-
-def _with_rest(error: InputError, place: ResultsPlace) -> InputError:
-    """The same error, with what is kept where the system refused to write."""
-    assert place.new is not None
-    if place.new.is_placed or not place.finished or not isinstance(error.__cause__, OSError):
-        return error
-    return InputError(
-        f"{error}; {len(place.finished)} finished runs are kept, and the same command with --resume goes on"
-    )
 
 
 def _require_same(study: Mapping[str, Any], before: Mapping[str, Any]) -> None:

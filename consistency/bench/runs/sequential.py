@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -80,7 +79,10 @@ def run_until_decided(
     ) as campaign:  # fmt: skip
         _require_less(campaign, max_runs)
         names = campaign.gathered.filters
-        read = partial(_record, campaign, scenario.truth.steps)
+
+        def read(runs: int, name: str) -> Record:
+            return record_of(campaign.so_far(runs), name, scenario.truth.steps)
+
         results = campaign.finish(_rounds(campaign, looks(design, names, read, decided), decided, names))
     return results, {name: decided[name] for name in names}
 
@@ -112,10 +114,6 @@ def _look(design: Design, record: Record, runs: int, spent: float | None) -> Ver
         return None
     verdict = of_look(look(design, some, spent), runs, record, design)
     return with_map(verdict, record.ends, design.settings, design)
-
-
-def _record(campaign: Campaign, steps: int, runs: int, name: str) -> Record:
-    return record_of(campaign.so_far(runs), name, steps)
 
 
 def _rounds(

@@ -13,7 +13,7 @@ from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import worker_count
-from consistency.bench.runs.compiling import compile_for
+from consistency.bench.runs.compiling import compile_all
 from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.scenario import Belief
 from consistency.bench.tuning.scores import Score, score_of
@@ -76,7 +76,7 @@ class BeliefScorer:
 
     def compile(self) -> None:
         """Compile what the filter needs, and is not yet compiled."""
-        compile_for([self.filter], self.trials[0], self._isolation.belief)
+        compile_all([(self.filter, self.trials[0], self._isolation.belief)])
 
     def __call__(self, belief: Belief) -> Scores:
         """Scores of all runs.

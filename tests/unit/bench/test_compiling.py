@@ -70,7 +70,7 @@ def case():
         os.setgid(65534)
         os.setuid(65534)
     try:
-        compiling.compile_for(filters, None, None, int(jobs))
+        compiling.compile_all(((f, None, None) for f in filters), int(jobs))
     except KeyboardInterrupt:
         print("stopped")
     else:

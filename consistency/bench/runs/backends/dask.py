@@ -24,7 +24,7 @@ from dask.config import set as set_config
 from distributed import Client, Future, KilledWorker, LocalCluster, Security, WorkerPlugin
 
 from consistency.bench.filters.stepping import reason_of
-from consistency.bench.runs.backends.batches import Batch, Batches, Event, WorkerLost, in_batches
+from consistency.bench.runs.backends.batches import Batch, Batches, Event, in_batches
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
 from consistency.bench.runs.isolation.isolating import ONE_THREAD
@@ -186,7 +186,7 @@ class _Engine:
             return []
         del self._sent[key]
         if part is None:
-            return [(batch, WorkerLost("its worker died, and so did those that tried it again"))]
+            return [(batch, "its worker died, and so did those that tried it again")]
         return [(batch, part), (batch, None)]
 
     def _count(self) -> None:

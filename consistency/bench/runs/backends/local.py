@@ -81,15 +81,12 @@ def _in_threads(work: TrialWork, runs: Sequence[int], workers: int) -> Outcomes:
                     while True:
                         ready.append(finished.get_nowait())
                 under_way -= len(ready)
-                ready.sort(key=_failed, reverse=True)  # what is finished counts, whatever ends the rest
+                # what is finished counts, whatever ends the rest
+                ready.sort(key=lambda future: future.exception() is not None, reverse=True)
                 while ready:
                     yield ready.pop().result()
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _failed(future: Future[RunOutcome]) -> bool:
-    return future.exception() is not None
 
 
 def worker_count(jobs: int) -> int:

@@ -185,7 +185,7 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, pose_errors.read(study).filters, innovations.read(study).filters,
+        anees.read(study).curves, pose_errors.read(study).filters, innovations.read(study).tracks,
         world.read(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, innovation, (_, path)) in zip(study.tracks, parts, strict=True):
@@ -197,7 +197,9 @@ def test_the_model_is_what_analyse_says(folder):
         assert curve.expected == 3.0
         table = results.estimates[results.estimates["filter"] == track.name]
         by_step = table.groupby("step")
-        np.testing.assert_allclose(innovation.ratio, by_step["nis"].sum() / by_step["nis_dof"].sum().replace(0, np.nan))
+        np.testing.assert_allclose(
+            innovation.nis_ratio, by_step["nis"].sum() / by_step["nis_dof"].sum().replace(0, np.nan)
+        )
         first = table[table["run"] == 0]
         np.testing.assert_allclose(error.sigma[:, 2], np.rad2deg(np.sqrt(first["P_hh"])))
         np.testing.assert_allclose(path, first[["x", "y"]])
@@ -537,7 +539,7 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     assert row(study, wrong)["Failed runs"] == "0 of 12"
     first = results.estimates[results.estimates["run"] < 12].groupby("step")
     np.testing.assert_allclose(
-        innovations.read(study).filters[1].ratio, first["nis"].sum() / first["nis_dof"].sum().replace(0, np.nan)
+        study.tracks[1].nis_ratio, first["nis"].sum() / first["nis_dof"].sum().replace(0, np.nan)
     )
     assert "kf after 24 runs and small after 12 runs" in verdicts.caption(study)
     assert "Average NEES over 24 runs" in anees.caption(anees.read(study))

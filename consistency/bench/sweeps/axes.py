@@ -65,10 +65,6 @@ def _disparity_noise(scenario: Scenario) -> float:
     return float(sensor.sigma[2] * sensor.disparity_growth.ratio_at(np.array(middle)))
 
 
-def _range(base: Scenario, value: float) -> Changes:
-    return {"truth.sensor.range": (base.truth.sensor.range[0], value)}
-
-
 def _count(base: Scenario, value: float) -> Changes:
     landmarks = base.truth.landmarks
     if not isinstance(landmarks, UniformLandmarks):
@@ -153,7 +149,12 @@ def _loops_of(scenario: Scenario, base: Scenario) -> float:
 
 QUANTITIES: dict[str, Quantity] = {
     "baseline": Quantity("baseline", "m", _baseline, equivalent_baseline),
-    "range": Quantity("range of landmarks", "m", _range, lambda scenario, _: float(scenario.truth.sensor.range[1])),
+    "range": Quantity(
+        "range of landmarks",
+        "m",
+        lambda base, value: {"truth.sensor.range": (base.truth.sensor.range[0], value)},
+        lambda scenario, _: float(scenario.truth.sensor.range[1]),
+    ),
     "density": Quantity(
         "density of landmarks", "×", _count, lambda scenario, base: density_of(scenario) / density_of(base)
     ),

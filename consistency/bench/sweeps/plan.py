@@ -23,7 +23,6 @@ from consistency.bench.scenario import Count, Positive, Scenario, Table, data_fo
 from consistency.bench.sweeps.axes import QUANTITIES, Axis, leaves, require_key, with_changes
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, POWER
-from consistency.referee.diagnostics import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE
 
@@ -39,15 +38,6 @@ class StoppingRule(Table):
     detect: Positive = DETECT
     power: Positive = POWER
     max_runs: Count = 192
-
-    @property
-    def plan(self) -> dict[str, Any]:
-        return self.model_dump() | {"dof": len(POSE)}
-
-    @property
-    def settings(self) -> Settings:
-        """Settings of the verdict for a fixed number of runs."""
-        return Settings(self.false_alarm, self.detect, self.power)
 
 
 class SweepFile(Table):
@@ -161,9 +151,11 @@ def number_of_points(axes: Sequence[Axis]) -> int:
     return grid * (1 + sum(len(axis.values) - 1 for axis in axes if axis.home is not None))
 
 
-def text_alone(sweep: Sweep, cell: Cell) -> str:
-    """What of a cell varies alone, in words."""
-    return text_of(sweep.alone, [i for axis, i in zip(sweep.axes, cell.indices, strict=True) if axis.home is not None])
+def values_of(sweep: Sweep, axes: Sequence[Axis], cell: Cell) -> list[str]:
+    """A cell's values on some axes, and in a sweep with axes that vary alone what of the cell does."""
+    places = [cell.indices[sweep.axes.index(axis)] for axis in (*axes, *sweep.alone)]
+    alone = [text_of(sweep.alone, places[len(axes) :])] if sweep.alone else []
+    return [*map(Axis.say, axes, places), *alone]
 
 
 def _changed(axes: Sequence[Axis], at: Sequence[int]) -> list[tuple[Axis, int]]:
@@ -221,7 +213,7 @@ def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
     file = read_table(path, SweepFile)
     try:
         sweep = _sweep(path, file, tuple(filters or file.filters))
-        plan_of(sweep.rule.plan)
+        plan_of(sweep.rule.model_dump() | {"dof": len(POSE)})
         for filter_ in sweep.filters:
             get_filter(filter_)
         resolve_filters(sweep.filters, sweep.base.belief)

@@ -88,14 +88,11 @@ def _from_sensor(path: Path, base: Scenario, request: Request) -> Rig:
         low, high = camera.disparity
         disparity = (low, high * file.f * file.B / (f * B))
         assumed.append(f"disparities {low:g} to {disparity[1]:.0f} px")
-    if request.range is None:
-        assumed.append(f"landmarks up to {camera.range[1]:g} m (--range)")
-    if request.speed is None:
-        assumed.append(f"speed {base.truth.path.speed:g} m/s (--speed)")
-    if request.density is None:
-        assumed.append(f"{density_of(base):.2g} landmarks a square metre (--density)")
-    if request.dt is None:
-        assumed.append(f"time of a step {base.truth.dt:g} s (--dt)")
+    texts = {
+        "range": f"landmarks up to {camera.range[1]:g} m", "speed": f"speed {base.truth.path.speed:g} m/s",
+        "density": f"{density_of(base):.2g} landmarks a square metre", "dt": f"time of a step {base.truth.dt:g} s",
+    }  # fmt: skip
+    assumed += [f"{text} (--{option})" for option, text in texts.items() if getattr(request, option) is None]
     changes: Changes = {
         f"truth.sensor.{key}": value
         for key, value in {"sigma": file.sigma, "f": file.f, "B": file.B, "image": image, "disparity": disparity,

@@ -10,12 +10,6 @@ SIZE = "steps"  # the dimension that makes a world small by itself; it is shrunk
 HALVINGS = 3  # of the way to the plain value
 
 
-def changed(space: Space, point: Point) -> int:
-    """Number of values that are not the plain ones, the size of the world aside."""
-    pairs = zip(space.dimensions, point, strict=True)
-    return sum(value != d.plain for d, value in pairs if d.name != SIZE)
-
-
 def shrink(space: Space, worst: Point, holds: Callable[[Point], bool], left: Callable[[], bool]) -> Point:
     """The smallest point found on the way from ``worst`` to the plain one at which ``holds`` is still true.
 

@@ -32,11 +32,6 @@ class Scores:
     ratio: float  # total NIS or NEES over its degrees of freedom
     failures: tuple[str, ...]  # of runs that failed
 
-    @property
-    def total(self) -> float:
-        """Sum over all runs; minus infinity where a run failed, because its value is unknown."""
-        return -np.inf if self.failures else float(self.log_density.sum())
-
 
 class BeliefScorer:
     """Scores a filter on trials under any belief; to be used in a ``with``, whose end kills what still works.
@@ -89,7 +84,11 @@ class BeliefScorer:
         with one_blas_thread():
             scores = list(self._pool.map(lambda trial: self._score(trial, belief), self.trials))
         self.settings += 1
-        self._tell()
+        now = time.monotonic()
+        if now - self._told >= EVERY:
+            self._told = now
+            count = f"{self.settings} settings on {len(self.trials)} run{'s' * (len(self.trials) != 1)}"
+            say(f"fitting {name_of(self.filter)} by {self.by}: {count} each, {now - self.began:.0f} s")
         density = np.zeros((len(scores), max(trial.steps for trial in self.trials)))
         for row, score in zip(density, scores, strict=True):
             row[: len(score.log_density)] = score.log_density
@@ -101,11 +100,3 @@ class BeliefScorer:
     def _score(self, trial: Trial, belief: Belief) -> Score:
         [estimates] = self._isolation.run(trial, belief)
         return score_of(trial, estimates, self.by)
-
-    def _tell(self) -> None:
-        """A line of progress, every few seconds."""
-        now = time.monotonic()
-        if now - self._told >= EVERY:
-            self._told = now
-            count = f"{self.settings} settings on {len(self.trials)} run{'s' * (len(self.trials) != 1)}"
-            say(f"fitting {name_of(self.filter)} by {self.by}: {count} each, {now - self.began:.0f} s")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -194,8 +195,9 @@ class SweepFolder:
 
     def results(self) -> dict[tuple[int, str], CellResult]:
         """What is there, by number of the cell and filter; results with other inputs are left out."""
-        found = ((work, self.fresh(work)) for work in self.all_work())
-        return {(work.cell.number, work.filter): result for work, result in found if result is not None}
+        places = itertools.product(self.sweep.cells, self.sweep.filters)
+        found = ((cell.number, name, self.fresh(CellWork(cell, name))) for cell, name in places)
+        return {(number, name): result for number, name, result in found if result is not None}
 
 
 class StaleCell(InputError):

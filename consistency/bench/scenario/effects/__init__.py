@@ -8,7 +8,7 @@ from consistency.bench.scenario.effects.bias_map import BiasMap
 from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
 from consistency.bench.scenario.effects.distortion import Distortion
 from consistency.bench.scenario.effects.drift import Drift as Drift
-from consistency.bench.scenario.effects.effect import EFFECTS, Effect, ListedEffect, register
+from consistency.bench.scenario.effects.effect import EFFECTS, ListedEffect, register
 from consistency.bench.scenario.effects.field_of_view import FieldOfView
 from consistency.bench.scenario.effects.frame_rate import Frames as Frames
 from consistency.bench.scenario.effects.heavy_tails import HeavyTails as HeavyTails
@@ -23,6 +23,7 @@ from consistency.bench.scenario.effects.selection import Selection as Selection
 from consistency.bench.scenario.effects.swap import Swap as Swap
 from consistency.bench.scenario.effects.track_error import TrackError as TrackError
 
+Effect = FieldOfView | Noise | SearchRange | ListedEffect
 BUILT_IN = (FieldOfView.label, Noise.label, SearchRange.label)
 
 __all__ = [

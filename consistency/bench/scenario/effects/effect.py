@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Annotated, Any, ClassVar, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, TypeAdapter, model_validator
@@ -13,21 +13,6 @@ from consistency.bench.scenario.effects.observations import Context, Observation
 from consistency.bench.scenario.toml_tables import Table
 
 E = TypeVar("E", bound="ListedEffect")
-
-
-class Effect(Protocol):
-    """One thing that a sensor does to the observations of a whole trial."""
-
-    @property
-    def label(self) -> str:
-        """Name in messages, and of the random stream."""
-
-    @property
-    def draws(self) -> bool:
-        """Whether it draws random numbers. One that does not is a function of observations and path alone."""
-
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """What becomes of ``observations``; ``rng`` is this effect's own in this run."""
 
 
 class ListedEffect(Table):

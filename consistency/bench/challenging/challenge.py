@@ -205,7 +205,6 @@ def corners(space: Space) -> list[Scenario]:
 
 
 def scenario_of(space: Space, point: Point) -> Scenario | None:
-    """The scenario of a point; None where there is no such world."""
     try:
         return space.world(point)
     except ValueError:

@@ -41,7 +41,6 @@ class Candidate:
 
     @property
     def score(self) -> float:
-        """Mean score less its standard error."""
         if not self.scores or not self.usable:
             return -np.inf
         return float(np.mean(self.scores)) - standard_error(self.scores)
@@ -62,7 +61,6 @@ class Budget:
 
     @property
     def elapsed(self) -> float:
-        """Seconds since the start."""
         return time.monotonic() - self.started
 
     def left(self, share: float) -> bool:

@@ -57,7 +57,6 @@ def command(outcome: Challenge, out: Path) -> str:
 
 
 def as_data(outcome: Challenge, out: Path) -> dict[str, Any]:
-    """The outcome for programs."""
     plan, verdict, space = outcome.plan, outcome.verdict, outcome.space
     search_seed, shrink_seed, confirm_seed = plan.seeds
     return {

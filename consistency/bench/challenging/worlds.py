@@ -98,11 +98,9 @@ class Choice:
         return self.base if self.base in self.values else self.values[0]
 
     def at(self, u: float) -> Value:
-        """Value at ``u`` in [0, 1]."""
         return self.values[min(int(u * len(self.values)), len(self.values) - 1)]
 
     def where(self, value: Value) -> float:
-        """Place of a value in [0, 1]."""
         return (self.values.index(value) + 0.5) / len(self.values)
 
     def between(self, value: Value) -> Value:
@@ -121,7 +119,6 @@ class Choice:
         return replace(self, values=tuple(known[part] for part in dict.fromkeys(parts)))
 
     def text(self, value: Value) -> str:
-        """A value with its unit."""
         return f"{_text(value)}{self.unit}"
 
 
@@ -173,7 +170,6 @@ class Space:
         return f"{self.base.name} with {', '.join(parts)}" if parts else f"{self.base.name} as it is"
 
     def values(self, point: Point) -> dict[str, Value]:
-        """Values of a point by the names of the dimensions."""
         return {d.name: value for d, value in zip(self.dimensions, point, strict=True)}
 
 

@@ -59,7 +59,6 @@ TIPS: Tips = (
 
 
 def compose_regime(regime: Regime) -> Document:
-    """The document that HTML and PDF show."""
     sweep = regime.sweep
     regions = tuple(figure for name in sweep.filters for figure in _figures(regime, name))
     about = Text(method(regime), style="note")
@@ -91,7 +90,6 @@ def answer(regime: Regime) -> str:
 
 
 def method(regime: Regime) -> str:
-    """How a cell is judged."""
     rule, wrong = regime.sweep.rule, "a ratio of true to stated covariance of"
     return (
         f"Each filter runs in each cell until it is decided, with at most {rule.max_runs} runs. A filter that is right "
@@ -225,7 +223,6 @@ def _pair(regime: Regime, name: str, shown: list[grid.Axis], fixed: list[tuple[g
 
 
 def _axis(axis: grid.Axis) -> Axis:
-    """An axis of the grid as one of a panel."""
     values = tuple(map(float, axis.values))
     if not axis.log:
         room = 0.08 * (values[-1] - values[0])

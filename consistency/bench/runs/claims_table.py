@@ -9,7 +9,6 @@ from consistency.referee.document.blocks import Cell, Column, Status, Table, tab
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:
-    """One row a finding."""
     columns = tuple(map(Column, ("finding", "published", "measured", "verdict")))
     rows: list[tuple[Cell, ...]] = [
         (f.id, f.published, f.measured, Status(outcome(f.source, f.verdict))) for f in findings

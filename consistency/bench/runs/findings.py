@@ -155,7 +155,6 @@ def _executed(path: Path, name: str) -> ModuleType:
 
 
 def _summary(module: ModuleType) -> str:
-    """First line of a script's docstring."""
     return (module.__doc__ or "").strip().splitlines()[0]
 
 

@@ -78,7 +78,6 @@ class Gathered:
         self._now = InMemory() if journal is None else journal
 
     def add(self, outcome: RunOutcome) -> None:
-        """Keep what a run left."""
         parts = {f"estimates {name}": columns for name, columns in outcome.estimates.items()}
         parts |= {f"map {name}": columns for name, columns in outcome.maps.items()}
         parts |= {} if outcome.truth is None else {"truth": outcome.truth}
@@ -204,7 +203,6 @@ class SoFar(Tables):
         return True  # NaN in runs of older results, which lack it
 
     def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
-        """See :meth:`Tables.batches`."""
         for name in self.filters if filter_name is None and table != "truth" else [filter_name or ""]:
             for piece in takewhile(lambda piece: piece["run"][0] < self.runs, self.gathered.pieces(table, name)):
                 nothing = np.full(len(piece["run"]), np.nan)

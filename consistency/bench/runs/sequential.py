@@ -155,6 +155,5 @@ def settled(verdict: Verdict) -> bool:
 
 
 def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:
-    """One line of progress."""
     parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
     return ", ".join(parts + [f"{name} open" for name in filters if name not in decided])

@@ -41,7 +41,6 @@ def noted_table(name: str, rows: Sequence[Failure | Rejected]) -> pd.DataFrame:
 
 
 def controls_table(trials: Sequence[Trial]) -> pd.DataFrame:
-    """``controls.parquet``."""
     return pd.concat(
         [
             pd.DataFrame(

@@ -65,7 +65,6 @@ class Journal:
 
     @property
     def runs(self) -> set[int]:
-        """Numbers of the runs that are there."""
         return set(self._offsets)
 
     def begin(self, study: Mapping[str, Any]) -> None:
@@ -74,7 +73,6 @@ class Journal:
         self.study = dict(study)
 
     def clear(self) -> None:
-        """Drop all that is there."""
         self._file.truncate(0)
         self._end, self.study, self._unsynced = 0, {}, True
         self.notes.clear()
@@ -109,7 +107,6 @@ class Journal:
                 at += size
 
     def close(self) -> None:
-        """Synchronise and close the file."""
         self._closed.set()
         if self._syncing is not None:
             self._syncing.join()

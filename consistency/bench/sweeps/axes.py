@@ -248,7 +248,6 @@ class Axis:
 
 
 def say_value(unit: str, value: Any) -> str:
-    """A value with its unit."""
     text = f"{value:.3g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value)
     return f"×{text}" if unit == "×" else f"{text} {unit}".rstrip()
 

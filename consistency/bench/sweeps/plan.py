@@ -60,8 +60,6 @@ class SweepFile(Table):
 
 @dataclass(frozen=True)
 class Cell:
-    """One point of the sweep."""
-
     number: int  # 0, 1, ... in the order of :func:`points`
     indices: tuple[int, ...]  # place on each axis
     name: str  # of its folder
@@ -146,7 +144,6 @@ def points(axes: Sequence[Axis]) -> Iterator[tuple[int, ...]]:
 
 
 def number_of_points(axes: Sequence[Axis]) -> int:
-    """How many :func:`points` gives."""
     grid = math.prod(len(axis.values) for axis in axes if axis.home is None)
     return grid * (1 + sum(len(axis.values) - 1 for axis in axes if axis.home is not None))
 
@@ -186,7 +183,6 @@ def _shipped() -> Path:
 
 
 def sweep_names() -> list[str]:
-    """Names of the built-in sweeps."""
     return sorted(path.stem for path in _shipped().glob("*.toml"))
 
 

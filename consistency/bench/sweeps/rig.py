@@ -119,7 +119,6 @@ def _with_bias(camera: UvdSensor, file: SensorFile) -> list[ListedEffect]:
 
 
 def _with_options(scenario: Scenario, request: Request) -> Scenario:
-    """The scenario with what the options say."""
     for option in ("range", "speed", "density", "dt"):
         value = getattr(request, option)
         if value is None:

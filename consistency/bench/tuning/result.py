@@ -172,7 +172,6 @@ def files(tuning: Tuning) -> dict[str, str]:
 
 
 def _next(tuning: Tuning, out: Path) -> str:
-    """What to do with the files."""
     world, run = tuning.parts.world, "consistency run"
     if isinstance(world, Log):
         use = f"{run} --log {world.name} --filter {tuning.filter} --out results"

@@ -112,5 +112,4 @@ def part_of(trial: Trial, start: int, end: int) -> Trial:
 
 
 def with_belief(scenario: Scenario, belief: Belief, name: str | None = None) -> Scenario:
-    """The scenario with another belief."""
     return scenario.variant(name or scenario.name, belief=belief.model_dump(), summary=scenario.summary)

@@ -43,7 +43,6 @@ def read(report: Report) -> pd.DataFrame | None:
 
 
 def show(filters: pd.DataFrame) -> tuple[Block, ...]:
-    """One row for each filter."""
     first = filters.iloc[0]
     rows = [_row(values) for values in filters.to_dict("records")]
     caption = (
@@ -69,7 +68,6 @@ def _row(values: dict[Any, Any]) -> tuple[Cell, ...]:
 
 
 def _brief(diagnosis: str) -> str:
-    """The first two things that a diagnosis says."""
     return "; ".join(diagnosis.split("; ")[:CLAUSES])
 
 

@@ -14,12 +14,10 @@ CAPTION = "Rules of acceptance are constants of the scripts, fixed before this r
 
 
 def read(report: Report) -> tuple[dict[str, Any], ...] | None:
-    """Findings of the folder; None where there are none."""
     return report.findings or None
 
 
 def show(findings: tuple[dict[str, Any], ...]) -> tuple[Table, ...]:
-    """One row a finding."""
     return (findings_table(findings, "Findings", CAPTION),)
 
 

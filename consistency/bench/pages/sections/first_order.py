@@ -73,7 +73,6 @@ def _panel(estimator: str, cells: pd.DataFrame, table: pd.DataFrame) -> Panel:
 
 
 def caption(table: pd.DataFrame) -> str:
-    """What the map of cells shows."""
     same, lost = table.iloc[0], table["nees_ratio"].isna().sum()
     note = f" Cells without a run that is left, not drawn: {lost}." if lost else ""
     return (

@@ -15,12 +15,10 @@ LONG = 12  # rows from which the table may be broken between pages
 
 
 def read(study: Study) -> Study | None:
-    """The study; None where the truth is not known."""
     return study if study.has_truth else None
 
 
 def show(study: Study) -> tuple[Block, ...]:
-    """Table with a row for each filter."""
     rows = [(Name(track.name, track.look), *cells(FURTHER, track.verdict)) for track in study.tracks]
     label = f"Further figures of {study.name}"
     whole = len(rows) <= LONG

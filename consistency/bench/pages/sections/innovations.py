@@ -45,7 +45,6 @@ def read(study: Study) -> Study:
 
 
 def lags(track: Track) -> Lags | None:
-    """Autocorrelation of lag 1, 2, ...; None with too few innovations."""
     innovations = track.verdict.innovations
     if (
         innovations is None

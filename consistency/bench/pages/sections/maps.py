@@ -21,7 +21,6 @@ CAPTION = (
 
 
 def read(study: Study) -> Study | None:
-    """The study; None where no landmark has a NEES."""
     return study if any(_has_map(track) for track in study.tracks) else None
 
 

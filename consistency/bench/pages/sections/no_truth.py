@@ -8,17 +8,14 @@ from consistency.referee.pages.section import STUDY, Section
 
 
 def read(study: Study) -> Study | None:
-    """The study, where its truth is not known."""
     return None if study.has_truth else study
 
 
 def show(study: Study) -> tuple[Text, ...]:
-    """One paragraph."""
     return (Text(note(study), style="note"),)
 
 
 def note(study: Study) -> str:
-    """What is left to judge."""
     return (
         f"The truth of {study.name} is not known, so there are no pose errors and no NEES to show; the innovations "
         f"below are {'all that can be judged' if study.judged else 'reported and not judged'}."

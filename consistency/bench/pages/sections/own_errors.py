@@ -17,7 +17,6 @@ def read(study: Study) -> Study | None:
 
 
 def show(study: Study) -> tuple[Block, ...]:
-    """Two rows for each filter with an error of its own."""
     rows = [row for track in study.tracks for row in _rows(track)]
     return (
         Heading("Errors of their own", 4, "Errors of their own"),

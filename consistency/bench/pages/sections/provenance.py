@@ -20,7 +20,6 @@ def read(report: Report) -> Report:
 
 
 def show(report: Report) -> tuple[Block, ...]:
-    """Facts of the folder, then of each study with its settings."""
     rows = facts(report.manifest)
     return Facts(rows), *(_study(study, rows, len(report.studies) > 1) for study in report.studies)
 

@@ -17,12 +17,10 @@ CAPTION = (
 
 
 def read(study: Study) -> Study | None:
-    """The study; None where no filter has a guard."""
     return study if any(track.verdict.rejection is not None for track in study.tracks) else None
 
 
 def show(study: Study) -> tuple[Block, ...]:
-    """One row for each filter that has a guard."""
     scores = [(track, track.verdict.rejection) for track in study.tracks]
     rows = [(Name(track.name, track.look), *rejection_cells(r)) for track, r in scores if r is not None]
     return (

@@ -16,7 +16,6 @@ def read(report: Report) -> Report:
 
 
 def show(report: Report) -> tuple[Block, ...]:
-    """Tables and sentences of each study, then the method."""
     if not report.studies:
         return (Text("No study was run for these findings."),)
     blocks = [block for study in report.studies for block in judgement(study)]

@@ -32,7 +32,6 @@ class World:
 
 
 def read(study: Study) -> World:
-    """Paths of the shown run."""
     landmarks = study.results.landmarks
     return World(
         study,
@@ -74,7 +73,6 @@ def _odometry(study: Study) -> Array | None:
 
 
 def figures(world: World) -> tuple[Figure, ...]:
-    """One map."""
     study = world.study
     panel = Panel(
         Axis("x (m)"), Axis("y (m)"), (*_surroundings(world), *_estimates(world), *_start(world)),
@@ -120,7 +118,6 @@ def _keys(world: World) -> list[Key]:
 
 
 def caption(world: World) -> str:
-    """What the map shows."""
     parts = []
     if world.truth is not None:
         parts.append("true path solid with its start as a circle")

@@ -34,7 +34,6 @@ class Distortion(ListedEffect):
     right: Coefficients
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """All observations, distorted."""
         assert context.sensor.f is not None
         return observations.with_z(self.distorted(observations.z, context.sensor.f))
 

@@ -32,7 +32,6 @@ class ListedEffect(Table):
 
     @property
     def label(self) -> str:
-        """``name``, or ``kind`` where no name is given."""
         return self.name or self.kind
 
     @abstractmethod

@@ -26,7 +26,6 @@ class FieldOfView:
     draws: ClassVar[bool] = False
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The rows of the ideal ``observations`` (T, N) that are seen."""
         path = context.planned if context.linear else context.path
         x, y, heading = path[1:].T[..., None]
         c, s = np.cos(heading), np.sin(heading)

@@ -24,6 +24,5 @@ class Frames(ListedEffect):
     every: Annotated[list[Count], Field(min_length=1)]
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The rows of steps with an image."""
         images = np.cumsum(np.resize(self.every, context.steps))
         return observations.keep(np.isin(observations.step, images))

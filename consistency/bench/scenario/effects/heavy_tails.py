@@ -26,7 +26,6 @@ class HeavyTails(ListedEffect):
     sigma: tuple[NonNegative, NonNegative, NonNegative]
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """All rows, some with a further error."""
         hit = np.flatnonzero(rng.random(len(observations)) < self.rate)
         z = observations.z.copy()
         z[hit] += rng.standard_normal((len(hit), 3)) * self.sigma

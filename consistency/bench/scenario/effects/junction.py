@@ -58,7 +58,6 @@ class Junction(ListedEffect):
         return self
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The observations with those of crossings."""
         z, seen = self._seen(self.drawn(context), context)
         step, thing = np.nonzero(seen)
         return observations.add(step + 1, thing, z[seen])

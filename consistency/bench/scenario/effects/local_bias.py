@@ -25,7 +25,6 @@ class LocalBias(ListedEffect, BiasMap):
     kind: Literal["local-bias"] = "local-bias"
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """All observations, shifted."""
         z = observations.z
         return observations.with_z(z + self.at(z[:, 0], z[:, 1]))
 

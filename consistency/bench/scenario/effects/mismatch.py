@@ -33,7 +33,6 @@ class Mismatch(ListedEffect):
         return self
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """All rows, some of them mismatched."""
         hit = np.flatnonzero(rng.random(len(observations)) < self.rate)
         searched = self.disparity or context.sensor.search_range
         assert searched is not None

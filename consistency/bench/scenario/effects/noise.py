@@ -22,7 +22,6 @@ class Noise:
     growth: DisparityGrowth | None = None
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """All rows, with noise."""
         z = rng.standard_normal((len(observations), len(self.sigma)))
         z *= self.sigma
         if self.growth is not None:

@@ -29,7 +29,6 @@ class Occlusion(ListedEffect):
     walls: Annotated[list[tuple[Finite, Finite, Finite, Finite]], Field(min_length=1)]
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The rows of what no wall hides."""
         x, y, heading = context.path[observations.step].T
         dx, dy, _ = context.sensor.mount.position
         c, s = np.cos(heading), np.sin(heading)

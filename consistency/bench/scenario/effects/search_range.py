@@ -21,6 +21,5 @@ class SearchRange:
     high: float  # px
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The rows that are found."""
         d = observations.z[:, 2]
         return observations.keep((d >= self.low) & (d <= self.high))

@@ -48,7 +48,6 @@ class Selection(ListedEffect):
     depth: NonNegative
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The rows of chosen tracks."""
         base, cell, is_near = self._ranked(observations, context)
         ends = np.searchsorted(observations.step, np.arange(1, context.steps + 2))
         last, is_kept = np.zeros(observations.ids, np.int64), np.zeros(observations.ids, bool)

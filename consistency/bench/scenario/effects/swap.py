@@ -23,7 +23,6 @@ class Swap(ListedEffect):
     rate: Rate
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """All rows, some with the values of another."""
         chance, pick = rng.random((2, len(observations)))
         first = np.searchsorted(observations.step, observations.step, side="left")
         seen = np.searchsorted(observations.step, observations.step, side="right") - first

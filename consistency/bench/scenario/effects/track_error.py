@@ -28,7 +28,6 @@ class TrackError(ListedEffect):
     correlation: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False, strict=True)]
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """All rows, with the error of their track."""
         if not len(observations):
             return observations
         track, age = observations.tracks()

@@ -104,13 +104,7 @@ def require_writable(out: Path, overwrite: bool) -> None:
 
 
 def write_scenario(outcome: Challenge, out: Path) -> None:
-    """Write the world of a filter that was found overconfident, whole or not at all.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written.
-    """
+    """Write the world of a filter that was found overconfident, whole or not at all."""
     verdict = outcome.verdict
     summary = (
         f"{_subject(outcome)} is {verdict.status} here, ANEES {verdict.statistic:.3g} in {verdict.runs} runs: "

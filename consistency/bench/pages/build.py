@@ -94,13 +94,7 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
 
 
 def compose(report: Report, sections: tuple[Section[Any, Any], ...] | None = None) -> Document:
-    """The document that HTML and PDF show: every section that applies, in the order of ``sections``.
-
-    Raises
-    ------
-    InputError
-        A file that a section reads is damaged.
-    """
+    """The document that HTML and PDF show: every section that applies, in the order of ``sections``."""
     chapters: list[Chapter] = []
     opening: tuple[Block, ...] = ()
     for part, group in groupby(SECTIONS if sections is None else sections, key=lambda section: section.part):

@@ -59,13 +59,7 @@ def section(part: Part, exhibits: Sequence[Exhibit]) -> Section[Report, tuple[Sh
     """The section of these exhibits; an exhibit without any of its tables is left out."""
 
     def read(report: Report) -> tuple[Shown, ...] | None:
-        """The exhibits of the folder; None where there is none.
-
-        Raises
-        ------
-        InputError
-            A file is damaged or lacks a column.
-        """
+        """The exhibits of the folder; None where there is none."""
         shown = (_read(report, exhibit) for exhibit in exhibits)
         return tuple(each for each in shown if each.tables) or None
 

@@ -33,13 +33,7 @@ POINT = ("x", "y", "z")
 
 
 def records_of(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
-    """A record for every filter of the results, or for those named, each read when it is asked for.
-
-    Raises
-    ------
-    InputError
-        As :func:`record_of`.
-    """
+    """A record for every filter of the results, or for those named, each read when it is asked for."""
     steps = steps_of(results)
     return (record_of(results, name, steps) for name in filters or results.filters)
 

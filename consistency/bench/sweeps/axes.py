@@ -253,13 +253,7 @@ def say_value(unit: str, value: Any) -> str:
 
 
 def require_key(axis: Axis, base: Scenario) -> None:
-    """Refuse a key that no scenario has.
-
-    Raises
-    ------
-    InputError
-        Says what is allowed in its place.
-    """
+    """Refuse a key that no scenario has, and say what is allowed in its place."""
     if axis.key in QUANTITIES:
         return
     for key in axis.changes(base, None):

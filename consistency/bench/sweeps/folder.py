@@ -112,13 +112,7 @@ class SweepFolder:
             return None
 
     def require_usable(self, overwrite: bool) -> None:
-        """Refuse, before any work, a folder of something else, and cells that were made with other inputs.
-
-        Raises
-        ------
-        InputError
-            See above; with ``overwrite`` such cells are run again.
-        """
+        """Refuse before any work a folder of something else, and unless ``overwrite`` cells made with other inputs."""
         if not (self.path.exists() or self.path.is_symlink()):
             return
         try:

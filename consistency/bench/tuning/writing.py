@@ -25,13 +25,7 @@ def verdicts(tuning: Tuning) -> dict[str, Verdict]:
 
 
 def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
-    """Write the files of a fit, with its outcome, as a folder that appears whole.
-
-    Raises
-    ------
-    InputError
-        The folder is there already, or cannot be written.
-    """
+    """Write the files of a fit, with its outcome, as a folder that appears whole."""
     outcome = json.dumps(as_data(tuning, out), indent=2, allow_nan=False) + "\n"
     texts = files(tuning) | {"tuning.json": outcome}
 

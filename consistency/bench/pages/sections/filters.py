@@ -32,13 +32,7 @@ COLUMNS = (
 
 
 def read(report: Report) -> pd.DataFrame | None:
-    """The table of the folder; None where the file does not exist.
-
-    Raises
-    ------
-    InputError
-        The file is damaged or lacks a column.
-    """
+    """The table of the folder; None where the file does not exist."""
     return extra_table(report.folder / FILE, NUMBERS, NAMES, MISSING)
 
 

@@ -22,13 +22,7 @@ KEYS = (
 
 
 def read(report: Report) -> pd.DataFrame | None:
-    """The table of the folder, by depth; None where the file does not exist.
-
-    Raises
-    ------
-    InputError
-        The file is damaged or lacks a column.
-    """
+    """The table of the folder, by depth; None where the file does not exist."""
     table = extra_table(report.folder / FILE, COLUMNS)
     return None if table is None else table.sort_values("depth")
 

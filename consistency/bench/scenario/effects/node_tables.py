@@ -10,13 +10,7 @@ from consistency.referee.types import Array
 
 
 def require_increasing(key: str, nodes: tuple[float, ...]) -> None:
-    """Refuse nodes of a table that are not in increasing order.
-
-    Raises
-    ------
-    ValueError
-        A node is not greater than the one before it.
-    """
+    """Refuse nodes of a table that are not in increasing order; raises ValueError."""
     if not all(a < b for a, b in pairwise(nodes)):
         raise ValueError(f"{key} must increase from each number to the next, got {list(nodes)}")
 

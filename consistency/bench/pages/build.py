@@ -100,15 +100,13 @@ def compose(report: Report, sections: tuple[Section[Any, Any], ...] | None = Non
     for part, group in groupby(SECTIONS if sections is None else sections, key=lambda section: section.part):
         members = tuple(group)
         if part is STUDY:
-            chapters += [_chapter(study, index, members) for index, study in enumerate(report.studies)]
+            for index, study in enumerate(report.studies):
+                shown = tuple(block for section in members for block in section.blocks(study))
+                anchor = f"{STUDY.anchor}-{index}"
+                chapters.append(Chapter(anchor, study.name, study.name, shown, study.summary, study.keys()))
         elif blocks := tuple(block for section in members for block in section.blocks(report)):
             if part is OPENING:
                 opening = blocks
             else:
                 chapters.append(Chapter(part.anchor, part.title, part.link, blocks))
     return Document(report.title, answer(report.studies, report.findings), tuple(chapters), opening)
-
-
-def _chapter(study: Study, index: int, sections: tuple[Section[Any, Any], ...]) -> Chapter:
-    blocks = tuple(block for section in sections for block in section.blocks(study))
-    return Chapter(f"{STUDY.anchor}-{index}", study.name, study.name, blocks, study.summary, study.keys())

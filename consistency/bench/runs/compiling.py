@@ -80,7 +80,9 @@ def _compile(missing: Sequence[Need], jobs: int) -> None:
     shared = sorted(
         (need for need in missing if need.outlook.is_shared), key=lambda need: need.outlook.seconds, reverse=True
     )
-    workers = min(jobs, len(shared)) if len(shared) > 1 and _may_fork() and not disk_cache.refusal() else 1
+    # processes start as copies of this one: in a thread beside others a lock may be held for ever
+    may_fork = sys.platform == "linux" and threading.active_count() == 1
+    workers = min(jobs, len(shared)) if len(shared) > 1 and may_fork and not disk_cache.refusal() else 1
     seconds = _wall([need.outlook.seconds for need in missing], workers)
     with _processes(shared, workers if workers > 1 else 0) as links, progress.foreseen(_label(missing), seconds):
         _side_by_side(len(shared), links)
@@ -104,11 +106,6 @@ def _wall(seconds: Sequence[float], workers: int) -> float:
 
 
 # --- side by side ---------------------------------------------------------------------------------
-
-
-def _may_fork() -> bool:
-    """Whether processes can start as copies of this one: in a thread beside others a lock may be held for ever."""
-    return sys.platform == "linux" and threading.active_count() == 1
 
 
 @contextlib.contextmanager

@@ -101,7 +101,7 @@ def looks(
         yield runs
         for name in [name for name in filters if name not in decided]:
             verdict = _look(design, read(runs, name), runs, spent)
-            if verdict is not None and (settled(verdict) or runs == design.max_runs):
+            if verdict is not None and (verdict.status != "undecided" or runs == design.max_runs):
                 decided[name] = verdict
         if len(decided) == len(filters):
             return
@@ -147,11 +147,6 @@ def plan_of(plan: dict[str, Any]) -> Design:
         return sequential_design(**plan)
     except ValueError as error:
         raise refused(error) from None
-
-
-def settled(verdict: Verdict) -> bool:
-    """No further run changes what this look says."""
-    return verdict.status != "undecided"
 
 
 def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:

@@ -229,7 +229,9 @@ class Unfinished:
                 require_free(out, overwrite or resume, kind)
             self._lock = self._locked()
             try:
-                self._recover()
+                replaced = self.path / "replaced"
+                if replaced.exists() and not out.exists():  # the process ended while the results were being replaced
+                    os.replace(replaced, out)
                 if overwrite and not resume:
                     (self.path / "journal").unlink(missing_ok=True)
                 self.journal = Journal(self.path / "journal")
@@ -278,12 +280,6 @@ class Unfinished:
             if self.path.exists():
                 return lock
             lock.release()
-
-    def _recover(self) -> None:
-        """Put back the results of before if the process ended while they were being replaced."""
-        replaced = self.path / "replaced"
-        if replaced.exists() and not self.out.exists():
-            os.replace(replaced, self.out)
 
 
 def unfinished_of(out: Path) -> Path:

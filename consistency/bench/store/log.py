@@ -100,8 +100,7 @@ def read_log(folder: str | Path) -> Log:
     _check_pixels(folder, observations, sensor)
     start = np.array([sensor.start.x, sensor.start.y, sensor.start.heading]) if sensor.start else None
     names = _names(folder, observations, tables["landmarks"])
-    _require_landmarks_only(folder, names, belief)
-    positions = _positions(folder, tables["landmarks"], names.landmarks, belief)
+    positions = _positions(folder, tables["landmarks"], names, belief)
     of_controls, of_observations, truth = _by_run(controls), _by_run(observations), tables["truth"]
     of_truth = None if truth is None else _by_run(truth)
     trials = [
@@ -261,16 +260,13 @@ def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | N
     return _Names(real, np.setdiff1d(labels, real))
 
 
-def _require_landmarks_only(folder: Path, names: _Names, belief: Belief) -> None:
+def _positions(folder: Path, landmarks: pd.DataFrame | None, names: _Names, belief: Belief) -> Array | None:
     if belief.sensor.model == "linear" and len(names.things):
         raise InputError(
             f"{table_file(folder, 'observations')}: column 'landmark': {names.things[0]} is no landmark, and a linear "
             "world needs one that it is linearised about"
         )
-
-
-def _positions(folder: Path, landmarks: pd.DataFrame | None, labels: Array, belief: Belief) -> Array | None:
-    path = table_file(folder, "landmarks")
+    path, labels = table_file(folder, "landmarks"), names.landmarks
     if landmarks is None:
         if belief.sensor.model == "linear":
             raise InputError(f"{path}: missing; a linear world needs the landmarks it is linearised about")

@@ -77,7 +77,8 @@ def _rows(trial: Trial, estimates: Estimates) -> tuple[Estimates, Columns]:
     first = _full_rank((estimates.covariance if own is None else own)[:last])
     columns = _columns(trial, estimates, last, first)
     step, reason = _first_failure(columns, first, trial.truth is not None)
-    if not step and estimates.map is not None and not _is_bounded(estimates.map):
+    numbers = () if estimates.map is None else (estimates.map.mean, estimates.map.covariance)
+    if not step and not all((np.abs(values) <= LARGEST_NUMBER).all() for values in numbers):
         step, reason = last, f"a number in the map is beyond {LARGEST_NUMBER:g}"
     if not step:
         return estimates, columns
@@ -102,10 +103,6 @@ def _first_failure(columns: Columns, first: int, has_truth: bool) -> tuple[int, 
             beyond = f"is beyond {LARGEST_NUMBER:g}" if np.isfinite(size[at]) else "is not finite"
             faults.append((at + 1, f"the {kind} {beyond}"))
     return min(faults, key=lambda fault: fault[0], default=(0, ""))
-
-
-def _is_bounded(map_: Map) -> bool:
-    return all(bool((np.abs(values) <= LARGEST_NUMBER).all()) for values in (map_.mean, map_.covariance))
 
 
 def _last(trial: Trial, estimates: Estimates) -> int:

@@ -181,7 +181,7 @@ def test_a_map_that_is_not_finished_says_what_is_missing(regime: Regime) -> None
     """The sweep was interrupted before the second filter was in the nearest cell: none is not known yet."""
     bad = made(lambda *_: result("biased"))
     *_, second = bad.sweep.filters
-    here = advise(bad).nearest
+    here = advise(bad).here.nearest
     part = replace(bad, results={k: v for k, v in bad.results.items() if k != (here.number, second)})
     [answer] = sentences_of(advise(part))
     assert answer == (

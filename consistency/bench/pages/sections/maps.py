@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from consistency.bench.pages.report_input import Study, Track
-from consistency.referee.diagnostics import Verdict
+from consistency.referee.diagnostics.verdict.parts import MapScore
 from consistency.referee.document.blocks import Block, Heading, Name, Text, table
 from consistency.referee.document.map import COLUMNS, map_cells
 from consistency.referee.document.verdict import FILTER
@@ -21,27 +21,23 @@ CAPTION = (
 
 
 def read(study: Study) -> Study | None:
-    return study if any(_has_map(track) for track in study.tracks) else None
+    return study if any(of.landmarks > 0 for _, of in _maps(study)) else None
 
 
-def _has_map(track: Track) -> bool:
-    return track.verdict.map is not None and track.verdict.map.landmarks > 0
+def _maps(study: Study) -> list[tuple[Track, MapScore]]:
+    return [(track, track.verdict.map) for track in study.tracks if track.verdict.map is not None]
 
 
 def show(study: Study) -> tuple[Block, ...]:
     """One row for each filter that has a map, and a sentence for each verdict on one."""
-    tracks = [track for track in study.tracks if track.verdict.map is not None]
-    rows = [(Name(t.name, t.look), *map_cells(t.verdict.map)) for t in tracks if t.verdict.map is not None]
-    sentences = [f"Map of {t.name}: {v.reasons[0]}." for t in tracks if (v := _verdict(t)) is not None]
+    maps = _maps(study)
+    rows = [(Name(track.name, track.look), *map_cells(of)) for track, of in maps]
+    sentences = [f"Map of {track.name}: {of.verdict.reasons[0]}." for track, of in maps if of.verdict is not None]
     return (
         Heading("Map", 4, "Map"),
         table((FILTER, *COLUMNS), rows, f"Maps of {study.name}", caption=CAPTION, apart=True, whole=True),
-        *(Text(sentence) for sentence in sentences),
+        *map(Text, sentences),
     )
-
-
-def _verdict(track: Track) -> Verdict | None:
-    return None if track.verdict.map is None else track.verdict.map.verdict
 
 
 SECTION = Section(STUDY, read, show)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pydantic import model_validator
 
 from consistency.bench.scenario.belief import Belief
-from consistency.bench.scenario.toml_tables import Table, read_table
+from consistency.bench.scenario.toml_tables import UNITS, Table, read_table
 from consistency.bench.scenario.truth import Truth
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_folder, one_line
@@ -49,16 +50,31 @@ class Scenario(Table):
 
         >>> load_scenario("herath2007-stereo").variant("far", truth__sensor__range=(0.5, 8.0))  # doctest: +SKIP
         """
-        changes.setdefault("summary", f"{self.name} with other {', '.join(changes) or 'name'}".replace("__", "."))
-        data = self.model_dump()
-        data["name"] = name
-        for path, value in changes.items():
-            table = data
-            *parents, key = path.split("__")
-            for parent in parents:
-                table = table[parent]
-            table[key] = value
-        return Scenario.model_validate(data)
+        default = f"{self.name} with other {', '.join(changes) or 'name'}".replace("__", ".")
+        summary = changes.pop("summary", default)
+        return with_changes(self, name, summary, {path.replace("__", "."): value for path, value in changes.items()})
+
+
+def with_changes(base: Scenario, name: str, summary: str, changes: Mapping[str, Any]) -> Scenario:
+    """A copy of the scenario with values set by dotted key; raises pydantic's ValidationError."""
+    data = base.model_dump() | {"name": name, "summary": summary}
+    for path, value in changes.items():
+        *parents, key = path.split(".")
+        table = data
+        for parent in parents:
+            table = table[parent]
+        stem, _, unit = key.rpartition("_")
+        if key not in table and f"_{unit}" in UNITS.values():
+            table.pop(stem, None)  # the value comes with its unit
+        table[key] = value
+    return Scenario.model_validate(data)
+
+
+def unknown(what: str, name: str, known: Sequence[str]) -> str:
+    """That there is no such scenario or sweep, and what there is."""
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f" (did you mean '{near[0]}'?)" if near else ""
+    return f"unknown {what} '{name}'{hint}; known: {', '.join(known)}"
 
 
 def scenario_names() -> list[str]:
@@ -80,8 +96,5 @@ def load_scenario(name: str | Path) -> Scenario:
     elif is_folder(path):
         raise InputError(f"{path}: a folder; give a .toml file in it, or to filter a log --log {path}")
     elif path.suffix != ".toml":
-        near = difflib.get_close_matches(str(name), scenario_names(), n=1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        known = ", ".join(scenario_names())
-        raise InputError(f"unknown scenario '{one_line(name)}'{hint}; known: {known}; or give the path of a .toml file")
+        raise InputError(f"{unknown('scenario', one_line(name), scenario_names())}; or give the path of a .toml file")
     return read_table(path, Scenario, name=path.stem)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor
-from consistency.bench.scenario.toml_tables import UNITS
 from consistency.bench.simulation import draw_landmarks
 from consistency.bench.simulation.path import lap_length
 from consistency.bench.simulation.variation import course_of, mount_of
@@ -275,18 +274,3 @@ def leaves(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]
             yield from leaves(value, f"{path}{key}.")
         else:
             yield path + key, value
-
-
-def with_changes(base: Scenario, name: str, summary: str, changes: Changes) -> Scenario:
-    """A copy of the scenario with keys set; raises pydantic's ValidationError."""
-    data = base.model_dump() | {"name": name, "summary": summary}
-    for path, value in changes.items():
-        *parents, key = path.split(".")
-        table = data
-        for parent in parents:
-            table = table[parent]
-        stem, _, unit = key.rpartition("_")
-        if key not in table and f"_{unit}" in UNITS.values():
-            table.pop(stem, None)  # the value comes with its unit
-        table[key] = value
-    return Scenario.model_validate(data)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import itertools
 import math
@@ -20,7 +19,8 @@ from consistency.bench.filters import get_filter
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.runs.sequential import plan_of
 from consistency.bench.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
-from consistency.bench.sweeps.axes import QUANTITIES, Axis, leaves, require_key, with_changes
+from consistency.bench.scenario.scenario import unknown, with_changes
+from consistency.bench.sweeps.axes import QUANTITIES, Axis, leaves, require_key
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, POWER
 from consistency.referee.errors import InputError
@@ -202,10 +202,7 @@ def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
     if str(name) in sweep_names():
         path = _shipped() / f"{name}.toml"
     elif path.suffix != ".toml":
-        near = difflib.get_close_matches(str(name), sweep_names(), n=1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        known = ", ".join(sweep_names())
-        raise InputError(f"unknown sweep '{name}'{hint}; known: {known}; or give a .toml file or a folder of 'sweep'")
+        raise InputError(f"{unknown('sweep', str(name), sweep_names())}; or give a .toml file or a folder of 'sweep'")
     file = read_table(path, SweepFile)
     try:
         sweep = _sweep(path, file, tuple(filters or file.filters))

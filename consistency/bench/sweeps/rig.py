@@ -10,8 +10,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from consistency.bench.scenario import ListedEffect, LocalBias, Scenario, UvdSensor, explain, load_scenario, read_table
+from consistency.bench.scenario.scenario import with_changes
 from consistency.bench.store.log import SensorFile
-from consistency.bench.sweeps.axes import QUANTITIES, Axis, Changes, density_of, leaves, say_value, with_changes
+from consistency.bench.sweeps.axes import QUANTITIES, Axis, Changes, density_of, leaves, say_value
 from consistency.bench.sweeps.plan import Cell, Sweep
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_toml

@@ -12,11 +12,12 @@ import pytest
 
 import consistency as cs
 from consistency.bench.scenario import data_folder, misbelief
+from consistency.bench.scenario.scenario import with_changes
 from consistency.bench.store.log import write_log
 from consistency.bench.sweeps import recommend as advising
 from consistency.bench.sweeps import regime as maps
 from consistency.bench.sweeps import rig as rigs
-from consistency.bench.sweeps.axes import QUANTITIES, Axis, equivalent_baseline, with_changes
+from consistency.bench.sweeps.axes import QUANTITIES, Axis, equivalent_baseline
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.bench.sweeps.printing import advice_blocks, advice_json, notes_of, sentences_of

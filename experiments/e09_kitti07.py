@@ -26,8 +26,7 @@ import pandas as pd
 import consistency as cs
 from consistency.bench.models import point, stereo
 from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.runs.claims_table import findings_table
-from consistency.bench.runs.findings import command_line, sibling
+from consistency.bench.runs.findings import command_line, findings_table, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.log import Log, write_log

@@ -21,8 +21,7 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.claims_table import findings_table
-from consistency.bench.runs.findings import OURS, command_line, sibling
+from consistency.bench.runs.findings import OURS, command_line, findings_table, sibling
 from consistency.referee.diagnostics import Evidence, Verdict, judge
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.show.terminal import show

@@ -21,8 +21,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.claims_table import findings_table
-from consistency.bench.runs.findings import command_line, sibling
+from consistency.bench.runs.findings import command_line, findings_table, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.log import Log, write_log

@@ -23,8 +23,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.claims_table import findings_table
-from consistency.bench.runs.findings import OURS, command_line, sibling
+from consistency.bench.runs.findings import OURS, command_line, findings_table, sibling
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.progress import each

@@ -10,8 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search, standard_error
-from consistency.bench.challenging.shrink import shrink
+from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search, shrink, standard_error
 from consistency.bench.challenging.world_scores import ChallengeScorer, Part, has_map
 from consistency.bench.challenging.worlds import Point, Space, require_right_belief, space_of
 from consistency.bench.filters import get_filter

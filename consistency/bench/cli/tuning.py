@@ -48,9 +48,8 @@ def tune(
     """Fit the process and measurement noise of a filter, and judge it before and after on data the fit has not seen."""
     from consistency.bench.scenario import load_scenario
     from consistency.bench.store.log import read_log
-    from consistency.bench.tuning.result import lines
+    from consistency.bench.tuning.result import KIND, as_data, lines, verdicts, write
     from consistency.bench.tuning.tune import tune as tune_filter
-    from consistency.bench.tuning.writing import KIND, as_data, verdicts, write
     from consistency.referee.document.verdict import document
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free

@@ -14,10 +14,9 @@ from consistency.bench.filters import filter_names, get_filter, usable_names
 from consistency.bench.filters.stepping import error_of, name_of
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.campaign import Campaign, own_errors
+from consistency.bench.runs.campaign import PLAN, Campaign, ResultsPlace, own_errors, place_for
 from consistency.bench.runs.campaign import Interrupted as Interrupted
 from consistency.bench.runs.isolation.isolating import Isolation
-from consistency.bench.runs.resuming import PLAN, ResultsPlace, place_for
 from consistency.bench.runs.trial_work import Backend, Recorded, Simulated, TrialWork
 from consistency.bench.scenario import Belief, Scenario
 from consistency.bench.scenario.toml_tables import UNITS

@@ -7,21 +7,26 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.campaign import Campaign
-from consistency.bench.runs.montecarlo import studied
-from consistency.bench.runs.results_to_records import record_of
+from consistency.bench.runs.montecarlo import run_trials, studied
+from consistency.bench.runs.results_to_records import record_of, records_of
+from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.trial_work import Backend
-from consistency.bench.scenario import Scenario
+from consistency.bench.scenario import Scenario, load_scenario
 from consistency.bench.store.journal import Journal
-from consistency.bench.store.results import Results, StoredResults, Tables
+from consistency.bench.store.results import Results, StoredResults, Tables, open_results
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import Design, Record, Verdict, look, sequential_design, speaks
+from consistency.referee.diagnostics.questions.scale import FEW
 from consistency.referee.diagnostics.verdict.judge import of_look, with_map
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
+from consistency.referee.types import Array
 from consistency.referee.verdicts.options import refused
 
 
@@ -152,3 +157,32 @@ def plan_of(plan: dict[str, Any]) -> Design:
 def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:
     parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
     return ", ".join(parts + [f"{name} open" for name in filters if name not in decided])
+
+
+# --- pilots: runs that tell how steps depend on each other, from which a number of runs is planned ----------------
+
+
+def pilots_in(folder: Path, filters: Sequence[str] | None = None) -> dict[str, tuple[Array, int]]:
+    """Pilots in a folder of results; see :func:`pilots_of`."""
+    return pilots_of(open_results(folder), filters)
+
+
+def pilots_in_world(scenario: str, filters: Sequence[str], runs: int, seed: int) -> dict[str, tuple[Array, int]]:
+    """Pilots that are run for it, in a world by its name or path; see :func:`pilots_of`."""
+    return pilots_of(run_trials(load_scenario(scenario), filters, runs, seed), filters)
+
+
+def pilots_of(results: Tables, filters: Sequence[str] | None = None) -> dict[str, tuple[Array, int]]:
+    """Pilots of :func:`consistency.referee.verdicts.options.plan`, of every filter or of those named."""
+    return {of.name: (_pilot_means(of), of.t.size) for of in records_of(results, filters)}
+
+
+def _pilot_means(of: Record) -> Array:
+    """Mean NEES over dof of the runs that did not fail, (runs,)."""
+    if of.nees is None:
+        raise InputError(f"{of.name}: has no truth; only runs with a NEES tell how their steps depend on each other")
+    means = run_means(of)
+    means = means[np.isfinite(means)] / len(POSE)
+    if len(means) < FEW:
+        raise InputError(f"{of.name}: a pilot needs at least {FEW} runs that did not fail, got {len(means)}")
+    return np.asarray(means)

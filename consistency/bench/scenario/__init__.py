@@ -6,10 +6,16 @@ does to an ideal observation, one effect a file: its keys and its ``apply``. Not
 simulation's.
 """
 
-from consistency.bench.scenario.agreement import misbelief
 from consistency.bench.scenario.belief import Belief, BelievedMotion, GuardSettings, SigmaPoints
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
-from consistency.bench.scenario.scenario import Scenario, load_scenario, scenario_names
+from consistency.bench.scenario.scenario import (
+    Scenario,
+    load_scenario,
+    misbelief,
+    scenario_names,
+    scenario_text,
+    toml_text,
+)
 from consistency.bench.scenario.sensor import (
     BelievedSensor,
     PicturedSensor,
@@ -31,7 +37,6 @@ from consistency.bench.scenario.truth import (
     UniformLandmarks,
     Waypoints,
 )
-from consistency.bench.scenario.writing import scenario_text, toml_text
 from consistency.referee.shipped import data_folder
 
 __all__ = [

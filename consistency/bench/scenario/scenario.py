@@ -5,18 +5,26 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+import tomli_w
 from pydantic import model_validator
 
 from consistency.bench.scenario.belief import Belief
+from consistency.bench.scenario.effects import LocalBias
 from consistency.bench.scenario.toml_tables import UNITS, Table, read_table
 from consistency.bench.scenario.truth import Truth
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_folder, one_line
 from consistency.referee.shipped import data_folder
+
+# keys of both halves; of the second kind one half may have what the other leaves out
+SHARED = (("motion", ("sigma_v", "sigma_omega")), ("sensor", ("sigma", "mount", "f", "B", "disparity")))
+OPTIONAL = (("sensor", ("disparity_growth",)),)
+ARRAYS = re.compile(r"\[\n((?: +[-+.\w]+,\n)+) *\]")  # an array of numbers, each on a line
 
 
 class Scenario(Table):
@@ -98,3 +106,36 @@ def load_scenario(name: str | Path) -> Scenario:
     elif path.suffix != ".toml":
         raise InputError(f"{unknown('scenario', one_line(name), scenario_names())}; or give the path of a .toml file")
     return read_table(path, Scenario, name=path.stem)
+
+
+def misbelief(scenario: Scenario) -> str:
+    """What the belief has otherwise than the truth, and the remedy, in one clause; empty where the belief is right.
+
+    A bias map must be believed if it is the case. Other effects that make observations err are in no belief.
+    """
+    truth, belief = scenario.truth, scenario.belief
+    for keys, may_lack in ((SHARED, True), (OPTIONAL, False)):
+        for table, key in ((table, key) for table, names in keys for key in names):
+            believed, true = (getattr(getattr(of, table), key, None) for of in (belief, truth))
+            if believed != true and not (may_lack and None in (believed, true)):
+                return f"key 'belief.{table}.{key}' is not what truth.{table}.{key} is; make them the same"
+    effects = truth.sensor.effects
+    maps = [effect.map() for effect in effects if isinstance(effect, LocalBias)]
+    if maps != ([] if belief.sensor.bias is None else [belief.sensor.bias]):
+        return "key 'belief.sensor.bias' is not the bias of the effect 'local-bias' in truth.sensor; make them the same"
+    unknown = [effect.label for effect in effects if effect.errs and not isinstance(effect, LocalBias)]
+    return f"no belief holds the effect '{unknown[0]}' (truth.sensor.effects); leave it out" if unknown else ""
+
+
+def toml_text(data: Mapping[str, Any]) -> str:
+    """Data as TOML, with arrays of numbers on one line."""
+    return ARRAYS.sub(lambda array: f"[{', '.join(array[1].replace(',', ' ').split())}]", tomli_w.dumps(data))
+
+
+def scenario_text(scenario: Scenario, comment: str = "") -> str:
+    """The text of a file that :func:`load_scenario` reads as the same world and belief, in SI units and radians.
+
+    The name is not in it, because it follows from the file's name. Each line of ``comment`` becomes one at the top.
+    """
+    text = toml_text(scenario.model_dump(mode="json", exclude_none=True, exclude={"name"}))
+    return "".join(f"# {line}\n" for line in comment.splitlines()) + text

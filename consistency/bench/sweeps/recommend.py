@@ -164,9 +164,7 @@ def recommend_for(
         alike = not unlike and (beyond is None or candidate.beyond is not None)
         known.append(replace(candidate, sure=sureness(candidate, not outside, alike, alone=runs == 0)))
     elsewhere = "" if any(c.is_near for c in known) else _elsewhere(regime, here.places)
-    # those to be trusted first, then those that the runs contradict; else as they are
-    ordered = tuple(sorted(known, key=lambda c: (not c.trusted, c.sure != "no")))
-    return Advice(rig, here, beyond, ordered, unlike, not outside, runs, elsewhere)
+    return Advice(rig, here, beyond, _sorted(known), unlike, not outside, runs, elsewhere)
 
 
 def place_in(regime: Regime, rig: Rig, known: Collection[str] = ()) -> MapPlace | None:
@@ -246,6 +244,11 @@ def sureness(candidate: NearFilter, inside: bool, alike: bool, alone: bool = Fal
         return "unsure"
     shown = verdict is not None and verdict.status == "consistent"
     return "sure" if shown and candidate.agreeing == candidate.around else "fairly sure"
+
+
+def _sorted(candidates: Sequence[NearFilter]) -> tuple[NearFilter, ...]:
+    """Those to be trusted first, then those that the runs contradict; else as they are."""
+    return tuple(sorted(candidates, key=lambda c: (not c.trusted, c.sure != "no")))
 
 
 def _elsewhere(regime: Regime, places: tuple[AxisPlace, ...]) -> str:

@@ -19,8 +19,7 @@ from consistency.bench.tuning.balance import balanced, nearest
 from consistency.bench.tuning.fit import FactorFit, maximise
 from consistency.bench.tuning.noise_groups import NoiseGroup, groups_of, rounded, scaled
 from consistency.bench.tuning.result import Factor, Setting, Tuning
-from consistency.bench.tuning.scores import require_scorable
-from consistency.bench.tuning.setting_scores import BeliefScorer
+from consistency.bench.tuning.scores import BeliefScorer, require_scorable
 from consistency.bench.tuning.split import Judging, Parts, parts_of
 from consistency.bench.tuning.why import Probe, is_at_fault, reasons_of
 from consistency.referee.diagnostics import Settings, Verdict

@@ -4,7 +4,7 @@
 known by the imports below, one line each; docs/extending.md shows how to add one.
 """
 
-from consistency.bench.scenario.effects.bias_map import BiasMap
+from consistency.bench.scenario.effects.bias_map import BiasMap, LocalBias
 from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
 from consistency.bench.scenario.effects.distortion import Distortion
 from consistency.bench.scenario.effects.drift import Drift as Drift
@@ -13,7 +13,6 @@ from consistency.bench.scenario.effects.field_of_view import FieldOfView
 from consistency.bench.scenario.effects.frame_rate import Frames as Frames
 from consistency.bench.scenario.effects.heavy_tails import HeavyTails as HeavyTails
 from consistency.bench.scenario.effects.junction import Junction as Junction
-from consistency.bench.scenario.effects.local_bias import LocalBias
 from consistency.bench.scenario.effects.mismatch import Mismatch as Mismatch
 from consistency.bench.scenario.effects.noise import Noise
 from consistency.bench.scenario.effects.observations import Context, Observations

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from consistency.bench.scenario.effects.effect import ListedEffect, register
 from consistency.bench.scenario.effects.node_tables import require_increasing
+from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.bench.scenario.toml_tables import Finite, Table
 from consistency.referee.types import Array
 
@@ -68,3 +70,25 @@ def _between(x: Array, nodes: tuple[float, ...]) -> tuple[Array, Array, Array]:
     place = np.interp(x, nodes, np.arange(len(nodes)))
     before = np.minimum(place.astype(np.int64), max(len(nodes) - 2, 0))
     return before, np.minimum(before + 1, len(nodes) - 1), (place - before)[..., None]
+
+
+@register
+class LocalBias(ListedEffect, BiasMap):
+    """Adds the bias of a :class:`BiasMap` at the ideal (u, v) to each observation.
+
+    It comes before the noise, so that the bias is that of the true pixel and the same in every run.
+    """
+
+    models: ClassVar[tuple[str, ...]] = ("uvd",)
+    draws: ClassVar[bool] = False
+    before_noise: ClassVar[bool] = True
+
+    kind: Literal["local-bias"] = "local-bias"
+
+    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+        z = observations.z
+        return observations.with_z(z + self.at(z[:, 0], z[:, 1]))
+
+    def map(self) -> BiasMap:
+        """The map alone, as a belief holds it."""
+        return BiasMap.model_validate(self.model_dump(include=set(BiasMap.model_fields)))

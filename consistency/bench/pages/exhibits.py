@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from consistency.bench.pages.experiment_tables import extra_table
-from consistency.bench.pages.report_input import Report
+from consistency.bench.pages.report_input import Report, as_given
 from consistency.bench.types import outcome
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Small, Stack, Status, Table, table
 from consistency.referee.document.drawing import Figure, Key, Panel, Sheet
@@ -92,6 +92,15 @@ def findings_table(findings: Sequence[dict[str, Any]], label: str, caption: str 
     """Claim, rule, published and measured value and verdict of each finding."""
     rows = [_row(finding) for finding in findings]
     return table(OF_FINDINGS, rows, label, caption=caption, paper=f"{caption}." if caption else "", style="prose")
+
+
+def _all_findings(report: Report) -> tuple[Block, ...]:
+    """Published claims of the folder beside what was measured."""
+    caption = "Rules of acceptance are constants of the scripts, fixed before this run"
+    return (findings_table(report.findings, "Findings", caption),) if report.findings else ()
+
+
+FINDINGS = Section(Part("findings", "Findings: published beside measured", "Findings"), as_given, _all_findings)
 
 
 def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:

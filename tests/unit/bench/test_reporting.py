@@ -26,12 +26,12 @@ from consistency.bench.pages.sections import (
     first_order,
     innovations,
     nees,
-    no_truth,
     pose_errors,
     referee,
     shares,
     world,
 )
+from consistency.bench.pages.sections.study_tables import NO_TRUTH
 from consistency.bench.runs.findings import Finding
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.results import read_results
@@ -508,8 +508,8 @@ def test_without_truth_only_a_declared_optimal_gain_is_put_to_the_test(report):
     assert written(shown_inside(unknown.verdict)) == "–"
     assert written(shown_inside(good.verdict)).startswith("yes")
     study = replace(report.studies[0], tracks=(unknown,))
-    assert "reported and not judged" in no_truth.note(study)
-    assert "all that can be judged" in no_truth.note(replace(study, tracks=(good, unknown)))
+    assert "reported and not judged" in NO_TRUTH.blocks(study)[0].text
+    assert "all that can be judged" in NO_TRUTH.blocks(replace(study, tracks=(good, unknown)))[0].text
     assert "Without truth the ratio is that of the NIS" in verdicts.method((study,))
 
 

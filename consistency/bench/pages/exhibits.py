@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.experiment_tables import extra_table
 from consistency.bench.pages.report_input import Report, as_given
+from consistency.bench.store.parquet import read_frame
 from consistency.bench.types import outcome
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Small, Stack, Status, Table, table
 from consistency.referee.document.drawing import Figure, Key, Panel, Sheet
 from consistency.referee.document.wording import number, p_cell
+from consistency.referee.errors import InputError
 from consistency.referee.pages.section import Part, Section
+from consistency.referee.parsing import one_line, reading
 
 OF_FINDINGS = (
     Column("Finding", width="2.5cm"),
@@ -24,6 +28,7 @@ OF_FINDINGS = (
     Column("Verdict", width="1.75cm"),
 )
 STATUS, P_VALUE = "status", "p"  # in place of a format: the word of a verdict, a p value
+FINDINGS = Section(Part("findings", "Findings: published beside measured", "Findings"), as_given, _all_findings)
 
 
 @dataclass(frozen=True)
@@ -100,9 +105,6 @@ def _all_findings(report: Report) -> tuple[Block, ...]:
     return (findings_table(report.findings, "Findings", caption),) if report.findings else ()
 
 
-FINDINGS = Section(Part("findings", "Findings: published beside measured", "Findings"), as_given, _all_findings)
-
-
 def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:
     below = []
     if finding["accept"]:
@@ -163,3 +165,41 @@ def several(title: str, caption: str, panels: Sequence[Panel], keys: tuple[Key, 
 def groups(data: pd.DataFrame, column: str) -> list[tuple[str, pd.DataFrame]]:
     """Rows by the text in a column, in the order in which the texts come."""
     return [(str(name), part) for name, part in data.groupby(column, sort=False)]
+
+
+def extra_table(
+    path: Path, numbers: Sequence[str], texts: Sequence[str] = (), missing: Sequence[str] = ()
+) -> pd.DataFrame | None:
+    """Columns of a Parquet file; None where the file does not exist.
+
+    Parameters
+    ----------
+    numbers : columns of finite numbers, read as float
+    texts : columns of names
+    missing : columns of ``numbers`` that may hold NaN
+
+    Raises
+    ------
+    InputError
+        The file is damaged, has no rows, lacks a column or holds what the column may not.
+    """
+    if not path.exists():
+        return None
+    table = read_frame(path)
+    wanted = [*numbers, *texts]
+    if absent := [column for column in wanted if column not in table.columns]:
+        raise InputError(f"{path}: column '{absent[0]}' is missing; needed: {', '.join(wanted)}")
+    if not table.columns.is_unique:
+        raise InputError(f"{path}: a column is there twice; write the folder again")
+    if table.empty:
+        raise InputError(f"{path}: has no rows; write the folder again")
+    for column in numbers:
+        with reading(path, f"column '{column}' cannot be read as numbers"):
+            values = pd.to_numeric(table[column], errors="coerce").to_numpy(float, na_value=np.nan)
+        bad = ~np.isfinite(values) & (table[column].notna().to_numpy() | (column not in missing))
+        if bad.any():
+            row = int(np.flatnonzero(bad)[0])
+            value = one_line(table[column].iloc[row], 60)
+            raise InputError(f"{path}: column '{column}', row {row}: not a finite number ({value})")
+        table[column] = values
+    return table[wanted]

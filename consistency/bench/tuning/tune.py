@@ -15,13 +15,12 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import Belief, Scenario, load_scenario
 from consistency.bench.store.log import Log
-from consistency.bench.tuning.balance import balanced, nearest
+from consistency.bench.tuning.faults import Probe, balanced, is_at_fault, nearest, reasons_of
 from consistency.bench.tuning.fit import FactorFit, maximise
 from consistency.bench.tuning.noise_groups import NoiseGroup, groups_of, rounded, scaled
 from consistency.bench.tuning.result import Factor, Setting, Tuning
 from consistency.bench.tuning.scores import BeliefScorer, require_scorable
 from consistency.bench.tuning.split import Judging, Parts, parts_of
-from consistency.bench.tuning.why import Probe, is_at_fault, reasons_of
 from consistency.referee.diagnostics import Settings, Verdict
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError

@@ -18,8 +18,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.pages import write_reports
-from consistency.bench.pages.answer import answer
-from consistency.bench.pages.build import build_report, compose
+from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.report_input import Report, Study, Track
 from consistency.bench.pages.sections import (
     anees,

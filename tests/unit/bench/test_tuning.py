@@ -21,13 +21,12 @@ from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.stepping import run_filter, step_through
 from consistency.bench.store.log import Log
 from consistency.bench.tuning import tune as tuning_module
-from consistency.bench.tuning.balance import balanced, directions, nearest
+from consistency.bench.tuning.faults import balanced, directions, nearest, with_noise
 from consistency.bench.tuning.noise_groups import groups_of, rounded, scaled, sigma_by_channel
 from consistency.bench.tuning.result import Tuning, as_data, factor_text, lines
 from consistency.bench.tuning.scores import BeliefScorer, require_scorable, score_of
 from consistency.bench.tuning.split import part_of, parts_of
 from consistency.bench.tuning.tune import MOST_TOLERATED, tolerant
-from consistency.bench.tuning.why import with_noise
 from consistency.referee.cli import main
 from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval

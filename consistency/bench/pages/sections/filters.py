@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from consistency.bench.pages.experiment_tables import extra_table
+from consistency.bench.pages.exhibits import extra_table
 from consistency.bench.pages.report_input import Report
 from consistency.referee.document.blocks import Block, Cell, Column, Small, Stack, Status, table
 from consistency.referee.document.wording import brief

@@ -28,7 +28,6 @@ OF_FINDINGS = (
     Column("Verdict", width="1.75cm"),
 )
 STATUS, P_VALUE = "status", "p"  # in place of a format: the word of a verdict, a p value
-FINDINGS = Section(Part("findings", "Findings: published beside measured", "Findings"), as_given, _all_findings)
 
 
 @dataclass(frozen=True)
@@ -51,46 +50,26 @@ class Exhibit:
     sources: tuple[Source, ...]
 
 
-@dataclass(frozen=True)
-class Shown:
-    """An exhibit as a folder has it."""
-
-    exhibit: Exhibit
-    findings: tuple[dict[str, Any], ...]
-    tables: tuple[tuple[Source, pd.DataFrame], ...]
-
-
-def section(part: Part, exhibits: Sequence[Exhibit]) -> Section[Report, tuple[Shown, ...]]:
+def section(part: Part, exhibits: Sequence[Exhibit]) -> Section[Report, Report]:
     """The section of these exhibits; an exhibit without any of its tables is left out."""
 
-    def read(report: Report) -> tuple[Shown, ...] | None:
-        """The exhibits of the folder; None where there is none."""
-        shown = (_read(report, exhibit) for exhibit in exhibits)
-        return tuple(each for each in shown if each.tables) or None
+    def show(report: Report) -> tuple[Block, ...]:
+        """Each exhibit: its heading, its findings with published value, measured value and rule, and its tables."""
+        blocks: list[Block] = []
+        for exhibit in exhibits:
+            tables = []
+            for source in exhibit.sources:
+                path = report.folder / f"{source.name}.parquet"
+                tables.append((source, extra_table(path, source.numbers, source.texts, source.missing)))
+            shown = [source.show(data) for source, data in tables if data is not None]
+            own = [finding for finding in report.findings if finding["id"] in exhibit.findings]
+            if shown:
+                blocks.append(Heading(exhibit.title, paper=exhibit.title))
+                blocks += [findings_table(own, f"Findings on: {exhibit.title}")] if own else []
+                blocks += shown
+        return tuple(blocks)
 
-    return Section(part, read, show)
-
-
-def _read(report: Report, exhibit: Exhibit) -> Shown:
-    own = tuple(finding for finding in report.findings if finding["id"] in exhibit.findings)
-    tables = []
-    for source in exhibit.sources:
-        path = report.folder / f"{source.name}.parquet"
-        data = extra_table(path, source.numbers, source.texts, source.missing)
-        if data is not None:
-            tables.append((source, data))
-    return Shown(exhibit, own, tuple(tables))
-
-
-def show(shown: tuple[Shown, ...]) -> tuple[Block, ...]:
-    """Each exhibit: its heading, its findings with published value, measured value and rule, and its tables."""
-    blocks: list[Block] = []
-    for each in shown:
-        blocks.append(Heading(each.exhibit.title, paper=each.exhibit.title))
-        if each.findings:
-            blocks.append(findings_table(each.findings, f"Findings on: {each.exhibit.title}"))
-        blocks += [source.show(data) for source, data in each.tables]
-    return tuple(blocks)
+    return Section(part, as_given, show)
 
 
 def findings_table(findings: Sequence[dict[str, Any]], label: str, caption: str = "") -> Table:
@@ -103,6 +82,9 @@ def _all_findings(report: Report) -> tuple[Block, ...]:
     """Published claims of the folder beside what was measured."""
     caption = "Rules of acceptance are constants of the scripts, fixed before this run"
     return (findings_table(report.findings, "Findings", caption),) if report.findings else ()
+
+
+FINDINGS = Section(Part("findings", "Findings: published beside measured", "Findings"), as_given, _all_findings)
 
 
 def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:

@@ -1,7 +1,7 @@
 """What is left to try and to say where a fitted filter has a fault.
 
-Settings at which errors have the size that is stated: any setting that is consistent lies among them. And why no setting
-of the noises makes a filter consistent: what the referee finds, and what other noise tells.
+Settings at which errors have the size that is stated: any setting that is consistent lies among them. And why no
+setting of the noises makes a filter consistent: what the referee finds, and what other noise tells.
 """
 
 from __future__ import annotations

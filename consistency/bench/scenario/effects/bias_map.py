@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register
 from consistency.bench.scenario.effects.node_tables import require_increasing
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.bench.scenario.toml_tables import Finite, Table
@@ -73,13 +73,12 @@ def _between(x: Array, nodes: tuple[float, ...]) -> tuple[Array, Array, Array]:
 
 
 @register
-class LocalBias(ListedEffect, BiasMap):
+class LocalBias(UvdEffect, BiasMap):
     """Adds the bias of a :class:`BiasMap` at the ideal (u, v) to each observation.
 
     It comes before the noise, so that the bias is that of the true pixel and the same in every run.
     """
 
-    models: ClassVar[tuple[str, ...]] = ("uvd",)
     draws: ClassVar[bool] = False
     before_noise: ClassVar[bool] = True
 

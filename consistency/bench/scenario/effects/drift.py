@@ -6,14 +6,14 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register
 from consistency.bench.scenario.effects.observations import NO_LANDMARK, Context, Observations
 from consistency.bench.scenario.toml_tables import Positive, Rate
 from consistency.referee.types import Array, Indices
 
 
 @register
-class Drift(ListedEffect):
+class Drift(UvdEffect):
     """In each step of a track, with probability ``rate``, the tracker loses its feature and starts to slide.
 
     From then on u and v move by ``speed`` (px a step) in a direction of the track's own, on top of the motion of the
@@ -21,7 +21,6 @@ class Drift(ListedEffect):
     of no landmark (source -1) from the first such step on.
     """
 
-    models: ClassVar[tuple[str, ...]] = ("uvd",)
     units: ClassVar[dict[str, str]] = {"speed": "_px"}
 
     kind: Literal["drift"] = "drift"

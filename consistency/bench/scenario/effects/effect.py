@@ -63,6 +63,12 @@ class ListedEffect(Table):
         return effects.validate_python({str(data["kind"]): data})[str(data["kind"])]
 
 
+class UvdEffect(ListedEffect):
+    """An effect on the pixels of a stereo sensor."""
+
+    models: ClassVar[tuple[str, ...]] = ("uvd",)
+
+
 EFFECTS: dict[str, type[ListedEffect]] = {}  # by kind
 
 

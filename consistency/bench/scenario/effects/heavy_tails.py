@@ -6,19 +6,18 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.bench.scenario.toml_tables import NonNegative, Rate
 
 
 @register
-class HeavyTails(ListedEffect):
+class HeavyTails(UvdEffect):
     """A contaminated normal (Tukey 1960): some observations have a second Gaussian error beside their noise.
 
     With probability ``rate`` an observation gets an error of ``sigma`` (u, v, d). It is still of its landmark.
     """
 
-    models: ClassVar[tuple[str, ...]] = ("uvd",)
     units: ClassVar[dict[str, str]] = {"sigma": "_px"}
 
     kind: Literal["heavy-tails"] = "heavy-tails"

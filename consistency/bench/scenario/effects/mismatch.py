@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import model_validator
 
-from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register
 from consistency.bench.scenario.effects.observations import NO_LANDMARK, Context, Observations
 from consistency.bench.scenario.toml_tables import Positive, Rate
 
 
 @register
-class Mismatch(ListedEffect):
+class Mismatch(UvdEffect):
     """With probability ``rate`` an observation has a disparity that says nothing of its landmark.
 
     It is uniform over ``disparity``, or over the search range where that is left out; u and v stay. In the trial such
     a row is of no landmark (source -1).
     """
-
-    models: ClassVar[tuple[str, ...]] = ("uvd",)
 
     kind: Literal["mismatch"] = "mismatch"
     rate: Rate

@@ -7,20 +7,19 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.bench.scenario.toml_tables import NonNegative
 
 
 @register
-class TrackError(ListedEffect):
+class TrackError(UvdEffect):
     """A first-order Gauss-Markov error along each track, stationary from its first step on.
 
     e_k = c e_k-1 + sqrt(1 - c^2) w_k with w ~ N(0, sigma^2) and c the ``correlation`` from step to step. After a gap
     in a track it starts anew.
     """
 
-    models: ClassVar[tuple[str, ...]] = ("uvd",)
     units: ClassVar[dict[str, str]] = {"sigma": "_px"}
 
     kind: Literal["track-error"] = "track-error"

@@ -6,10 +6,13 @@ does to an ideal observation, one effect a file: its keys and its ``apply``. Not
 simulation's.
 """
 
-from consistency.bench.scenario.belief import Belief, BelievedMotion, GuardSettings, SigmaPoints
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
 from consistency.bench.scenario.scenario import (
+    Belief,
+    BelievedMotion,
+    GuardSettings,
     Scenario,
+    SigmaPoints,
     load_scenario,
     misbelief,
     scenario_names,

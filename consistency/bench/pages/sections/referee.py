@@ -47,12 +47,6 @@ class Rate:
     measured: float
     interval: tuple[float, float]  # exact binomial, Clopper & Pearson (1934)
 
-    @property
-    def broken(self) -> bool:
-        """The whole interval lies on the wrong side of the promise."""
-        low, high = self.interval
-        return low > self.promised if self.at_most else high < self.promised
-
 
 @dataclass(frozen=True)
 class Promise:

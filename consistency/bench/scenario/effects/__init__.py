@@ -4,9 +4,7 @@
 known by the imports below, one line each; docs/extending.md shows how to add one.
 """
 
-from consistency.bench.scenario.effects.bias_map import BiasMap, LocalBias
 from consistency.bench.scenario.effects.built_in import FieldOfView, Noise, SearchRange
-from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
 from consistency.bench.scenario.effects.distortion import Distortion
 from consistency.bench.scenario.effects.drift import Drift as Drift
 from consistency.bench.scenario.effects.effect import EFFECTS, ListedEffect, register
@@ -14,6 +12,7 @@ from consistency.bench.scenario.effects.frame_rate import Frames as Frames
 from consistency.bench.scenario.effects.heavy_tails import HeavyTails as HeavyTails
 from consistency.bench.scenario.effects.junction import Junction as Junction
 from consistency.bench.scenario.effects.mismatch import Mismatch as Mismatch
+from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth, LocalBias
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.bench.scenario.effects.occlusion import Occlusion as Occlusion
 from consistency.bench.scenario.effects.selection import Selection as Selection

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from consistency.bench.models import point, stereo
-from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
+from consistency.bench.scenario.effects.node_tables import DisparityGrowth
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.referee.types import Array
 

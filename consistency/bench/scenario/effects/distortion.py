@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from consistency.bench.scenario.effects.bias_map import BiasMap
 from consistency.bench.scenario.effects.effect import UvdEffect, register
+from consistency.bench.scenario.effects.node_tables import BiasMap
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.bench.scenario.toml_tables import Finite
 from consistency.referee.types import Array

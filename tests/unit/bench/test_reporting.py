@@ -901,19 +901,19 @@ def test_the_front_end_is_what_its_tables_hold(results, tmp_path):
     points, registrations, cells = (section.read(report) for section in (shares, scenes, first_order))
     np.testing.assert_array_equal(points.depth, [2.0, 4.0])
     np.testing.assert_array_equal(points.share, [0.95, 0.8])
-    assert points.accepted == (0.9, 0.985)
+    assert [*points[["low", "high"]].iloc[0]] == [0.9, 0.985]
     assert [(scene.far, scene.noise, scene.ratio) for scene in registrations.scenes] == [
         (3.0, 2.0, 1.01),
         (6.0, 0.5, 1.2),
     ]
     assert registrations.window[0] < 0.96 < 1.3 < registrations.window[1]
-    svd, odd = cells.estimators
-    assert (svd.title, odd.title) == ("svd: 1 of 2 accepted", "$x$ <b>: 0 of 1 accepted")
-    np.testing.assert_array_equal(svd.nees, [1.02, 7.0])
-    assert cells.failed == 83
+    (figure,) = first_order.figures(cells)
+    assert [panel.title for panel in figure.panels] == ["svd: 1 of 2 accepted", "$x$ <b>: 0 of 1 accepted"]
+    np.testing.assert_array_equal(cells["nees_ratio"][cells["estimator"] == "svd"], [1.02, 7.0])
+    assert cells["failed"].sum() == 83
     text = "".join(Page(shown(report)).text)
     for caption in (
-        shares.caption(points), scenes.caption(registrations), first_order.caption(cells)
+        shares.caption(points.iloc[0]), scenes.caption(registrations), first_order.caption(cells)
     ):  # fmt: skip
         assert caption in text
     assert "Cells without a run that is left, not drawn: 1." in text

@@ -21,8 +21,7 @@ import numpy as np
 import consistency as cs
 from consistency.bench.models import point, stereo
 from consistency.bench.scenario import PicturedSensor, Scenario, UvdSensor
-from consistency.bench.scenario.effects.node_tables import BiasMap
-from consistency.bench.scenario.effects.node_tables import DisparityGrowth
+from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth
 from consistency.bench.simulation import World
 from consistency.bench.types import Trial
 from consistency.referee.types import Array

@@ -21,9 +21,8 @@ from edited import accept_changes
 from flight import Flight
 
 import consistency as cs
-from consistency.bench.store.data_frames import noted_table
 from consistency.bench.store.log import read_log
-from consistency.bench.store.trial_rows import Rejected
+from consistency.bench.store.trial_rows import Rejected, noted_table
 from consistency.referee.cli import main
 from consistency.referee.readers.formats.kitti_oxts import read_drive
 from consistency.referee.system.provenance import manifest_of

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from consistency.bench.store.data_frames import noted_table, stacked_table
 from consistency.bench.store.folder_tables import with_tables
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.parquet import OPTIONAL, Columns, Writer, write_table
 from consistency.bench.store.results import JOINT, MAP_NUMBERS, NUMBERS, OWN_NUMBERS, Results, StoredResults, Tables
-from consistency.bench.store.trial_rows import Rejected, RunOutcome
+from consistency.bench.store.trial_rows import Rejected, RunOutcome, noted_table, stacked_table
 from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import NewFolder

@@ -25,10 +25,9 @@ from consistency.bench.scenario import (
     toml_text,
 )
 from consistency.bench.scenario.toml_tables import SIGMA_UNITS
-from consistency.bench.store.data_frames import controls_table, observations_table, stacked_table
 from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.log_tables import read_table_file, require_format, table_file
-from consistency.bench.store.trial_rows import truth_columns
+from consistency.bench.store.trial_rows import controls_table, observations_table, stacked_table, truth_columns
 from consistency.bench.types import Trial
 from consistency.referee.column_names import COLUMNS, POSE
 from consistency.referee.errors import InputError

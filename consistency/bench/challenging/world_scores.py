@@ -74,7 +74,6 @@ class ChallengeScorer:
         return list(self._parallel(tasks))
 
     def split(self, world: Scenario, runs: Sequence[int]) -> list[Job]:
-        """The trials of one world as a job for each worker."""
         return [(world, part) for part in (runs[i :: self.workers] for i in range(self.workers)) if part]
 
 

@@ -283,5 +283,4 @@ class Unfinished:
 
 
 def unfinished_of(out: Path) -> Path:
-    """Folder of the unfinished work on an output folder."""
     return out.absolute().parent / f".{out.absolute().name}.unfinished"

@@ -59,8 +59,6 @@ NUMBERS = tuple(f.name for f in fields(CellResult) if f.type == "float")
 
 
 class CellOutcome(NamedTuple):
-    """A result with its table of runs."""
-
     result: CellResult
     runs: pd.DataFrame  # RUN_COLUMNS
 

@@ -41,8 +41,6 @@ class StoppingRule(Table):
 
 
 class SweepFile(Table):
-    """Keys of a sweep's file."""
-
     summary: str
     base: str  # name or path of a scenario
     filters: Annotated[list[str], Field(min_length=1)]

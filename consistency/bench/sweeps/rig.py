@@ -34,8 +34,6 @@ class Request:
 
 @dataclass(frozen=True)
 class Rig:
-    """A rig as a scenario."""
-
     name: str
     scenario: Scenario
     assumed: tuple[str, ...]  # what was taken from the map's world
@@ -164,7 +162,6 @@ class AxisPlace:
 
 
 def is_known(value: Any) -> bool:
-    """Whether a rig has a value on an axis."""
     return value is not None and bool(value == value)
 
 

@@ -139,7 +139,6 @@ class BeliefScorer:
         self._pool.shutdown(cancel_futures=True)
 
     def compile(self) -> None:
-        """Compile what the filter needs, and is not yet compiled."""
         compile_all([(self.filter, self.trials[0], self._isolation.belief)])
 
     def __call__(self, belief: Belief) -> Scores:

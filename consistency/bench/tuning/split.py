@@ -38,11 +38,6 @@ class Parts:
         """Belief before the fit."""
         return self.world.belief
 
-    @property
-    def scenario(self) -> Scenario | None:
-        """The world, where it is simulated."""
-        return self.world if isinstance(self.world, Scenario) else None
-
 
 def parts_of(world: Scenario | Log, runs: int, seed: int) -> Parts:
     """So many runs of a scenario and as many fresh ones; or the first half of a log and its second.

@@ -86,8 +86,6 @@ def tune(
 
 
 class _Tuner:
-    """One filter in one world: fits and verdicts."""
-
     def __init__(
         self,
         filter_: Filter,
@@ -109,8 +107,8 @@ class _Tuner:
 
     def explained(self, chosen: Setting) -> Explanation:
         """For a setting with a fault: another one, how many were tried, whether none is consistent, and why."""
-        probe, scenario = None, self.parts.scenario
-        if scenario is not None:
+        probe, scenario = None, self.parts.world
+        if isinstance(scenario, Scenario):
             say("a fault is found; asking whether it is there with the true noises, too")
             count, seed = len(self.parts.trials), self.parts.spare_seed
             probe = Probe(self.filter, scenario, count, seed, self.jobs, self.timeout, self.settings)

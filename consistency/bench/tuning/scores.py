@@ -110,7 +110,7 @@ class BeliefScorer:
     Parameters
     ----------
     belief : that a fit begins with
-    by : one of :data:`consistency.tuning.scores.BY`
+    by : one of :data:`BY`
     timeout : seconds a trial of a filter that is not compiled
     """
 

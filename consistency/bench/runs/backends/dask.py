@@ -91,7 +91,7 @@ class Dask:
         ------
         InputError
             No scheduler, or no worker of it, for as long as is waited; bad input, see
-            :func:`consistency.runs.backends.batches.in_batches`.
+            :func:`consistency.bench.runs.backends.batches.in_batches`.
         """
         with _silence(), self._address(len(runs)) as address, closing(_Engine(address, work, self.wait)) as engine:
             yield from in_batches(engine, Batches(runs, TARGET), work)
@@ -118,7 +118,7 @@ class Dask:
 
 
 class _Engine:
-    """See :class:`consistency.runs.backends.batches.Engine`."""
+    """See :class:`consistency.bench.runs.backends.batches.Engine`."""
 
     def __init__(self, address: dict[str, Any], work: TrialWork, wait: float) -> None:
         self._address, self._pickled, self._wait = address, pickled_work(work), wait

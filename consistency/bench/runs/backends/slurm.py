@@ -70,7 +70,7 @@ class Slurm:
         ------
         InputError
             There is no Slurm here, or it does not know an option; bad input, see
-            :func:`consistency.runs.backends.batches.in_batches`.
+            :func:`consistency.bench.runs.backends.batches.in_batches`.
         """
         jobs = min(JOBS if self.jobs < 0 else self.jobs, len(runs))
         with closing(_Engine(self.folder, self.options, jobs, work)) as engine:
@@ -104,7 +104,7 @@ class _Job:
 
 
 class _Engine:
-    """See :class:`consistency.runs.backends.batches.Engine`."""
+    """See :class:`consistency.bench.runs.backends.batches.Engine`."""
 
     def __init__(self, folder: Path, options: Mapping[str, Any], room: int, work: TrialWork) -> None:
         self.room, self.folder = room, folder.absolute()

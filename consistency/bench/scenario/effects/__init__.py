@@ -1,7 +1,7 @@
-"""Effects of a sensor on an ideal observation, each in a file with its keys in a scenario and its ``apply``.
+"""Effects of a sensor on an ideal observation, each with its keys in a scenario and its ``apply``.
 
-``field_of_view``, ``noise`` and ``search_range`` are in every sensor. The effects that a scenario may list are made
-known by the imports below, one line each; docs/extending.md shows how to add one.
+Those of ``built_in`` are in every sensor. The effects that a scenario may list are made known by the imports below;
+docs/extending.md shows how to add one.
 """
 
 from consistency.bench.scenario.effects.built_in import FieldOfView, Noise, SearchRange

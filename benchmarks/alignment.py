@@ -21,14 +21,14 @@ from pathlib import Path
 
 import numpy as np
 from scipy import signal, stats
+from script_options import options_of
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.alignment.align import Aligned
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.clock_offset import clocks_and_frames
 from consistency.referee.readers.formats.sheet import Places
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.matching import Aligned, Poses
 from consistency.referee.types import Array
 
 SEED, RUNS, STEPS, DRAWS, OFTEN, FEWER, QUICK = 20261123, 60, 400, 500, 400, 100, 20
@@ -49,7 +49,6 @@ def white(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
 
 
 def first_order(rng: np.random.Generator, shape: tuple[int, ...], correlation: float) -> Array:
-    """Stationary, along the second axis."""
     w = rng.standard_normal(shape) * np.sqrt(1.0 - correlation**2)
     w[:, 0] /= np.sqrt(1.0 - correlation**2)
     return np.asarray(signal.lfilter([1.0], [1.0, -correlation], w, axis=1))
@@ -190,7 +189,6 @@ def displaced(rng: np.random.Generator, runs: Sequence[Poses], mode: str) -> lis
 
 
 def verdict(runs: Sequence[Poses], mode: str) -> Verdict:
-    """As ``analyse FILES --align mode`` says, with all questions."""
     if mode == "offset":
         shift, _, found = clocks_and_frames("bench", runs, "estimate", None, range(3))
     else:
@@ -267,7 +265,6 @@ def kept(row: Row, confidence: float) -> bool:
 
 
 def said(row: Row) -> str:
-    """A row as a line."""
     statuses = ", ".join(f"{status} {row.counts[status]}" for status in FAULTS if row.counts.get(status))
     fault, low, high = row.share("fault")
     return (
@@ -278,7 +275,6 @@ def said(row: Row) -> str:
 
 
 def write_docs(rows: Sequence[Row], path: Path) -> None:
-    """Replace the table of a document."""
     lines = ["| errors | covariance ratio | runs x steps | mode | found at fault | of these | consistent | draws |"]
     lines.append("| --- " * 8 + "|")
     for row in rows:
@@ -322,15 +318,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Measure verdicts on aligned files.")
-    parser.add_argument("--quick", action="store_true", help="few draws of right runs, with fresh random numbers")
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    parser.add_argument("--docs", type=Path, help="document whose table to replace")
-    parser.add_argument("--only", default="", help="cases whose world or modes contain this text")
-    parser.add_argument("--draws", type=int, help="of each case at most")
-    parser.add_argument("--seed", type=int)
-    parser.add_argument("--workers", type=int, default=2)
-    return parser.parse_args(arguments)
+    return options_of(
+        "Measure verdicts on aligned files.",
+        arguments,
+        quick=(False, "few draws of right runs, with fresh random numbers"),
+        out=(Path, "JSON file to write"),
+        docs=(Path, "document whose table to replace"),
+        only=("", "cases whose world or modes contain this text"),
+        draws=(int, "of each case at most"),
+        seed=(int, None),
+        workers=(2, None),
+    )
 
 
 if __name__ == "__main__":

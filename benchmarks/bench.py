@@ -7,7 +7,6 @@ read it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -27,6 +26,7 @@ from bench_models import WARM, Peer
 from bench_peers import FilterpyEkf, FilterpyUkf, stone_soup
 from bench_trials import LANDMARKS, SEEN, Case, Work, growing, grown, interleaved, require_equal, steady
 from scipy.linalg import blas, lapack
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter
@@ -247,7 +247,6 @@ def start(effort: Effort) -> Iterator[Row]:
 
 
 def vision(effort: Effort) -> Iterator[Row]:
-    """The stereo front-end."""
     points, samples = effort.cloud
     s = front_end.covariance_and_simulation(points, samples, effort.growth_repeats)
     note = f"{_us(s['simulate'])}, sample by sample / {_us(s['propagate'])}"
@@ -275,7 +274,6 @@ GROUPS: dict[str, Callable[[Effort], Iterator[Row]]] = {
 
 
 def document(rows: list[Row], wall: float) -> dict[str, Any]:
-    """The JSON document."""
     versions = {name: metadata.version(name) for name in ("numpy", "scipy", "numba", "filterpy")}
     machine = {"cores": os.cpu_count(), "architecture": platform.machine(), "load": os.getloadavg()[0]}
     return {
@@ -288,7 +286,6 @@ def document(rows: list[Row], wall: float) -> dict[str, Any]:
 
 
 def line(row: Row) -> str:
-    """One row as text."""
     value = "-" if row.value is None else f"{row.value:.3g} {row.unit}".strip()
     target = "" if row.target is None else f"{'<=' if row.at_most else '>='} {row.target:g}"
     return f"{row.what:<72} {value:>10}  {target:<8} {row.verdict:<7} {row.note}".rstrip()
@@ -299,14 +296,13 @@ def _us(seconds: float) -> str:
 
 
 def main(arguments: list[str] | None = None) -> list[Row]:
-    """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("reports/bench.json"), help="JSON file to write")
-    parser.add_argument(
-        "--full", action="store_true", help="measure the memory of 10,000 runs instead of extrapolating"
+    chosen = options_of(
+        (__doc__ or "").splitlines()[0],
+        arguments,
+        out=(Path("reports/bench.json"), "JSON file to write"),
+        full=(False, "measure the memory of 10,000 runs instead of extrapolating"),
+        only=(str, "groups of rows", {"nargs": "+", "choices": GROUPS, "default": list(GROUPS)}),
     )
-    parser.add_argument("--only", nargs="+", choices=GROUPS, default=list(GROUPS), help="groups of rows")
-    chosen = parser.parse_args(arguments)
     started, effort, rows = time.monotonic(), Effort(), []
     for group in chosen.only:
         for row in memory(effort, chosen.full) if group == "memory" else GROUPS[group](effort):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from bench_trials import Case, twin_state
 
-from consistency.bench.filters.textbook.basics import Unicycle, process_noise
+from consistency.bench.filters.textbook.basics import motion_jacobians, move, process_noise
 from consistency.bench.filters.textbook.sensors import PointSensor
 from consistency.bench.models import point, stereo
 from consistency.bench.scenario import Belief
@@ -20,17 +20,16 @@ class Models:
     """f, h and their Jacobians over the whole state."""
 
     def __init__(self, belief: Belief) -> None:
-        self.belief, self.motion = belief, Unicycle()
-        self.sensor = PointSensor(belief.sensor, uvd=True)
+        self.belief, self.sensor = belief, PointSensor(belief.sensor, uvd=True)
 
     def f(self, x: Array, control: Control) -> Array:
         moved = x.copy()
-        moved[:3] = self.motion.move(x[:3], control)
+        moved[:3] = move(x[:3], control)
         return moved
 
     def noise(self, x: Array, control: Control, Q: Array) -> Array:
         """Q (n, n) <- G Q G' of the pose, zero elsewhere."""
-        Q[:3, :3] = process_noise(self.motion.jacobians(x[:3], control)[1], self.belief)
+        Q[:3, :3] = process_noise(motion_jacobians(x[:3], control)[1], self.belief)
         return Q
 
     def h(self, x: Array, at: Array) -> Array:

@@ -17,6 +17,7 @@ from bench_models import Peer, Said
 from bench_trials import Case
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
+from consistency.bench.filters.textbook.basics import motion_jacobians
 from consistency.bench.types import Control
 from consistency.referee.types import Array
 
@@ -30,8 +31,6 @@ class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
 
 
 class FilterpyEkf(Peer):
-    """filterpy's ExtendedKalmanFilter."""
-
     def prepare(self) -> None:
         self.ekf = _Ekf(dim_x=self.n, dim_z=len(self.R))
         self.ekf.F, self.ekf.Q, self.ekf.R = np.eye(self.n), np.zeros((self.n, self.n)), self.R
@@ -39,7 +38,7 @@ class FilterpyEkf(Peer):
     def step(self, x: Array, P: Array, control: Control, at: Array, z: Array) -> Said:
         ekf, m = self.ekf, self.models
         ekf.x, ekf.P, ekf.f = x, P, lambda x: m.f(x, control)
-        ekf.F[:3, :3] = m.motion.jacobians(x[:3], control)[0]
+        ekf.F[:3, :3] = motion_jacobians(x[:3], control)[0]
         m.noise(x, control, ekf.Q)
         ekf.predict()
         ekf.update(z, HJacobian=lambda x: m.H(x, at), Hx=lambda x: m.h(x, at))

@@ -15,6 +15,7 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, UnscentedKalmanUpdater
 
+from consistency.bench.filters.textbook import basics
 from consistency.bench.types import Control
 from consistency.referee.types import Array
 
@@ -56,11 +57,11 @@ class Drive(_Quiet, TransitionModel):  # type: ignore[misc]
 
     def function(self, state: Any, noise: Any = False, **kwargs: Any) -> StateVectors:
         points = _points(state).copy()
-        points[:, :3] = self.models.motion.move(points[:, :3].T, self.control).T
+        points[:, :3] = basics.move(points[:, :3].T, self.control).T
         return _vectors(points)
 
     def jacobian(self, state: Any, **kwargs: Any) -> Array:
-        self.F[:3, :3] = self.models.motion.jacobians(_flat(state)[:3], self.control)[0]
+        self.F[:3, :3] = basics.motion_jacobians(_flat(state)[:3], self.control)[0]
         return self.F
 
     def covar(self, **kwargs: Any) -> Array:
@@ -91,8 +92,6 @@ class Look(_Quiet, MeasurementModel):  # type: ignore[misc]
 
 
 class StoneSoupEkf(Peer):
-    """ExtendedKalmanPredictor and ExtendedKalmanUpdater."""
-
     def prepare(self) -> None:
         self.drive, self.look = Drive(), Look(ndim_state=self.n, mapping=None)
         self.drive.models = self.look.models = self.models
@@ -101,7 +100,6 @@ class StoneSoupEkf(Peer):
         self.pair()
 
     def pair(self) -> None:
-        """Make predictor and updater."""
         self.predictor = ExtendedKalmanPredictor(self.drive)
         self.updater = ExtendedKalmanUpdater(self.look)
 
@@ -115,8 +113,6 @@ class StoneSoupEkf(Peer):
 
 
 class StoneSoupUkf(StoneSoupEkf):
-    """UnscentedKalmanPredictor and UnscentedKalmanUpdater."""
-
     filter = "ukf-uvd"
     reorders = True
 

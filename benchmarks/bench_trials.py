@@ -47,7 +47,6 @@ class Case:
         return estimates
 
     def head(self, steps: int) -> Case:
-        """The first steps of it."""
         t, last = self.trial, self.trial.first[steps]
         short = cs.Trial(
             t.run, t.start, t.controls[:steps], t.first[: steps + 1], t.landmark[:last], t.z[:last], t.n_landmarks

@@ -31,6 +31,7 @@ from calibration_cases import DETECT, MOST, POWER, QUICK_FAILURE, Case, cases, q
 from calibration_gates import DOF, SEED, STEPS, Draw, Gate, joined
 from calibration_rows import CONFIDENCE, Row, document, kept, merged, write_docs
 from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
@@ -80,17 +81,6 @@ COUNTED: dict[str, Callable[[Outcome], bool]] = {
 # --- the referee --------------------------------------------------------------------------------------------
 
 
-def _judge_one(gate: Gate, false_alarm: float) -> Verdict:
-    """The verdict on a gate: the only place that calls ``judge``."""
-    return judge(Evidence("gate", **vars(gate)), Settings(false_alarm, DETECT, POWER))
-
-
-def _follow_one(gate_of: Callable[[int], Gate], false_alarm: float, dof: int) -> tuple[Verdict, int]:
-    """The verdict of ``--until-decided``, and the runs it took: the only place that does so."""
-    design = sequential_design(dof, DETECT, false_alarm, POWER, MOST)
-    return follow(design, lambda runs: Evidence("gate", **vars(gate_of(runs))))
-
-
 def _evidence_values(means: Array, dof: int) -> Array:
     """E-values after each run, from run means of the NEES over its degrees of freedom."""
     return e_process(means, dof).both
@@ -133,11 +123,14 @@ def judged(case: Case, numbers: Sequence[int], seed: int) -> list[Outcome]:
 
 
 def _at_once(case: Case, gate_of: Growing) -> Outcome:
-    return _outcome(_judge_one(gate_of(case.runs), case.false_alarm), case.runs)
+    evidence = Evidence("gate", **vars(gate_of(case.runs)))
+    return _outcome(judge(evidence, Settings(case.false_alarm, DETECT, POWER)), case.runs)
 
 
 def _until_decided(case: Case, gate_of: Growing) -> Outcome:
-    return _outcome(*_follow_one(gate_of, case.false_alarm, ANY[case.world].dof or DOF))
+    """The verdict of ``--until-decided``, and the runs it took."""
+    design = sequential_design(ANY[case.world].dof or DOF, DETECT, case.false_alarm, POWER, MOST)
+    return _outcome(*follow(design, lambda runs: Evidence("gate", **vars(gate_of(runs)))))
 
 
 def _betting(case: Case, gate_of: Growing) -> Outcome:
@@ -201,7 +194,6 @@ def is_kept_so_far(row: Row) -> bool:
 
 
 def rows_of_case(case: Case, outcomes: Sequence[Outcome]) -> list[Row]:
-    """One row for each claim of a case."""
     took = np.array([outcome.runs for outcome in outcomes])
     return [
         Row(
@@ -309,7 +301,6 @@ def _measured(options: argparse.Namespace, seed: int) -> tuple[list[Row], dict[s
 
 
 def said(row: Row) -> str:
-    """A row as a line."""
     runs = f"{row.runs} runs" if row.looks == 1 else f"{row.mean_runs:.0f} runs, 95 %: {row.late_runs:.0f}"
     return (
         f"{row.question:<28} {row.world:<24} x{row.ratio:<5.3g} {runs:<20} "
@@ -318,16 +309,18 @@ def said(row: Row) -> str:
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Measure the rates of the referee.")
-    parser.add_argument("--quick", action="store_true", help="fewer gates of fewer rows, with fresh random numbers")
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    parser.add_argument("--docs", type=Path, help="document whose table to replace")
-    parser.add_argument("--only", default="", help="rows whose world or question contains this text")
-    parser.add_argument("--module", action="append", choices=MODULES, help="rows of this module alone, put into --out")
-    parser.add_argument("--gates", type=int, default=10**9, help="of a row, at most")
-    parser.add_argument("--seed", type=int)
-    parser.add_argument("--workers", type=int, default=2)
-    return parser.parse_args(arguments)
+    return options_of(
+        "Measure the rates of the referee.",
+        arguments,
+        quick=(False, "fewer gates of fewer rows, with fresh random numbers"),
+        out=(Path, "JSON file to write"),
+        docs=(Path, "document whose table to replace"),
+        only=("", "rows whose world or question contains this text"),
+        module=(str, "rows of this module alone, put into --out", {"action": "append", "choices": MODULES}),
+        gates=(10**9, "of a row, at most"),
+        seed=(int, None),
+        workers=(2, None),
+    )
 
 
 if __name__ == "__main__":

@@ -51,7 +51,6 @@ class Case:
 
 
 def cases() -> list[Case]:
-    """All that ``make calibrate`` measures."""
     return [
         *(case for runs, rate, gates in alarm_plans() for case in _alarms(WORLDS, runs, rate, gates)),
         *_until_decided(WORLDS, 1000),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from calibration_count import row
+from calibration_gates import row
 
 from consistency.referee.diagnostics import RunSummary, compare
 
@@ -42,11 +42,11 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
 
 
 def _p_value(rng: np.random.Generator, runs: int, dof: int, slow_first: bool) -> float:
-    slow, mixed = (_summary(rng.chisquare(k, runs) / k, dof) for k in (dof, STEPS * dof))
+    slow, mixed = (summary(rng.chisquare(k, runs) / k, dof) for k in (dof, STEPS * dof))
     a, b = (slow, mixed) if slow_first else (mixed, slow)
     return compare(a, b).p_value
 
 
-def _summary(means: np.ndarray, dof: int) -> RunSummary:
+def summary(means: np.ndarray, dof: int) -> RunSummary:
     none = np.empty((len(means), 0))
     return RunSummary(np.arange(len(means)), dof, means, none, none)

@@ -1,4 +1,4 @@
-"""What the worlds of the calibration are made of: records of draws, gates and worlds, and errors that several need."""
+"""Records of draws, gates and worlds of the calibration, errors that several worlds need, and counted rows."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy import signal
 
 from consistency.referee.types import Array
 
@@ -102,6 +103,12 @@ def first_order(draw: Draw, correlation: Array | np.float64, n: int) -> Array:
     return w
 
 
+def stationary(noise: Array, correlation: float, axis: int = 0) -> Array:
+    """White noise made a stationary first-order autoregression of its variance along an axis; it is overwritten."""
+    np.moveaxis(noise, axis, 0)[1:] *= np.sqrt(1.0 - correlation**2)
+    return np.asarray(signal.lfilter([1.0], [1.0, -correlation], noise, axis=axis))
+
+
 def random_walk_filter(draw: Draw, start: float, process: float, noise: float, n: int) -> tuple[Array, Array]:
     """Errors (R, T, n) of the Kalman filter of n random walks, and their variances (T, n)."""
     kicks, noises = draw.rng.standard_normal((2, draw.steps, draw.runs, n))
@@ -136,3 +143,13 @@ def with_innovations(rows: Sequence[tuple[Array, float, Array, float]]) -> Gate:
     error, innovation = (np.stack([row[i] for row in rows], axis=1) for i in (0, 2))
     P, S = (np.array([row[i] for row in rows])[:, None, None] * np.eye(2) for i in (1, 3))
     return Gate(error, shared(P, error), innovations=innovation, innovation_covariances=shared(S, innovation))
+
+
+def row(
+    world: str, question: str, ratio: float, runs: int, stated: float, bound: str, gates: int, found: int
+) -> dict[str, Any]:
+    """``found`` of ``gates`` gates, and the share that is ``stated`` with its ``bound``, "<=" or ">="."""
+    return {
+        "world": world, "question": question, "ratio": ratio, "runs": runs, "looks": 1, "stated": stated,
+        "bound": bound, "gates": gates, "found": found,
+    }  # fmt: skip

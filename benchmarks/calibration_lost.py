@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from calibration_count import row
+from calibration_gates import row
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, follow, gate_runs, judge, sequential_design
 from consistency.referee.types import Array

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from calibration_count import row
+from calibration_gates import row
 
 from consistency.referee.diagnostics import Evidence, JointNees, Verdict, judge
 from consistency.referee.types import Array

@@ -9,15 +9,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from calibration_count import row, show
-from scipy import signal
+from calibration_gates import row, stationary
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.diagnostics.records.log_pieces import in_pieces
+from consistency.referee.diagnostics.planning.single_log import in_pieces
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.space_errors import spatial_error
+from consistency.referee.geometry.groups import spatial_error
 from consistency.referee.types import Array
 
 STEPS, DOF, RHO = 20_000, 3, 0.95
@@ -40,9 +39,7 @@ ABOUT = {
 
 
 def log_of(rng: np.random.Generator, constant: float, ratio: float) -> Evidence:
-    w = rng.standard_normal((STEPS, DOF))
-    w[1:] *= np.sqrt(1.0 - RHO**2)
-    e = np.sqrt(1.0 - constant) * signal.lfilter([1.0], [1.0, -RHO], w, axis=0)
+    e = np.sqrt(1.0 - constant) * stationary(rng.standard_normal((STEPS, DOF)), RHO)
     e = np.sqrt(ratio) * (e + np.sqrt(constant) * rng.standard_normal((1, DOF)))
     return Evidence("log", e[None], np.broadcast_to(np.eye(DOF), (1, STEPS, DOF, DOF)))
 
@@ -69,7 +66,6 @@ def applied(pose: Array, e: Array, convention: str) -> Array:
 
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
-    """Rows of the calibration table."""
     table, gates = [], QUICK_GATES if quick else GATES
     for k, constant in enumerate(CONSTANT[:1] if quick else CONSTANT):
         world = f"one log, {100 * constant:g} % constant"
@@ -87,7 +83,3 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
         gone = sum(not judge(study_of(rng, kind)).guesses[kind].possible for _ in range(gates))
         table.append(row(f"poses, error {kind}", LEFT, 1.0, RUNS, 0.05, "<=", gates, gone))
     return table
-
-
-if __name__ == "__main__":
-    show(rows(quick=False, seed=20070101))

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from calibration_count import row
+from calibration_gates import row
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Evidence, Verdict, judge, mean_shape
@@ -71,7 +71,6 @@ ABOUT = {
 
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
-    """Rows of the calibration table."""
     return [*_nis_rows(quick, seed), *_gap_rows(quick, seed), *_shape_rows(quick, seed)]
 
 

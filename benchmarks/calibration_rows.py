@@ -106,7 +106,6 @@ def markdown(table: dict[str, Any]) -> str:
 
 
 def write_docs(table: dict[str, Any], path: Path) -> None:
-    """Put the table between its marks in a document."""
     text = path.read_text(encoding="utf-8")
     start, end = MARKS
     marked = f"{start}\n\n{markdown(table)}\n\n{end}"

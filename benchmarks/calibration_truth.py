@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from calibration_count import row, show
-from scipy import optimize, signal
+from calibration_gates import row, stationary
+from scipy import optimize
 
 from consistency.referee.diagnostics import Evidence, judge
 from consistency.referee.types import Array
@@ -48,7 +48,10 @@ def gate(rng: np.random.Generator, kind: str, s: float, ratio: float, errors: st
     """Errors of 50 runs with covariances P, and those of the truth beside them."""
     P, Q = covariance(rng), covariance(rng)
     Q *= optimize.brentq(lambda c: np.trace(np.linalg.solve(P + c * Q, c * Q)) / DOF - s, 1e-6, 1e6)
-    e = _ar(rng, 0.5) @ np.linalg.cholesky(ratio * P).T + errors_of_truth(rng, kind) @ np.linalg.cholesky(Q).T
+    e = (
+        stationary(rng.standard_normal((RUNS, STEPS, DOF)), 0.5, 1) @ np.linalg.cholesky(ratio * P).T
+        + errors_of_truth(rng, kind) @ np.linalg.cholesky(Q).T
+    )
     shape = (RUNS, STEPS, DOF, DOF)
     return Evidence(
         "gate", e, np.broadcast_to(P, shape), truth_covariance=np.broadcast_to(Q, shape), truth_errors=errors
@@ -57,24 +60,16 @@ def gate(rng: np.random.Generator, kind: str, s: float, ratio: float, errors: st
 
 def errors_of_truth(rng: np.random.Generator, kind: str) -> Array:
     """Standard normal errors, (runs, steps, n)."""
-    if kind == "white":
-        return rng.standard_normal((RUNS, STEPS, DOF))
-    if kind == "AR(.9)":
-        return _ar(rng, 0.9)
+    if kind in ("white", "AR(.9)"):
+        white = rng.standard_normal((RUNS, STEPS, DOF))
+        return white if kind == "white" else stationary(white, 0.9, 1)
     if kind == "constant per run":
         return np.broadcast_to(rng.standard_normal((RUNS, 1, DOF)), (RUNS, STEPS, DOF))
     one = np.broadcast_to(rng.standard_normal((1, 1, DOF)), (RUNS, STEPS, DOF))
     return one * rng.choice([-1.0, 1.0], (RUNS, 1, 1)) if kind == SIGNS else one
 
 
-def _ar(rng: np.random.Generator, rho: float) -> Array:
-    w = rng.standard_normal((RUNS, STEPS, DOF))
-    w[:, 1:] *= np.sqrt(1.0 - rho**2)
-    return np.asarray(signal.lfilter([1.0], [1.0, -rho], w, axis=1))
-
-
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
-    """Rows of the calibration table."""
     table, gates = [], QUICK_GATES if quick else GATES
     for k, s in enumerate(SHARES[:1] if quick else SHARES):
         for kind in (*DECLARED, SIGNS):
@@ -96,7 +91,3 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
                     if errors or s == SHARES[0] or bound == "<=":
                         table.append(row(world, question, ratio, RUNS, stated, bound, gates, count))
     return table
-
-
-if __name__ == "__main__":
-    show(rows(quick=False, seed=20070101))

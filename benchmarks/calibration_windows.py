@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from calibration_count import row, show
-from scipy import signal, stats
+from calibration_gates import row, stationary
+from scipy import stats
 
 from consistency.referee.diagnostics import Evidence, judge
 from consistency.referee.diagnostics.questions.independence import ENOUGH, independence
@@ -37,9 +37,7 @@ ABOUT = {
 
 def windows_of(rng: np.random.Generator, count: int, rho: float, n: int = DOF, slow: float = 1.0) -> Array:
     """Whitened errors (count, n), each standard normal by itself; ``slow`` is the share of the scores that is AR."""
-    noise = rng.standard_normal(count)
-    noise[1:] *= np.sqrt(1.0 - rho**2)
-    score = np.sqrt(slow) * signal.lfilter([1.0], [1.0, -rho], noise)
+    score = np.sqrt(slow) * stationary(rng.standard_normal(count), rho)
     score += np.sqrt(1.0 - slow) * rng.standard_normal(count)
     way = rng.standard_normal((count, n))
     length = np.sqrt(stats.chi2.isf(stats.norm.sf(score), n))
@@ -69,7 +67,3 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
             found = sum(independence(rng.standard_normal((runs, n))).doubtful for _ in range(gates))
             table.append(row(f"independent windows, n = {n}", DOUBTED, 1.0, runs, 0.005, "<=", gates, found))
     return table
-
-
-if __name__ == "__main__":
-    show(rows(quick=False, seed=20070101))

@@ -29,6 +29,7 @@ from scipy import special
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.geometry.conventions import planar_error
+from consistency.referee.readers.formats.numpy_archive import steps_of
 from consistency.referee.readers.runs_to_record import Track, assemble, symmetric
 from consistency.referee.types import Array
 
@@ -218,7 +219,7 @@ def recorded(truth: Array, estimate: Array, covariance: Array) -> Evidence:
     error, columns = planar_error(truth, estimate, "left"), np.arange(truth.shape[1])
     tracks = []
     for run, P in enumerate(covariance):
-        place = [f"run {run}, step {k + 1}" for k in columns]
+        place = steps_of("memory", run, columns)
         tracks.append(Track(run, columns, place, error[run], symmetric(P, place.__getitem__)))
     return assemble("left", tracks, columns * 1.0, AXES, "memory", "left")
 

@@ -13,17 +13,18 @@ Exit status 1 if more searches found something than a rate as stated explains (b
 
 from __future__ import annotations
 
-import argparse
 import sys
 from typing import Any
 
 import numpy as np
 from scipy import stats
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.challenging.challenge import Plan, challenge
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.jit import Outlook
+from consistency.bench.filters.methods.ekf import parts
 from consistency.bench.models.motion import dead_reckoning, unicycle_jacobian, unicycle_noise
 from consistency.bench.types import Estimates
 
@@ -40,14 +41,13 @@ class DeadReckoning(Compiled):
     def __init__(self) -> None:
         ekf = cs.get_filter("ekf-uvd")  # whose memory is more than enough
         assert isinstance(ekf, Compiled)
-        super().__init__(ekf.textbook, ekf.parts, sensors=ekf.sensors, uvd=True)
+        super().__init__(ekf.textbook, parts, ekf.sensors)
         self.name = "dead-reckoning"
 
     def is_ready(self, trial: Any, belief: Any) -> bool:
         return True
 
     def outlook(self, trial: Any, belief: Any) -> Outlook:
-        """There is nothing to compile."""
         return Outlook(self.name, is_ready=True, is_shared=True, seconds=0.0)
 
     def run(self, trial: Any, belief: Any, halt: Any = None) -> Estimates:
@@ -73,17 +73,17 @@ def opponents(name: str) -> tuple[Any, Any]:
 
 
 def main() -> None:
-    """Search, count, and compare with the stated rate."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--searches", type=int, default=200)
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each search")
-    parser.add_argument("--trials", type=int, help="of each search, in place of --seconds")
-    parser.add_argument("--filter", default="kf", help="one that is right in the worlds of its scenario")
-    parser.add_argument("--of", choices=("pose", "map"), default="pose", help="whose covariance is challenged")
-    parser.add_argument("--false-alarm", type=float, default=0.05)
-    parser.add_argument("--seed", type=int, default=0, help="of the first search")
-    parser.add_argument("--jobs", type=int, default=-1)
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        searches=(200, None),
+        seconds=(10.0, "of each search"),
+        trials=(int, "of each search, in place of --seconds"),
+        filter=("kf", "one that is right in the worlds of its scenario"),
+        of=("pose", "whose covariance is challenged", {"choices": ("pose", "map")}),
+        false_alarm=(0.05, None),
+        seed=(0, "of the first search"),
+        jobs=(-1, None),
+    )
     minutes = None if options.trials is not None else options.seconds / 60.0
     found, worlds, longest = 0, 0, 0.0
     filter_, base = opponents(options.filter)

@@ -11,12 +11,12 @@ is wider than 5 % of its value, or if the bias map is off by more than 0.1 px rm
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.models import point, stereo
@@ -119,12 +119,10 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Whether the promise is kept."""
         share = np.mean([not names for names in self.missed])
         return bool(share >= SHARE and self.width.max() <= WIDTH and np.sqrt(np.mean(self.rms**2)) <= RMS)
 
     def text(self, name: str) -> str:
-        """One paragraph."""
         held = sum(not names for names in self.missed)
         counts = (
             ", ".join(f"{key} {n}" for key, n in Counter(key for names in self.missed for key in names).most_common())
@@ -140,7 +138,6 @@ class Outcome:
 
 
 def repeat(truth: Real, repetitions: int, runs: int, seed: int) -> Outcome:
-    """Simulate and characterise, each time with another seed."""
     scenario = cs.load_scenario(SCENARIO)
     sensor = scenario.truth.sensor
     assert isinstance(sensor, UvdSensor)
@@ -161,12 +158,12 @@ def repeat(truth: Real, repetitions: int, runs: int, seed: int) -> Outcome:
 
 
 def main() -> None:
-    """Both worlds."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repetitions", type=int, default=100)
-    parser.add_argument("--runs", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0, help="of the first repetition")
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        repetitions=(100, None),
+        runs=(10, None),
+        seed=(0, "of the first repetition"),
+    )
     good = True
     for name, truth in {"plain": Real(None, None), "real": real()}.items():
         outcome = repeat(truth, options.repetitions, options.runs, options.seed)

@@ -13,7 +13,8 @@ import itertools
 import sys
 
 import numpy as np
-from scipy import signal, stats
+from calibration_gates import stationary
+from scipy import stats
 
 from consistency.referee.diagnostics import Evidence, Settings, judge
 from consistency.referee.types import Array
@@ -31,8 +32,7 @@ def errors(rng: np.random.Generator, rho: float, runs: int, steps: int, tails: b
         e = rng.standard_t(5, size=e.shape) * np.sqrt(3.0 / 5.0)
     if rho == 1.0:
         return np.repeat(e[:, :1], steps, axis=1)
-    e[:, 1:] *= np.sqrt(1.0 - rho**2)
-    return np.asarray(signal.lfilter([1.0], [1.0, -rho], e, axis=1))
+    return stationary(e, rho, 1)
 
 
 def hinted(error: Array) -> tuple[bool, bool]:

@@ -12,7 +12,6 @@ rows together).
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -22,16 +21,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
+from script_options import options_of
 
 from consistency.referee.defaults import DETECT
+from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.persistence import doubts, persistent
 from consistency.referee.fit_covariance.refusals import growth_of, require_sound
-from consistency.referee.fit_covariance.variances import terms_of
-from consistency.referee.fit_covariance.white_noise import fit_noise, intervals
+from consistency.referee.fit_covariance.white_noise import fit_noise, intervals, terms_of
 from consistency.referee.fit_covariance.windows import PLANE, SPACE, Windows, span_of, windows_of
 from consistency.referee.geometry.groups import composed, matrices, vectors
 from consistency.referee.types import Array
@@ -134,7 +134,6 @@ def drive(rng: np.random.Generator, world: World = World(), name: str = "drive",
 
 
 def drives(rng: np.random.Generator, number: int, world: World = World(), length: float = LENGTH) -> list[Drive]:
-    """Several drives, by name."""
     return [drive(rng, world, f"drive {i + 1}", length) for i in range(number)]
 
 
@@ -205,8 +204,8 @@ def recovery_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         for term in terms:
             inside, cover = share_within(term.ratios), int(term.covered.sum())
             least, possible = surely(inside, draws), surely(term.best, draws) >= SHARE
-            low, high = binomial(cover, draws, SURE / tests)
-            held &= (least >= SHARE or draws < 200) and low <= COVERED[1] and high >= COVERED[0]
+            low, high = binomial_interval(cover, draws, 1.0 - SURE / tests)
+            held &= bool((least >= SHARE or draws < 200) and low <= COVERED[1] and high >= COVERED[0])
             five, rest = np.quantile(term.ratios, [0.05, 0.95])
             print(
                 f"| {road}{number} | {term.name} | {five:.2f} to {rest:.2f} | {inside:.3f}, at least {least:.3f} "
@@ -232,7 +231,6 @@ class Case:
 
     @property
     def later(self) -> World:
-        """Of the judged drives."""
         return replace(self.world, times=self.times)
 
 
@@ -294,7 +292,7 @@ def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         ratio = np.array([each[1] for each in found])
         outside = (ratio < 1 / DETECT) | (ratio > DETECT)
         wrong = sum(status == "consistent" and out for (status, _, _), out in zip(found, outside, strict=True))
-        held &= binomial(wrong, draws, 2 * SURE / tests)[0] <= WRONG
+        held &= bool(binomial_interval(wrong, draws, 1.0 - 2 * SURE / tests)[0] <= WRONG)
         statuses = ", ".join(
             f"{word} {count / draws:.2f}" for word, count in Counter(f[0] for f in found).most_common()
         )
@@ -306,19 +304,13 @@ def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
     return held
 
 
-def binomial(count: int, draws: int, alpha: float) -> tuple[float, float]:
-    """Exact interval of a share (Clopper & Pearson 1934)."""
-    low = float(stats.beta.ppf(alpha / 2, count, draws - count + 1)) if count else 0.0
-    high = float(stats.beta.isf(alpha / 2, count + 1, draws - count)) if count < draws else 1.0
-    return low, high
-
-
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="rows with this in their names; the numbers are the same")
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__,
+        draws=(200, None),
+        seed=(0, None),
+        only=("", "rows with this in their names; the numbers are the same"),
+    )
     draws, seed, only, tests = arguments.draws, arguments.seed, arguments.only, len(CASES) + ROWS
     roads = any(only in f"known noise, {road}{number} drives" for road, _ in ROADS for number in (1, 10))
     held = recovery_rows(draws, seed, tests, only) if roads else True

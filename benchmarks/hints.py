@@ -12,19 +12,19 @@ status 1 if more than 6 of 1,200 honest logs get a hint (as large a share of ano
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy import signal
+from calibration_gates import stationary
 from scipy.spatial.transform import Rotation
+from script_options import options_of
 
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.matching import Poses
 from consistency.referee.readers.mix_ups.hints import hints
-from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 
 AXES = {
@@ -95,8 +95,7 @@ def covariance(rng: np.random.Generator, sigma: Array, correlated: bool) -> Arra
 
 def noise(rng: np.random.Generator, steps: int, n: int, rho: float, tails: bool) -> Array:
     w = rng.standard_t(4, (steps, n)) / np.sqrt(2.0) if tails else rng.normal(size=(steps, n))
-    w[1:] *= np.sqrt(1.0 - rho**2)
-    return np.asarray(signal.lfilter([1.0], [1.0, -rho], w, axis=0))
+    return stationary(w, rho)
 
 
 def run_of(rng: np.random.Generator, kind: str, convention: str, e: Array, P: Array) -> Poses:
@@ -232,11 +231,12 @@ def smallest(rng: np.random.Generator, name: str, cells: int) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--logs", type=int, default=1200, help="Honest logs.")
-    parser.add_argument("--cells", type=int, default=20, help="Logs of each mix-up and factor; 0 for none.")
-    parser.add_argument("--seed", type=int, default=5)
-    given = parser.parse_args()
+    given = options_of(
+        __doc__.splitlines()[0] if __doc__ else "",
+        logs=(1200, "Honest logs."),
+        cells=(20, "Logs of each mix-up and factor; 0 for none."),
+        seed=(5, None),
+    )
     for number, name in enumerate(MIXED if given.cells else ()):
         print(f"{name:<36} {smallest(np.random.default_rng((given.seed, number)), name, given.cells)}", flush=True)
     found: dict[str, int] = dict.fromkeys((f"{k}, {w}" for k, w in itertools.product(AXES, WRONG)), 0)

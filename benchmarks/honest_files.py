@@ -7,7 +7,6 @@ several verdicts of is counted by the verdict that is at fault most often.
 
 from __future__ import annotations
 
-import argparse
 import runpy
 import sys
 import tempfile
@@ -19,9 +18,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from relative_poses import exp
 from scipy.spatial.transform import Rotation
+from script_options import options_of
 
 from consistency.referee.diagnostics import Verdict, judge
+from consistency.referee.geometry.groups import composed, vectors
 from consistency.referee.readers.formats.geodetic import axes_at, centred, geodetic
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.read_files import read_recordings
@@ -73,7 +75,6 @@ def write(path: Path, columns: Sequence[Array], header: str = "", separator: str
 
 
 def runs(at: Path, s: Study, columns: Callable[[Array], list[Array]], header: str = "", suffix: str = "txt") -> Path:
-    """A folder with a file for each run."""
     separator = " " if suffix == "txt" else ","
     for run, own in enumerate(s.own):
         write(at / "est" / f"{run}.{suffix}", columns(own), header, separator)
@@ -187,21 +188,17 @@ def rates(at: Path, s: Study) -> Drawn:
     L = np.linalg.cholesky(s.P[:3, :3]) * 0.1
     e = np.sqrt(_ratio(s)) * s.rng.normal(size=(n, 3)) @ L.T
     t, v, w = 0.1 * np.arange(n), s.rng.uniform(0.5, 1.5, n), s.rng.normal(0.0, 0.3, n)
-    pose, true = np.zeros(3), [np.zeros(3)]
-    for k in range(n - 1):
-        arc = np.array([v[k] * dt * np.sinc(w[k] * dt / np.pi), v[k] * dt * _versine(w[k] * dt), w[k] * dt])
-        pose = _moved(_moved(pose, arc), _exp(e[k]))
-        true.append(pose)
+    arcs = exp(dt * np.column_stack([v, np.zeros(n), w])) @ exp(e)
+    true = vectors(composed(np.concatenate([np.eye(3)[None], arcs[:-1]])))
     P = L @ L.T
     header = "t,v,omega,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh"
     numbers = [np.full(n, P[i, j]) for i, j in zip(*np.triu_indices(3), strict=True)]
     est = write(at / "odometry.csv", [t, v, w, *numbers], header, ",")
-    truth = write(at / "truth.csv", [t, *np.array(true).T], "t,x,y,heading", ",")
+    truth = write(at / "truth.csv", [t, *true.T], "t,x,y,heading", ",")
     return est, {"truth": truth, "motions": True, "relative": 10, "error": "left"}
 
 
 def planar(at: Path, s: Study) -> Drawn:
-    """A table of all runs."""
     P = s.P[np.ix_([0, 1, 5], [0, 1, 5])]
     e = s.e[..., [0, 1, 5]].reshape(-1, 3)
     true = np.tile(np.column_stack([s.true[:, :2], s.true[:, 7]]), (RUNS, 1))
@@ -281,7 +278,6 @@ def px4(at: Path, s: Study) -> Drawn:
 
 
 def ardupilot(at: Path, s: Study) -> Drawn:
-    """Innovations of body odometry."""
     Flight = runpy.run_path(str(HELPERS / "dataflash_log.py"))["Flight"]
     log, variance = Flight("XKFD"), np.exp(s.rng.normal(size=(400, 3)))
     own = np.sqrt(_ratio(s) * variance) * s.rng.normal(size=(400, 3))
@@ -348,21 +344,6 @@ def _with_body_rotation(s: Study, P: Array) -> Study:
     return Study(s.true, own, P, e, s.rng)
 
 
-def _versine(angle: float) -> float:
-    return float((1.0 - np.cos(angle)) / angle) if angle else 0.0
-
-
-def _exp(e: Array) -> Array:
-    """Of SE(2)."""
-    a, b = np.sinc(e[2] / np.pi), _versine(e[2])
-    return np.array([a * e[0] - b * e[1], b * e[0] + a * e[1], e[2]])
-
-
-def _moved(pose: Array, step: Array) -> Array:
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.array([pose[0] + c * step[0] - s * step[1], pose[1] + s * step[0] + c * step[1], pose[2] + step[2]])
-
-
 def verdicts(row: str, rng: np.random.Generator, ratio: float) -> list[tuple[bool, bool]]:
     """Of each verdict on one draw: whether it finds a fault, and whether it says overconfident."""
     with tempfile.TemporaryDirectory() as folder:
@@ -388,11 +369,12 @@ def counted(row: str, draws: int, seed: int) -> tuple[int, int, int]:
 
 def main() -> int:
     """Print the table; 1 if a row has more faults than 5 % allows, or x2 in P is missed."""
-    parser = argparse.ArgumentParser(description="Honest files of every kind.")
-    parser.add_argument("--draws", type=int, default=100)
-    parser.add_argument("--only", default="", help="rows whose name contains this text")
-    parser.add_argument("--seed", type=int, default=20070101)
-    options = parser.parse_args()
+    options = options_of(
+        "Honest files of every kind.",
+        draws=(100, None),
+        only=("", "rows whose name contains this text"),
+        seed=(20070101, None),
+    )
     print("| file | honest, at fault | x2 in P, overconfident |\n| --- | --- | --- |")
     broken = 0
     for row in ROWS:

@@ -11,18 +11,19 @@ the rate may be there.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from calibration_compare import summary
 from calibration_gates import Draw, first_order
 from calibration_monitor import Monitors, Velocity
 from calibration_windows import undoubted, windows_of
 from scipy import stats
+from script_options import options_of
 
-from consistency.referee.diagnostics import Evidence, RunSummary, Verdict, compare, e_process, judge
+from consistency.referee.diagnostics import Evidence, Verdict, compare, e_process, judge
 from consistency.referee.readers.formats.numpy_archive import record_of_arrays
 from consistency.referee.types import Array
 
@@ -107,13 +108,8 @@ HEAVY: dict[str, Callable[[Rng, int], Array]] = {
 def worse(candidate: Callable[[Rng, int], Array], reference: Callable[[Rng, int], Array], runs: int,
           gates: int, rng: Rng) -> int:  # fmt: skip
     """Comparisons in which the candidate is called less consistent."""
-    both = ((_summary(candidate(rng, runs)), _summary(reference(rng, runs))) for _ in range(gates))
+    both = ((summary(candidate(rng, runs), DOF), summary(reference(rng, runs), DOF)) for _ in range(gates))
     return sum(compare(a, b, RATE).worse for a, b in both)
-
-
-def _summary(means: Array) -> RunSummary:
-    none = np.empty((len(means), 0))
-    return RunSummary(np.arange(len(means)), DOF, means, none, none)
 
 
 def slow_sizes(gates: int, rng: Rng) -> int:
@@ -135,7 +131,6 @@ def found_axes(n: int, ratio: float, runs: int, gates: int, rng: Rng) -> int:
 
 
 def limits() -> Iterator[Limit]:
-    """All rows, in the order of the table."""
     for runs in (21, 50, 100):
         yield Limit("runs of two hidden types", "any fault", runs, partial(faults, typed, runs))
     yield Limit("runs of two hidden types", "e-process ever at 20", 100, partial(bets, typed, 100))
@@ -158,7 +153,6 @@ def limits() -> Iterator[Limit]:
 
 
 def table(gates: int, seed: int, only: str = "") -> Iterator[str]:
-    """The lines of the table."""
     yield "| world | what is counted | runs | share |"
     yield "| --- | --- | --- | --- |"
     for number, limit in enumerate(limits()):
@@ -171,12 +165,12 @@ def table(gates: int, seed: int, only: str = "") -> Iterator[str]:
 
 
 def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--gates", type=int, default=GATES, help="of a row")
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--only", default="", help="rows with this in their worlds; the numbers are the same")
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        gates=(GATES, "of a row"),
+        seed=(SEED, None),
+        only=("", "rows with this in their worlds; the numbers are the same"),
+    )
     for line in table(options.gates, options.seed, options.only):
         print(line, flush=True)
 

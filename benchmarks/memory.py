@@ -17,6 +17,7 @@ import sys
 from typing import Any, NamedTuple
 
 import numpy as np
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.runs.memory_needed import trial_bytes
@@ -80,10 +81,11 @@ def resident() -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--pairs", type=int, nargs="+", default=range(1, len(PAIRS) + 1), help="numbers from 1")
-    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__.split("\n")[0],
+        pairs=(int, "numbers from 1", {"nargs": "+", "default": range(1, len(PAIRS) + 1)}),
+        one=(int, argparse.SUPPRESS),
+    )
     if arguments.one is not None:
         print(json.dumps(measured(PAIRS[arguments.one - 1])))
         return 0

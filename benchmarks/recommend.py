@@ -11,7 +11,6 @@ status 1 otherwise.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -21,6 +20,8 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.scenario import scenario_text
@@ -118,7 +119,6 @@ def answer(scenario: cs.Scenario, package: Path | None, seed: int, runs: int, jo
 
 
 def row(name: str, found: Answer) -> str:
-    """A line of the table."""
     v = found.verdict
     low, high = (math.nan, math.nan) if v is None else v.inflation_interval
     told = " | | " if v is None else f"{v.status} | {v.inflation:.2f} [{low:.2f}, {high:.2f}] | {found.bias:.2f}"
@@ -127,13 +127,14 @@ def row(name: str, found: Answer) -> str:
 
 def main() -> None:
     """Ask for each rig, print a table, and compare with the promise."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=200, help="by which advice is judged")
-    parser.add_argument("--seed", type=int, default=33, help="of the advice; the next one judges it")
-    parser.add_argument("--advice-of", type=Path, help="folder that holds another package 'consistency'")
-    parser.add_argument("--only", action="append", choices=RIGS, help="rigs; may be repeated")
-    parser.add_argument("--jobs", type=int, default=-1)
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        runs=(200, "by which advice is judged"),
+        seed=(33, "of the advice; the next one judges it"),
+        advice_of=(Path, "folder that holds another package 'consistency'"),
+        only=(str, "rigs; may be repeated", {"action": "append", "choices": RIGS}),
+        jobs=(-1, None),
+    )
     print("| rig | advice | how sure | runs of another seed | ratio | bias, sigma | a consistent filter |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     answers = []

@@ -11,7 +11,6 @@ Exit status 1 if a promise is broken (binomial, 1 % for all rows together).
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 from scipy.linalg import expm
+from script_options import options_of
 
 from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.planning.number_of_runs import power_of
@@ -146,7 +146,6 @@ class Row:
         return float(stats.binom.cdf(self.found, self.draws, self.stated))
 
     def line(self) -> str:
-        """A row of the table in docs/files.md."""
         low, high = stats.binomtest(self.found, self.draws).proportion_ci(0.95, "exact")
         bound = "≤" if self.ratio == 1.0 else "≥"
         share = f"{self.found / self.draws:.1%} [{low:.1%}, {high:.1%}]"
@@ -201,11 +200,11 @@ def first_order(draws: int, seed: int) -> Iterator[str]:
 
 
 def main() -> None:
-    """Measure, print, and compare with what is promised."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=500, help="logs a row")
-    parser.add_argument("--seed", type=int, default=60607)
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        draws=(500, "logs a row"),
+        seed=(60607, None),
+    )
     print("| log | windows | ratio | promised | found |\n| --- | --- | --- | --- | --- |", flush=True)
     measured = []
     for row in rows(options.draws, options.seed):

@@ -23,9 +23,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from script_options import options_of
 
-from consistency.referee.system.ending import LEAVE
-from consistency.referee.system.stopping import STOPS
+from consistency.referee.system.stopping import LEAVE, STOPS
 
 LIMIT = 2.0  # s
 LONGEST = 20.0  # s after which a signal comes at the latest
@@ -71,8 +71,6 @@ COMMANDS = {
 
 @dataclass
 class Ended:
-    """How one command ended."""
-
     seconds: float = 0.0
     faults: list[str] = field(default_factory=list)
     was_done: bool = False
@@ -84,7 +82,6 @@ def as_in_a_terminal() -> None:
 
 
 def session(leader: int) -> list[str]:
-    """Processes of a session, by their command."""
     left = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -160,13 +157,14 @@ def large_file(path: Path, rows: int) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--signals", type=int, default=300)
-    parser.add_argument("--resumes", type=int, default=60, help="at most; 0 begins at once")
-    parser.add_argument("--runs", type=int, default=300, help="of a command, so that it takes 20 s")
-    parser.add_argument("--rows", type=int, default=3_000_000, help="of the large file")
-    parser.add_argument("--seed", type=int, default=None)
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__.split("\n")[0],
+        signals=(300, None),
+        resumes=(60, "at most; 0 begins at once"),
+        runs=(300, "of a command, so that it takes 20 s"),
+        rows=(3_000_000, "of the large file"),
+        seed=(int, None),
+    )
     rng, counts, slow, seconds = np.random.default_rng(arguments.seed), Counter[str](), Counter[str](), list[float]()
     with tempfile.TemporaryDirectory() as name:
         top, whole = Path(name), dict[str, Path]()

@@ -12,12 +12,13 @@ false alarms (binomial, 1 % for all rows together).
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import signal, stats
+from calibration_gates import stationary
+from scipy import stats
+from script_options import options_of
 
 from consistency.referee.diagnostics import Evidence, Settings, judge
 from consistency.referee.diagnostics.planning.single_log import within
@@ -36,9 +37,7 @@ SETTINGS = Settings(RATE)
 
 def errors(rng: np.random.Generator, rho: float, steps: int, n: int) -> Array:
     """Standard normal errors (steps, n), neighbours correlated by ``rho``."""
-    noise = rng.normal(size=(steps, n))
-    noise[1:] *= np.sqrt(1.0 - rho**2)
-    return np.asarray(signal.lfilter([1.0], [1.0, -rho], noise, axis=0))
+    return stationary(rng.normal(size=(steps, n)), rho)
 
 
 def coverage(draws: int, seed: int) -> Iterator[tuple[str, bool]]:
@@ -92,11 +91,11 @@ def _name(rho: float) -> str:
 
 
 def main() -> None:
-    """Measure, print, and compare with what is promised."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=2000, help="logs a row")
-    parser.add_argument("--seed", type=int, default=80808)
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        draws=(2000, "logs a row"),
+        seed=(80808, None),
+    )
     broken = []
     print("| errors | steps | correlation times | told | holds 1 | width |\n| --- | --- | --- | --- | --- | --- |")
     for line, kept in coverage(options.draws, options.seed):

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
+from script_options import options_of
 
 import consistency as cs
 from consistency.bench.tuning.fit import FactorFit
@@ -89,14 +90,15 @@ def wrong(scenario: cs.Scenario, true_q: float, true_r: float) -> cs.Scenario:
 
 def main() -> None:
     """Fit, count, and compare with the stated rates; then time a long search."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repetitions", type=int, default=100)
-    parser.add_argument("--fits", type=int, default=200, help="without verdicts, in each of the other worlds")
-    parser.add_argument("--runs", type=int, default=20, help="of each fit, and of each verdict")
-    parser.add_argument("--by", default="innovations", help="innovations or nees")
-    parser.add_argument("--seed", type=int, default=31_000, help="of the first repetition")
-    parser.add_argument("--jobs", type=int, default=-1)
-    options = parser.parse_args()
+    options = options_of(
+        __doc__,
+        repetitions=(100, None),
+        fits=(200, "without verdicts, in each of the other worlds"),
+        runs=(20, "of each fit, and of each verdict"),
+        by=("innovations", "innovations or nees"),
+        seed=(31_000, "of the first repetition"),
+        jobs=(-1, None),
+    )
     broken = coverage(options) if options.repetitions else False
     for name, world in WORLDS.items():
         broken |= intervals(name, world, options) if options.fits else False

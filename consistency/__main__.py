@@ -3,7 +3,7 @@
 import gc
 from typing import Any
 
-from consistency.referee.system.ending import supervised
+from consistency.referee.system.stopping import supervised
 
 
 def main() -> Any:

@@ -14,9 +14,8 @@ from typing import Any
 import pytest
 from _pytest.reports import TestReport  # public under the name of pytest from 7.0 on
 
-from consistency.referee.gating.false_alarm_budget import in_place_rate
 from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, refusal, to_property
-from consistency.referee.gating.watch import DEFAULTS, Entry, Watch, current, watching
+from consistency.referee.gating.watch import DEFAULTS, Entry, Watch, current, in_place_rate, watching
 
 NAME = "consistency-gates"
 MARKER = (

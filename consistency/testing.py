@@ -12,10 +12,19 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Comparison, Record, Settings, Verdict, gate_runs, judge
 from consistency.referee.diagnostics.comparison import FEWEST
+from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.gating.comparing import Sides, of_arrays, of_filters
 from consistency.referee.gating.input_checks import checked, of_results, planned_dof, shares
-from consistency.referee.gating.watch import DEFAULTS, Entry, Terms, current, terms
-from consistency.referee.gating.wording import fault_text, few_to_compare, undecided_text
+from consistency.referee.gating.watch import (
+    DEFAULTS,
+    Entry,
+    Terms,
+    current,
+    fault_text,
+    few_to_compare,
+    terms,
+    undecided_text,
+)
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline
@@ -254,8 +263,6 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
 
 @dataclass(frozen=True)
 class _Look:
-    """The result of a gate at one false-alarm rate."""
-
     bad: bool
     sure: bool  # bad at any rate
     p_value: float
@@ -268,7 +275,6 @@ class _Look:
 def _settle(
     gate: str, record: Record, demand: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
 ) -> _Look:
-    """Record the result of a gate, and raise if it is already decided."""
     __tracebackhide__ = True
     result, late = look(demand.false_alarm), None
     runs, dof = len(record.run_numbers), planned_dof(record)
@@ -327,12 +333,12 @@ def _entry(
     statistics = result.verdict.statistics if result.verdict is not None else {}
     fields = _summary(result)
     if (c := result.comparison) is not None:
-        fields |= {key: _finite(getattr(c, key)) for key in ("distance", "standard_error")}
+        fields |= plain({key: getattr(c, key) for key in ("distance", "standard_error")})
         spread = {key: getattr(c, key) for key in ("at_most", "sum_error", "reference")}
         fields["spread"] = {key: value for key, value in spread.items() if np.isfinite(value)}
         statistics = {"differences": [vars(d) for d in c.differences]}
     return Entry(
-        gate=gate, name=record.name, outcome=outcome, p_value=_finite(result.p_value),
+        gate=gate, name=record.name, outcome=outcome, p_value=plain(result.p_value),
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
         in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
         runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=shares(record),
@@ -344,20 +350,16 @@ def _entry(
 def _summary(look: _Look) -> dict[str, Any]:
     summary: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
     if look.comparison is not None:
-        return summary | {"statistic": _finite(look.comparison.differences[0].a)}
+        return summary | {"statistic": plain(look.comparison.differences[0].a)}
     assert look.verdict is not None
     v = look.verdict
-    return summary | {
-        "statistic": _finite(v.statistic), "threshold": [_finite(x) for x in v.threshold],
-        "inflation": _finite(v.inflation), "inflation_interval": [_finite(x) for x in v.inflation_interval],
-        "axis": None if v.axis is None else v.axis[0],
-        "axis_ratio": [] if v.axis is None else [_finite(x) for x in v.axis[1]],
-        "first_step": v.first_step, "subset": v.subset, "faults": list(v.faults),
-    }  # fmt: skip
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    axis, ratio = v.axis or (None, ())
+    rest: dict[str, Any] = plain({
+        "statistic": v.statistic, "threshold": v.threshold, "inflation": v.inflation,
+        "inflation_interval": v.inflation_interval, "axis": axis, "axis_ratio": ratio, "first_step": v.first_step,
+        "subset": v.subset, "faults": v.faults,
+    })  # fmt: skip
+    return summary | rest
 
 
 def _refuse(arrays: Mapping[str, Any], why: str) -> None:

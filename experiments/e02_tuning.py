@@ -7,7 +7,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.findings import script
-from consistency.referee.diagnostics.statistics.coverage import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 
 FINDINGS = ("fig2b", "fig2c")
 KERNELS = {"herath2007-xyz": ("ekf-xyz",)}
@@ -77,7 +77,6 @@ def bound(curves: cs.Record, side: str) -> np.ndarray:
 
 
 def shares(curves: cs.Record) -> str:
-    """The shares and their one-sided bounds in words."""
     rows = zip(
         ("x", "y", "heading"), inside(curves).mean(axis=0), bound(curves, "lower"), bound(curves, "upper"), strict=True
     )

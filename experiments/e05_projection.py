@@ -82,7 +82,6 @@ def transformed(baseline: float, rng: np.random.Generator) -> pd.DataFrame:
 
 
 def rejected(x: np.ndarray) -> float:
-    """Share of batches in which normality is rejected."""
     return float(np.mean([normality(batch).p_value < LEVEL for batch in x.reshape(-1, BATCH)]))
 
 
@@ -101,7 +100,6 @@ def overlap(a: tuple[float, float], b: tuple[float, float]) -> float:
 
 
 def described(test: Normality, linear: float, shared: float, rejecting: float, found: float) -> str:
-    """One line of numbers."""
     return (
         f"normality rejected in {100 * rejecting:.0f} % of batches; within the search range ({100 * found:.0f} % of "
         f"samples) mean {test.mean:.2f} m (true 10), std {test.std:.2f} m (linearised {linear:.2f}), "

@@ -9,7 +9,6 @@ how it becomes a log: docs/kitti07.md.
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import os
 import sys
@@ -26,16 +25,14 @@ import pandas as pd
 import consistency as cs
 from consistency.bench.models import point, stereo
 from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.runs.findings import command_line, findings_table, sibling
+from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.log import Log, write_log
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics import anees_interval, chi2_mean_interval
-from consistency.referee.diagnostics.statistics.coverage import coverage
-from consistency.referee.show.terminal import show
-from consistency.referee.system.folders import require_free
+from consistency.referee.diagnostics.statistics.accuracy import coverage
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 
@@ -43,6 +40,7 @@ if TYPE_CHECKING:
     import kitti07_log as conversion
 else:
     conversion = sibling(__file__, "kitti07_log")
+scripts = sibling(__file__, "data_scripts")
 
 FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
 
@@ -72,16 +70,6 @@ ACCEPT = {
     "one-log": "refuted if the last position error of ekf-uvd changes more between two selections of the same tracks "
     "(4 and 5 slots) than it differs among the filters on one selection",
 }
-
-
-def main(study: cs.Study) -> list[cs.Finding]:
-    """What do the filters get wrong on KITTI 07? Needs the data in the folder CONSISTENCY_DATA."""
-    folder = os.environ.get("CONSISTENCY_DATA")
-    if not folder:
-        print("kitti07: set CONSISTENCY_DATA to the folder that holds ece276a_stereo_tracks", file=sys.stderr)
-        return []
-    tracks, truth = conversion.find_recording(Path(folder) / "ece276a_stereo_tracks")
-    return measure(study, logs_of(conversion.read_recording(tracks, truth), study.seed), name_of(tracks))
 
 
 def name_of(tracks: Path) -> str:
@@ -125,8 +113,6 @@ def white_twin(trial: Trial, belief: Any, rng: np.random.Generator) -> Trial:
 
 @dataclass(frozen=True)
 class Measured:
-    """One filter on one log."""
-
     nees: float  # mean per degree of freedom after SETTLED; infinite if the filter failed
     above: int  # steps after SETTLED with NEES above the bound for all steps at once
     covered: Array  # (3,), share of the steps after SETTLED within 2 sigma
@@ -200,7 +186,6 @@ def run_all(logs: dict[str, Log], jobs: int) -> dict[str, Results]:
 
 
 def measure(study: cs.Study, logs: dict[str, Log], drive: str) -> list[cs.Finding]:
-    """Run everything, keep it in ``study`` and say what was found."""
     results = run_all(logs, study.jobs)
     study.kept |= {f"{drive}{name}": each for name, each in results.items()}
     on = {name: measured(results[MAIN], name) for name in results[MAIN].filters}
@@ -276,14 +261,10 @@ def measure(study: cs.Study, logs: dict[str, Log], drive: str) -> list[cs.Findin
 
 def command(arguments: Sequence[str] | None = None) -> None:
     """Write OUT as `consistency reproduce` does, and the log itself as OUT/log."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="file of tracks, or a folder with one and its truth")
-    parser.add_argument("--truth", type=Path, help="true poses [the .txt file beside the tracks]")
-    parser.add_argument("--out", type=Path, required=True, help="folder to write")
-    parser.add_argument("--jobs", type=int, default=-1, help="workers; -1 is one a core")
-    parser.add_argument("--overwrite", action="store_true", help="replace an output folder of this bench")
-    given = parser.parse_args(arguments)
-    require_free(given.out, given.overwrite, "findings")
+    given = scripts.options_of(
+        __doc__, arguments, "file of tracks, or a folder with one and its truth",
+        "true poses [the .txt file beside the tracks]", jobs=True,
+    )  # fmt: skip
     study, started = cs.Study(runs=1, seed=0, jobs=given.jobs), time.monotonic()
     tracks, truth = conversion.find_recording(given.data, given.truth)
     data = conversion.read_recording(tracks, truth)
@@ -300,10 +281,9 @@ def command(arguments: Sequence[str] | None = None) -> None:
         licence=LICENCE,
     )
     findings = measure(study, logs, name_of(tracks))
-    study.write(given.out, findings, time.monotonic() - started, given.overwrite)
+    scripts.keep(study, findings, given, started)
     view = (data.size, (float(data.centre[0]), float(data.centre[1])))
     write_log(given.out / "log", logs[MAIN].trials, logs[MAIN].belief, None, manifest, view=view)
-    show(findings_table(findings))
     print(f"results in {given.out}, the log in its folder log; next: consistency report {given.out}")
 
 

@@ -7,13 +7,9 @@ DIR of ``--data`` holds the folders kitti06_f0-50, euroc_static and minnie_quad 
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,12 +17,10 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, command_line, findings_table, sibling
+from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.referee.diagnostics import Evidence, Verdict, judge
 from consistency.referee.diagnostics.statistics.nees import nees
-from consistency.referee.show.terminal import show
 from consistency.referee.system.atomic import write_whole
-from consistency.referee.system.folders import require_free
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import (
     RelativePose,
@@ -48,6 +42,7 @@ else:
     data = sibling(__file__, "front_end_data")
     drawings = sibling(__file__, "front_end_figures")
     Case = data.Case
+scripts = sibling(__file__, "data_scripts")
 
 FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
 
@@ -173,7 +168,6 @@ def floored(errors: Array, covariances: Array) -> tuple[Array, Array]:
 
 
 def measure(study: cs.Study, cases: dict[str, Case]) -> tuple[list[cs.Finding], dict[str, bytes]]:
-    """Run everything; findings, and figures by file name."""
     study.tables["motions"] = pd.concat([table_of(case) for case in cases.values()], ignore_index=True)
     rng = np.random.default_rng(study.seed)
     simulations, pictures = monte_carlo(study, cases, rng)
@@ -182,7 +176,6 @@ def measure(study: cs.Study, cases: dict[str, Case]) -> tuple[list[cs.Finding], 
 
 
 def found(study: cs.Study, holds: bool, name: str, **text: str) -> cs.Finding:
-    """A finding of this script."""
     text = {"source": OURS, "published": "not asked", "id": f"front-end-{name}", "accept": ACCEPT[name]} | text
     return study.finding(bool(holds), scenario="none", **text)
 
@@ -327,29 +320,14 @@ def shared(study: cs.Study, case: Case) -> cs.Finding:
     )  # fmt: skip
 
 
-def main(study: cs.Study) -> list[cs.Finding]:
-    """Is the covariance honest on real images? Needs the data in the folder CONSISTENCY_DATA."""
-    folder = os.environ.get("CONSISTENCY_DATA")
-    if not folder:
-        print(f"front-end: set CONSISTENCY_DATA to the folder that holds {KITTI}, {EUROC}, {MINNIE}", file=sys.stderr)
-        return []
-    return measure(study, data.cases_of(Path(folder), study.seed))[0]
-
-
 def command(arguments: Sequence[str] | None = None) -> None:
     """Write OUT as `consistency reproduce` does, with the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help=f"folder with {KITTI}, {EUROC} and {MINNIE}")
-    parser.add_argument("--out", type=Path, required=True, help="folder to write")
-    parser.add_argument("--overwrite", action="store_true", help="replace an output folder of this bench")
-    given = parser.parse_args(arguments)
-    require_free(given.out, given.overwrite, "findings")
+    given = scripts.options_of(__doc__, arguments, f"folder with {KITTI}, {EUROC} and {MINNIE}")
     study, started = cs.Study(runs=1, seed=0), time.monotonic()
     findings, pictures = measure(study, data.cases_of(given.data, study.seed))
-    study.write(given.out, findings, time.monotonic() - started, given.overwrite)
+    scripts.keep(study, findings, given, started)
     for name, content in pictures.items():
         write_whole(given.out / name, content)
-    show(findings_table(findings))
     print(f"results in {given.out}, figures beside them")
 
 

@@ -68,7 +68,6 @@ class Errors:
     failures: tuple[Failure, ...] = ()
 
     def row(self) -> dict[str, object]:
-        """What the referee says."""
         evidence = Evidence(self.name, self.error[:, None], self.covariance[:, None], failures=self.failures)
         verdict = judge(evidence, Settings(false_alarm=ALARM))
         dof = self.error.shape[1]

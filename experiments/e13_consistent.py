@@ -120,7 +120,6 @@ def judged(study: cs.Study, baseline: float = BASELINE, layout: int = 0) -> pd.D
 
 
 def verdicts(study: cs.Study, asked: Sequence[tuple[Cell, list[str]]]) -> pd.DataFrame:
-    """A row for each cell and filter."""
     rows = []
     for cell, names in each(asked, len(asked), "worlds", "worlds"):
         results = cs.run_trials(cell.scenario(), names, study.runs, study.seed, study.jobs)
@@ -131,12 +130,10 @@ def verdicts(study: cs.Study, asked: Sequence[tuple[Cell, list[str]]]) -> pd.Dat
 
 
 def good(table: pd.DataFrame) -> int:
-    """Cells called consistent."""
     return int((table["status"] == "consistent").sum())
 
 
 def missed(table: pd.DataFrame) -> str:
-    """The cells that are not, in words."""
     rows = table[table["status"] != "consistent"]
     said = [
         f"{r.path} {r.reach:g} m, density {r.density:g}, {r.baseline:g} m: {r.status}, {r.anees:.2f}"
@@ -174,7 +171,6 @@ def at_nine_centimetres(study: cs.Study) -> cs.Finding:
 
 
 def baselines(study: cs.Study) -> cs.Finding:
-    """The same cells at a narrower and a wider baseline."""
     tables = [judged(study, baseline) for baseline in (BASELINE, *OTHER_BASELINES)]
     table = study.tables["consistent_baselines"] = pd.concat(tables, ignore_index=True)
     narrow, wide = table[table["baseline"] < BASELINE], table[table["baseline"] >= BASELINE]
@@ -194,7 +190,6 @@ def baselines(study: cs.Study) -> cs.Finding:
 
 
 def layouts(study: cs.Study) -> cs.Finding:
-    """Other places of the landmarks."""
     first, *tables = (judged(study, layout=layout) for layout in range(LAYOUTS + 1))
     table = study.tables["consistent_layouts"] = pd.concat(tables, ignore_index=True)
     counts = np.array([[good(each), len(each) - good(each)] for each in (table, first)])

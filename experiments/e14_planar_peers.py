@@ -167,13 +167,11 @@ def agreement(study: cs.Study, peer: str, name: str, table: pd.DataFrame) -> cs.
 
 
 def said(name: str, verdict: cs.Verdict) -> str:
-    """Status and average NEES over 3."""
     assert verdict.scale is not None
     return f"{name} {verdict.status}, ANEES {verdict.scale.mean_anees:.2f}"
 
 
 def verdicts(study: cs.Study, world: cs.Scenario, names: Sequence[str]) -> dict[str, cs.Verdict]:
-    """Verdicts with a false alarm of one in a hundred each."""
     return cs.analyse(study.results(world, names), names, confidence=1.0 - FALSE_ALARM)
 
 

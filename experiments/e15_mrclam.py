@@ -8,8 +8,6 @@ recording becomes a log: docs/planar.md.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -21,18 +19,17 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.findings import command_line, findings_table, sibling
+from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.log import Log, write_log
-from consistency.referee.show.terminal import show
-from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 
 if TYPE_CHECKING:
     import mrclam_log as conversion
 else:
     conversion = sibling(__file__, "mrclam_log")
+scripts = sibling(__file__, "data_scripts")
 
 FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
 
@@ -48,15 +45,6 @@ class Drive(NamedTuple):
     log: Log
     found: conversion.Calibration
     dropped: conversion.Dropped
-
-
-def main(study: cs.Study) -> list[cs.Finding]:
-    """Are planar filters consistent on MRCLAM? Needs the data in the folder CONSISTENCY_DATA."""
-    folder = os.environ.get("CONSISTENCY_DATA")
-    if not folder:
-        print("mrclam: set CONSISTENCY_DATA to the folder that holds mrclam", file=sys.stderr)
-        return []
-    return measure(study, drives(Path(folder) / "mrclam"))
 
 
 def drives(folder: Path) -> dict[str, Drive]:
@@ -96,8 +84,6 @@ def measure(study: cs.Study, logs: dict[str, Drive]) -> list[cs.Finding]:
 
 
 class Row(NamedTuple):
-    """What a filter said of one drive."""
-
     log: str
     filter: str
     status: str
@@ -108,7 +94,6 @@ class Row(NamedTuple):
 
 
 def row(name: str, filter_: str, verdict: cs.Verdict, c: cs.Record) -> Row:
-    """Averages over one drive."""
     assert c.error is not None
     assert c.nees is not None
     nees = np.inf if c.failures else float(np.nanmean(c.nees)) / 3
@@ -120,7 +105,6 @@ def row(name: str, filter_: str, verdict: cs.Verdict, c: cs.Record) -> Row:
 
 
 def finding(study: cs.Study, name: str, drive: Drive, rows: Sequence[Row]) -> cs.Finding:
-    """What all filters said of one robot."""
     found, trial = drive.found, drive.log.trials[0]
     each = "; ".join(
         f"{r.filter} {r.status}, NEES/3 {r.nees:.2f}, NIS/dof {r.nis:.2f}, RMSE {r.position:.2f} m" for r in rows
@@ -142,13 +126,7 @@ def finding(study: cs.Study, name: str, drive: Drive, rows: Sequence[Row]) -> cs
 
 def command(arguments: Sequence[str] | None = None) -> None:
     """Write OUT as `consistency reproduce` does, and the logs themselves as OUT/logs/NAME."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for key, text in (("--data", "folder with MRCLAM_DatasetN"), ("--out", "folder to write")):
-        parser.add_argument(key, type=Path, required=True, help=text)
-    parser.add_argument("--jobs", type=int, default=-1, help="workers; -1 is one a core")
-    parser.add_argument("--overwrite", action="store_true", help="replace an output folder of this bench")
-    given = parser.parse_args(arguments)
-    require_free(given.out, given.overwrite, "findings")
+    given = scripts.options_of(__doc__, arguments, "folder with MRCLAM_DatasetN", jobs=True)
     study, started = cs.Study(runs=1, seed=0, jobs=given.jobs), time.monotonic()
     logs = drives(given.data)
     manifest = manifest_of(
@@ -156,10 +134,9 @@ def command(arguments: Sequence[str] | None = None) -> None:
         licence=LICENCE,
     )  # fmt: skip
     findings = measure(study, logs)
-    study.write(given.out, findings, time.monotonic() - started, given.overwrite)
+    scripts.keep(study, findings, given, started)
     for name, drive in logs.items():
         write_log(given.out / "logs" / name, drive.log.trials, drive.log.belief, drive.log.landmarks, manifest)
-    show(findings_table(findings))
     print(f"results in {given.out}, the logs in its folder logs; next: consistency report {given.out}")
 
 

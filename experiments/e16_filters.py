@@ -28,22 +28,17 @@ COST = 2.0  # times a step of the reference
 
 def main(study: cs.Study) -> list[cs.Finding]:
     """Verdicts on pose and map, errors, failures and cost of a step of every filter of (u, v, d)."""
-    names = [name for name in filter_names() if name.endswith("-uvd") and _is_installed(name) and not _smooths(name)]
+    left_out = (
+        "gtsam-",
+        *(() if find_spec("filterpy") else ("filterpy-",)),
+    )  # a smoother takes a minute a trial
+    names = [name for name in filter_names() if name.endswith("-uvd") and not name.startswith(left_out)]
     results = study.results(WORLD, names)
     verdicts = cs.analyse(results, names, confidence=1.0 - FALSE_ALARM)
     cost = costs(names, study.seed)
     table = pd.DataFrame([row(verdicts[name], cost[name]) for name in names])
     study.tables["filters"] = table.assign(runs=study.runs, false_alarm=FALSE_ALARM, scenario=WORLD)
     return [map_finding(study, table), cost_finding(study, table)]
-
-
-def _is_installed(name: str) -> bool:
-    return not name.startswith("filterpy-") or find_spec("filterpy") is not None
-
-
-def _smooths(name: str) -> bool:
-    """Smoothers, a minute and more a trial here, have an experiment of their own."""
-    return name.startswith("gtsam-")
 
 
 def costs(names: list[str], seed: int) -> dict[str, float]:
@@ -113,7 +108,6 @@ def map_finding(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
 
 
 def cost_finding(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
-    """Does a consistent pose cost much more than the EKF?"""
     right = table[(table["status"] == "consistent") & (table["realisable"] == "yes")].sort_values("cost")
     parts = [
         f"{r['filter']} {r['cost']:.2f} times {REFERENCE}, RMSE {r['rmse']:.3f} m" for r in right.to_dict("records")

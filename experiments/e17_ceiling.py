@@ -42,7 +42,6 @@ def main(study: cs.Study) -> list[cs.Finding]:
 
 
 def finding(study: cs.Study, holds: bool, measured: str) -> cs.Finding:
-    """The finding with what was measured."""
     return study.finding(
         holds,
         scenario="herath2007-stereo, 3 variants",

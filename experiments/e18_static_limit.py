@@ -22,7 +22,11 @@ NEAR = (1.0, 2.0, 3.0, 4.0)  # where a disparity of 0 is 5 sigma away: beyond, a
 OBSERVATIONS = 2000  # of a run: the estimate's own error is then a fiftieth of that of one observation
 ALARM = 1e-3  # chance that a right closed form fails a finding, by chance at any depth
 
-SOURCE = f"{OURS}, docs/static-limit.md"
+COMMON = {
+    "scenario": "none",
+    "source": f"{OURS}, docs/static-limit.md",
+    "published": "in brackets beside what is measured",
+}
 ACCEPT = (
     f"at every depth the closed form is within the sampling error of the mean over runs: t interval of {1 - ALARM:.1%} "
     "over all depths together (Bonferroni)"
@@ -36,12 +40,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
         for lateral in (False, True)
     }
     ahead, whole = watches[False], watches[True]
-    return [
-        limit_finding(study, ahead),
-        growth_finding(study, ahead),
-        lateral_finding(study, whole),
-        predicted_finding(study),
-    ]
+    return [*ahead_findings(study, ahead), lateral_finding(study, whole), predicted_finding(study)]
 
 
 # --- closed forms ------------------------------------------------------------------------------------
@@ -150,39 +149,34 @@ def agreement(samples: list[Array], expected: Array) -> tuple[bool, str]:
     return worst <= quantile, f"{text}; largest distance {worst:.1f} standard errors, of {quantile:.1f} allowed"
 
 
-def limit_finding(study: cs.Study, watches: list[Watch]) -> cs.Finding:
-    expected = limit_ratio(noise_ratio(watches), lateral=False)
-    holds, text = agreement([watch.ratio for watch in watches], expected)
-    return study.finding(
-        holds,
-        scenario="none",
-        id="static-limit",
-        source=SOURCE,
-        claim="with R at the measured point and noise in the disparity alone, the depth of a landmark converges to "
-        "x (1 + 3 rho^2) / (1 + 6 rho^2 + 3 rho^4)",
-        statistic=f"estimate over truth of ekf-xyz after {OBSERVATIONS} observations, mean over runs, at "
-        f"{', '.join(f'{depth:g}' for depth in DEPTHS)} m",
-        published="in brackets beside what is measured",
-        measured=text,
-        accept=ACCEPT,
-    )
-
-
-def growth_finding(study: cs.Study, watches: list[Watch]) -> cs.Finding:
-    expected = growth(noise_ratio(watches), lateral=False)
-    holds, text = agreement([watch.slope for watch in watches], expected)
-    return study.finding(
-        holds,
-        scenario="none",
-        id="static-growth",
-        source=SOURCE,
-        claim="the NEES of that landmark grows without bound, by (1 - ratio)^2 (1 + 6 rho^2 + 3 rho^4) / rho^2 an "
-        "observation",
-        statistic=f"growth of the NEES by an observation over the second half of {OBSERVATIONS}, mean over runs",
-        published="in brackets beside what is measured",
-        measured=text,
-        accept=ACCEPT,
-    )
+def ahead_findings(study: cs.Study, watches: list[Watch]) -> list[cs.Finding]:
+    """Limit and growth with noise in the disparity alone."""
+    rho = noise_ratio(watches)
+    limits = agreement([watch.ratio for watch in watches], limit_ratio(rho, lateral=False))
+    slopes = agreement([watch.slope for watch in watches], growth(rho, lateral=False))
+    return [
+        study.finding(
+            limits[0],
+            id="static-limit",
+            claim="with R at the measured point and noise in the disparity alone, the depth of a landmark converges to "
+            "x (1 + 3 rho^2) / (1 + 6 rho^2 + 3 rho^4)",
+            statistic=f"estimate over truth of ekf-xyz after {OBSERVATIONS} observations, mean over runs, at "
+            f"{', '.join(f'{depth:g}' for depth in DEPTHS)} m",
+            measured=limits[1],
+            accept=ACCEPT,
+            **COMMON,
+        ),
+        study.finding(
+            slopes[0],
+            id="static-growth",
+            claim="the NEES of that landmark grows without bound, by (1 - ratio)^2 (1 + 6 rho^2 + 3 rho^4) / rho^2 an "
+            "observation",
+            statistic=f"growth of the NEES by an observation over the second half of {OBSERVATIONS}, mean over runs",
+            measured=slopes[1],
+            accept=ACCEPT,
+            **COMMON,
+        ),
+    ]
 
 
 def lateral_finding(study: cs.Study, watches: list[Watch]) -> cs.Finding:
@@ -192,15 +186,13 @@ def lateral_finding(study: cs.Study, watches: list[Watch]) -> cs.Finding:
     alone, _ = agreement([watch.ratio for watch in watches], limit_ratio(rho, lateral=False))
     return study.finding(
         limits and slopes and not alone,
-        scenario="none",
         id="static-lateral",
-        source=SOURCE,
         claim="noise in u and v draws the landmark nearer still, whatever its size: to "
         "x (1 + 3 rho^2) / (1 + 8 rho^2 + 5 rho^4)",
         statistic="as in static-limit and static-growth, with noise in u, v and d",
-        published="in brackets beside what is measured",
         measured=f"limits {limit_text}. Growth {slope_text}",
         accept=f"{ACCEPT}, for limits and for growth; and the limits of static-limit are not",
+        **COMMON,
     )
 
 
@@ -215,16 +207,14 @@ def predicted_finding(study: cs.Study) -> cs.Finding:
         text.append(f"{name} {words}")
     return study.finding(
         holds,
-        scenario="none",
         id="static-predicted",
-        source=SOURCE,
         claim="with R at the prediction the landmark converges to the mean of the triangulated points, 1 + rho^2 + ... "
         "times too far; with the bias subtracted the error is of fourth order in rho",
         statistic=f"estimate over truth after {OBSERVATIONS} observations, mean over runs, at "
         f"{', '.join(f'{depth:g}' for depth in NEAR)} m",
-        published="in brackets beside what is measured",
         measured="; ".join(text),
         accept=f"{ACCEPT}, for both filters; and the limits of ekf-xyz are not",
+        **COMMON,
     )
 
 

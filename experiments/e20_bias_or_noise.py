@@ -86,7 +86,6 @@ def variants(k: float) -> dict[str, cs.Scenario]:
 
 
 def share(study: cs.Study, worlds: dict[str, cs.Scenario]) -> cs.Finding:
-    """What of the excess of ekf-uvd goes with the map."""
     found = {name: study.judged(world, "ekf-uvd") for name, world in worlds.items()}
     means = {name: run_means(curves) for name, (_, curves) in found.items()}
     status = {name: verdict.status for name, (verdict, _) in found.items()}
@@ -129,7 +128,6 @@ def nodes_of(world: cs.Scenario) -> pd.DataFrame:
 
 
 def over_steps(belief: str, curves: cs.Record) -> pd.DataFrame:
-    """Mean NEES of all runs in each step."""
     assert curves.nees is not None
     known = np.isfinite(curves.nees).any(axis=0)
     nees = np.nanmean(curves.nees[:, known], axis=0)

@@ -86,7 +86,6 @@ def ransac(study: cs.Study) -> cs.Finding:
 
 
 def guarded(study: cs.Study) -> cs.Finding:
-    """Every guard against what the same filter does on clean data."""
     rows, texts, holds = list[tuple[object, ...]](), list[str](), True
     for name in FILTERS:
         verdict, curves = study.judged("herath2007-stereo", name)
@@ -172,13 +171,11 @@ def lens(degrees: float, k: float) -> cs.Scenario:
 
 
 def degrees_of(table: pd.DataFrame, name: str, k: float) -> str:
-    """RMSE of heading over the field of view."""
     rows = table[(table["filter"] == name) & (table.k1 == k)]
     return ", ".join(f"{e:.2f} deg at {d:g}" for e, d in zip(rows.rmse_heading_deg, rows.degrees, strict=True))
 
 
 def anees_of(table: pd.DataFrame, name: str, k: float) -> str:
-    """ANEES over the field of view."""
     rows = table[(table["filter"] == name) & (table.k1 == k)]
     return ", ".join(f"{anees:.2f}" for anees in rows.anees)
 
@@ -187,7 +184,6 @@ def anees_of(table: pd.DataFrame, name: str, k: float) -> str:
 
 
 def feature_count(study: cs.Study) -> cs.Finding:
-    """More features at a time."""
     found = {count: study.judged(selected(count), "parked-ekf-uvd") for count in COUNTS}
     errors = {count: log_rmse(curves, (0, 1)) for count, (_, curves) in found.items()}
     steps = list(pairwise(COUNTS))
@@ -224,7 +220,6 @@ def selected(count: int, reach: tuple[float, float] = (0.5, 4.0)) -> cs.Scenario
 
 
 def near_far_mix(study: cs.Study) -> cs.Finding:
-    """As many features near, far, or both."""
     worlds = {"near": selected(8, (0.5, NEAR)), "far": selected(8, (NEAR, 4.0)), "both": selected(8)}
     found = {name: study.judged(world, "parked-ekf-uvd") for name, world in worlds.items()}
     study.tables["near_far_mix"] = outcomes(found)
@@ -300,12 +295,10 @@ def rank(verdict: cs.Verdict) -> int:
 
 
 def summary(verdict: cs.Verdict) -> str:
-    """Status, ANEES, RMSE of position."""
     return f"{verdict.status}, ANEES {verdict.statistic:.2f}, RMSE {rmse(verdict)[0]:.3f} m"
 
 
 def scored(verdict: cs.Verdict) -> str:
-    """Precision and recall of what a guard rejected."""
     score = verdict.rejection
     assert score is not None
     return f"precision {score.precision.value:.3f}, recall {score.recall.value:.3f}"

@@ -12,16 +12,18 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.findings import script
+from consistency.bench.runs.findings import script, sibling
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.calibration import track_means
 from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import MISMATCH, Chain, Tracks
-from consistency.stereo.rendered_images.filtering import LeftRightCheck
 from consistency.stereo.rendered_images.protocols import Stops, stand
+from consistency.stereo.rendered_images.stages import LeftRightCheck
 from consistency.stereo.visual_odometry.features import opencv
+
+drives = sibling(__file__, "image_drives")
 
 FINDINGS = ("fig4-protocol", "fig5a", "fig5b", "fig5c", "fig7-8")
 LONG = True
@@ -109,7 +111,6 @@ def centred(tracks: Tracks) -> Array:
 
 
 def figure_4(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
-    """Enough features at each stop."""
     least = int(table["features"].min())
     return study.finding(
         least >= KEPT and len(table) == 101,
@@ -126,7 +127,6 @@ def figure_4(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
 
 
 def figure_5a(study: cs.Study, tracks: Tracks) -> cs.Finding:
-    """Errors about track means: autocorrelation and tails."""
     kept = whole(tracks.kept)
     errors = centred(kept).reshape(-1, IMAGES + 1)
     study.tables["images_fig5a"] = histogram(errors.ravel())
@@ -138,7 +138,9 @@ def figure_5a(study: cs.Study, tracks: Tracks) -> cs.Finding:
         {"lag": np.arange(1, LAGS + 1), "autocorrelation": lags, "limit": WHITE}
     )
     stop = kept.sequence.reshape(-1, IMAGES + 1)[:, 0]
-    low, high = bootstrap(generator(study, 5), [errors[stop == k].ravel() for k in np.unique(stop)], stats.kurtosis)
+    low, high = drives.bootstrap(
+        generator(study, 5), [errors[stop == k].ravel() for k in np.unique(stop)], stats.kurtosis, DRAWS, LEVEL
+    )
     white = max(map(abs, lags)) <= WHITE
     return study.finding(
         bool(white and (low > 0.0 or high < 0.0)),
@@ -156,9 +158,8 @@ def figure_5a(study: cs.Study, tracks: Tracks) -> cs.Finding:
 
 
 def figure_5b(study: cs.Study, table: pd.DataFrame, both: pd.DataFrame) -> cs.Finding:
-    """Pooled sd over the sd about track means."""
     ratio = table["pooled"] / table["within"]
-    low, high = bootstrap(generator(study, 6), list(np.log(ratio.to_numpy())[:, None]), np.mean)
+    low, high = drives.bootstrap(generator(study, 6), list(np.log(ratio.to_numpy())[:, None]), np.mean, DRAWS, LEVEL)
     totals = [
         f"k1 = {k1:g}: {rms(part['pooled']):.3f} pooled, {rms(part['within']):.3f} about track means"
         for k1, part in both.groupby("residual")
@@ -178,7 +179,6 @@ def figure_5b(study: cs.Study, table: pd.DataFrame, both: pd.DataFrame) -> cs.Fi
 
 
 def figure_5c(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
-    """Rank correlation of noise and disparity."""
     found = stats.spearmanr(table["disparity"], table["within"], alternative="greater")
     p, rank = float(found.pvalue), float(found.statistic)
     ends = [part["within"].mean() for part in (table.nsmallest(10, "disparity"), table.nlargest(10, "disparity"))]
@@ -261,17 +261,6 @@ def histogram(errors: Array, bins: int = 80) -> pd.DataFrame:
     density, edges = np.histogram(errors, bins, (-5 * sd, 5 * sd))
     density = density / (len(errors) * np.diff(edges))
     return pd.DataFrame({"low": edges[:-1], "high": edges[1:], "density": density, "sd": sd, "samples": len(errors)})
-
-
-def bootstrap(rng: np.random.Generator, parts: list[Array], statistic: object) -> tuple[float, float]:
-    """Interval of a statistic of all parts together, from drawing parts with replacement."""
-    assert callable(statistic)
-    drawn = [
-        float(statistic(np.concatenate([parts[k] for k in rng.integers(0, len(parts), len(parts))])))
-        for _ in range(DRAWS)
-    ]
-    low, high = np.quantile(drawn, [LEVEL / 2, 1 - LEVEL / 2])
-    return float(low), float(high)
 
 
 if __name__ == "__main__":

@@ -21,11 +21,14 @@ from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, joined
-from consistency.stereo.rendered_images.correspondence import KnownDisparity
-from consistency.stereo.rendered_images.filtering import LeftRightCheck, TrackResidual
 from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand
-from consistency.stereo.rendered_images.selection import Spread
-from consistency.stereo.rendered_images.tracking import KnownProjection
+from consistency.stereo.rendered_images.stages import (
+    KnownDisparity,
+    KnownProjection,
+    LeftRightCheck,
+    Spread,
+    TrackResidual,
+)
 from consistency.stereo.visual_odometry.features import opencv
 
 drives = sibling(__file__, "image_drives")
@@ -106,7 +109,9 @@ def figure_6_of(study: cs.Study, walls: list[Array], name: str) -> cs.Finding:
     sd = np.array([errors.std(axis=0) for errors in walls])
     mean = np.sqrt((sd**2).mean(axis=0))
     low, high = sd.min(axis=0), sd.max(axis=0)
-    tails = bootstrap(generator(study, 6), walls, lambda drawn: stats.kurtosis((drawn - drawn.mean(0)) / drawn.std(0)))
+    tails = drives.bootstrap(
+        generator(study, 6), walls, lambda drawn: stats.kurtosis((drawn - drawn.mean(0)) / drawn.std(0)), DRAWS, LEVEL
+    )
     ratio = np.maximum(mean / (SD_U, SD_V), (SD_U, SD_V) / mean)
     shaken = name == "fig6-shake"
     return study.finding(
@@ -177,7 +182,6 @@ def figure_9_of(study: cs.Study, table: pd.DataFrame, column: str, name: str, cl
 
 
 def above(table: pd.DataFrame, column: str) -> float:
-    """Chance that a junction has the greater value."""
     junction = table["junction"].to_numpy(bool)
     values = table[column].to_numpy()
     found = stats.mannwhitneyu(values[junction], values[~junction]).statistic
@@ -283,7 +287,6 @@ def mean_squares(tracks: Tracks) -> Array:
 
 
 def by_frame(tracks: Tracks, name: str) -> pd.DataFrame:
-    """Survivors and rms errors in each image."""
     rows = []
     for frame in range(IMAGES):
         own = tracks.take(tracks.frame == frame)
@@ -350,16 +353,6 @@ def budget_finding(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
         measured=f"{'. '.join(texts)}. The sum misses the whole by up to {miss:.0%}",
         accept=f"the sum is within {ADDS:.0%} of the whole for u, v and d, standing and moving",
     )
-
-
-def bootstrap(rng: np.random.Generator, parts: list[Array], statistic: Callable[[Array], Array]) -> tuple[float, float]:
-    """Interval of the least entry of a statistic of all parts together, from drawing parts with replacement."""
-    drawn = [
-        np.min(statistic(np.concatenate([parts[k] for k in rng.integers(0, len(parts), len(parts))])))
-        for _ in range(DRAWS)
-    ]
-    low, high = np.quantile(drawn, [LEVEL / 2, 1 - LEVEL / 2])
-    return float(low), float(high)
 
 
 if __name__ == "__main__":

@@ -26,8 +26,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.characterising.bias import GRID
-from consistency.stereo.characterising.board_images import MODELS, find_corners
-from consistency.stereo.characterising.board_residuals import of_model
+from consistency.stereo.characterising.boards import MODELS, find_corners, of_model
 from consistency.stereo.characterising.characterise import Characterisation
 from consistency.stereo.characterising.writing import sensor_text
 from consistency.stereo.visual_odometry.features import opencv
@@ -61,7 +60,6 @@ def main(study: cs.Study) -> list[cs.Finding]:
 
 
 def judged(study: cs.Study, known: dict[str, Characterisation]) -> list[cs.Finding]:
-    """Findings on the sensors of the lens models."""
     camera = known[FULL].sensor
     cameras = {model: replace(of, sensor=camera) for model, of in known.items()}
     worlds = {(model, text): world for model, of in cameras.items() for text, world in beliefs(model, of).items()}
@@ -81,7 +79,7 @@ def sensors(folder: Path) -> dict[str, Characterisation]:
     Raises
     ------
     InputError
-        As :func:`consistency.stereo.characterising.board_images.find_corners`.
+        As :func:`consistency.stereo.characterising.boards.find_corners`.
     """
     corners = find_corners(folder, BOARD, SQUARE)
     return {model: of_model(corners, model, DATA, GRID) for model in MODELS}
@@ -183,7 +181,6 @@ def with_noise(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
 
 
 def said(table: pd.DataFrame) -> str:
-    """Lens model by lens model."""
     parts = []
     for model, part in table.groupby("model", sort=False):
         texts = (f"{row.filter} {row.status} {row.anees:.2f}, {row.rmse_position_m:.3f} m" for row in part.itertuples())

@@ -10,8 +10,6 @@ drive that is two and three times as fast. Both methods get the same matches.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -23,9 +21,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, command_line, findings_table, sibling
-from consistency.referee.show.terminal import show
-from consistency.referee.system.folders import require_free
+from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import RelativePose, StereoRig, triangulate
@@ -39,6 +35,7 @@ if TYPE_CHECKING:
 else:
     data = sibling(__file__, "front_end_data")
     Case = data.Case
+scripts = sibling(__file__, "data_scripts")
 
 FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
 
@@ -64,7 +61,6 @@ class Matches:
     truth: RelativePose
 
     def keep(self, rows: Array) -> Matches:
-        """Those of ``rows``."""
         return Matches(self.uv0[rows], self.uv1[rows], self.sigma0[rows], self.sigma1[rows], self.truth)
 
 
@@ -148,7 +144,6 @@ def table_of(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def measure(study: cs.Study, folder: Path) -> list[cs.Finding]:
-    """The table on all data, and the finding."""
     rows = []
     for case in drives(folder):
         motions = [
@@ -179,27 +174,12 @@ def drives(folder: Path) -> Iterator[Case]:
         yield data.sequence_case(folder / data.KITTI, np.random.default_rng(0), step=step)
 
 
-def main(study: cs.Study) -> list[cs.Finding]:
-    """Needs the data in the folder CONSISTENCY_DATA."""
-    folder = os.environ.get("CONSISTENCY_DATA")
-    if not folder:
-        print(f"front-end: set CONSISTENCY_DATA to the folder that holds {data.KITTI}", file=sys.stderr)
-        return []
-    return measure(study, Path(folder))
-
-
 def command(arguments: Sequence[str] | None = None) -> None:
     """Write OUT as `consistency reproduce` does."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="folder with the data sets")
-    parser.add_argument("--out", type=Path, required=True, help="folder to write")
-    parser.add_argument("--overwrite", action="store_true", help="replace an output folder of this bench")
-    given = parser.parse_args(arguments)
-    require_free(given.out, given.overwrite, "findings")
+    given = scripts.options_of(__doc__, arguments, "folder with the data sets")
     study, started = cs.Study(runs=1, seed=31), time.monotonic()
     findings = measure(study, given.data)
-    study.write(given.out, findings, time.monotonic() - started, given.overwrite)
-    show(findings_table(findings))
+    scripts.keep(study, findings, given, started)
     print(f"results in {given.out}")
 
 

@@ -64,12 +64,10 @@ def clusters(count: int, seed: int, centres: list[tuple[float, float]], radius: 
 
 
 def both(table: str, **values: Any) -> dict[str, Any]:
-    """Values that truth and belief have in common."""
     return {f"{half}__{table}__{key}": value for half in ("truth", "belief") for key, value in values.items()}
 
 
 def odometry(factor: float) -> dict[str, Any]:
-    """So many times the noise of both velocities."""
     motion = BASE.truth.motion
     return both("motion", sigma_v=factor * motion.sigma_v, sigma_omega=factor * motion.sigma_omega)
 
@@ -80,7 +78,6 @@ def mounted(position: tuple[float, float, float], pitch: float = 0.0, roll: floa
 
 
 def effect(kind: str, **keys: Any) -> dict[str, Any]:
-    """One effect of the sensor."""
     return {"truth__sensor__effects": [{"kind": kind, **keys}]}
 
 
@@ -216,7 +213,6 @@ def pooled(runs: Sequence[tuple[str, Array]], kind: str) -> dict[str, Any]:
 
 
 def finding(study: cs.Study, ours: pd.DataFrame, kinds: pd.DataFrame) -> cs.Finding:
-    """Whether the rule is met, and what was measured."""
     asked = kinds[kinds["kind"] != APART]
     surely = float(ours[ours["kind"] != APART]["low"].max())
     failures = int(ours["failures"].sum())

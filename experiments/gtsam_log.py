@@ -26,9 +26,15 @@ from consistency.referee.errors import InputError
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
-from consistency.stereo.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
-from consistency.stereo.frontend.planar_log import CAMERA, relative
-from consistency.stereo.frontend.tum_output import trajectory_text
+from consistency.stereo.frontend.images_to_log import trajectory_text
+from consistency.stereo.frontend.planar_log import (
+    CAMERA,
+    in_robot_axes,
+    planar_motions,
+    planar_path,
+    relative,
+    robot_axes,
+)
 from consistency.stereo.visual_odometry.sequence import read_table
 
 if TYPE_CHECKING:
@@ -122,7 +128,6 @@ def log_of(data: Factors) -> tuple[Trial, Belief]:
 
 
 def main() -> None:
-    """Write the log."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name, text in (("factors", "frame, landmark, u left, u right, v, x, y, z in each line"),
                        ("poses", "frame and 4 x 4 matrix in each line, by visual odometry"),

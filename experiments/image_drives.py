@@ -1,6 +1,8 @@
-"""Drives before rendered scenes, for e25_image_tracks.py: experiment 1 and figures 6 and 9 of Herath et al. (2007)."""
+"""Drives before rendered scenes, for e24 and e25: experiment 1 and figures 6 and 9 of Herath et al. (2007)."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -9,8 +11,7 @@ from consistency.stereo.rendered_images.camera import StereoCamera
 from consistency.stereo.rendered_images.chain import Chain, Tracks
 from consistency.stereo.rendered_images.protocols import Stops, pose_at, wall_texture
 from consistency.stereo.rendered_images.render import film
-from consistency.stereo.rendered_images.scene import Layer, Scene
-from consistency.stereo.rendered_images.texture import Plain, RandomTexture
+from consistency.stereo.rendered_images.scene import Layer, Plain, RandomTexture, Scene
 
 
 def retreat(chain: Chain, camera: StereoCamera, stops: Stops, rng: np.random.Generator, shake: float = 0.0) -> Tracks:
@@ -112,3 +113,15 @@ def _residual(uv: Array, places: Array, f: float, steps: int) -> float:
         weight = 1.0 / np.where(np.abs(depth) > 0.05, depth, 0.05)
     error = weight * (rows * (point - twice)).sum(axis=1)
     return float(np.sqrt(np.mean(error**2)))
+
+
+def bootstrap(
+    rng: np.random.Generator, parts: list[Array], statistic: Callable[[Array], Array], draws: int, level: float
+) -> tuple[float, float]:
+    """Interval of the least entry of a statistic of all parts together, from drawing parts with replacement."""
+    drawn = [
+        np.min(statistic(np.concatenate([parts[k] for k in rng.integers(0, len(parts), len(parts))])))
+        for _ in range(draws)
+    ]
+    low, high = np.quantile(drawn, [level / 2, 1 - level / 2])
+    return float(low), float(high)

@@ -19,6 +19,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.referee.parsing import reading
 from consistency.referee.types import Array
+from consistency.stereo.frontend.planar_log import CAMERA
 from consistency.stereo.visual_odometry import tracks
 from consistency.stereo.visual_odometry.common_motion import screened
 from consistency.stereo.visual_odometry.sequence import read_table
@@ -35,7 +36,6 @@ BANDS = 3  # image columns that the slots are spread over
 SIZES = {  # px, rectified images by their focal length in px: calib_cam_to_cam.txt of the five days of KITTI raw
     721.5377: (1242, 375), 707.0493: (1224, 370), 718.3351: (1238, 374), 707.0912: (1226, 370), 718.8560: (1241, 376),
 }  # fmt: skip
-KITTI_FROM_SENSOR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # right, down, forward <- forward, left, up
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def log_of(data: Recording, slots: int = SLOTS, gated: bool = True) -> tuple[Tri
     slots : landmarks seen at once, at most
     gated : whether a landmark begins anew where it leaves the common motion
     """
-    mount = Mount(position=tuple(data.lever), rotation=roll_pitch_heading(data.axes.T @ KITTI_FROM_SENSOR))
+    mount = Mount(position=tuple(data.lever), rotation=roll_pitch_heading(data.axes.T @ CAMERA))
     searched = MIN_DISPARITY, float(data.size[0])  # the tracker has no other limit than the image
     sensor = BelievedSensor(model="uvd", sigma=SIGMA_PX, f=data.f, B=data.B, mount=mount, disparity=searched)
     belief = Belief(motion=BelievedMotion(sigma_v=SIGMA_V, sigma_omega=SIGMA_OMEGA), sensor=sensor)

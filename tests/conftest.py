@@ -14,6 +14,8 @@ from hypothesis import settings
 import consistency as cs
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler import jit
+from consistency.bench.runs.trial_work import TrialWork
+from consistency.bench.store.trial_rows import RunOutcome
 
 gc.set_threshold(100_000, 20, 100)  # what is collected lives to the end
 pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin
@@ -32,7 +34,7 @@ LONGER = {
     "imaging_experiments", "imports", "isolating", "joint", "journal", "kept", "kept_cells", "kept_looks", "kernels",
     "lens_models", "log", "log_tables", "monitoring", "montecarlo", "offset", "overview", "own_error",
     "pytest_plugin", "recommend", "recording", "relative", "report_errors", "reporting", "reporting_files", "results",
-    "sensor_experiments", "sequential", "sequential_decisions", "skipping", "slurm", "sources", "static_limit",
+    "sensor_experiments", "sequential", "skipping", "slurm", "sources", "static_limit",
     "sweeps", "testing", "tuning", "vision_experiments", "vision_shared", "vision_small", "wrong_inputs",
 }  # fmt: skip
 
@@ -109,6 +111,25 @@ def dense() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Compiled, "local_from", 10**9)
         yield
+
+
+@pytest.fixture
+def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], list[int]]:
+    """Has an error raised in the place of a run; gives the list of the runs that are done."""
+
+    def arm(run: int, error: BaseException) -> list[int]:
+        one, done = TrialWork.__call__, list[int]()
+
+        def stopped(self: TrialWork, number: int) -> RunOutcome:
+            if number == run:
+                raise error
+            done.append(number)
+            return one(self, number)
+
+        monkeypatch.setattr(TrialWork, "__call__", stopped)
+        return done
+
+    return arm
 
 
 @pytest.fixture

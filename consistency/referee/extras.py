@@ -1,6 +1,7 @@
 """Optional packages: which extra brings which, what is missing here, and the one sentence that says how to install it.
 
-Also names of a package that are loaded on first use, since that is where a missing package is noticed.
+Also names of a package that are loaded on first use, and functions that are loaded when they are called, those of the
+bench by name: that is where a missing package is noticed.
 """
 
 from __future__ import annotations
@@ -171,3 +172,31 @@ def lazy_names(
             raise explained(error, f"{package}.{name}") or error from None
 
     return load, lambda: sorted(modules), sorted(modules)
+
+
+OUTSIDE = {  # may need an extra
+    "results": "bench.runs.results_to_records:source_of",  # of the bench, in memory or in a folder
+    "innovations": "bench.runs.results_to_records:innovations_of",  # of one run in a folder of results
+    "report": "bench.pages:write_reports",  # of a folder of results
+    "pilot": "bench.runs.sequential:pilots_in",  # runs in a folder of results, to plan by
+    "pilot runs": "bench.runs.sequential:pilots_in_world",  # runs of a scenario, to plan by
+    "columns": "bench.store.parquet:read_columns",  # of a Parquet file
+}
+
+
+def function_at(target: str) -> Callable[..., Any]:
+    """The function that ``module:function`` names, of a module below ``consistency``."""
+    module, name = target.split(":")
+    function: Callable[..., Any] = getattr(import_module(f"consistency.{module}"), name)
+    return function
+
+
+def outside(name: str) -> Callable[..., Any]:
+    """The function of that name.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        A package of its extra is not installed.
+    """
+    return function_at(OUTSIDE[name])

@@ -96,7 +96,7 @@ def is_folder(path: Path) -> bool:
         return False
 
 
-def read_text(path: Path, refusal: str, largest: int | None = LARGEST, encoding: str = "utf-8") -> str:
+def read_text(path: Path, refusal: str, largest: int = LARGEST) -> str:
     """All of a text file.
 
     Raises
@@ -108,9 +108,9 @@ def read_text(path: Path, refusal: str, largest: int | None = LARGEST, encoding:
         size = path.stat().st_size
         if not path.is_file():
             raise InputError(f"{path}: is {'a folder' if path.is_dir() else 'a device'}, not a file")
-        if largest is not None and size > largest:
+        if size > largest:
             raise InputError(f"{path}: has {size / 2**20:.0f} MiB; at most {largest / 2**20:.0f} MiB are read")
-        return path.read_text(encoding=encoding)
+        return path.read_text(encoding="utf-8")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -18,17 +18,15 @@ def data_folder(name: str) -> Path:
 
 
 def summaries() -> dict[str, dict[str, str]]:
-    """What each scenario, experiment and sweep is, in a line, by kind and name."""
     experiments = data_folder("experiments")
+    scripts = {path.stem: path.read_text(encoding="utf-8") for path in sorted(experiments.glob("e[0-9][0-9]_*.py"))}
     return {
         "scenarios": _of_tables(data_folder("scenarios")),
-        "experiments": {path.stem: _first_line(path) for path in sorted(experiments.glob("e[0-9][0-9]_*.py"))},
+        "experiments": {
+            name: (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0] for name, text in scripts.items()
+        },
         "sweeps": _of_tables(experiments / "sweeps"),
     }
-
-
-def _first_line(script: Path) -> str:
-    return (ast.get_docstring(ast.parse(script.read_text(encoding="utf-8"))) or "").partition("\n")[0]
 
 
 def _of_tables(folder: Path) -> dict[str, str]:

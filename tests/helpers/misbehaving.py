@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -153,6 +154,20 @@ def ignores_signals(*_: Any) -> None:
     loops()
 
 
+def is_gone(pid: int, patience: float = 10.0) -> bool:
+    """Whether a process ends in good time; it may have to be reaped by others than us."""
+    until = time.monotonic() + patience
+    while time.monotonic() < until:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
 TIME_OUT = "time-out after 1 s"
 NO_INNOVATION = "the innovation or its covariance is not finite"
 KINDS: dict[str, tuple[Callable[..., Any], str]] = {
@@ -185,6 +200,19 @@ KINDS: dict[str, tuple[Callable[..., Any], str]] = {
     "complex pose": (answers(mean=np.full(3, 1 + 1j)), "TypeError: pose() gave numbers of type complex128, not real"),
     "text for a pose": (answers(mean=["1", "2", "3"]), "TypeError: pose() gave numbers of type <U1, not real"),
     "too few numbers": (answers(mean=np.zeros(2)), "ValueError: pose() gave an array of shape (2,), not (3,)"),
+    "raises": (raises(RuntimeError("out of ideas")), "RuntimeError: out of ideas"),
+    "NaN pose": (answers(mean=np.full(3, np.nan)), "the estimate is not finite"),
+    "indefinite": (answers(covariance=np.diag([1.0, 1.0, -1.0])), "the pose covariance is not positive definite"),
+    "singular": (answers(covariance=np.diag([1.0, 1.0, 0.0])), "the pose covariance is not positive definite"),
+    "asymmetric": (answers(covariance=np.eye(3) + 1e-3 * np.eye(3, k=1)), "the pose covariance is not symmetric"),
+    "small covariance": (
+        answers(covariance=np.eye(2)),
+        "ValueError: pose() gave an array of shape (2, 2), not (3, 3)",
+    ),
+    "negative S": (
+        answers(innovation=np.ones(3), S=-np.eye(3)),
+        "the innovation covariance is not positive definite",
+    ),
     "NaN innovation": (answers(innovation=np.full(1, np.nan), S=np.eye(1)), NO_INNOVATION),
     "infinite S": (answers(innovation=np.ones(1), S=np.full((1, 1), np.inf)), NO_INNOVATION),
     "infinite NIS": (answers(innovation=np.full(1, 1e200), S=np.eye(1)), "the NIS is not finite"),

@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from estimates import apart
 
 import consistency as cs
 from consistency.bench.filters import usable_names
 from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.compiled import Compiled, problem_for
-from consistency.bench.filters.compiler.dispatch import require_fitting
-from consistency.bench.filters.kernel.gain import linearise_seen
 from consistency.bench.filters.kernel.part_functions import (
     State,
     insert_error,
@@ -31,15 +30,16 @@ from consistency.bench.filters.kernel.part_functions import (
     retract,
     stands_apart,
 )
+from consistency.bench.filters.kernel.update_steps import linearise_seen
 from consistency.bench.filters.kernel.work_arrays import make_work
 from consistency.bench.filters.motion.unicycle import Unicycle
-from consistency.bench.filters.point.truth import AtTruth
+from consistency.bench.filters.point.at_known import AtTruth
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.filters.textbook.sensors import view
 from consistency.bench.protocols import Problem
-from consistency.bench.types import Control, Estimates, Gaussian, Info, Observation, Trial
+from consistency.bench.types import Control, Gaussian, Info, Observation, Trial
 from consistency.referee.types import Array
 
 pytestmark = pytest.mark.usefixtures("dense")  # test_local_updating.py compares it with local updating
@@ -292,27 +292,15 @@ def test_the_gap_to_the_kalman_filter_at_the_truth_shrinks_with_the_noise(small:
 # --- twins -----------------------------------------------------------------------------------------
 
 
-def difference(a: Estimates, b: Estimates) -> float:
-    """Largest difference of poses (m, rad), of covariances and of NIS relative to their size."""
-    assert a.failure is None
-    assert b.failure is None
-    size = np.abs(b.covariance).max(axis=(1, 2), keepdims=True)
-    nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
-    assert a.log_det is not None
-    assert b.log_det is not None
-    nis = max(nis, np.nanmax(np.abs(a.log_det - b.log_det)))
-    return float(max(np.abs(a.pose - b.pose).max(), (np.abs(a.covariance - b.covariance) / size).max(), nis))
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_kernel_equals_its_twin_over_a_trial(small: Small, name: str, tilted: dict[str, Any]) -> None:
     mount = mounted(name, tilted)
     scenario = small(world_of(name), truth__steps=200, truth__sensor__mount=mount, belief__sensor__mount=mount)
     trial, filter_ = cs.simulate(scenario, run=2), cs.get_filter(name)
     ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
-    assert difference(ours, twin) < 1e-10
+    assert apart(ours, twin) < 1e-10
     straight = small(world_of(name), truth__steps=200, truth__sensor__mount=mount)  # negative control
-    assert difference(filter_.run(trial, straight.belief), twin) > 1e-6
+    assert apart(filter_.run(trial, straight.belief), twin) > 1e-6
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -331,9 +319,3 @@ def test_the_map_is_that_of_the_twin(small: Small, name: str) -> None:
     rows = (3 * rows[:, None] + np.arange(3)).ravel()
     assert close(joint.mean[rows], np.append(filter_.pose(state).mean, ours.mean), 1e-10)
     assert np.abs(ours.joint - joint.covariance[np.ix_(rows, rows)]).max() <= 1e-10 * np.abs(ours.joint).max()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_combinations_fit(small: Small, name: str) -> None:
-    trial, scenario, filter_ = cs.simulate(small(world_of(name))), small(world_of(name)), cs.get_filter(name)
-    require_fitting(filter_.parts(problem_for(filter_, trial, scenario.belief), np.array(trial.controls)))

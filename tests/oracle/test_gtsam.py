@@ -64,7 +64,6 @@ class Dense:
         self.labels = np.unique(trial.landmark)
         self.sigma_motion = np.array([self.belief.motion.sigma_v, self.belief.motion.sigma_omega])
         self.rows = trial.step - 1
-        assert trial.landmarks is not None
         self.start = np.concatenate([np.zeros(2 * trial.steps), trial.landmarks[self.labels].ravel()])
 
     def poses(self, x: Array) -> Array:
@@ -111,7 +110,6 @@ def test_every_pose_and_landmark_is_that_of_a_dense_gauss_newton(sparse: cs.Scen
     assert np.abs((ours.pose - poses)[1:] / sigma).max() < 1e-4
     assert np.abs((ours.covariance - covariances)[1:] / (sigma[:, :, None] * sigma[:, None, :])).max() < 1e-4
     assert np.abs(ours.covariance[0] - covariances[0]).max() < 1e-4 * covariances[0].max()
-    assert ours.map is not None
     assert np.array_equal(ours.map.landmarks, dense.labels)
     blocks = np.array([P[i : i + 3, i : i + 3] for i in range(2 * trial.steps, len(x), 3)])
     sigma = np.sqrt(np.einsum("kii->ki", blocks))
@@ -172,7 +170,6 @@ def test_the_whole_likelihood_is_greatest_with_the_search_range(sparse: cs.Scena
             "ki,ki->k", np.diff(poses[:, :2], axis=0), np.array([np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])]).T
         )
         noise = np.column_stack([v, np.diff(poses[:, 2])]) / trial.controls[:, :1] - trial.controls[:, 1:]
-        assert ours.map is not None
         x = np.concatenate([noise.ravel(), ours.map.mean.ravel()])
         scale = np.sqrt(np.diag(np.linalg.inv((J := complex_step(dense.residual, x)).T @ J)))
         low, high = ((edge - dense.expected(x)[:, 2].real) / far.belief.sensor.sigma[2] for edge in searched)
@@ -200,13 +197,13 @@ class LinearWorld:
     def moved(self, pose: Array, control: Control) -> Array:
         step = len(self.reference)
         at = self.reference.setdefault(0, self.problem.start) if step == 0 else self.reference[step - 1]
-        self.reference[max(step, 1)] = basics.Unicycle().move(at, control)
-        F, _ = basics.Unicycle().jacobians(at, control)
+        self.reference[max(step, 1)] = basics.move(at, control)
+        F, _ = basics.motion_jacobians(at, control)
         return self.reference[max(step, 1)] + F @ (pose - at)
 
     def motion(self, step: int, control: Control) -> Any:
         at, belief = self.reference[step - 1], self.problem.belief.motion
-        F, _ = basics.Unicycle().jacobians(at, control)
+        F, _ = basics.motion_jacobians(at, control)
         turn, ahead = heading_matrix(at[2]).T, self.reference[step]
         sigmas = control.dt * np.array([belief.sigma_v, 1e-7 * belief.sigma_v, belief.sigma_omega])
 
@@ -218,7 +215,6 @@ class LinearWorld:
         return factor([pose_key(k) for k in (step - 1, step) if k > 0], sigmas, error)
 
     def placed(self, label: int, pose: Array, z: Array) -> Array:
-        assert self.problem.landmarks is not None
         self.origins[label] = self.problem.landmarks[label]
         return self.origins[label]
 
@@ -284,7 +280,6 @@ def test_what_cannot_be_solved_is_a_result_with_step_and_reason(sparse: cs.Scena
            - set(trial.landmark[: trial.first[k - 1]])]  # fmt: skip
     for filter_, step in ((Incremental("blind", BlindWorld), new[0]), (WholeTrialSmoother("blind", BlindWorld), 1)):
         failure = run_filter(filter_, trial, sparse.belief).failure
-        assert failure is not None
         assert failure.step in (step, step + 1)  # gtsam notices at once, or when it solves again
         assert "ndeterminate linear system detected while working near variable" in failure.reason
         assert "\n" not in failure.reason

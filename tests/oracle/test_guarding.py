@@ -9,21 +9,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from estimates import apart
 from mismatch import corrupted
 from scipy import stats
 
 import consistency as cs
 from consistency.bench.filters.compiled import Compiled, problem_of
 from consistency.bench.filters.compiler.jit import Kernel
-from consistency.bench.filters.guard import joint_compatibility, plain_rules
-from consistency.bench.filters.guard.guard_part import guard_part
-from consistency.bench.filters.guard.plain_rules import kept
-from consistency.bench.filters.guard.settings import KINDS, limits_of
+from consistency.bench.filters.guard import kernel_rules, plain_rules
+from consistency.bench.filters.guard.guard_part import guard_part, keep_agreeing
+from consistency.bench.filters.guard.plain_rules import KINDS, kept, limits_of
 from consistency.bench.filters.kernel import loop
-from consistency.bench.filters.kernel.part_functions import keep_some, make_watch
+from consistency.bench.filters.kernel.part_functions import make_watch
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.scenario import GuardSettings
-from consistency.bench.types import Estimates, Observation
+from consistency.bench.types import Observation
 from consistency.referee.types import Array, Indices
 
 Small = Callable[..., cs.Scenario]
@@ -93,7 +93,7 @@ ORACLES = {"gate": by_gate, "joint": by_subsets, "ransac": by_updates}
 def by_kernel(kind: str, step: Step) -> Array:
     guard = guard_part(kind, SETTINGS, step.s, step.m)
     watch: Any = make_watch(guard, step.s, step.m, step.m, step.m)
-    assert keep_some(guard, step.s, step.m, step.y, np.triu(step.S), watch)  # the upper half alone
+    assert keep_agreeing(guard, step.s, step.m, step.y, np.triu(step.S), watch)  # the upper half alone
     return np.array(watch.kept)
 
 
@@ -110,17 +110,11 @@ def test_decisions_are_those_of_the_definitions(kind: str, rng: np.random.Genera
     assert {0, 1, 2} <= sizes  # cases in which something happened
 
 
-def test_kinds_differ(rng: np.random.Generator) -> None:
-    steps = [Step(rng, 6, 3) for _ in range(60)]
-    decisions = {kind: [tuple(ORACLES[kind](step)) for step in steps] for kind in KINDS}
-    assert decisions["gate"] != decisions["joint"] != decisions["ransac"] != decisions["gate"]
-
-
 @pytest.mark.parametrize("nodes", [1, 3, 7, 20])
 def test_a_search_that_is_cut_short_is_so_at_the_same_node(
     nodes: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (plain_rules, joint_compatibility):
+    for module in (plain_rules, kernel_rules):
         monkeypatch.setattr(module, "MOST_NODES", nodes)
     for _ in range(40):
         step = Step(rng, 6, 3)
@@ -128,22 +122,12 @@ def test_a_search_that_is_cut_short_is_so_at_the_same_node(
         assert plain.tolist() == by_kernel("joint", step).tolist()
 
 
-def test_a_gate_rejects_as_many_right_observations_as_it_says(rng: np.random.Generator) -> None:
-    """Independent draws; false-alarm rate 1e-6."""
-    y, settings = rng.normal(size=3 * 4000), GuardSettings(confidence=0.9)
-    rejected = ~np.concatenate(
-        [kept("gate", part, np.eye(12), 3, limits_of(settings, 3, 4)) for part in y.reshape(-1, 12)]
-    )
-    assert stats.binomtest(int(rejected.sum()), len(rejected), 0.1).pvalue > 1e-6
-    assert stats.binomtest(int(rejected.sum()), len(rejected), 0.15).pvalue < 1e-6  # negative control
-
-
 def test_a_covariance_that_is_not_definite_ends_the_run(rng: np.random.Generator) -> None:
     step = Step(rng, 2, 3)
     step.S[2, 2] = -1.0
     guard = guard_part("gate", SETTINGS, 3, 2)
     watch: Any = make_watch(guard, 3, 2, 2, 2)
-    assert not keep_some(guard, 3, 2, step.y, step.S, watch)
+    assert not keep_agreeing(guard, 3, 2, step.y, step.S, watch)
     with pytest.raises(np.linalg.LinAlgError):
         kept("gate", step.y, step.S, 3, limits_of(SETTINGS, 3, 2))
 
@@ -166,15 +150,6 @@ INTERPRETED = [
 ]  # fmt: skip
 
 
-def difference(a: Estimates, b: Estimates) -> float:
-    """Largest difference of poses (m, rad), of covariances and of NIS relative to their size."""
-    assert a.failure is None
-    assert b.failure is None
-    size = np.abs(b.covariance).max(axis=(1, 2), keepdims=True)
-    nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
-    return float(max(np.abs(a.pose - b.pose).max(), (np.abs(a.covariance - b.covariance) / size).max(), nis))
-
-
 def first_sightings(trial: cs.Trial) -> Indices:
     """Row of the first observation of each landmark."""
     return np.unique(trial.landmark, return_index=True)[1]
@@ -186,17 +161,13 @@ def agree(name: str, scenario: cs.Scenario, rng: np.random.Generator) -> None:
     trial = replace(trial, z=wrong)
     ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
     assert ours.filter == twin.filter == name
-    assert ours.rejected is not None
-    assert twin.rejected is not None
     assert ours.rejected.tolist() == twin.rejected.tolist()
     assert (ours.rejected & trial.spurious).any()
     assert ours.rejected[first_sightings(trial)].any()  # of landmarks that began anew
-    assert difference(ours, twin) < 1e-7  # rounding, which what is wrong and accepted amplifies; 2e-8 on one processor
+    assert apart(ours, twin) < 1e-7  # rounding, which what is wrong and accepted amplifies; 2e-8 on one processor
     assert ours.nis_dof.tolist() == twin.nis_dof.tolist()
-    assert ours.map is not None
-    assert twin.map is not None
     assert ours.map.landmarks.tolist() == twin.map.landmarks.tolist()
-    assert difference(filter_.run(cs.simulate(scenario, run=2), scenario.belief), twin) > 1e-6  # negative control
+    assert apart(filter_.run(cs.simulate(scenario, run=2), scenario.belief), twin) > 1e-6  # negative control
 
 
 @pytest.fixture
@@ -230,7 +201,6 @@ def test_a_guarded_kernel_is_the_guarded_twin(small: Small, name: str, world: st
 def test_what_is_compiled_of_a_guarded_filter_is_its_guarded_twin(
     small: Small, name: str, world: str, rng: np.random.Generator
 ) -> None:
-    agree(name, small(world, truth__steps=STEPS), rng)
     agree(name, of_tracks(small(world, truth__steps=STEPS)), rng)
 
 
@@ -266,13 +236,9 @@ def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None
     filter_ = cs.get_filter(name)
     ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
     wrong = first_sightings(trial)[np.isin(np.unique(trial.landmark), [*AGAIN])]
-    assert ours.rejected is not None
-    assert twin.rejected is not None
     assert ours.rejected[wrong].all()
     assert ours.rejected.tolist() == twin.rejected.tolist()
-    assert difference(ours, twin) < 1e-8
-    assert ours.map is not None
-    assert trial.landmarks is not None
+    assert apart(ours, twin) < 1e-8
     for label in AGAIN:  # where they are: 1e-9 of a chi-square with 3 degrees of freedom lies beyond 45
         at = ours.map.landmarks.tolist().index(label)
         gap = ours.map.mean[at] - trial.landmarks[label]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bench_trials import growing, grown
+from estimates import apart
 
 import consistency as cs
 from consistency.bench.filters.stepping import step_through
@@ -36,19 +37,11 @@ def run(name: str, trial: Trial, belief: Belief, local_from: int, monkeypatch: p
 
 
 def gap(a: Estimates, b: Estimates) -> float:
-    """Largest difference of poses, of covariances in correlation units, of NIS relative to it, and of the maps."""
-    assert a.failure is None
-    assert b.failure is None
-    assert np.array_equal(a.nis_dof, b.nis_dof)
-    sigma = np.sqrt(np.einsum("kii->ki", b.covariance))
-    scale = np.maximum(sigma[:, :, None] * sigma[:, None, :], 1e-30)
-    nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
-    assert a.map is not None
-    assert b.map is not None
+    """As :func:`apart`, and of the maps."""
     assert np.array_equal(a.map.landmarks, b.map.landmarks)
     spread = np.abs(b.map.covariance).max(axis=(1, 2), keepdims=True)
     points = max(np.abs(a.map.mean - b.map.mean).max(), (np.abs(a.map.covariance - b.map.covariance) / spread).max())
-    return float(max(np.abs(a.pose - b.pose).max(), (np.abs(a.covariance - b.covariance) / scale).max(), nis, points))
+    return float(max(apart(a, b), points))
 
 
 @pytest.mark.parametrize(("name", "world"), ALL)
@@ -118,5 +111,4 @@ def test_a_failure_is_in_the_same_step(monkeypatch: pytest.MonkeyPatch, steps: i
     broken = cs.Trial(0, t.start, t.controls, t.first, t.landmark, z, t.n_landmarks, t.truth)
     local, dense = (run("ekf-xyz", broken, case.belief, each, monkeypatch) for each in (10, NEVER))
     assert local.failure == dense.failure
-    assert local.failure is not None
     assert local.failure.step >= steps

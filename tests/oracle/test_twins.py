@@ -12,8 +12,7 @@ import pytest
 import consistency as cs
 from consistency.bench.filters.kernel.loop import trial_kernel
 from consistency.bench.filters.stepping import step_through
-from consistency.bench.filters.textbook.ckf import CUBATURE
-from consistency.bench.filters.textbook.ukf import sigma_points
+from consistency.bench.filters.textbook.ukf import CUBATURE, sigma_points
 from consistency.bench.scenario import Belief
 from consistency.bench.simulation import planned_path
 from consistency.bench.types import Estimates, Trial
@@ -33,8 +32,6 @@ def differences(a: Estimates, b: Estimates) -> tuple[float, float, float]:
     assert np.array_equal(a.nis_dof, b.nis_dof)
     assert np.array_equal(np.isfinite(a.nis), b.nis_dof > 0)
     nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
-    assert a.log_det is not None
-    assert b.log_det is not None
     log_det = np.nanmax(np.abs(a.log_det - b.log_det))
     return float(pose), float(covariance), float(max(nis, log_det))
 
@@ -52,16 +49,11 @@ def compiled(name: str, trial: Trial, belief: Belief) -> Estimates:
 # --- twins -----------------------------------------------------------------------------------
 
 CASES: list[tuple[str, str, int, dict[str, Any]]] = [
-    ("kf", "linear-gaussian", 300, {}),
-    ("ekf-xyz", "herath2007-xyz", 500, {}),
     ("ekf-xyz", "herath2007-stereo", 300, {}),
     ("ekf-xyz", "long-loop", 300, {}),
-    ("ekf-uvd", "herath2007-stereo", 500, {}),
     ("ekf-uvd", "herath2007-wide-baseline", 150, {"truth__motion__noise_on": "motion"}),
-    ("ukf-xyz", "herath2007-xyz", 120, {}),
     ("ukf-xyz", "herath2007-stereo", 120, {}),
     ("ukf-xyz", "herath2007-xyz", 120, MERWE),
-    ("ukf-uvd", "herath2007-stereo", 300, {}),
     ("ukf-uvd", "herath2007-wide-baseline", 120, {"truth__path": EIGHT}),
     ("ukf-uvd", "herath2007-wide-baseline", 120, MERWE),
 ]
@@ -74,29 +66,6 @@ def test_kernel_equals_its_twin(small: Small, name: str, world: str, steps: int,
     assert agree(
         compiled(name, trial, scenario.belief), step_through(cs.get_filter(name).textbook, trial, scenario.belief)
     )
-
-
-@pytest.mark.parametrize(
-    ("name", "world"),
-    [
-        ("kf", "linear-gaussian"),
-        ("ekf-xyz", "herath2007-xyz"),
-        ("ekf-xyz", "herath2007-stereo"),
-        ("ekf-uvd", "herath2007-stereo"),
-        ("ukf-xyz", "herath2007-stereo"),
-        ("ukf-uvd", "herath2007-stereo"),
-    ],
-)
-def test_kernel_equals_its_twin_with_a_tilted_camera(
-    small: Small, name: str, world: str, tilted: dict[str, list[float]]
-) -> None:
-    scenario = small(world, truth__sensor__mount=tilted, belief__sensor__mount=tilted)
-    trial = cs.simulate(scenario)
-    ours = compiled(name, trial, scenario.belief)
-    assert agree(ours, step_through(cs.get_filter(name).textbook, trial, scenario.belief))
-    # negative control: a filter that takes the camera to look straight ahead says something else
-    straight = small(world, truth__sensor__mount=tilted)
-    assert not max(differences(compiled(name, trial, straight.belief), ours)) < 1e-6
 
 
 def test_the_four_steps_of_a_compiled_filter_are_its_twin(uvd: cs.Scenario) -> None:
@@ -115,15 +84,6 @@ def test_one_compiled_signature_serves_every_caller(uvd: cs.Scenario) -> None:
     again = compiled("ekf-uvd", turned, uvd.belief)
     assert np.array_equal(again.pose, ours.pose)
     assert len(trial_kernel._entries) == signatures
-
-
-def test_sigma_points_matter(small: Small) -> None:
-    """Negative control: the comparison would see sigma points that are not taken from the belief."""
-    trial = cs.simulate(small("herath2007-stereo"))
-    default, merwe = (
-        compiled("ukf-uvd", trial, small("herath2007-stereo", **changes).belief) for changes in ({}, MERWE)
-    )
-    assert not agree(default, merwe, 1e-6)
 
 
 def test_the_cubature_filter_has_its_points_whatever_the_belief_says(small: Small) -> None:

@@ -13,9 +13,8 @@ from consistency.referee.geometry import rotation
 from consistency.stereo.visual_odometry import RelativePose, StereoRig, register_svd, triangulate
 from consistency.stereo.visual_odometry.cameras.rig import solved
 from consistency.stereo.visual_odometry.propagation import registration_derivatives, triangulation_derivatives
-from consistency.stereo.visual_odometry.refinement import _profile
-from consistency.stereo.visual_odometry.robust_loss import loss
-from consistency.stereo.visual_odometry.two_frame_cost import Measure, PixelMatches, PointMatches, TwoFrames
+from consistency.stereo.visual_odometry.refinement import _profile, loss
+from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches, PointMatches, TwoFrames
 from consistency.stereo.visual_odometry.two_frame_cost import derivatives as two_frame_derivatives
 
 Array = np.ndarray[Any, Any]
@@ -109,7 +108,7 @@ def test_registration(vector: tuple[float, ...], rng: np.random.Generator) -> No
 
 @pytest.mark.parametrize("vector", POSES[:2])
 @pytest.mark.parametrize("measure", [PointMatches(), PixelMatches(RIG)], ids=["points", "pixels"])
-def test_two_frames(measure: Measure, vector: tuple[float, ...], rng: np.random.Generator) -> None:
+def test_two_frames(measure: PointMatches | PixelMatches, vector: tuple[float, ...], rng: np.random.Generator) -> None:
     """All blocks of the cost of pose and points, at noisy measurements with correlated noise."""
     pose = RelativePose.from_vector(np.array(vector))
     n = 4

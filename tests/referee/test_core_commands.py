@@ -73,12 +73,6 @@ def test_innovations_from_a_pipe(folder: Path) -> None:
     assert "alarm" in out + err
 
 
-def test_a_plan(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = here(["plan", "--dof", "3"], capsys)
-    assert status == 0
-    assert out.startswith("61 runs")
-
-
 @pytest.mark.parametrize("command", ["", "analyse", "compare", "baseline", "monitor", "plan"])
 def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = here([*command.split(), "--help"], capsys)

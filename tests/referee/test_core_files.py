@@ -1,4 +1,4 @@
-"""Files of every format that the core reads, and what it refuses."""
+"""Files of every format that the core reads, what it refuses, and truth between its samples against known motions."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.space_errors import se3_log, spatial_error
+from consistency.referee.geometry.groups import se3_log, spatial_error
 from consistency.referee.readers.formats.sheet import read_sheet
+from consistency.referee.readers.matching import BRIDGED, truth_at
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.read_files import read_recordings
+from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import _known
 
 
@@ -52,23 +54,6 @@ def test_a_trajectory_in_another_world(align: str, tmp_path: Path) -> None:
         np.savetxt(path, rows, fmt="%.17g")
     assert np.abs(cs.read(est, truth=true, covariance=cov, axes=["x", "y", "z"]).error).max() > 1.0
     assert np.nanmax(np.abs(cs.read(est, truth=true, covariance=cov, align=align).error)) < 1.0
-
-
-def test_an_archive(tmp_path: Path) -> None:
-    record = cs.read(inputs.archive(tmp_path, 2.0))
-    np.testing.assert_array_equal(record.error.ravel(), 2.0 * inputs.normal(inputs.RUNS * inputs.STEPS, 2).ravel())
-    assert cs.judge(record).status == "overconfident"
-
-
-def test_nees_alone(tmp_path: Path) -> None:
-    np.savez(tmp_path / "nees.npz", nees=np.square(inputs.normal(200, 3)).sum(axis=1)[:, None], dof=3)
-    assert cs.judge(cs.read(tmp_path / "nees.npz")).status == "consistent"
-
-
-def test_windows_of_motions(tmp_path: Path) -> None:
-    est, true = inputs.drive(tmp_path)
-    record = cs.read(est, truth=true, relative=20, motions=True)
-    assert cs.judge(record).status == "consistent"
 
 
 def test_a_state_of_other_columns(tmp_path: Path) -> None:
@@ -140,3 +125,86 @@ def test_an_unknown_key_of_a_baseline() -> None:
 
 def test_no_run_needs_no_hint() -> None:
     assert hints("a", ("x", "y", "heading"), []) == []
+
+
+# --- truth between its samples --------------------------------------------------------------------------------
+
+
+T = 100.0 + 0.1 * np.arange(30)
+
+
+@pytest.fixture
+def times() -> Array:
+    return np.sort(np.random.default_rng().uniform(T[0], T[-1], 50))
+
+
+def straight(t: Array) -> Array:
+    return np.outer(t, [1.0, -2.0, 0.5]) + np.array([3.0, 1.0, 0.0])
+
+
+def test_even_motion_is_met_exactly(times: Array) -> None:
+    """Straight on, and about one axis of the body, in space."""
+    axis = np.array([0.3, -0.5, 0.8])
+
+    start = Rotation.from_euler("ZYX", [0.4, -0.7, 1.1])
+
+    def motion(t: Array) -> Array:
+        return np.hstack([straight(t), (start * Rotation.from_rotvec(np.outer(t - 100.0, axis))).as_quat()])
+
+    known = truth_at(times, T, motion(T), "spatial", 0.0)
+    assert known.rows.tolist() == list(range(50))
+    np.testing.assert_allclose(known.truth[:, :3], straight(times), atol=1e-9)
+    turn = Rotation.from_quat(known.truth[:, 3:]).inv() * Rotation.from_quat(motion(times)[:, 3:])
+    assert turn.magnitude().max() < 1e-9
+    np.testing.assert_allclose(known.bend, 0.0, atol=1e-9)
+
+
+def test_a_quaternion_and_its_negative_are_one_turn(times: Array) -> None:
+    poses = np.hstack([straight(T), Rotation.from_rotvec(np.outer(T, [0, 0, 0.4])).as_quat()])
+    flipped = poses * np.where(np.arange(len(T))[:, None] % 2, np.append(np.ones(3), -np.ones(4)), 1.0)
+    one, other = (Rotation.from_quat(truth_at(times, T, p, "spatial", 0.0).truth[:, 3:]) for p in (poses, flipped))
+    assert (one.inv() * other).magnitude().max() < 1e-9
+
+
+def test_headings_go_the_short_way(times: Array) -> None:
+    heading = 1.7 * times
+    values = np.column_stack([np.cos(T), np.sin(T), wrap(1.7 * T)])
+    known = truth_at(times, T, values, "planar", 0.0)
+    np.testing.assert_allclose(wrap(known.truth[:, 2] - heading), 0.0, atol=1e-9)
+    assert np.abs(known.truth[:, 2]).max() <= np.pi
+    between = (T[:-1] + T[1:]) / 2.0  # one of them where the heading jumps
+    plain = truth_at(between, T, values, "vector", 0.0).truth[:, 2]
+    assert np.abs(wrap(plain - 1.7 * between)).max() > 0.5, "negative control"
+
+
+def test_at_a_sample_it_is_the_sample_to_the_bit() -> None:
+    values = np.random.default_rng().normal(size=(len(T), 7))
+    known = truth_at(T, T, values, "spatial", 0.0)
+    assert np.array_equal(known.truth, values)
+    assert known.before.tolist() == list(range(len(T)))
+    assert not known.apart.any()
+
+
+def test_what_is_bridged() -> None:
+    """A gap of a second is not, but near one of its ends; nor is what is before the first or after the last sample."""
+    reference = np.array([0.0, 0.1, 1.1, 1.1 + BRIDGED])
+    times = np.array([-0.02, -0.005, 0.05, 0.108, 0.12, 1.095, 1.15, 1.206, 1.25])
+    values = reference[:, None] * [1.0, 2.0]
+    known = truth_at(times, reference, values, "vector", 0.01)
+    assert known.rows.tolist() == [1, 2, 3, 5, 6, 7]
+    np.testing.assert_allclose(known.truth[:, 0], [0.0, 0.05, 0.108, 1.095, 1.15, 1.1 + BRIDGED], atol=1e-12)
+    np.testing.assert_allclose(known.truth[:, 1], 2.0 * known.truth[:, 0])
+    np.testing.assert_allclose(known.apart, [0.005, 0.05, 0.008, 0.005, 0.05, 0.006], atol=1e-12)
+
+
+def test_one_sample_serves_what_is_near() -> None:
+    known = truth_at(np.array([0.9, 0.995, 1.004]), np.array([1.0]), np.array([[7.0]]), "vector", 0.01)
+    assert (known.rows.tolist(), known.truth.ravel().tolist()) == ([1, 2], [7.0, 7.0])
+
+
+def test_the_bend_bounds_the_error_under_even_acceleration(times: Array) -> None:
+    a = np.array([2.0, -1.0, 0.5])
+    values = 0.5 * T[:, None] ** 2 * a
+    known = truth_at(times, T, values, "vector", 0.0)
+    error = np.linalg.norm(known.truth - 0.5 * times[:, None] ** 2 * a, axis=1)
+    np.testing.assert_allclose(known.bend, error, atol=1e-9)

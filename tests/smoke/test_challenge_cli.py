@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from command import consistency
+from own_process import consistency
 
 FAR = ("--within", "steps=50:100", "--within", "range=6:9", "--trials", "100", "--jobs", "1")
 
@@ -24,10 +24,3 @@ def test_a_world_is_found_and_can_be_run(tmp_path: Path) -> None:
     again = consistency("run", "far.toml", *options, cwd=tmp_path)
     assert data["status"] in again.stdout
     assert f"{data['anees']:.2f}" in again.stdout
-
-
-def test_unusable_input_is_one_line(tmp_path: Path) -> None:
-    done = consistency("challenge", "ekf-uvd", "--within", "range=8:2", cwd=tmp_path, status=2)
-    assert "--within range=8:2: give bounds as range=LOW:HIGH" in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert not list(tmp_path.iterdir())

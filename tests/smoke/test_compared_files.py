@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from command import consistency
+from own_process import consistency
 from recorded import read_recordings
 
-from consistency.referee.cli import main
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.baselines import baseline
 
@@ -93,23 +93,11 @@ def test_a_report_of_files(folder: Path) -> None:
     ],
 )
 def test_what_cannot_be_compared(
-    folder: Path,
-    command: tuple[str, ...],
-    said: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    folder: Path, refused: Callable[..., str], command: tuple[str, ...], said: str
 ) -> None:
-    monkeypatch.chdir(folder)
     (folder / "empty").mkdir(exist_ok=True)
     (folder / "kept.json").write_text("{}")
-    before = sorted(folder.iterdir())
-    with pytest.raises(SystemExit) as ended:
-        main(list(command))
-    done = capsys.readouterr()
-    assert ended.value.code == 2
-    assert said in done.err
-    assert done.out == ""
-    assert sorted(folder.iterdir()) == before
+    assert said in refused(folder, *command)
 
 
 def test_files_without_truth(folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from command import consistency
+from own_process import consistency
 
 WORLD, RUN = ("kf", "--scenario", "linear-gaussian"), ("run", "linear-gaussian", "--filter", "kf", "--runs", "1")
 

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command import begun, consistency, size_of
 from forks import LIMIT, Program
+from own_process import begun, consistency, size_of
 
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal

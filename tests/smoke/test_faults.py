@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command import COMPILING, begun, size_of
 from forks import LIMIT, Program
+from own_process import COMPILING, begun, size_of
 
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal
@@ -126,21 +126,6 @@ def test_killed_and_resumed(fresh: Path) -> None:
     done = kept(fresh)
     assert 0 < done < RUNS
     resume(fresh)
-
-
-@pytest.mark.slow
-def test_killed_and_begun_anew(fresh: Path) -> None:
-    process = begin(fresh)
-    wait_for(working(fresh), process)
-    process.kill()
-    process.communicate()
-    status, error = end(begin(fresh))
-    assert status == 2
-    said = f"unfinished work is there, with {kept(fresh)} finished runs; add --resume"
-    assert said in one_sentence(error)
-    status, error = end(begin(fresh, "--overwrite"))
-    assert status == 0, error
-    require_same(fresh)
 
 
 @pytest.mark.slow
@@ -256,18 +241,6 @@ def test_three_processes_on_one_place(fresh: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_place_that_is_taken_meanwhile(fresh: Path) -> None:
-    process = begin(fresh)
-    wait_for(working(fresh), process)
-    shutil.copytree(fresh / "whole", fresh / "out")
-    status, error = end(process)
-    assert status == 2
-    assert one_sentence(error).endswith("the finished work is in out-2")
-    require_same(fresh, "out-2")
-    assert not (fresh / UNFINISHED).exists()
-
-
-@pytest.mark.slow
 def test_results_that_are_removed_meanwhile(fresh: Path) -> None:
     """Those that a resume goes on from: the runs that it has done are kept."""
     assert end(begin(fresh, runs=50))[0] == 0
@@ -277,32 +250,6 @@ def test_results_that_are_removed_meanwhile(fresh: Path) -> None:
     assert end(process)[0] == 2
     assert kept(fresh) == RUNS - 50
     resume(fresh)
-
-
-@pytest.mark.slow
-def test_a_full_disk_that_is_freed(fresh: Path, tmp_path: Path) -> None:
-    """A file system of 16 MiB, of which something else takes 11; nobody but root may mount it."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=16m", "none", str(disk)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip("no file system can be mounted here")
-    try:
-        (disk / "ballast").write_bytes(bytes(11 * 2**20))
-        shutil.copy(fresh / "world.toml", disk)
-        status, error = end(begin(disk))
-        assert status == 2
-        done = kept(disk)
-        said = f"--out out: cannot be written (No space left on device); {done} finished runs are kept, and the same"
-        assert said in one_sentence(error)
-        assert 0 < done < RUNS
-        (disk / "ballast").unlink()
-        status, error = end(begin(disk, "--resume"))
-        assert status == 0, error
-        for path in (fresh / "whole").glob("*.parquet"):
-            assert (disk / "out" / path.name).read_bytes() == path.read_bytes(), path.name
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
 
 
 @pytest.mark.slow
@@ -328,19 +275,6 @@ def test_memory_that_is_taken_away(fresh: Path) -> None:
         assert kept(fresh) >= done > 0
         resume(fresh)
     require_same(fresh)
-
-
-@pytest.mark.slow
-def test_a_journal_that_is_cut_short_anywhere(fresh: Path) -> None:
-    process = begin(fresh)
-    wait_for(working(fresh), process)
-    process.kill()
-    process.communicate()
-    journal, done = fresh / UNFINISHED / "journal", kept(fresh)
-    cut = random.Random().randrange(journal.stat().st_size)
-    os.truncate(journal, cut)
-    assert kept(fresh) < done
-    resume(fresh)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")

@@ -29,7 +29,7 @@ from documents import PAGES, PROGRAMS, ROOT, SHELL, Block, Command, blocks, comm
 import consistency as cs
 from consistency.bench.challenging.worlds import space_of
 from consistency.bench.filters import filter_names
-from consistency.bench.filters.guard.settings import KINDS
+from consistency.bench.filters.guard.plain_rules import KINDS
 from consistency.bench.runs.findings import experiments
 from consistency.bench.scenario import data_folder, scenario_names
 from consistency.bench.sweeps.plan import load_sweep, sweep_names

@@ -49,10 +49,8 @@ def test_the_command_of_the_document_works(copy: Path) -> None:
     module, row = code("Add a command")
     assert row.count("\n") == 1
     (copy / "consistency/referee/cli/worst.py").write_text(module, encoding="utf-8")
-    table = copy / "consistency/referee/cli/commands.py"
     first = "    # the laboratory\n"
-    assert table.read_text(encoding="utf-8").count(first) == 1
-    table.write_text(table.read_text(encoding="utf-8").replace(first, f"{row.rstrip()},\n{first}"), encoding="utf-8")
+    changed(copy / "consistency/referee/cli/commands.py", first, f"{row.rstrip()},\n{first}")
     told = python(
         copy,
         "import sys\nfrom consistency.referee.cli import main\n"
@@ -76,15 +74,15 @@ def changed(path: Path, old: str, new: str) -> None:
 
 
 def test_the_question_of_the_document_is_asked(copy: Path) -> None:
-    """Three files; runs whose errors grow are found at fault, the same runs in random order are not."""
+    """Two files; runs whose errors grow are found at fault, the same runs in random order are not."""
     statistic, table, line = code("Add a question of the verdict")
     folder = copy / "consistency/referee/diagnostics"
     (folder / "questions/trend.py").write_text(statistic, encoding="utf-8")
     changed(folder / "verdict/answers.py", "\n\ndef answers(", f"{table}\n\ndef answers(")
     first = "    distribution = pit(sample.nees, sample.dof)\n"
-    changed(folder / "verdict/p_values.py", first, f"    {line.strip()}\n{first}")
+    changed(folder / "verdict/answers.py", first, f"    {line.strip()}\n{first}")
     changed(
-        folder / "verdict/p_values.py", "from consistency.referee.diagnostics.records.whitening",
+        folder / "verdict/answers.py", "from consistency.referee.diagnostics.records.whitening",
         "from consistency.referee.diagnostics.questions.trend import trend\n"
         "from consistency.referee.diagnostics.records.whitening",
     )  # fmt: skip
@@ -159,10 +157,8 @@ def test_the_bias_of_the_document_works(copy: Path) -> None:
     effect, line, key, test = code("Add a sensor effect")
     assert line.count("\n") == 1
     (copy / EFFECTS / "bias.py").write_text(effect, encoding="utf-8")
-    names = copy / EFFECTS / "__init__.py"
-    first = "from consistency.bench.scenario.effects.effect"
-    assert names.read_text(encoding="utf-8").count(first) == 1
-    names.write_text(names.read_text(encoding="utf-8").replace(first, line + first), encoding="utf-8")
+    names, first = copy / EFFECTS / "__init__.py", "from consistency.bench.scenario.effects.effect"
+    changed(names, first, line + first)
     scenario = (copy / "scenarios" / "herath2007-stereo.toml").read_text(encoding="utf-8")
     (copy / "mine.toml").write_text(f"{scenario}\n{key}", encoding="utf-8")
     (copy / "test_bias.py").write_text(test, encoding="utf-8")
@@ -175,7 +171,7 @@ def test_the_bias_of_the_document_works(copy: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert str(copy) in done.stdout
     assert "Bias(kind='bias', name=None, bias=(0.0, 0.0, 1.0))" in done.stdout
-    names.write_text(names.read_text(encoding="utf-8").replace(line, ""), encoding="utf-8")
+    changed(names, line, "")
     assert "'bias' is not one of" in python(copy, program).stderr  # negative control
 
 

@@ -26,8 +26,6 @@ DOCS = Path(__file__).parents[2] / "docs"
 def load(path: str, monkeypatch: pytest.MonkeyPatch | None = None) -> ModuleType:
     name = Path(path).stem
     spec = importlib.util.spec_from_file_location(name, DOCS / path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(DOCS / "_extensions"))
     try:

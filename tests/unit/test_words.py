@@ -49,6 +49,7 @@ def test_an_offset_in_some_steps_is_biased(rng: np.random.Generator) -> None:
     verdict = verdict_on(error, false_alarm=SURE)
     assert verdict.status == "biased"
     assert " sigma in axis 1, in step 12" in verdict.reasons[0]
+    assert verdict.reasons[0].lower().count("biased") == 1
 
 
 def test_an_offset_and_a_wrong_scale_are_both_said(rng: np.random.Generator) -> None:
@@ -62,8 +63,6 @@ def test_an_offset_and_a_wrong_scale_are_both_said(rng: np.random.Generator) -> 
 def test_an_offset_does_not_make_a_small_error_large(rng: np.random.Generator) -> None:
     """Errors of half the stated variance about a mean of 1.2 sigma in every axis: not 'overconfident'."""
     verdict = verdict_on(np.sqrt(0.5) * independent(rng, 100, 30, 3) + 1.2, false_alarm=SURE)
-    assert verdict.bias is not None
-    assert verdict.bias.inflation_without is not None
     assert verdict.bias.inflation_without.high < 0.6
     assert verdict.status in ("biased", "conservative")
 
@@ -194,7 +193,6 @@ def test_a_fault_from_the_start_has_no_date(rng: np.random.Generator) -> None:
     assert "visible" not in verdict.reasons[0]
     error = independent(rng, 30, 40, 3) * np.sqrt(np.linspace(1.3, 3.0, 40))[:, None]  # grows: visible late, not begun
     growing = verdict_on(error, false_alarm=1e-3)
-    assert growing.location is not None
     assert growing.location.since is None or growing.location.since > 1
 
 
@@ -318,18 +316,9 @@ def said_twice(text: str) -> bool:
 
 
 FLAWS = [
-    infinite,
-    placeholder,
-    zero_end,
-    wrong_number,
-    gap,
-    long,
-    same_correlations,
-    outside,
-    contradiction,
-    must_grow,
+    infinite, placeholder, zero_end, wrong_number, gap, long, same_correlations, outside, contradiction, must_grow,
     said_twice,
-]
+]  # fmt: skip
 KINDS = [worlds, one_component, six_components, some_diverged, without_error]
 
 
@@ -346,22 +335,16 @@ def sentences(kind: Callable[..., Iterator[Array]]) -> list[tuple[str, int]]:
     return texts
 
 
-def pairs() -> list[Any]:
-    return [pytest.param(kind, flaw) for kind in KINDS for flaw in FLAWS]
-
-
-@pytest.mark.parametrize(("kind", "flaw"), pairs())
+@pytest.mark.parametrize("flaw", FLAWS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_sentences_are_sound(kind: Callable[..., Iterator[Array]], flaw: Callable[[str], bool]) -> None:
     assert [text for text, _ in sentences(kind) if flaw(text)] == []
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_one_run_does_is_not_that_of_a_few(kind: Callable[..., Iterator[Array]]) -> None:
-    assert not any("a few runs" in text for text, runs in sentences(kind) if runs == 1)
-
-
-def test_no_error_at_all_is_not_made_by_a_few_runs() -> None:
-    assert not any("a few runs" in text for text, _ in sentences(without_error))
+    none_errs = kind is without_error
+    assert not any("a few runs" in text for text, runs in sentences(kind) if runs == 1 or none_errs)
 
 
 def test_the_flaws_are_seen() -> None:
@@ -387,11 +370,6 @@ def test_the_flaws_are_seen() -> None:
         assert flaw(bad[flaw])
         assert not flaw(good)
     assert not zero_end("covariance ratio 0.95 [0.87, 1.04]")
-
-
-def test_a_fault_of_one_run_is_not_that_of_a_few(rng: np.random.Generator) -> None:
-    for scale in (1e-3, 1e3, 1e8):
-        assert "a few runs" not in verdict_on(scale * independent(rng, 1, 50, 2)).reasons[0]
 
 
 def test_a_few_runs_that_make_the_mean_are_said(rng: np.random.Generator) -> None:
@@ -423,13 +401,6 @@ def test_one_run_that_failed_is_said_in_the_singular(rng: np.random.Generator) -
     assert "1 of 40 runs has " in verdict.reasons[0]
 
 
-def test_a_bias_in_a_step_is_said_once(rng: np.random.Generator) -> None:
-    error = independent(rng, 100, 30, 3)
-    error[:, 11, 1] += 2.0
-    text = verdict_on(error, false_alarm=SURE).reasons[0]
-    assert text.lower().count("biased") == 1
-
-
 # --- numbers in words --------------------------------------------------------------------------------------
 
 
@@ -459,12 +430,6 @@ def test_plural_and_p() -> None:
 
 
 # --- the whole verdict in text -------------------------------------------------------------------------------
-
-
-def test_a_sentence_about_many_axes_is_short(rng: np.random.Generator) -> None:
-    error = 1.5 * independent(rng, 50, 8, 6) + 1.0
-    axes = ["x", "y", "z", "roll", "pitch", "yaw"]
-    assert len(judge(Evidence("f", error, identities(error), axes=axes)).reasons[0]) < 300
 
 
 def test_print_is_short(rng: np.random.Generator) -> None:
@@ -528,11 +493,6 @@ def test_statistics_have_every_key_that_files_have_had(rng: np.random.Generator)
         assert set(again) == set(s)
         answer = again["answers"][0] if again["answers"] else {}
         assert not answer or {"question", "p_value", "share", "adjusted", "found"} <= set(answer)
-
-
-def test_statistics_of_nothing_can_be_written() -> None:
-    for error in (np.full((3, 2, 2), np.nan), np.zeros((2, 2, 2)), np.zeros((1, 1, 1))):
-        json.dumps(plain(verdict_on(error).statistics), allow_nan=False)
 
 
 def test_statistics_are_the_numbers_of_the_arrays(rng: np.random.Generator) -> None:
@@ -626,7 +586,6 @@ def test_a_tolerance_wider_than_what_is_to_be_shown(rng: np.random.Generator) ->
     """Consistent then means: inside the tolerance."""
     error = np.sqrt(1.8) * independent(rng, 300, 10, 3)
     verdict = verdict_on(error, false_alarm=1e-3, tolerance=2.0)
-    assert verdict.equivalence is not None
     assert verdict.equivalence.factor == 2.0
     assert verdict.status == "consistent"
 
@@ -651,7 +610,6 @@ def test_innovations_of_no_declared_gain_change_nothing(
     beside = judge(Evidence("f", error, identities(error), **nis))
     assert (alone.status, alone.faults, alone.answers) == (beside.status, beside.faults, beside.answers)
     assert alone.reasons[0] == beside.reasons[0]
-    assert beside.innovations is not None
     assert not beside.innovations.judged
     only = judge(Evidence("f", **nis))
     assert (only.status, only.answers) == ("undecided", ())

@@ -12,7 +12,7 @@ from consistency.referee.extras import missing, remedy
 def list_(as_json: AsJson = False) -> None:
     """Scenarios, filters, experiments and sweeps."""
     from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
-    from consistency.bench.filters.guard.settings import KINDS
+    from consistency.bench.filters.guard.plain_rules import KINDS
     from consistency.referee.shipped import summaries
 
     shipped, filters = summaries(), filter_summaries()

@@ -119,7 +119,8 @@ def run(
                 raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
             recorded = read_log(log)
             if screen is not None:
-                screening = import_module("consistency.stereo.frontend.log_screening")  # the bench does not know it
+                # the bench does not know it
+                screening = import_module("consistency.stereo.visual_odometry.common_motion")
                 recorded = screening.screened_log(recorded, screen)
                 say(screening.screening_line(recorded))
             resolve_filters(filters, recorded.belief, recorded.name)

@@ -1,8 +1,8 @@
 """What the filter believes: SLAM filters by name.
 
 A method is two files of one name: in ``textbook`` as a textbook writes it, in ``methods`` the parts that its kernel is
-made of. Parts that several methods use have a folder for each role; ``kernel`` is what all share. Nothing here knows
-the simulation.
+made of. Parts that several methods use are in ``methods.ekf`` or in a folder for each role; ``kernel`` is what all
+share. Nothing here knows the simulation.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ MODULES: dict[str, tuple[str, str, str]] = {
     ),
     "ukf-xyz": ("methods.ukf", "XYZ", "Unscented Kalman filter on points"),
     "ukf-uvd": ("methods.ukf", "UVD", "Unscented Kalman filter on pixels"),
-    "ckf-xyz": ("methods.ckf", "XYZ", "Cubature Kalman filter on points"),
-    "ckf-uvd": ("methods.ckf", "UVD", "Cubature Kalman filter on pixels"),
+    "ckf-xyz": ("methods.ukf", "CKF_XYZ", "Cubature Kalman filter on points"),
+    "ckf-uvd": ("methods.ukf", "CKF_UVD", "Cubature Kalman filter on pixels"),
     "iekf-xyz": ("methods.iekf", "XYZ", "EKF with an iterated update, on points"),
     "iekf-uvd": ("methods.iekf", "UVD", "EKF with an iterated update, on pixels"),
     "ispkf-xyz": ("methods.ispkf", "XYZ", "UKF with an iterated update, on points"),

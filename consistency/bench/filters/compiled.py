@@ -19,16 +19,21 @@ from consistency.bench.filters.covariance_update.local import LOCAL_FROM, Local
 from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.guard.guard_part import guard_part
 from consistency.bench.filters.guard.guarded import Guarded
-from consistency.bench.filters.guard.settings import KINDS
-from consistency.bench.filters.kernel.gain import HALTED, REASONS
+from consistency.bench.filters.guard.plain_rules import KINDS
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
-from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width, robot_width
+from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
+from consistency.bench.filters.kernel.update_steps import HALTED, REASONS
 from consistency.bench.protocols import Filter, Problem, TrialTruth
 from consistency.bench.scenario import Belief, GuardSettings
-from consistency.bench.types import Control, Estimates, Gaussian, Info, Map, Observation, Trial
+from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE
 from consistency.referee.types import Array, Failure, Indices
+
+# models of sensors by what the name of a filter ends in
+SENSORS = {"xyz": ("xyz", "uvd"), "uvd": ("uvd",), "xy": ("relative-xy",), "rb": ("range-bearing",)}
+
+Parts = Callable[[Problem, Array, bool], Slam]
 
 _lock = threading.Lock()
 _inside: list[Any] = []  # the limit in force, once for every trial that is running
@@ -58,68 +63,44 @@ class Halted(Exception):
 
 
 class Compiled:
-    """``init``, ``predict``, ``update``, ``pose`` of the textbook's filter, and ``run`` of the kernels.
+    """``init``, ``predict``, ``update``, ``pose``, ``map`` of the textbook's filter, and ``run`` of the kernels.
 
     Parameters
     ----------
-    textbook : the filter in plain NumPy, with ``name`` and the optional ``map``
-    parts : gives the parts of the filter for a problem and the controls (T, 3) of a trial
+    textbook : the filter in plain NumPy, with ``name`` and ``uvd``: whether it works on (u, v, d); if not, such data
+        are turned into points by eq. 21
+    parts : gives the parts of a filter for a problem, the controls (T, 3) of a trial, and ``uvd``
     sensors : models of sensors whose data it takes
-    uvd : whether it works on (u, v, d); if not, such data are turned into points by eq. 21
-    innovations : "optimal" where they are white if the belief is right, see
-        :class:`consistency.protocols.Filter`
-    error : convention of the error in which its covariance is meant, see
-        :mod:`consistency.referee.geometry.conventions`
-    guard : kind of the guard that ``textbook`` has, if it has one
+    changes : parts in the place of those, by role
 
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
-    allow it; the numbers are the same. ``realisable`` and ``needs`` are those of ``textbook``: False for a bound
-    that is told the truth, and the keys of ``belief.sensor`` that it cannot do without and others can.
+    allow it; the numbers are the same. What else ``textbook`` declares is declared of this: ``innovations`` and
+    ``realisable`` (:class:`consistency.bench.protocols.Filter`), ``error``
+    (:mod:`consistency.referee.geometry.conventions`), and ``needs``, the keys of ``belief.sensor`` that it cannot do
+    without and others can.
     """
 
     local_from = LOCAL_FROM
 
-    def __init__(
-        self,
-        textbook: Any,
-        parts: Callable[[Problem, Array], Slam],
-        *,
-        sensors: tuple[str, ...],
-        uvd: bool,
-        innovations: str | None = None,
-        error: str = ADDITIVE,
-        guard: str | None = None,
-    ) -> None:
-        self.textbook, self.parts, self.sensors, self.uvd = textbook, parts, sensors, uvd
-        self.innovations, self.error = innovations, error
+    def __init__(self, textbook: Any, parts: Parts, sensors: tuple[str, ...], **changes: Any) -> None:
+        self.textbook, self.sensors, self.uvd = textbook, sensors, textbook.uvd
+        self._parts, self._changes = parts, changes
+        self.innovations: str | None = getattr(textbook, "innovations", None)
+        self.error: str = getattr(textbook, "error", ADDITIVE)
         self.name: str = textbook.name
         self.realisable: bool = is_realisable(textbook)
         self.needs: tuple[str, ...] = getattr(textbook, "needs", ())
-        self.guard = guard
+        self.guard: str | None = textbook.kind if isinstance(textbook, Guarded) else None
+        self.init, self.predict, self.update = textbook.init, textbook.predict, textbook.update
+        self.pose, self.map = textbook.pose, textbook.map
 
     def guarded(self, kind: str) -> Compiled:
         """This filter behind a guard, with the textbook's behind the same guard in plain Python."""
-        return Compiled(
-            Guarded(self.textbook, kind), self.parts, sensors=self.sensors, uvd=self.uvd, error=self.error, guard=kind
-        )
+        return Compiled(Guarded(self.textbook, kind), self._parts, self.sensors, **self._changes)
 
-    def init(self, problem: Problem) -> Any:
-        return self.textbook.init(problem)
-
-    def predict(self, state: Any, control: Control) -> Any:
-        return self.textbook.predict(state, control)
-
-    def update(self, state: Any, observation: Observation) -> tuple[Any, Info | None]:
-        updated: tuple[Any, Info | None] = self.textbook.update(state, observation)
-        return updated
-
-    def pose(self, state: Any) -> Gaussian:
-        pose: Gaussian = self.textbook.pose(state)
-        return pose
-
-    def map(self, state: Any) -> dict[int, Gaussian]:
-        landmarks: dict[int, Gaussian] = self.textbook.map(state)
-        return landmarks
+    def parts(self, problem: Problem, controls: Array) -> Slam:
+        """Parts of the filter for a problem and the controls (T, 3) of a trial."""
+        return self._parts(problem, controls, self.uvd)._replace(**self._changes)
 
     def own_covariance(self, state: Any) -> Array:
         """Covariance (3, 3) of the error that the filter declares."""
@@ -177,12 +158,12 @@ class Compiled:
         first, landmark = (np.array(a, np.int64, order="C") for a in (trial.first, trial.landmark))
         halt = np.zeros(1, np.int64) if halt is None else halt
         data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks, halt)
-        r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-        slam = self._with_covariance_update(slam, r + w * trial.n_landmarks)
+        w = landmark_width(slam.landmark)
+        slam = self._with_covariance_update(slam, 3 + w * trial.n_landmarks)
         if self.guard is not None:
             most = int(np.diff(first).max(initial=1))
             slam = slam._replace(guard=guard_part(self.guard, belief.guard or GuardSettings(), z.shape[1], most))
-        return slam, data, r + w * len(np.unique(landmark))
+        return slam, data, 3 + w * len(np.unique(landmark))
 
     def _with_covariance_update(self, slam: Slam, most: int) -> Slam:
         """Local updating, which takes longer to compile, only in a world in which the state may grow so large."""
@@ -220,19 +201,15 @@ def guarded(filter_: Filter, kind: str) -> Any:
     return filter_.guarded(kind) if isinstance(filter_, Compiled) else Guarded(filter_, kind)
 
 
-def planar(
-    textbook: Callable[..., Any], method: str, parts: Callable[[Problem, Array], Slam], **options: str
-) -> tuple[Compiled, Compiled]:
-    """A method on landmarks in the plane, by relative positions (``METHOD-xy``) or range and bearing (``METHOD-rb``).
+def variants(
+    textbook: Callable[..., Any], method: str, parts: Parts, suffixes: str = "xyz uvd xy rb", **changes: Any
+) -> tuple[Compiled, ...]:
+    """A method on points (``METHOD-xyz``), pixels (``-uvd``), relative positions (``-xy``), and by bearings (``-rb``).
 
-    ``textbook`` makes the plain filter of a name and ``uvd``, ``parts`` take sensor and landmark from the belief, and
-    ``options`` are those of :class:`Compiled`.
+    ``textbook`` makes the plain filter of a name and ``uvd``; ``changes`` are as for :class:`Compiled`.
     """
-    xy, rb = (textbook(f"{method}-{suffix}", uvd=False) for suffix in ("xy", "rb"))
-    return (
-        Compiled(xy, parts, sensors=("relative-xy",), uvd=False, **options),
-        Compiled(rb, parts, sensors=("range-bearing",), uvd=False, **options),
-    )
+    plain = [(textbook(f"{method}-{s}", uvd=s == "uvd"), SENSORS[s]) for s in suffixes.split()]
+    return tuple(Compiled(each, parts, sensors, **changes) for each, sensors in plain)
 
 
 def problem_of(trial: Trial, belief: Belief) -> Problem:

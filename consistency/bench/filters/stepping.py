@@ -102,14 +102,17 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, record: RunRecor
             if step == 1:
                 state = filter_.init(problem)
             state = filter_.predict(state, given.control(step))
-            state, info = _state_and_info(filter_.update(state, given.observation(step)))
+            updated: Any = filter_.update(state, given.observation(step))
+            if not isinstance(updated, tuple) or len(updated) != 2:
+                raise TypeError("update must return (state, info)")
+            state, info = updated
             if rejects(filter_):
                 record.rejected[: trial.first[step]] = _value_of(filter_, "rejected", state)
             mean, covariances = _pose_and_covariances(filter_, state, error)
             if info is not None and len(info.innovation):
                 record.nis[step - 1], record.dof[step - 1] = _nis(info), len(info.innovation)
                 record.log_det[step - 1] = info.log_det
-            _require_finite(mean, *covariances)
+            _require_finite("the estimate", mean, *covariances)
             rank.require(covariances)
             map_ = _map(filter_, state, trial) if step == T else None
         except (Exception, GeneratorExit, SystemExit) as exception:  # whatever a user's filter throws is a result
@@ -144,12 +147,10 @@ def _nis(info: Info) -> float:
     """NIS of an update whose innovation (k,) and S (k, k) are finite, and S positive definite."""
     innovation = _array(info.innovation, (len(info.innovation),), "update")
     S = _array(info.S, (len(innovation), len(innovation)), "update")
-    if not (np.isfinite(innovation).all() and np.isfinite(S).all()):
-        raise _Unusable("the innovation or its covariance is not finite")
+    _require_finite("the innovation or its covariance", innovation, S)
     np.linalg.cholesky(S)
     nis = info.nis
-    if not np.isfinite(nis):
-        raise _Unusable("the NIS is not finite")
+    _require_finite("the NIS", nis)
     return nis
 
 
@@ -178,8 +179,7 @@ class _Rank:
     def require(self, covariances: list[Array]) -> None:
         """Raise for covariances (3, 3) that are not as they must be; the last one is of the filter's own error."""
         for name, P in zip(self.names, covariances, strict=False):
-            if _asymmetric(P):
-                raise _Unusable(f"{name} is not symmetric")
+            _require_symmetric(name, P)
         rank = definiteness(covariances[-1])
         if rank < 0 or (self.full and rank == 0):
             raise _Unusable(f"{self.names[len(covariances) - 1]} is not positive definite")
@@ -188,19 +188,14 @@ class _Rank:
             raise _Unusable(f"{self.names[0]} is not positive definite")
 
 
-def _asymmetric(P: Array) -> bool:
-    return bool(np.abs(P - P.T).max() > SYMMETRY * np.abs(P).max())
+def _require_symmetric(name: str, P: Array) -> None:
+    if np.abs(P - P.T).max() > SYMMETRY * np.abs(P).max():
+        raise _Unusable(f"{name} is not symmetric")
 
 
-def _require_finite(*arrays: Array) -> None:
-    if not all(np.isfinite(array).all() for array in arrays):
-        raise _Unusable("the estimate is not finite")
-
-
-def _state_and_info(value: Any) -> tuple[Any, Info | None]:
-    if not isinstance(value, tuple) or len(value) != 2:
-        raise TypeError("update must return (state, info)")
-    return value
+def _require_finite(name: str, *values: Array | float) -> None:
+    if not all(np.isfinite(each).all() for each in values):
+        raise _Unusable(f"{name} is not finite")
 
 
 def _map(filter_: Filter, state: Any, trial: Trial) -> Map | None:
@@ -230,10 +225,8 @@ def _joint(filter_: Filter, state: Any, labels: list[int]) -> Array | None:
         return None
     n = 3 + 3 * len(labels)
     P = _array(_value_of(filter_, "joint", state).covariance, (n, n), "joint")
-    if not np.isfinite(P).all():
-        raise _Unusable("the joint covariance of pose and map is not finite")
-    if _asymmetric(P):
-        raise _Unusable("the joint covariance of pose and map is not symmetric")
+    _require_finite("the joint covariance of pose and map", P)
+    _require_symmetric("the joint covariance of pose and map", P)
     order = np.append(0, 1 + np.argsort(labels))
     rows = (3 * order[:, None] + np.arange(3)).ravel()
     return P[np.ix_(rows, rows)]
@@ -241,10 +234,8 @@ def _joint(filter_: Filter, state: Any, labels: list[int]) -> Array | None:
 
 def _landmark(label: int, estimate: Gaussian) -> tuple[Array, Array]:
     mean, P = _array(estimate.mean, (3,), "map"), _array(estimate.covariance, (3, 3), "map")
-    if not (np.isfinite(mean).all() and np.isfinite(P).all()):
-        raise _Unusable(f"landmark {label} in the map is not finite")
-    if _asymmetric(P):
-        raise _Unusable(f"the covariance of landmark {label} in the map is not symmetric")
+    _require_finite(f"landmark {label} in the map", mean, P)
+    _require_symmetric(f"the covariance of landmark {label} in the map", P)
     return mean, P
 
 

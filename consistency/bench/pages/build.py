@@ -24,7 +24,7 @@ from consistency.referee.diagnostics.words.sentences import plural
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.wording import listed
 from consistency.referee.errors import InputError
-from consistency.referee.pages.clock import clock_of
+from consistency.referee.pages.judged import clock_of
 from consistency.referee.pages.section import OPENING, STUDY, Section
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.system.progress import Advance

@@ -25,7 +25,7 @@ NAMES = (
     "bench.pages.sections.shares",
     "stereo.pages.scenes",
     "bench.pages.sections.first_order",
-    *(f"stereo.pages.{name}" for name in ("biases", "sensor_issues", "images", "image_tracks")),
+    *(f"stereo.pages.{name}" for name in ("sensor_issues", "images")),
     "bench.pages.sections.referee",
     "bench.pages.sections.provenance",
 )

@@ -20,9 +20,8 @@ from consistency.bench.store.results import Results, StoredResults, Tables, open
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE
 from consistency.referee.system.folders import NewFolder
-from consistency.referee.system.machine import in_words, this_machine
 from consistency.referee.system.progress import progress, say
-from consistency.referee.system.provenance import manifest_of
+from consistency.referee.system.provenance import in_words, manifest_of, this_machine
 from consistency.referee.system.stopping import Stop, stoppable
 
 PLAN = "until_decided"

@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection, wait
 from typing import NamedTuple
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.compiler import compile_time, disk_cache
+from consistency.bench.filters.compiler import disk_cache
 from consistency.bench.filters.compiler.jit import Outlook
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter, WholeTrial
@@ -22,8 +22,7 @@ from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.system import progress
-from consistency.referee.system.ending import die_with_parent
-from consistency.referee.system.stopping import STOPS, undisturbed
+from consistency.referee.system.stopping import STOPS, die_with_parent, undisturbed
 
 GLANCE = 0.1  # s between looks, for a signal that another thread was given
 NAMED = 3  # filters that are named where several are compiled
@@ -101,7 +100,7 @@ def _label(missing: Sequence[Need]) -> str:
 def _wall(seconds: Sequence[float], workers: int) -> float:
     """Seconds for all of them: the first of each process in full, as later ones share functions with it."""
     longest = sorted(seconds, reverse=True)
-    total = sum(longest[:workers]) + compile_time.AGAIN * sum(longest[workers:])
+    total = sum(longest[:workers]) + disk_cache.AGAIN * sum(longest[workers:])
     return max(longest[0], total / workers)
 
 

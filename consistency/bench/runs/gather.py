@@ -22,7 +22,7 @@ from consistency.bench.store.trial_rows import Rejected, RunOutcome, noted_table
 from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import NewFolder
-from consistency.referee.system.machine import this_machine
+from consistency.referee.system.provenance import this_machine
 from consistency.referee.system.stopping import undisturbed
 from consistency.referee.types import Failure
 

@@ -18,15 +18,15 @@ from consistency.bench.filters.covariance_update.local import (
     start_counting,
 )
 from consistency.bench.filters.covariance_update.parking import WORTH, Parking
-from consistency.bench.filters.kernel.local_state import Factors, make_factors
 from consistency.bench.filters.kernel.part_functions import (
     Data,
+    Factors,
     Slam,
     landmark_width,
+    make_factors,
     make_room,
     make_watch,
     observed_width,
-    robot_width,
 )
 
 try:
@@ -79,9 +79,9 @@ def trial_bytes(filters: Sequence[Compiled], trial: Trial, belief: Belief) -> in
 
 def _working(slam: Slam, data: Data, size: int) -> int:
     """What ``run_trial`` writes to: covariance and outcome, which it fills, and a part of what it works with."""
-    T, labels, r = len(data.controls), data.n_landmarks, robot_width(slam.motion)
+    T, labels = len(data.controls), data.n_landmarks
     spare = spare_width(slam.covariance, T, labels)
-    outcome = T * (r + 2 * r * r + 3) + 12 * labels
+    outcome = T * (3 + 2 * 9 + 3) + 12 * labels
     return touched(slam, data, size, spare) + NUMBER * ((size + spare) ** 2 + outcome)
 
 
@@ -192,49 +192,49 @@ def half(n: int) -> int:
 
 def touched(slam: Slam, data: Data, size: int, spare: int) -> int:
     """Bytes of work arrays that are written to; the state grows to ``size`` variables and up to ``spare`` more."""
-    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
-    local = _tally(slam, r, w, size + spare)
-    reach = _reach(slam, data, r, w, size + spare, local)
+    w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
+    local = _tally(slam, w, size + spare)
+    reach = _reach(slam, data, w, size + spare, local)
     gathered, a, b = s * reach.seen, reach.active, reach.base
     # S; A and rows; then of the active part P, Phi, Psi, and of the whole rows and owed
     numbers = half(gathered) + reach.cells * s // w + reach.cells
     numbers += a * a + a * b + half(b) + (a + b) * (size + spare)
     most = int(np.diff(data.first).max(initial=1))
-    return NUMBER * numbers + _beside(slam, data, (r, w, s), reach.back, most, size + spare)
+    return NUMBER * numbers + _beside(slam, data, (w, s), reach.back, most, size + spare)
 
 
-def _tally(slam: Slam, r: int, w: int, size: int) -> Factors:
+def _tally(slam: Slam, w: int, size: int) -> Factors:
     """What local updating counts with, and the active part for which there is room, as its ``make_local`` has it."""
     is_local = isinstance(slam.covariance, Local | Parking) and size >= slam.covariance.start
-    return make_factors(r, r, 1)._replace(x=np.empty(max(size // (2 * w), 1) * w if is_local else r))
+    return make_factors(3, 3, 1)._replace(x=np.empty(max(size // (2 * w), 1) * w if is_local else 3))
 
 
-def _beside(slam: Slam, data: Data, widths: tuple[int, int, int], back: int, most: int, size: int) -> int:
+def _beside(slam: Slam, data: Data, widths: tuple[int, int], back: int, most: int, size: int) -> int:
     """Bytes of what the update alone needs for ``back`` landmarks, and the guard for ``most``."""
-    r, w, s = widths
+    w, s = widths
     try:
-        room = make_room(slam.update, r, w, s, back, size)
+        room = make_room(slam.update, w, s, back, size)
         watch = make_watch(slam.guard, s, most, len(data.landmark), data.n_landmarks)
     except MemoryError:  # which takes by the square of these
         return 16 * _beside(slam, data, widths, back // 4, most // 4, size // 4)
     return sum(np.asarray(array).nbytes for array in (*room, *watch))
 
 
-def _reach(slam: Slam, data: Data, r: int, w: int, size: int, local: Factors) -> Reach:
+def _reach(slam: Slam, data: Data, w: int, size: int, local: Factors) -> Reach:
     """As the trial keeps its state, step by step."""
     if isinstance(slam.covariance, Parking):
         return _parked(slam.covariance, data, size, local)
     reach, known, active, n, b = Reach(), set[int](), set[int](), 0, 0
     for k in range(len(data.controls)):
         labels = data.landmark[data.first[k] : data.first[k + 1]].tolist()
-        whole, seen = r + w * len(known), sum(label in known for label in labels)
+        whole, seen = 3 + w * len(known), sum(label in known for label in labels)
         if isinstance(slam.covariance, Local):
             if b > 0 and is_due(whole, n, b, w * len(labels), local):
                 count_settling(whole, n, b, local)
                 b = 0
-            if b == 0 and whole >= slam.covariance.start and may_split(r, w, len(labels), local):
+            if b == 0 and whole >= slam.covariance.start and may_split(w, len(labels), local):
                 active = known.intersection(labels)
-                n = b = r + w * len(active)
+                n = b = 3 + w * len(active)
                 start_counting(b, local)
             if b > 0:
                 more = w * len(known.intersection(labels) - active)
@@ -242,7 +242,7 @@ def _reach(slam: Slam, data: Data, r: int, w: int, size: int, local: Factors) ->
                 n, b = n + more, b + more
                 count(whole, n, b, more, w * len(labels), local)
         width = n + b if b > 0 else whole
-        reach = reach.with_step(seen, seen, width, (r + w * seen) * width if seen else 0, b, n if b > 0 else 0)
+        reach = reach.with_step(seen, seen, width, (3 + w * seen) * width if seen else 0, b, n if b > 0 else 0)
         n += w * len(set(labels) - known)
         known.update(labels)
     return reach

@@ -28,8 +28,7 @@ from consistency.bench.store.results import Results, StoredResults, Tables
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
 from consistency.referee.system.folders import require_free
-from consistency.referee.system.machine import this_machine
-from consistency.referee.system.provenance import manifest_of
+from consistency.referee.system.provenance import manifest_of, this_machine
 
 
 # fmt: off

@@ -19,8 +19,7 @@ from consistency.bench.store.parquet import Columns
 from consistency.bench.store.results import JOINT, Tables, open_results
 from consistency.referee.column_names import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
 from consistency.referee.diagnostics import Design, JointNees, MapRecord, Record, Rejections, sequential_design
-from consistency.referee.diagnostics.records.array_blocks import by_runs
-from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, planar_error
 from consistency.referee.parsing import LARGEST_NUMBER, one_line

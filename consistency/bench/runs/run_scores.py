@@ -9,7 +9,7 @@ from scipy import stats
 
 from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.questions import scale
-from consistency.referee.diagnostics.records.array_blocks import by_steps
+from consistency.referee.diagnostics.records.large_arrays import by_steps
 from consistency.referee.types import Array
 
 

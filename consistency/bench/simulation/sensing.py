@@ -45,47 +45,37 @@ def effects_of(sensor: TrueSensor) -> list[Effect]:
 
 
 class EffectChain:
-    """Effects applied one after the other.
+    """Effects applied one after the other, each with the purpose of its random stream, None if it draws nothing.
 
     What the first effects do is the same in every run if it depends on the path alone and the path is the same:
     :meth:`shared` works it out once.
     """
 
     def __init__(self, effects: Sequence[Effect]) -> None:
-        self._links = [_Link(effect) for effect in effects]
+        self._links = [(effect, purpose_of(effect.label) if effect.draws else None) for effect in effects]
 
     def leading(self) -> int:
         """How many effects come before the first that draws random numbers."""
-        return next((i for i, link in enumerate(self._links) if link.purpose is not None), len(self._links))
+        return next((i for i, (_, purpose) in enumerate(self._links) if purpose is not None), len(self._links))
 
     def shared(self, context: Context, number: int) -> Observations:
         """The ideal observations after the first ``number`` effects, which draw no random numbers."""
-        observations = context.ideal()
-        for link in self._links[:number]:
-            observations = link.apply(observations, context, 0, 0)
-        return observations
+        return _after(self._links[:number], context.ideal(), context, 0, 0)
 
     def rest(self, observations: Observations, context: Context, number: int, run: int, seed: int) -> Observations:
         """``observations`` after all effects but the first ``number``, in one run."""
-        for link in self._links[number:]:
-            observations = link.apply(observations, context, run, seed)
-        return observations
+        return _after(self._links[number:], observations, context, run, seed)
 
 
-class _Link:
-    """An effect with the purpose of its random stream, which is None if it draws nothing."""
-
-    def __init__(self, effect: Effect) -> None:
-        self.effect, self.is_listed = effect, isinstance(effect, ListedEffect)
-        self.purpose = purpose_of(effect.label) if effect.draws else None
-        self._no_numbers = cast(np.random.Generator, _NoNumbers(effect.label))
-
-    def apply(self, observations: Observations, context: Context, run: int, seed: int) -> Observations:
-        rng = self._no_numbers if self.purpose is None else generator(seed, run, self.purpose)
-        observations = self.effect.apply(observations, rng, context)
-        if self.is_listed:
-            _require_sound(self.effect.label, observations, context)
-        return observations
+def _after(
+    links: list[tuple[Effect, int | None]], observations: Observations, context: Context, run: int, seed: int
+) -> Observations:
+    for effect, purpose in links:
+        rng = generator(seed, run, purpose) if purpose is not None else _NoNumbers(effect.label)
+        observations = effect.apply(observations, cast(np.random.Generator, rng), context)
+        if isinstance(effect, ListedEffect):
+            _require_sound(effect.label, observations, context)
+    return observations
 
 
 class _NoNumbers:

@@ -18,7 +18,7 @@ from consistency.bench.simulation.path import planned_controls, start_pose
 from consistency.bench.simulation.sensing import MOTION_NOISE, EffectChain, effects_of, generator
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array, Indices
+from consistency.referee.types import Array
 
 SOME = 50  # steps of the planned path that are searched at a time for a landmark
 
@@ -62,7 +62,7 @@ class World:
             observations.ids,
             true_path,
             self.landmarks,
-            _source(observations),
+            None if np.array_equal(observations.sources, observations.landmark) else observations.source,
         )
 
     def _begin(self, context: Context) -> Observations:
@@ -92,15 +92,6 @@ def simulate(scenario: Scenario, run: int = 0, seed: int = 0) -> Trial:
         Observations are ordered by step, then by landmark.
     """
     return World(scenario.truth).trial(run, seed)
-
-
-def _source(observations: Observations) -> Indices | None:
-    """What the observations are really of, where that is not what they say."""
-    return (
-        None
-        if observations.source is None or np.array_equal(observations.source, observations.landmark)
-        else observations.source
-    )
 
 
 def draw_landmarks(truth: Truth) -> Array:

@@ -15,7 +15,7 @@ from consistency.bench.store.parquet import BY_FILTER, Columns
 from consistency.bench.store.results import JOINT
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.column_names import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
-from consistency.referee.diagnostics.maps.map_score import joint_nees
+from consistency.referee.diagnostics.maps.map_nees import joint_nees
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.geometry import pose_error
 from consistency.referee.geometry.conventions import planar_error, planar_map_error

@@ -39,16 +39,7 @@ def _main(
 
 
 def main(arguments: list[str] | None = None) -> Any:
-    """Entry point: unusable input ends in one line and exit status 2; SIGTERM and SIGHUP are taken as Ctrl-C.
-
-    Without ``arguments``, as a command, in a child of this process, see :mod:`consistency.referee.system.ending`.
-    """
-    from consistency.referee.system.ending import supervised
-
-    return supervised(_command) if arguments is None else _command(arguments)
-
-
-def _command(arguments: list[str] | None = None) -> Any:
+    """Entry point: unusable input ends in one line and exit status 2; SIGTERM and SIGHUP are taken as Ctrl-C."""
     from consistency.referee.system.stopping import STOPS, stoppable
 
     _open_closed_streams()
@@ -62,16 +53,16 @@ def _command(arguments: list[str] | None = None) -> Any:
         except MemoryError:
             _end("not enough memory; take fewer steps, landmarks or runs", 2)
         except InputError as error:
-            _end(_line(str(error)), 2)
+            _end(str(error), 2)
         except UsageError as error:
             command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
-            _end(_line(f"{error.format_message()} See: {command} --help"), 2)
+            _end(f"{error.format_message()} See: {command} --help", 2)
         except ModuleNotFoundError as error:
             words = sys.argv[1:] if arguments is None else arguments
             missing = explained(error, f"'{words[0]}' with these arguments")
             if missing is None:
                 raise
-            _end(_line(str(missing)), 2)
+            _end(str(missing), 2)
         except (BrokenPipeError, SystemExit) as error:  # libraries end with status 1, which is a verdict's here
             if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
                 raise
@@ -81,7 +72,7 @@ def _command(arguments: list[str] | None = None) -> Any:
             if error.filename is None and error.errno not in FULL:
                 raise
             fault = "output cannot be written" if error.filename is None else f"{error.filename}: cannot be used"
-            _end(_line(f"{fault} ({error.strerror})"), 2)
+            _end(f"{fault} ({error.strerror})", 2)
         except (KeyboardInterrupt, Abort):
             _end("stopped", stop.status)
         except Exception:
@@ -106,16 +97,11 @@ def _show_help(arguments: list[str] | None) -> bool:
     return command is not None
 
 
-def _line(sentence: str) -> str:
-    from consistency.referee.parsing import one_line
-
-    return one_line(sentence, 4000)
-
-
 def _end(sentence: str, status: int) -> NoReturn:
+    from consistency.referee.parsing import one_line
     from consistency.referee.system.progress import say
 
-    say(f"consistency: {sentence}")
+    say(f"consistency: {one_line(sentence, 4000)}")
     try:
         sys.stdout.flush()
     except OSError:
@@ -133,7 +119,3 @@ def _open_closed_streams() -> None:
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115
-
-
-if __name__ == "__main__":
-    main()

@@ -12,8 +12,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import CommandInfo
 
-from consistency.referee.extras import is_installed, remedy, require
-from consistency.referee.outside import function_at
+from consistency.referee.extras import function_at, is_installed, remedy, require
 
 HELP = ["-h", "--help"]
 

@@ -30,8 +30,7 @@ from consistency.referee.cli.options import (
 )
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
-from consistency.referee.extras import missing, remedy
-from consistency.referee.outside import outside
+from consistency.referee.extras import missing, outside, remedy
 from consistency.referee.readers.options import Reading
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import AsJson, given, require_word, show
+from consistency.referee.cli.options import AsJson, given, require_word, show, tell
 from consistency.referee.defaults import GATE_FALSE_ALARM
 from consistency.referee.errors import InputError
 
@@ -72,7 +71,7 @@ def monitor(
         watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
     else:
         log = read_innovations(Path(path), filter_name, run)
-        _print_notes(log.notes)
+        tell(log.notes)
         if plot is not None:
             require_plot(plot, overwrite)
         watched = watch(log, watcher)
@@ -87,21 +86,14 @@ def _show_ratios(
     path: Path, sensor: str | None, core: int | None, plot: Path | None, overwrite: bool, as_json: bool
 ) -> None:
     """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
-    from consistency.referee.document.test_ratios_table import ratios_document
+    from consistency.referee.document.monitor import ratios_document
     from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
     from consistency.referee.readers.formats.ardupilot_log import read_ratios
 
     if plot is not None:
         require_plot(plot, overwrite)
     ratios, notes = read_ratios(path, sensor, core)
-    _print_notes(notes)
+    tell(notes)
     if plot is not None:
         write_monitor_plot(plot, ratios)
     show(ratios_document(path.stem, ratios), as_json)
-
-
-def _print_notes(notes: Iterable[str]) -> None:
-    from consistency.referee.parsing import one_line
-
-    for note in notes:
-        print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)

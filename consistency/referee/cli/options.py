@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import Field, fields
 from functools import partial, wraps
 from pathlib import Path
@@ -93,7 +93,6 @@ def are_files(path: Path, files: Reading) -> bool:
 
 
 def read_files(path: Path, files: Reading) -> list[Evidence]:
-    """Files of another estimator."""
     from consistency.referee.readers.read_files import read_recordings
 
     return read_recordings(path, files)
@@ -101,9 +100,14 @@ def read_files(path: Path, files: Reading) -> list[Evidence]:
 
 def tell_notes(*read: list[Evidence]) -> None:
     """What was assumed and left out, to standard error; said when nothing is refused any more."""
+    tell(dict.fromkeys(note for recordings in read for one in recordings for note in one.notes))
+
+
+def tell(notes: Iterable[str]) -> None:
+    """A line for each note on standard error."""
     from consistency.referee.parsing import one_line
 
-    for note in dict.fromkeys(note for recordings in read for one in recordings for note in one.notes):
+    for note in notes:
         print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
 
 
@@ -118,7 +122,10 @@ def reads_files(command: Callable[..., Any] | None = None, only: Collection[str]
 
     @wraps(command)
     def with_files(**given: Any) -> Any:
-        options = {each.name: _parsed(each, given.pop(each.name)) for each in taken}
+        options = {each.name: given.pop(each.name) for each in taken}
+        for each in taken:
+            if (parse := each.metadata["parse"]) is not None and options[each.name] is not None:
+                options[each.name] = parse(options[each.name])
         return command(files=Reading(**options), **given)
 
     parameters = []
@@ -136,8 +143,3 @@ def _parameter(of: Field[Any], kind: Any) -> inspect.Parameter:
     typed = str | None if m["parse"] else kind
     annotation = Annotated[typed, option]  # type: ignore[valid-type]
     return inspect.Parameter(of.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
-
-
-def _parsed(of: Field[Any], value: Any) -> Any:
-    parse = of.metadata["parse"]
-    return value if value is None or parse is None else parse(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,10 +11,8 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
 from consistency.referee.diagnostics.records.record import numbered_axes
-from consistency.referee.diagnostics.records.symmetric import Symmetric
-from consistency.referee.diagnostics.records.whitening import entries
 from consistency.referee.diagnostics.statistics.log_ratio import Contrast, contrast, margin
 from consistency.referee.types import Array, Indices
 
@@ -106,10 +105,9 @@ def summary(
     means, _ = run_means(nees)
     squared = covered = np.empty((len(nees), 0))
     if error is not None and covariance is not None:
-        both = by_runs(_squared_and_covered, np.asarray(nees), np.asarray(error), entries(covariance))
+        both = by_runs(_squared_and_covered, np.asarray(nees), np.asarray(error), Symmetric.of(covariance))
         squared, covered = both[:, 0], both[:, 1]
-    numbers = np.arange(len(nees)) if runs is None else runs
-    return RunSummary(numbers, dof, means / dof, squared, covered)
+    return RunSummary(np.arange(len(nees)) if runs is None else runs, dof, means / dof, squared, covered)
 
 
 def _squared_and_covered(nees: Array, error: Array, covariance: Symmetric) -> Array:
@@ -164,10 +162,7 @@ def compare(
         raise ValueError(f"the errors have {a.dof} and {b.dof} dimensions; compare filters of the same state")
     common = np.intersect1d(a.runs[np.isfinite(a.nees)], b.runs[np.isfinite(b.nees)])
     paired = len(common) >= FEWEST if paired is None else paired
-    if paired:
-        a, b = (_rows(x, np.isin(x.runs, common)) for x in (a, b))
-    else:
-        a, b = (_rows(x, np.isfinite(x.nees)) for x in (a, b))
+    a, b = (_rows(x, np.isin(x.runs, common) if paired else np.isfinite(x.nees)) for x in (a, b))
     fewest = min(len(a.runs), len(b.runs))
     if fewest < FEWEST:
         raise ValueError(f"a comparison needs at least {FEWEST} runs{' in common' if paired else ''}, got {fewest}")
@@ -182,27 +177,21 @@ def compare(
         if not x.nees.mean() > 0:
             raise ValueError(f"every NEES of {side} is 0; a filter without errors cannot be compared")
     gap, total = (contrast(a.nees, b.nees, sign, paired) for sign in (-1.0, 1.0))
-    return _comparison(fewest, paired, tuple(differences), gap, total, false_alarm)
-
-
-def _rows(x: RunSummary, rows: Array) -> RunSummary:
-    order = np.argsort(x.runs[rows])
-    return RunSummary(x.runs[rows][order], x.dof, x.nees[rows][order], x.squared[rows][order], x.covered[rows][order])
-
-
-def _comparison(
-    runs: int, paired: bool, differences: tuple[Difference, ...], gap: Contrast, total: Contrast, false_alarm: float
-) -> Comparison:
-    """From log ratio_a - log ratio_b (``gap``) and log ratio_a + log ratio_b (``total``)."""
     above, below = (max(p) for p in zip(gap.p_values, total.p_values, strict=True))
     log_a, log_b = 0.5 * (total.value + gap.value), 0.5 * (total.value - gap.value)
     tail = 0.5 * false_alarm
     width = 0.5 * (total.half_width(tail) + gap.half_width(tail))  # of log_b, at most
     return Comparison(
-        runs=runs, paired=paired, differences=differences, distance=abs(log_a) - abs(log_b), standard_error=gap.error,
-        p_value=min(1.0, 2.0 * min(above, below)), false_alarm=false_alarm, at_most=_at_most(gap, total, tail),
-        sum_error=total.error, reference=max(0.0, abs(log_b) - width), side=-1.0 if below < above else 1.0,
+        runs=fewest, paired=paired, differences=tuple(differences), distance=abs(log_a) - abs(log_b),
+        standard_error=gap.error, p_value=min(1.0, 2.0 * min(above, below)), false_alarm=false_alarm,
+        at_most=_at_most(gap, total, tail), sum_error=total.error, reference=max(0.0, abs(log_b) - width),
+        side=-1.0 if below < above else 1.0,
     )  # fmt: skip
+
+
+def _rows(x: RunSummary, rows: Array) -> RunSummary:
+    order = np.argsort(x.runs[rows])
+    return RunSummary(x.runs[rows][order], x.dof, x.nees[rows][order], x.squared[rows][order], x.covered[rows][order])
 
 
 def _at_most(gap: Contrast, total: Contrast, tail: float) -> float:
@@ -229,10 +218,7 @@ def _planned(error: float, runs: int, size: float, false_alarm: float, power: fl
     low, high = FEWEST - 1, FEWEST
     while not enough(high) and high < MOST:
         low, high = high, 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if enough(middle) else (middle, high)
-    return high
+    return low + 1 + bisect_left(range(low + 1, high), True, key=enough)
 
 
 def _ratio(name: str, a: Array, b: Array, power: float, paired: bool, confidence: float) -> Difference:

@@ -61,12 +61,10 @@ class Quantity:
 
     @property
     def is_empty(self) -> bool:
-        return self.value is None or np.isnan(self.value) or (np.isinf(self.value) and not self.is_open)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether an infinite value is one: only without an interval and without digits of its own."""
-        return not self.digits and self.interval is None
+        """Whether there is no value; an infinite one is one only without an interval and without digits of its own."""
+        if self.value is None or np.isnan(self.value):
+            return True
+        return np.isinf(self.value) and bool(self.digits or self.interval)
 
 
 @dataclass(frozen=True)

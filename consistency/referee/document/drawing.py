@@ -1,20 +1,45 @@
 """What a figure shows, described once for two painters: ``with_bokeh`` and ``with_matplotlib`` in ``show``.
 
 A figure has panels, a panel has two axes and marks on them, in the order in which they are drawn. Nothing here draws
-and nothing is worked out; all records are plain data.
+and nothing is worked out, but which points are left out; all records are plain data.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from consistency.referee.document.colours import Look
-from consistency.referee.document.fewer_points import thin
 from consistency.referee.types import Array, Indices
+
+LIMIT = 2000  # points a line: more than a chart is wide in pixels
+
+
+def thin(*lines: Array, limit: int = LIMIT) -> Indices:
+    """Rows to keep of lines (T,) on one axis, at most about ``limit``; all where there are fewer.
+
+    The rows are cut into equal pieces, and each piece keeps where every line has its least and its
+    greatest value, so that no peak is lost. The first and the last row stay.
+    """
+    steps = len(lines[0])
+    if steps <= limit:
+        return np.arange(steps)
+    pieces = max(1, (limit - 2) // (2 * len(lines)))
+    edges = np.linspace(0, steps, pieces + 1).astype(np.int64)
+    keep = {0, steps - 1}
+    for start, end in pairwise(edges):
+        for line in lines:
+            piece = line[start:end]
+            if np.isfinite(piece).any():
+                keep |= {start + int(np.nanargmin(piece)), start + int(np.nanargmax(piece))}
+            else:
+                keep.add(int(start))
+    return np.array(sorted(keep), dtype=np.int64)
+
 
 Tips: TypeAlias = tuple[tuple[str, str], ...]  # what is pointed at, and its value with @column{digits} for numbers
 Columns: TypeAlias = Mapping[str, Array | Sequence[str]]
@@ -251,13 +276,7 @@ def numbers(mark: Mark) -> tuple[int, int]:
             return 0, 0
         case Bars():
             return len(mark.height), 3
-        case Tiles():
-            return len(mark.x), 6 + len(mark.columns)
         case Band():
             return len(mark.x), 3
-        case Intervals():
-            return len(mark.x), 4 + len(mark.columns)
-        case Line():
-            return len(mark.x), 2 + len(mark.columns) + 2 * (mark.bound is not None)
-        case _:
-            return len(mark.x), 2 + len(mark.columns)
+    own = {Tiles: 6, Intervals: 4}.get(type(mark), 2) + 2 * (isinstance(mark, Line) and mark.bound is not None)
+    return len(mark.x), own + len(mark.columns)

@@ -47,19 +47,15 @@ def map_summary(m: MapScore) -> str:
 
 
 def map_lines(scores: Mapping[str, MapScore]) -> list[str]:
-    """One line on the maps of several filters; none where there is no map."""
-    known = {name: m for name, m in scores.items() if m.landmarks}
-    if not known:
-        return []
-    judged = "" if any(m.verdict is not None for m in known.values()) else ", not judged"
-    texts = "; ".join(f"{name} {_with_verdict(m)}" for name, m in known.items())
-    return [f"map after the last step, mean NEES / 3{judged}: {texts}"]
-
-
-def _with_verdict(m: MapScore) -> str:
-    """NEES of landmarks over 3, and the verdict on the map with the ratio of pose and map together."""
-    if m.verdict is None:
-        return map_text(m)
-    joint = m.verdict.joint
-    together = "" if joint is None or not joint.runs else f" (together with the pose {short(joint.both.value)})"
-    return f"{m.verdict.status}, {map_text(m)}{together}"
+    """One line on the maps of several filters, with the verdicts on them; none where there is no map."""
+    texts, judged = [], ", not judged"
+    for name, m in scores.items():
+        if not m.landmarks:
+            continue
+        text = map_text(m)
+        if m.verdict is not None:
+            judged, joint = "", m.verdict.joint
+            together = "" if joint is None or not joint.runs else f" (together with the pose {short(joint.both.value)})"
+            text = f"{m.verdict.status}, {text}{together}"
+        texts.append(f"{name} {text}")
+    return [f"map after the last step, mean NEES / 3{judged}: {'; '.join(texts)}"] if texts else []

@@ -1,14 +1,15 @@
-"""What a monitor found, in a row and a sentence."""
+"""What a monitor found, in a row and a sentence; test ratios of a gate, sensor by sensor, and what they do not say."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from consistency.referee.diagnostics import Alarm, Monitor
+from consistency.referee.diagnostics.monitoring.gate_ratios import RARE, GateRatios
 from consistency.referee.diagnostics.monitoring.monitor import CAVEAT, accepted_scales
-from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
+from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Text, table
 
 
 def monitor_document(name: str, monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -> Document:
@@ -21,13 +22,17 @@ def monitor_document(name: str, monitor: Monitor, alarm: Alarm | None, t: float,
     alarm : its steps as the file numbers them
     t, since_t : s, of the alarm and of the beginning of the fault; NaN where they are not known
     """
-    sentence = _sentence(monitor, alarm, t, since_t)
-    return Document(
-        name, "", (), (_table(name, monitor), Text(""), Text(sentence)), _data(name, monitor, alarm, t, since_t)
-    )
-
-
-def _table(name: str, m: Monitor) -> Table:
+    m = monitor
+    data = {
+        "innovations": name, "steps": m.steps, "measurements": m.measurements, "rejected": m.rejections,
+        "judged": m.innovations, "nis_ratio": m.ratio, "scale": m.scale, "evidence": m.evidence,
+        "largest_evidence": m.largest, "threshold": m.threshold, "false_alarm": m.false_alarm,
+        "tolerance": m.tolerance, "gate": m.gate, "mission": m.mission, "note": CAVEAT,
+        "alarm": None if alarm is None else {
+            "step": alarm.step, "since": alarm.since, "t": t, "since_t": since_t, "direction": alarm.direction,
+            "evidence": alarm.evidence, "scale": alarm.scale, "sentence": str(alarm),
+        },
+    }  # fmt: skip
     cells: list[tuple[str, Cell]] = [("steps", str(m.steps)), ("judged", str(m.innovations))]
     if m.gate is not None:
         cells.append(("rejected", str(m.rejections)))
@@ -36,7 +41,8 @@ def _table(name: str, m: Monitor) -> Table:
         cells.append(("scale", Quantity(m.scale, digits=".3f")))
     cells += [("e-value", f"{m.evidence:.3g}"), ("largest", f"{m.largest:.3g}"), ("alarm at", f"{m.threshold:.4g}")]
     columns = (Column("innovations"), *(Column(head, number=True) for head, _ in cells))
-    return table(columns, [(name, *(cell for _, cell in cells))], f"Monitor of {name}")
+    shown = table(columns, [(name, *(cell for _, cell in cells))], f"Monitor of {name}")
+    return Document(name, "", (), (shown, Text(""), Text(_sentence(m, alarm, t, since_t))), data)
 
 
 def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -> str:
@@ -54,15 +60,47 @@ def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -
     return sentence
 
 
-def _data(name: str, monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -> dict[str, Any]:
-    return {
-        "innovations": name, "steps": monitor.steps, "measurements": monitor.measurements,
-        "rejected": monitor.rejections, "judged": monitor.innovations, "nis_ratio": monitor.ratio,
-        "scale": monitor.scale, "evidence": monitor.evidence, "largest_evidence": monitor.largest,
-        "threshold": monitor.threshold, "false_alarm": monitor.false_alarm, "tolerance": monitor.tolerance,
-        "gate": monitor.gate, "mission": monitor.mission, "note": CAVEAT,
-        "alarm": None if alarm is None else {
-            "step": alarm.step, "since": alarm.since, "t": t, "since_t": since_t, "direction": alarm.direction,
-            "evidence": alarm.evidence, "scale": alarm.scale, "sentence": str(alarm),
-        },
-    }  # fmt: skip
+NO_NIS = (
+    "These are test ratios and no NIS: the log does not hold the variances of the innovations. So there is no verdict "
+    "and no alarm. A ratio above 1 was rejected. A right filter has no larger shares than the table says, up to "
+    "chance; smaller shares do not show that it is right."
+)
+HEADS = (
+    "gate",
+    "messages",
+    "largest",
+    "above 1",
+    "right filter",
+    "unusual above",
+    "unusual",
+    "right filter",
+    "in a tenth",
+)
+
+
+def ratios_document(name: str, ratios: Sequence[GateRatios]) -> Document:
+    """A row for each sensor, and the numbers as data."""
+    columns = (Column("sensor"), *(Column(head, number=True) for head in HEADS))
+    rows: list[tuple[Cell, ...]] = []
+    sensors = {}
+    for each in ratios:
+        (begin, share), known = each.over_time(each.unusual), not np.isnan(each.gate)
+        rejected, unusual, largest = each.above(1.0), each.above(each.unusual), float(each.ratio.max())
+        most = int(np.nanargmax(share)) if known else 0
+        of_gate = (
+            f"≤ {each.rejected:.1g}", f"{each.unusual:.2f}", f"{unusual:.1%}", f"≤ {RARE:.0%}",
+            f"{share[most]:.1%} from {begin[most]:.4g} s",
+        )  # fmt: skip
+        rows.append((
+            each.sensor, f"{each.gate:g} sigma" if known else "", str(len(each.ratio)), f"{largest:.2f}",
+            "" if np.isnan(rejected) else f"{rejected:.1%}", *(of_gate if known else [""] * len(of_gate)),
+        ))  # fmt: skip
+        sensors[each.sensor] = {
+            "gate": each.gate, "messages": len(each.ratio), "largest": largest,
+            "above_1": rejected, "above_1_of_a_right_filter": each.rejected, "unusual_above": each.unusual,
+            "unusual": unusual, "unusual_of_a_right_filter": RARE,
+            "over_time": [{"t": float(t), "unusual": float(s)} for t, s in zip(begin, share, strict=True)],
+        }  # fmt: skip
+    shown = table(columns, rows, f"Test ratios of {name}")
+    data = {"log": name, "note": NO_NIS, "sensors": sensors}
+    return Document(name, "", (), (shown, Text(""), Text(NO_NIS)), data)

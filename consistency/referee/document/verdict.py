@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.verdict.as_dictionary import flat
+from consistency.referee.diagnostics.verdict.as_dictionary import whole
 from consistency.referee.diagnostics.words.sentences import (
     UNCERTAIN,
     p_text,
@@ -63,11 +63,11 @@ def columns(view: Iterable[Measure]) -> tuple[Column, ...]:
 
 def with_values(view: Sequence[Measure], verdicts: Sequence[Verdict]) -> tuple[Measure, ...]:
     """The measures that any of the verdicts has a value of."""
-    return tuple(m for m in view if any(not _is_empty(m.cell(v)) for v in verdicts))
 
+    def has_value(cell: Cell) -> bool:
+        return not isinstance(cell, Quantity) or not cell.is_empty
 
-def _is_empty(cell: Cell) -> bool:
-    return isinstance(cell, Quantity) and cell.is_empty
+    return tuple(m for m in view if any(has_value(m.cell(v)) for v in verdicts))
 
 
 # --- figures and views ------------------------------------------------------------------------------
@@ -238,7 +238,9 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         rows.append(("pose and map", f"NEES / dof {short(value)} [{short(low)}, {short(high)}]"))
     if v.world is not None:
         rows.insert(0, ("error", f"{v.convention}: {PLANAR[v.convention or ADDITIVE]}"))
-        rows.append(("in the world", _in_world(v.world)))
+        scale = v.world.scale
+        mean = f", mean NEES {short(scale.mean_anees)}" if scale is not None and scale.judged_steps else ""
+        rows.append(("in the world", f"{v.world.status}{mean} (additive error, '{ADDITIVE}')"))
     if v.map is not None:
         from consistency.referee.document.map import map_summary
 
@@ -255,11 +257,6 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
     return rows
 
 
-def _in_world(v: Verdict) -> str:
-    mean = f", mean NEES {short(v.scale.mean_anees)}" if v.scale is not None and v.scale.judged_steps else ""
-    return f"{v.status}{mean} (additive error, '{ADDITIVE}')"
-
-
 # --- several verdicts -------------------------------------------------------------------------------
 
 
@@ -272,12 +269,7 @@ def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = T
     blocks: list[Block] = [_overview(verdicts), *(Text(line) for line in _below(verdicts))]
     if reasons:
         blocks.append(Reasons(tuple(reason(v, name) for name, v in verdicts.items())))
-    return Document(title, "", (), tuple(blocks), data(verdicts))
-
-
-def data(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
-    """Status, reasons and statistics by filter."""
-    return {name: {"status": v.status, "reasons": v.reasons, "statistics": flat(v)} for name, v in verdicts.items()}
+    return Document(title, "", (), tuple(blocks), {name: whole(v) for name, v in verdicts.items()})
 
 
 def _overview(verdicts: Mapping[str, Verdict]) -> Table:

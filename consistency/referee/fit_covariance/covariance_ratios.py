@@ -10,14 +10,14 @@ from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.drives import Drive, names_of
-from consistency.referee.fit_covariance.variances import BLOCKS, ENOUGH
-from consistency.referee.fit_covariance.white_noise import Noise, fit_noise
+from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.white_noise import BLOCKS, ENOUGH, Noise, fit_noise
 from consistency.referee.fit_covariance.windows import Windows
+from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array, Indices
 
 DECIDE = 50  # windows that decide where drives are fewer than ENOUGH
-TURN, HALF = "in turn", "half"
+HALF = "half"
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,8 @@ def folds_of(
     none = np.zeros(len(drives), np.int64)
     every = np.arange(len(drives))
     if held_out == HALF or (held_out is None and len(drives) == 1):
-        middle = np.array([_middle(windows, int(i)) for i in every])
+        ends = [windows.last[windows.drive == i] for i in every]
+        middle = np.array([int(each[(len(each) - 1) // 2]) if len(each) else 0 for each in ends])  # rows at half time
         early = windows.of(windows.last <= middle[windows.drive])
         return fit_noise(windows, correct), [Fold(fit_noise(early, correct), every, middle)]
     if held_out is None:
@@ -105,19 +106,13 @@ def folds_of(
     names = [name.strip() for name in held_out.split(",")]
     known = [drive.name for drive in drives]
     if unknown := [name for name in names if name not in known]:
-        raise InputError(f"--held-out {held_out}: no drive '{unknown[0]}'; there are {names_of(drives)}, or 'half'")
+        raise InputError(f"--held-out {held_out}: no drive '{unknown[0]}'; there are {listed(known)}, or 'half'")
     judged = np.array([known.index(name) for name in names])
     rest = ~np.isin(windows.drive, judged)
     if not rest.any() or rest.all():
         raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if not rest.any() else 'judge'}")
     noise = fit_noise(windows.of(rest), correct)
     return noise, [Fold(noise, judged, none)]
-
-
-def _middle(windows: Windows, drive: int) -> int:
-    """Row at which half of the windows of a drive are over."""
-    ends = windows.last[windows.drive == drive]
-    return int(ends[(len(ends) - 1) // 2]) if len(ends) else 0
 
 
 def judged_by(folds: Sequence[Fold], windows: Windows, drives: int, general: bool) -> Judged:

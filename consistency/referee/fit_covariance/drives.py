@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from consistency.referee.errors import InputError
+from consistency.referee.extras import function_at
 from consistency.referee.geometry.groups import composed, matrices
-from consistency.referee.outside import function_at
 from consistency.referee.readers.file_kinds import (
     TABLES,
     TRAJECTORIES,
@@ -21,10 +21,10 @@ from consistency.referee.readers.file_kinds import (
     kind_of,
     trajectory_files,
 )
+from consistency.referee.readers.formats.sheet import refuse
 from consistency.referee.readers.formats.table import table_poses
-from consistency.referee.readers.matching import truth_at
+from consistency.referee.readers.matching import NamedPoses, truth_at
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.poses import NamedPoses
 from consistency.referee.types import Array, Indices
 
 
@@ -101,7 +101,6 @@ def drive_of(
 
 
 def _poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
-    """Name and poses of each drive."""
     kind = kind_of(path, r)
     if not is_bag(path) and path.is_dir() and not trajectory_files(path):
         yield from _of_folder(path, r)
@@ -127,12 +126,10 @@ def _of_folder(folder: Path, r: Reading) -> Iterator[NamedPoses]:
 
 
 def _drive(read: NamedPoses, r: Reading) -> Drive:
-    """The rows of a drive whose truth is known."""
     name, poses, clock = read
     finite = np.isfinite(poses.estimate).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise InputError(f"{poses.place[row]}: the pose is not finite; end the drive before it, or leave the row out")
+    what = "the pose is not finite; end the drive before it, or leave the row out"
+    refuse(~finite, poses.place.__getitem__, what)
     t = poses.t + r.shift
     known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
     if len(known.rows) < 2:
@@ -143,8 +140,3 @@ def _drive(read: NamedPoses, r: Reading) -> Drive:
     T = matrices(poses.estimate)
     T = composed(T) if r.motions else T
     return Drive(name, clock[known.rows] + r.shift, known.rows, T[known.rows], matrices(known.truth))
-
-
-def names_of(drives: Sequence[Drive]) -> str:
-    """The first names, for messages."""
-    return ", ".join(drive.name for drive in drives[:5]) + ", …" * (len(drives) > 5)

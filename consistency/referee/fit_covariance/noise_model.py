@@ -20,9 +20,8 @@ from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.motions import record_of, stretches_of
 from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
 from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_sound
-from consistency.referee.fit_covariance.variances import ENOUGH
-from consistency.referee.fit_covariance.white_noise import Noise, intervals, with_jitter
-from consistency.referee.fit_covariance.windows import PIECES, Windows, span_of, windows_of
+from consistency.referee.fit_covariance.white_noise import ENOUGH, Noise, intervals, with_jitter
+from consistency.referee.fit_covariance.windows import PIECES, Windows, span_of, windows_at, windows_of
 from consistency.referee.geometry.groups import matrices
 from consistency.referee.readers.relative_motions import Stretch
 from consistency.referee.types import Array
@@ -50,12 +49,12 @@ class NoiseModel:
     counts: Mapping[str, int]  # windows, and those left out: long, still, jumps
     growth: Growth  # of the squared rotation error over the span
     warnings: tuple[str, ...]
-    lasting: tuple[Lasting, ...] = ()  # errors that differ between drives
-    second: Second | None = None  # errors of the second estimator
-    drives: tuple[Drive, ...] = field(default=(), repr=False)
-    windows: Windows | None = field(default=None, repr=False)
-    folds: tuple[Fold, ...] = field(default=(), repr=False)
-    is_planar: bool = False
+    lasting: tuple[Lasting, ...]  # errors that differ between drives
+    second: Second | None  # errors of the second estimator
+    drives: tuple[Drive, ...] = field(repr=False)
+    windows: Windows = field(repr=False)
+    folds: tuple[Fold, ...] = field(repr=False)
+    is_planar: bool
 
     @property
     def ratio(self) -> Ratio:
@@ -71,7 +70,6 @@ class NoiseModel:
     @property
     def stretches(self) -> list[tuple[str, Stretch]]:
         """Judged motions as files have them."""
-        assert self.windows is not None
         return stretches_of(self.drives, self.windows, self.folds)
 
     def correct(self, motions: ArrayLike) -> Array:
@@ -164,7 +162,8 @@ def fit_covariance(
     is_half = held_out == HALF or (held_out is None and len(drives) == 1)
     if cautious is not None:
         factor = caution(judged_by(folds, windows, len(drives), not is_half).whole, cautious)
-        noise, folds = _raised(noise, factor), [replace(fold, noise=_raised(fold.noise, factor)) for fold in folds]
+        noise = replace(noise, factor=factor)
+        folds = [replace(fold, noise=replace(fold.noise, factor=factor)) for fold in folds]
     spans = _spans(folds, drives, windows, planar, not is_half)
     record = record_of(stretches_of(drives, windows, folds), windows.axes)
     fitted = windows.of(~np.isin(windows.drive, folds[0].judged)) if held_out not in (None, HALF) else windows
@@ -233,12 +232,7 @@ def _matrices(motion: ArrayLike, noise: Noise) -> Array:
     return matrices(values)
 
 
-def _raised(noise: Noise, factor: float) -> Noise:
-    return replace(noise, factor=factor)
-
-
 def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
-    """Whether x, y and yaw are modelled."""
     if not drives or not all(isinstance(drive, Drive) for drive in drives):
         raise InputError("records: needs at least one drive, of cs.read_drives or cs.drive_of")
     if axes not in (None, 3, 6):
@@ -254,18 +248,10 @@ def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
 def _spans(
     folds: Sequence[Fold], drives: Sequence[Drive], windows: Windows, planar: bool, general: bool
 ) -> tuple[Judged, ...]:
-    """The span of the fit and its multiples, as long as there are windows."""
     found = []
     for times in SPANS:
-        try:
-            some = (
-                windows
-                if times == 1
-                else windows_of(drives, replace(windows.span, size=windows.span.size * times), planar)
-            )
-        except InputError:
-            break
-        if sum(int(fold.judges(some).sum()) for fold in folds) < FEWEST:
+        some = windows if times == 1 else windows_at(drives, windows, windows.span.size * times, planar)
+        if some is None or sum(int(fold.judges(some).sum()) for fold in folds) < FEWEST:
             break
         found.append(judged_by(folds, some, len(drives), general))
     if not found:
@@ -277,5 +263,4 @@ def _spans(
 
 
 def error_windows(model: NoiseModel, judged: Judged) -> Windows:
-    """Corrected windows of one of the spans."""
     return model.noise.mean.applied(windows_of(model.drives, span_of(judged.span), model.is_planar))

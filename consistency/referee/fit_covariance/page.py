@@ -13,12 +13,12 @@ from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, ZERO, solid, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, Span
-from consistency.referee.extras import require
 from consistency.referee.fit_covariance.covariance_ratios import Judged
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
+from consistency.referee.fit_covariance.white_noise import nees_of
 from consistency.referee.fit_covariance.windows import span_of
 from consistency.referee.fit_covariance.wording import document
-from consistency.referee.types import Array
+from consistency.referee.pages.write_pages import plotted
 
 SHOWN = 3  # spans with a panel of errors
 WIDTH, HEIGHT = 3.0, 2.7  # inches, of a panel
@@ -26,14 +26,12 @@ CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 
 
 def page(model: NoiseModel, with_pictures: bool) -> Document:
-    """The sentence, the table, and pictures."""
     said = document(model)
     blocks: tuple[Block, ...] = figures(model) if with_pictures else ()
     return Document(said.title, "", (Chapter("pictures", "Pictures", "pictures", blocks),), said.opening, said.data)
 
 
 def figures(model: NoiseModel) -> tuple[Figure, ...]:
-    """One figure for errors, one for growth and ratios."""
     captions = (
         (
             "Errors of motions",
@@ -53,7 +51,6 @@ def figures(model: NoiseModel) -> tuple[Figure, ...]:
 
 
 def panels(model: NoiseModel) -> tuple[tuple[Panel, ...], ...]:
-    """Errors by span; growth, and ratios by drive."""
     d = 2 if len(model.noise.axes) == 3 else 3
     growth = (_growth(model, range(d), "m²"), _growth(model, range(d, len(model.noise.axes)), "rad²"))
     return tuple(_errors(model, judged) for judged in model.spans[:SHOWN]), (*growth, _drives(model))
@@ -61,30 +58,18 @@ def panels(model: NoiseModel) -> tuple[tuple[Panel, ...], ...]:
 
 def plot(model: NoiseModel, path: str | Path | None) -> Any:
     """All panels in one figure of Matplotlib; see :meth:`NoiseModel.plot`."""
-    require("a plot", "plot")
-    from consistency.referee.show.with_matplotlib import drawn, picture
-
     errors, rest = panels(model)
-    figure = drawn(Sheet((*errors, *rest), 5.0, columns=3))
-    if path is not None:
-        from consistency.referee.pages.write_pages import require_plot, write_file
-
-        path = Path(path)
-        require_plot(path, overwrite=True)
-        write_file(path, picture(figure, path.suffix.lower().removeprefix(".")))
-    return figure
+    return plotted(Sheet((*errors, *rest), 5.0, columns=3), path)
 
 
 def _errors(model: NoiseModel, judged: Judged) -> Panel:
-    """Errors in x and y of the windows of one span, and the ellipse of their mean covariance."""
     windows = error_windows(model, judged)
     error, C = windows.errors, model.noise.covariance(windows.pieces).mean(axis=0)[:2, :2]
     values, vectors = np.linalg.eigh(C)
     radius = np.sqrt(float(stats.chi2.ppf(CONFIDENCE, 2)))
     ellipse = radius * (vectors * np.sqrt(np.maximum(values, 0.0))) @ np.array([np.cos(CIRCLE), np.sin(CIRCLE)])
-    inside = float(
-        (stats.chi2.cdf(_squared(error[:, :2], model.noise.covariance(windows.pieces)), 2) < CONFIDENCE).mean()
-    )
+    squared = nees_of(error[:, :2], model.noise.covariance(windows.pieces)[:, :2, :2])
+    inside = float((stats.chi2.cdf(squared, 2) < CONFIDENCE).mean())
     marks: tuple[Mark, ...] = (
         Points(error[:, 0], error[:, 1], replace(style(0), size=2.5, alpha=0.7), whole=True),
         Line(ellipse[0], ellipse[1], solid(style(1)), path=True),
@@ -94,13 +79,7 @@ def _errors(model: NoiseModel, judged: Judged) -> Panel:
     return Panel(Axis("error in x (m)"), Axis("error in y (m)"), marks, f"Errors over {judged.span}", title=title)
 
 
-def _squared(error: Array, C: Array) -> Array:
-    P = C[:, : error.shape[1], : error.shape[1]]
-    return np.asarray((error * np.linalg.solve(P, error[..., None])[..., 0]).sum(axis=1))
-
-
 def _growth(model: NoiseModel, axes: range, unit: str) -> Panel:
-    """Mean squared errors over spans on logarithmic axes, beside the model."""
     found = [error_windows(model, judged) for judged in model.spans]
     spans = np.array([windows.span.size for windows in found])
     squares = np.array([(windows.errors**2).mean(axis=0) for windows in found])
@@ -121,7 +100,6 @@ def _growth(model: NoiseModel, axes: range, unit: str) -> Panel:
 
 
 def _drives(model: NoiseModel) -> Panel:
-    """Ratio of each judged drive at the span of the fit."""
     ratios = model.spans[0].by_drive[:, 0]
     known = np.flatnonzero(np.isfinite(ratios))
     rows = np.arange(len(known), dtype=float)

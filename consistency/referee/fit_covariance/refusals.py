@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, none_of
-from consistency.referee.fit_covariance.windows import Windows, windows_of
+from consistency.referee.fit_covariance.windows import Windows, windows_at
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.types import Array
 
@@ -38,12 +38,10 @@ class Growth:
 
     @property
     def shrinks(self) -> bool:
-        """Errors do not add up as white noise."""
         return self.power < SHRINKING and self.power + ERRORS * self.error < 1.0
 
     @property
     def persists(self) -> bool:
-        """Errors add up faster."""
         return self.power > PERSISTENT and self.power - ERRORS * self.error > 1.0
 
 
@@ -96,7 +94,8 @@ def body_turn(windows: Windows) -> tuple[float, float, float]:
     D, M, d = windows.motions, windows.true, windows.d
     both = [D[:, :d, d], M[:, :d, d]]
     if d == 3:
-        both = [np.concatenate([each, turn]) for each, turn in zip(both, (_vectors(D), _vectors(M)), strict=True)]
+        turns = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (D, M))
+        both = [np.concatenate([each, turn]) for each, turn in zip(both, turns, strict=True)]
     before, after = _squared(windows), 0.0
     for _ in range(2):  # what is left holds the turn about a straight way, which nothing tells, at none
         U, _, V = np.linalg.svd(both[1].T @ both[0] + after * np.eye(d))
@@ -110,10 +109,6 @@ def body_turn(windows: Windows) -> tuple[float, float, float]:
     gain = max(before - after, 0.0) / max(after, 1e-300)
     chance = float(stats.f.sf(gain * rest / angles, angles, rest)) if rest > 0 else 1.0
     return float(np.arccos(np.clip(cosine, -1.0, 1.0))), 1.0 - after / before if before > 0 else 0.0, chance
-
-
-def _vectors(T: Array) -> Array:
-    return np.asarray(Rotation.from_matrix(T[:, :3, :3]).as_rotvec())
 
 
 def _squared(windows: Windows) -> float:
@@ -131,14 +126,12 @@ def growth_of(drives: Sequence[Drive], windows: Windows, planar: bool, mean: Mea
     """
     spans, squares, counts = [], [], []
     for times in LONGER:
-        try:
-            some = windows_of(drives, replace(windows.span, size=windows.span.size * times), planar)
-        except InputError:
-            break
-        if len(some.drive) < FEW:
+        some = windows_at(drives, windows, windows.span.size * times, planar)
+        if some is None or len(some.drive) < FEW:
             break
         spans.append(times)
-        squares.append(_rotations(some, mean))
+        error = mean.applied(some).errors[:, some.d :]  # of the rotation
+        squares.append(float((error**2).sum(axis=1).mean()))
         counts.append(len(some.drive))
     if len(spans) < 3:
         return Growth(float("nan"), float("nan"))
@@ -146,12 +139,6 @@ def growth_of(drives: Sequence[Drive], windows: Windows, planar: bool, mean: Mea
     x = x - (weight * x).sum() / weight.sum()
     information = float((weight * x**2).sum())
     return Growth(float((weight * x * y).sum()) / information, float(np.sqrt(2.0 / information)))
-
-
-def _rotations(windows: Windows, mean: Mean) -> float:
-    """Mean square of the rotation error of corrected windows, rad^2."""
-    error = mean.applied(windows).errors[:, windows.d :]
-    return float((error**2).sum(axis=1).mean())
 
 
 def revisits(drives: Sequence[Drive], windows: Windows) -> tuple[float, float]:

@@ -37,7 +37,6 @@ class Mean:
         return out
 
     def applied(self, windows: Windows) -> Windows:
-        """The windows with corrected motions."""
         return replace(windows, pieces=self.corrected(windows.pieces))
 
 

@@ -41,7 +41,6 @@ class Windows:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Names of the components of the error."""
         return PLANE if self.d == 2 else SPACE
 
     @property
@@ -56,11 +55,9 @@ class Windows:
 
     @property
     def cut(self) -> float:
-        """Share of windows that have a jump."""
         return self.jumps / max(len(self.drive) + self.jumps, 1)
 
     def of(self, keep: Indices | Array) -> Windows:
-        """Some of the windows."""
         names = ("drive", "first", "last", "pieces", "true")
         return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
@@ -116,6 +113,14 @@ def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) ->
     if not (moved & ~jumped).any():
         raise InputError(f"--span {span.option}: no window of {drives[0].name} has motion without a jump; take another")
     return found.of(moved & ~jumped)
+
+
+def windows_at(drives: Sequence[Drive], windows: Windows, size: float, planar: bool) -> Windows | None:
+    """The windows of all drives over a span of another size; None where none fits."""
+    try:
+        return windows_of(drives, replace(windows.span, size=size), planar)
+    except InputError:
+        return None
 
 
 def _pieces(

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.defaults import DETECT
-from consistency.referee.diagnostics.verdict.as_dictionary import flat
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict.as_dictionary import flat, plain
 from consistency.referee.diagnostics.words.sentences import plural, short
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Ratio
 from consistency.referee.fit_covariance.noise_model import NoiseModel
 from consistency.referee.fit_covariance.persistence import SHARED, Second
-from consistency.referee.fit_covariance.variances import ENOUGH
+from consistency.referee.fit_covariance.white_noise import ENOUGH
 from consistency.referee.fit_covariance.windows import span_of
 
+RATIO = ("value", "low", "high", "spread", "drives", "windows", "status")  # of a ratio, as programs have it
 MARK = {"consistent": "", "undecided": " ?", "overconfident": " overconfident", "conservative": " conservative"}
 
 
@@ -30,7 +30,6 @@ def sentence(model: NoiseModel) -> str:
 
 
 def _text(span: str) -> str:
-    """1 m, 10 steps."""
     return span_of(span).text
 
 
@@ -156,44 +155,36 @@ def lines(model: NoiseModel) -> list[str]:
 
 
 def _of_second(second: Second, axes: Sequence[str]) -> str:
-    """How errors of both correlate, and where the second errs too much to tell."""
     shown = ", ".join(f"{axis} {each:.2f}" for axis, each in zip(axes, second.correlation, strict=True))
     rough = ", ".join(np.array(axes)[second.is_rough])
     text = f"correlation with errors of the second estimator: {shown}; above {SHARED:g} they are the truth's"
     return text + (f"; it errs too much to tell in {rough}" if rough else "")
 
 
-def _interval(value: Interval) -> list[float | None]:
-    return [float(each) if np.isfinite(each) else None for each in value]
-
-
-def _ratio(ratio: Ratio) -> dict[str, Any]:
-    numbers = {key: getattr(ratio, key) for key in ("value", "low", "high", "spread")}
-    clean = {key: float(each) if np.isfinite(each) else None for key, each in numbers.items()}
-    return {**clean, "drives": ratio.drives, "windows": ratio.windows, "status": ratio.status}
-
-
 def data(model: NoiseModel) -> dict[str, Any]:
     """Everything as plain data, as noise.toml and --json have it."""
-    n, m = model.noise, model.noise.mean
-    return {
-        "name": model.name, "status": model.status, "sentence": sentence(model), "span": model.span,
-        "axes": list(n.axes), "fitted_drives": list(model.fitted_drives), "judged_drives": list(model.judged_drives),
-        "held_out": model.held_out, "counts": dict(model.counts),
-        "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": list(m.drift)},
+    n, m, second = model.noise, model.noise.mean, model.second
+    spans = [
+        {
+            "span": each.span,
+            **{
+                axis: {key: getattr(ratio, key) for key in RATIO}
+                for axis, ratio in zip(("whole", *n.axes), (each.whole, *each.axes), strict=True)
+            },
+            "by_drive": each.by_drive[:, 0],
+        }
+        for each in model.spans
+    ]
+    found: dict[str, Any] = plain({
+        "name": model.name, "status": model.status, "sentence": sentence(model), "span": model.span, "axes": n.axes,
+        "fitted_drives": model.fitted_drives, "judged_drives": model.judged_drives, "held_out": model.held_out,
+        "counts": dict(model.counts), "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": m.drift},
         "noise": {
-            "variance_per_m": n.per_m.tolist(), "variance_per_rad": n.per_rad.tolist(), "floor": n.floor.tolist(),
-            "factor": n.factor, "per_m_interval": [_interval(each) for each in model.per_m],
-            "per_rad_interval": [_interval(each) for each in model.per_rad],
+            "variance_per_m": n.per_m, "variance_per_rad": n.per_rad, "floor": n.floor, "factor": n.factor,
+            "per_m_interval": model.per_m, "per_rad_interval": model.per_rad,
         },
-        "growth": None if np.isnan(model.growth.power) else model.growth.power, "warnings": list(model.warnings),
-        "second_correlation": None if model.second is None else model.second.correlation.tolist(),
-        "second_size": None if model.second is None else model.second.size.tolist(),
-        "spans": [
-            {"span": each.span, "whole": _ratio(each.whole),
-             **{axis: _ratio(of) for axis, of in zip(n.axes, each.axes, strict=True)},
-             "by_drive": [None if np.isnan(v) else float(v) for v in each.by_drive[:, 0]]}
-            for each in model.spans
-        ],
-        "referee": flat(model.verdict),
-    }  # fmt: skip
+        "growth": model.growth.power, "warnings": model.warnings,
+        "second_correlation": None if second is None else second.correlation,
+        "second_size": None if second is None else second.size, "spans": spans, "referee": flat(model.verdict),
+    })  # fmt: skip
+    return found

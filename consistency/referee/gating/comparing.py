@@ -25,8 +25,6 @@ NONE_FAILED = FailedRuns(0, 0)
 
 @dataclass(frozen=True)
 class Sides:
-    """Two filters to compare."""
-
     candidate: Record
     a: RunSummary
     b: RunSummary
@@ -37,7 +35,6 @@ class Sides:
 
     @property
     def failed_more(self) -> bool:
-        """a has more failed runs than b on the same trials."""
         return self.paired and self.failures.a > self.failures.b
 
     @property
@@ -47,11 +44,9 @@ class Sides:
         return len(np.intersect1d(a, b)) if self.paired else min(len(a), len(b))
 
     def compare(self, false_alarm: float) -> Comparison:
-        """See :func:`consistency.diagnostics.compare`."""
         return compare(self.a, self.b, false_alarm, self.axes, self.paired)
 
     def reasons(self, c: Comparison) -> list[str]:
-        """A sentence, then each quantity of both."""
         anees = c.differences[0]
         outcome = "worse" if c.worse or self.failed_more else "not worse"
         lines = [

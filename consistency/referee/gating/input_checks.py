@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from consistency.referee.diagnostics import Record, nis_of
 from consistency.referee.diagnostics.records.skipping import Skip, skip_of
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.numpy_archive import in_memory, record_of_arrays
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.formats.numpy_archive import in_memory, record_of_arrays, steps_of
 from consistency.referee.readers.runs_to_record import Track, judged_rows, longest_start, symmetric
 from consistency.referee.types import Array, Failure, Indices
 from consistency.referee.verdicts.sources import Results, source_of
@@ -205,7 +204,7 @@ def _vectors(
     used, tracks, failures, S = np.zeros(there.shape, bool), [], [], S.copy()
     for run, steps in enumerate(there):
         k = np.flatnonzero(steps)
-        place = Places(lambda row, run=run: f"innovation_covariances, run {run}, step {row + 1}", k)  # type: ignore[misc]
+        place = steps_of("innovation_covariances", run, k)
         S[run, k] = symmetric(S[run, k], place.__getitem__)
         tracks.append(Track(run, k, place, v[run, k], S[run, k]))
     longest = longest_start(tracks)

@@ -16,13 +16,13 @@ NUMBERS = {"p", "false-alarm rate", "runs", "planned", "true / stated"}
 
 
 def _cells(e: Entry) -> dict[str, Cell]:
-    """Cells of a gate by their heads."""
     first, *rest = e.reasons
     value, low, high = e.axis_ratio or (e.inflation, *(e.inflation_interval or (None, None)))
     low, high = (float("inf") if end is None else end for end in (low, high))
+    p = "-" if e.p_value is None else f"{min(e.p_value, 1.0):.2g}" if e.p_value >= 1e-6 else "<1e-6"
     return {
         "test": e.test, "gate": e.gate, "filter": e.name, "outcome": outcome(e), "verdict": Status(e.status),
-        "p": _p(e.p_value), "false-alarm rate": f"{e.false_alarm:.3g}", "runs": str(e.runs), "planned": str(e.needed),
+        "p": p, "false-alarm rate": f"{e.false_alarm:.3g}", "runs": str(e.runs), "planned": str(e.needed),
         "true / stated": Quantity(
             value, (low, high), f" in {e.axis}" if e.axis else "", digits=".3g", is_factor=True
         ),
@@ -47,11 +47,6 @@ HEADS = (
 BRIEF = ("test", "gate", "outcome", "p", "runs", "planned", "true / stated", "")  # on a terminal
 
 
-def _p(value: float | None) -> str:
-    """A p value, or a dash."""
-    return "-" if value is None else f"{min(value, 1.0):.2g}" if value >= 1e-6 else "<1e-6"
-
-
 def _table(entries: Iterable[Entry], heads: tuple[str, ...]) -> Table:
     columns = tuple(Column(head, number=head in NUMBERS) for head in heads)
     return table(columns, [tuple(map(_cells(e).__getitem__, heads)) for e in entries], "Gates")
@@ -63,7 +58,6 @@ def lines(ledger: Ledger) -> list[str]:
 
 
 def document(ledger: Ledger) -> Document:
-    """All gates in one table, and the statistics of their verdicts as data."""
     data = {
         "schema_version": 1,
         "kind": "gates",

@@ -9,9 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from consistency.referee.gating.false_alarm_budget import final_rate
-from consistency.referee.gating.watch import Entry, Terms
-from consistency.referee.gating.wording import fault_text, few_to_compare
+from consistency.referee.gating.watch import Entry, Terms, fault_text, few_to_compare, final_rate
 from consistency.referee.show import FORMATS
 
 PROPERTY = "consistency"  # of a test, one a gate: JSON without the statistics
@@ -26,8 +24,6 @@ def to_property(entry: Entry) -> tuple[str, str]:
 
 @dataclass
 class Tested:
-    """What the reports of one test said."""
-
     nodeid: str
     location: tuple[str, int | None, str]
     outcome: str = ""
@@ -62,7 +58,6 @@ class Ledger:
             tested.outcome = report.outcome
 
     def entries(self) -> list[Entry]:
-        """All gates, each with the outcome of its test."""
         return [
             replace(entry, test_outcome=tested.outcome) for tested in self.tests.values() for entry in tested.entries
         ]

@@ -1,14 +1,42 @@
-"""What a gate and the test session around it tell each other; standard library only, so that a plugin loads fast."""
+"""What a gate and the test session around it tell each other, the false-alarm rate that they share, and messages.
+
+Standard library only, so that a plugin loads fast.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from consistency.referee.defaults import DETECT, GATE_FALSE_ALARM, POWER
-from consistency.referee.gating.false_alarm_budget import in_place_rate
+
+FIRST = 10  # gates of each test that may fail in place
+
+
+def in_place_rate(budget: float, tests: int, before: int = 0) -> float:
+    """False-alarm rate at which the gate after ``before`` others of its test fails without waiting for the end.
+
+    The first 10 gates of each of ``tests`` collected tests share half of the budget; later ones wait (0).
+    """
+    return 0.5 * budget / (FIRST * max(tests, 1)) if before < FIRST else 0.0
+
+
+def final_rate(budget: float, in_place: Sequence[float]) -> float:
+    """False-alarm rate r of every gate, known when all have run: the sum of max(in_place, r) is the budget.
+
+    With up to 20 gates a test this is budget / number of gates (Bonferroni). Where more ran, the gates that
+    could fail in place have had their larger share, and the others split what is left: half the budget at least.
+
+    Parameters
+    ----------
+    in_place : rate of each gate of :func:`in_place_rate`
+    """
+    rate = budget / max(len(in_place), 1)
+    larger = [each for each in in_place if each > rate]
+    return (budget - sum(larger)) / (len(in_place) - len(larger)) if larger else rate
+
 
 # of a gate that is told nothing else; dof plans the runs of a test without the marker: a planar pose
 DEFAULTS: dict[str, Any] = {
@@ -120,6 +148,8 @@ def terms(
     ValueError
         An argument out of its range.
     """
+    from consistency.referee.diagnostics import Settings
+
     watch = current()
     given: dict[str, Any] = {
         "false_alarm": false_alarm, "detect": detect, "power": power, "allow": allow, "tolerance": tolerance,
@@ -127,26 +157,46 @@ def terms(
     }  # fmt: skip
     choices: dict[str, Any] = dict(watch.marked) | {key: value for key, value in given.items() if value is not None}
     options = DEFAULTS | choices
-    for key in ("false_alarm", "power"):
-        if not 0.0 < options[key] < 1.0:
-            raise ValueError(f"{key} must lie between 0 and 1, got {options[key]}")
-    if not 0.0 < options["detect"] < float("inf") or options["detect"] == 1.0:
-        raise ValueError(
-            f"detect must be a positive ratio of true to stated covariance, not 1; got {options['detect']}"
-        )
-    if options["allow"] not in (None, "conservative"):
-        raise ValueError(f"allow must be 'conservative' or None, got '{options['allow']}'")
+    Settings(**{key: options[key] for key in given})  # refuses what is out of range
     if options["allow"] == "conservative" and options["detect"] < 1.0:
         raise ValueError(f"detect {options['detect']} is a covariance too large, which allow='conservative' accepts")
-    wide = options["tolerance"]
-    if wide is not None and (not 0.0 < wide < float("inf") or wide == 1.0):
-        raise ValueError(f"tolerance must be a positive ratio of true to stated covariance, not 1; got {wide}")
-    if options["lost"] is not None and not 0.0 < options["lost"] < 1.0:
-        raise ValueError(f"lost must lie between 0 and 1, got {options['lost']}")
-    rest = float(options["detect"]), float(options["power"]), options["allow"], wide
+    rest = float(options["detect"]), float(options["power"]), options["allow"], options["tolerance"]
     if watch.budget is None or "false_alarm" in choices:
         return Terms(float(options["false_alarm"]), *rest, lost=options["lost"])
     rate = in_place_rate(watch.budget, watch.tests, watch.budgeted)
     watch.budgeted += 1
     provisional = rate or in_place_rate(watch.budget, watch.tests)
     return Terms(provisional, *rest, budget=watch.budget, may_fail=rate > 0, lost=options["lost"])
+
+
+def fault_text(gate: str, name: str, reasons: Sequence[str]) -> str:
+    first, *rest = reasons
+    return "\n  - ".join([f"{gate}: {name} is {first}", *rest])
+
+
+def plan_command(dof: int, terms: Terms) -> str:
+    return (
+        f"consistency plan --dof {dof} --detect {terms.detect!r} --false-alarm {terms.false_alarm!r} "
+        f"--power {terms.power!r}"
+        + (f" --allow {terms.allow}" if terms.allow else "")
+        + (f" --lost {terms.lost!r}" if terms.lost is not None else "")
+    )
+
+
+def undecided_text(gate: str, name: str, sentence: str, needed: int, dof: int, terms: Terms) -> str:
+    """Neither a fault nor that there is none: how many runs to simulate, and where the number comes from."""
+    larger = "a larger detect" if terms.lost is None else "a larger detect and a larger lost"
+    return (
+        f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for {larger}; the number that is enough "
+        f"however the steps depend on each other: {plan_command(dof, terms)}"
+    )
+
+
+def few_to_compare(gate: str, name: str, runs: int, needed: int, terms: Terms) -> str:
+    """How many runs a comparison lacks, and for what."""
+    return (
+        f"{gate}: {name} is not found worse, but {runs} run{'s are' if runs != 1 else ' is'} too few to pass: "
+        f"{needed} find a covariance ratio farther from 1 by x{terms.detect:g} with power {terms.power:g} "
+        f"at a false-alarm rate of {terms.false_alarm:.3g}, at the spread between these runs. Simulate more "
+        "runs, or ask for a larger detect."
+    )

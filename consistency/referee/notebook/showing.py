@@ -4,29 +4,22 @@ from __future__ import annotations
 
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.words.sentences import plural
 from consistency.referee.document.blocks import Bullets, Facts
 from consistency.referee.document.verdict import summary
-from consistency.referee.extras import require
 from consistency.referee.show import as_html, text
-from consistency.referee.system.atomic import write_whole
-
-if TYPE_CHECKING:
-    from consistency.referee.show.with_matplotlib import Drawn
 
 
 def record_text(record: Record) -> str:
-    """One line."""
     runs, unit = plural(len(record.run_numbers), "run"), "step" if record.window is None else "window"
     size = f"{runs} x {plural(len(record.t), unit)}"
     return f"<Record {record.name}: {size}, error {record.convention or '-'} of {', '.join(record.axes)}>"
 
 
 def record_html(record: Record) -> str:
-    """Table of its size and origin, and its notes."""
     rows = (
         ("runs", str(len(record.run_numbers))), ("steps", str(len(record.t))), ("error", record.convention or "-"),
         ("components", ", ".join(record.axes)), ("failed runs", str(len(record.failures))),
@@ -36,7 +29,6 @@ def record_html(record: Record) -> str:
 
 
 def verdict_text(verdict: Verdict) -> str:
-    """The sentence and a short table."""
     return text.fragment(*summary(verdict))
 
 
@@ -48,19 +40,9 @@ def verdict_html(verdict: Verdict) -> str:
     return as_html.fragment(*summary(verdict)) + "".join(map(as_html.block, pictures))
 
 
-def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Drawn:
+def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Any:
     """See :meth:`Record.plot`."""
     from consistency.referee.pages.files_report import record_sheet
+    from consistency.referee.pages.write_pages import plotted
 
-    sheet = record_sheet(record, verdict)
-    require("a plot", "plot")
-    from consistency.referee.show.with_matplotlib import drawn, picture
-
-    figure = drawn(sheet)
-    if path is not None:
-        from consistency.referee.pages.write_pages import require_plot
-
-        path = Path(path)
-        require_plot(path, overwrite=True)
-        write_whole(path, picture(figure, path.suffix.lower().removeprefix(".")), 0o644)
-    return figure
+    return plotted(record_sheet(record, verdict), path)

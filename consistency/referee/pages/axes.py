@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.statistics.coverage import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 from consistency.referee.document.colours import EXPECTED, solid
 from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, dodge
 from consistency.referee.pages.judged import Estimator, Judged

@@ -18,11 +18,10 @@ from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, SIGMAS,
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
 from consistency.referee.errors import InputError
 from consistency.referee.pages import axes, questions, verdicts
-from consistency.referee.pages.clock import Clock, clock_of
-from consistency.referee.pages.judged import Estimator, Judged, wide
-from consistency.referee.pages.one_step import errors_of_runs, has_one_step, nees_of_runs
+from consistency.referee.pages.judged import Clock, Estimator, Judged, clock_of, wide
+from consistency.referee.pages.one_step import columns_of, errors_of_runs, figure_of_errors, has_one_step, nees_of_runs
 from consistency.referee.pages.provenance import facts
-from consistency.referee.pages.trajectory import trajectory
+from consistency.referee.pages.trajectory import shown_run, trajectory
 from consistency.referee.types import Array
 
 MOST_PANELS = 12  # components of an error that are drawn
@@ -43,7 +42,13 @@ def compose_files(
     study = _study(tuple(judged.values()), title)
     several = len(judged) > 1
     chapters = [
-        Chapter(f"estimator-{i}", name, name, _of_one(named[name], verdict, several), _counts(named[name], verdict))
+        Chapter(
+            f"estimator-{i}",
+            name,
+            name,
+            (*[Text(f"{name} is {_ended(verdict.reasons[0])}")] * several, *record_figures(named[name], verdict)),
+            _counts(named[name], verdict),
+        )
         for i, (name, verdict) in enumerate(judged.items())
     ]
     by_axis = axes.read(study)
@@ -81,18 +86,13 @@ def _counts(record: Evidence, verdict: Verdict) -> str:
     return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and len(record.t) > 1 else size
 
 
-def _of_one(record: Evidence, verdict: Verdict, said: bool) -> tuple[Block, ...]:
-    sentence = (Text(f"{record.name} is {_ended(verdict.reasons[0])}"),) if said else ()
-    return (*sentence, *record_figures(record, verdict))
-
-
 def record_figures(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
     """Errors with their bounds, NEES, trajectory, coverage, and innovations; those that the record has."""
     if record.truth_covariance is not None:
         figures = record_figures(of_both(record), verdict)
         return tuple(replace(figure, caption=f"{figure.caption} {OF_BOTH}") for figure in figures)
     found = (
-        _errors(record), _nees(record, verdict), _trajectory(record), _coverage(record), _innovations(record, verdict),
+        _errors(record), _nees(record, verdict), trajectory(record), _coverage(record), _innovations(record, verdict),
     )  # fmt: skip
     return tuple(figure for figure in found if figure is not None)
 
@@ -107,13 +107,13 @@ def record_sheet(record: Evidence, verdict: Verdict | None = None) -> Sheet:
     """
     record = of_both(record)
     nees = None if verdict is None else _nees(record, verdict)
-    found = [figure for figure in (_errors(record), nees, _trajectory(record), _coverage(record)) if figure is not None]
+    found = [figure for figure in (_errors(record), nees, trajectory(record), _coverage(record)) if figure is not None]
     if not found:
         raise InputError(f"{record.name}: has neither errors nor NEES to draw; give --truth, or truth= in Python")
     first, *others = found
     own = (replace(panel, keys=figure.keys) for figure in others for panel in figure.panels)
     panels = (*first.panels, *own)
-    columns = _columns(len(panels))
+    columns = columns_of(len(panels))
     return Sheet(panels, 0.3 + 1.6 * -(-len(panels) // columns), columns=columns, keys=first.keys, title=record.name)
 
 
@@ -127,19 +127,13 @@ def unit_of(axis: str) -> tuple[str, float]:
     return ("m" if axis in METRES else DERIVED.get(axis[:-1], "") if axis[-1:] in METRES else "", 1.0)
 
 
-def shown_run(record: Evidence) -> int:
-    """Row of the run that is drawn: the first that reaches furthest."""
-    assert record.error is not None
-    return int(np.argmax(np.isfinite(record.error).all(axis=-1).sum(axis=1)))
-
-
 def _errors(record: Evidence) -> Figure | None:
     """Error of each component of one run with its 2-sigma bounds, as fig. 2b of Herath et al. (2007)."""
     if record.error is None or record.covariance is None:
         return None
     if has_one_step(record):
         units = [unit_of(name) for name in record.axes[:MOST_PANELS]]
-        return errors_of_runs(record, units, _columns(len(units)))
+        return errors_of_runs(record, units)
     clock, row = clock_of(record.t), shown_run(record)
     others = [i for i in np.linspace(0, len(record.run_numbers) - 1, MOST_RUNS + 1).astype(int) if i != row]
     names = record.axes[:MOST_PANELS]
@@ -149,24 +143,13 @@ def _errors(record: Evidence) -> Figure | None:
         Key("2-sigma bounds", replace(SHOWN, dash=(4.0, 3.0), width=0.8)),
     ]
     keys += [Key("other runs", OTHERS)] if others else []
-    left_out = len(record.axes) - len(names)
+    meaning = "truth minus estimate" if record.window is None else f"of the motion over each window of {record.window}"
     caption = (
-        f"Error ({_meaning(record)}) of run {record.run_numbers[row]} with the 2-sigma bounds that the estimator "
+        f"Error ({meaning}) of run {record.run_numbers[row]} with the 2-sigma bounds that the estimator "
         "states (dashed). Honest errors stay inside about 95 % of the time."
-        + (f" {plural(left_out, 'further component')} not drawn." if left_out else "")
-        + clock.note
     )
-    columns = _columns(len(panels))
-    sheet = Sheet(panels, 0.3 + 1.4 * -(-len(panels) // columns), columns=columns, keys=tuple(keys))
-    return Figure("Errors and stated bounds", caption, panels, (sheet,), tuple(keys))
-
-
-def _meaning(record: Evidence) -> str:
-    return "truth minus estimate" if record.window is None else f"of the motion over each window of {record.window}"
-
-
-def _columns(panels: int) -> int:
-    return 2 if panels in (2, 4) else min(3, panels)
+    figure = figure_of_errors(record, caption, panels, tuple(keys))
+    return replace(figure, caption=figure.caption + clock.note)
 
 
 def _error_panel(record: Evidence, clock: Clock, row: int, others: list[int], i: int) -> Panel:
@@ -238,15 +221,6 @@ def _nees_of_windows(record: Evidence) -> Figure | None:
         height=300,
     )  # fmt: skip
     return Figure("NEES", caption, (panel,), (Sheet((panel,), 2.2, keys=keys),), keys)
-
-
-# --- trajectory -------------------------------------------------------------------------------------
-
-
-def _trajectory(record: Evidence) -> Figure | None:
-    if record.error is None or has_one_step(record):
-        return None
-    return trajectory(record, shown_run(record))
 
 
 # --- coverage ---------------------------------------------------------------------------------------

@@ -9,8 +9,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
 from consistency.referee.document.colours import EXPECTED, LIMIT, style
-from consistency.referee.document.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span
-from consistency.referee.document.fewer_points import thin
+from consistency.referee.document.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span, thin
 from consistency.referee.show import with_matplotlib
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitor_sources import Watched
@@ -22,15 +21,13 @@ FAULT = replace(style(1), dash=(), width=1.1)
 
 def monitor_plot(shown: Watched | Sequence[GateRatios], kind: str) -> bytes:
     """NIS / dof above, the e-value below, over the steps of the file, or test ratios; ``kind`` is png, pdf or svg."""
-    return with_matplotlib.render(sheet(shown) if isinstance(shown, Watched) else ratios_sheet(shown), kind)
-
-
-def ratios_sheet(ratios: Sequence[GateRatios]) -> Sheet:
-    """A panel for each sensor: its test ratios over time, the gate, and what a right filter seldom exceeds."""
-    return Sheet(tuple(map(_ratios, ratios)), HEIGHT * len(ratios) / 2.0, columns=1)
+    if isinstance(shown, Watched):
+        return with_matplotlib.render(sheet(shown), kind)
+    return with_matplotlib.render(Sheet(tuple(map(_ratios, shown)), HEIGHT * len(shown) / 2.0, columns=1), kind)
 
 
 def _ratios(each: GateRatios) -> Panel:
+    """Test ratios of a sensor over time, the gate, and what a right filter seldom exceeds."""
     keep = thin(each.ratio)
     marks: list[Mark] = [Points(each.t[keep], each.ratio[keep], replace(style(0), size=2.0, alpha=0.7))]
     marks += [Rule("y", at, look) for at, look in ((1.0, LIMIT), (each.unusual, EXPECTED)) if np.isfinite(at)]

@@ -26,7 +26,7 @@ def _axis(record: Evidence) -> Axis:
     return Axis("run", share="run", window=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
 
 
-def errors_of_runs(record: Evidence, units: Sequence[tuple[str, float]], columns: int) -> Figure:
+def errors_of_runs(record: Evidence, units: Sequence[tuple[str, float]]) -> Figure:
     """Error of each run with its 2-sigma bounds, a panel for each of the components that have ``units``."""
     assert record.error is not None
     assert record.covariance is not None
@@ -39,15 +39,25 @@ def errors_of_runs(record: Evidence, units: Sequence[tuple[str, float]], columns
         label = f"{record.axes[i]} ({unit})" if unit else record.axes[i]
         alt = f"Error of {record.axes[i]} of {record.name} in each run, with 2-sigma bounds"
         panels.append(Panel(axis, Axis(label), marks, alt, height=220))
-    left_out = len(record.axes) - len(units)
     caption = (
         "Error (truth minus estimate) of each run with the 2-sigma bounds that the estimator states (shaded). "
         "About 95 % of honest errors are inside."
-        + (f" {plural(left_out, 'further component')} not drawn." if left_out else "")
     )
     keys = (Key("error of a run", EACH, "points"), Key("2-sigma bounds", SHADE, "band"))
-    sheet = Sheet(tuple(panels), 0.3 + 1.4 * -(-len(panels) // columns), columns=columns, keys=keys)
-    return Figure("Errors and stated bounds", caption, tuple(panels), (sheet,), keys)
+    return figure_of_errors(record, caption, tuple(panels), keys)
+
+
+def figure_of_errors(record: Evidence, caption: str, panels: tuple[Panel, ...], keys: tuple[Key, ...]) -> Figure:
+    """Panels of the first components, side by side."""
+    left_out, columns = len(record.axes) - len(panels), columns_of(len(panels))
+    caption += f" {plural(left_out, 'further component')} not drawn." if left_out else ""
+    sheet = Sheet(panels, 0.3 + 1.4 * -(-len(panels) // columns), columns=columns, keys=keys)
+    return Figure("Errors and stated bounds", caption, panels, (sheet,), keys)
+
+
+def columns_of(panels: int) -> int:
+    """Panels in a row."""
+    return 2 if panels in (2, 4) else min(3, panels)
 
 
 def nees_of_runs(record: Evidence) -> Figure | None:

@@ -11,6 +11,7 @@ from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.document.colours import TRUTH, Look, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet
+from consistency.referee.pages.one_step import has_one_step
 from consistency.referee.types import Array, Indices
 
 IN_WORLD = ("so2", "so3", "so3-body", "vector")  # errors whose position is about the axes of the world
@@ -21,20 +22,28 @@ TRUE, ESTIMATED = Look(TRUTH, width=0.9), replace(style(0), width=1.0)
 ELLIPSE, AT = replace(style(1), dash=(), width=0.9), Look(TRUTH, marker="X", size=5.0)
 
 
-def trajectory(record: Evidence, row: int) -> Figure | None:
-    """Figure of a run by its row; None where positions are not known.
+def shown_run(record: Evidence) -> int:
+    """Row of the run that is drawn: the first that reaches furthest."""
+    assert record.error is not None
+    return int(np.argmax(np.isfinite(record.error).all(axis=-1).sum(axis=1)))
+
+
+def trajectory(record: Evidence) -> Figure | None:
+    """Figure of the run that is drawn; None where positions are not known, or of runs of one step.
 
     It shows the two axes over which the path reaches furthest.
     """
-    if record.path is None or record.window is not None:
+    if record.path is None or record.error is None or record.window is not None or has_one_step(record):
         return None
+    row = shown_run(record)
     true, estimated = record.path[row, :, 0], record.path[row, :, 1]
     known = np.isfinite(record.path[row]).all(axis=(1, 2))
     names = [axis for axis in ("x", "y", "z") if axis in record.axes]
     if known.sum() < 2 or len(names) < 2:
         return None
-    pair = _widest(true[known], ["xyz".index(name) for name in names])
-    i, j = pair
+    reach = np.ptp(true[known], axis=0)
+    axes = itertools.combinations(["xyz".index(name) for name in names], 2)
+    i, j = pair = list(max(axes, key=lambda two: float(np.prod(reach[list(two)]))))  # the first where they are alike
     tips = (("x", "@x{0.000} m"), ("y", "@y{0.000} m"))
     marks: list[Mark] = [
         Line(true[:, i], true[:, j], TRUE, path=True, tips=tips),
@@ -72,12 +81,6 @@ def ellipse(centre: Array, P: Array) -> Array:
     angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
     circle = np.sqrt(float(distributions.chi2.ppf(SHARE, 2))) * np.column_stack([np.cos(angle), np.sin(angle)])
     return np.asarray(centre + circle @ np.linalg.cholesky(P).T)
-
-
-def _widest(position: Array, axes: list[int]) -> list[int]:
-    """The two axes over which positions (T, d) reach furthest, in order; the first two where they are alike."""
-    reach = np.ptp(position, axis=0)
-    return list(max(itertools.combinations(axes, 2), key=lambda pair: float(np.prod(reach[list(pair)]))))
 
 
 def _worst(record: Evidence, row: int) -> Indices:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from consistency.referee.diagnostics.words.sentences import plural, short
-from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Reasons, Table, table
+from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Reasons, table
 from consistency.referee.document.verdict import FILTER, cells, columns, page, reason, with_values
 from consistency.referee.document.wording import listed
 from consistency.referee.pages.judged import Estimator, Judged
@@ -21,20 +21,19 @@ FAILURES = (
 def judgement(study: Judged) -> list[Block]:
     """Table and sentences of one study, and its failed runs."""
     reasons = Reasons(tuple(reason(track.verdict, track.name, track.look) for track in study.tracks))
-    blocks: list[Block] = [Heading(study.name), _table(study), reasons]
+    view = with_values(page(equivalence_interval(study)), [track.verdict for track in study.tracks])
+    cells_of = [(Name(track.name, track.look), *cells(view, track.verdict)) for track in study.tracks]
+    text = caption(study)
+    shown = table(
+        (FILTER, *columns(view)), cells_of, f"Verdicts of {study.name}", caption=text, paper=f"{study.name}: {text}",
+        style="narrow", apart=True,
+    )  # fmt: skip
+    blocks: list[Block] = [Heading(study.name), shown, reasons]
     if study.failures:
         rows: list[tuple[Cell, ...]] = [(name, str(run), str(step), why) for name, run, step, why in study.failures]
-        caption = f"Failed runs of {study.name}: {len(rows)}"
-        blocks.append(table(FAILURES, rows, f"Failed runs of {study.name}", caption=caption))
+        failed = f"Failed runs of {study.name}"
+        blocks.append(table(FAILURES, rows, failed, caption=f"{failed}: {len(rows)}"))
     return blocks
-
-
-def _table(study: Judged) -> Table:
-    view = with_values(page(equivalence_interval(study)), [track.verdict for track in study.tracks])
-    rows = [(Name(track.name, track.look), *cells(view, track.verdict)) for track in study.tracks]
-    text = caption(study)
-    label, paper = f"Verdicts of {study.name}", f"{study.name}: {text}"
-    return table((FILTER, *columns(view)), rows, label, caption=text, paper=paper, style="narrow", apart=True)
 
 
 def equivalence_interval(study: Judged) -> str:
@@ -84,12 +83,7 @@ def method(studies: Sequence[Judged]) -> str:
     )
     if tracks:
         text += _consistent(tracks[0])
-    return text + "".join(sentence for applies, sentence in _conditions(studies) if applies)
-
-
-def _conditions(studies: Sequence[Judged]) -> tuple[tuple[bool, str], ...]:
-    """Sentences of the method, and whether the report needs them."""
-    return (
+    conditions = (
         (
             any(study.has_truth for study in studies),
             " Half of the false-alarm rate belongs to the mean NEES of whole runs, for which the number of runs is "
@@ -113,6 +107,7 @@ def _conditions(studies: Sequence[Judged]) -> tuple[tuple[bool, str], ...]:
             "part of their share.",
         ),
     )
+    return text + "".join(sentence for applies, sentence in conditions if applies)
 
 
 def _consistent(track: Estimator) -> str:

@@ -16,11 +16,12 @@ from consistency.referee.show import rendered
 from consistency.referee.system.atomic import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from consistency.referee.diagnostics import Evidence, Verdict
     from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
     from consistency.referee.document.blocks import Document
+    from consistency.referee.document.drawing import Sheet
     from consistency.referee.system.progress import Advance
     from consistency.referee.verdicts.monitor_sources import Watched
 
@@ -77,33 +78,27 @@ def write_file_reports(
     from consistency.referee.system.folders import write_folder
     from consistency.referee.system.provenance import manifest_of
 
-    manifest = manifest_of(kind="verdict", source=title)
-    write = _static_page(records, judged, title) if missing("report") else _pages(records, judged, title, manifest)
+    manifest, is_static = manifest_of(kind="verdict", source=title), missing("report")
+    if is_static:
+        from consistency.referee.pages.core_page import compose_plain
+
+        document = compose_plain(records, judged, title)
+    else:
+        from consistency.referee.pages.files_report import compose_files
+
+        document = compose_files(records, judged, title, manifest)
 
     def contents(at: Path) -> None:
-        write(at)
+        html = at / "report.html"
+        if is_static:
+            write_file(html, rendered(document, html).encode("utf-8"))
+        else:
+            write_document(document, html, at / "report.pdf")
         write_file(at / "verdict.json", data.encode("utf-8"))
 
     write_folder(folder, manifest, contents, overwrite)
     names = ("report.html", "report.pdf", "verdict.json")
     return [path for path in (folder / name for name in names) if path.exists()]
-
-
-def _pages(
-    records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str, manifest: dict[str, Any]
-) -> Callable[[Path], None]:
-    from consistency.referee.pages.files_report import compose_files
-
-    document = compose_files(records, judged, title, manifest)
-    return lambda at: write_document(document, at / "report.html", at / "report.pdf")
-
-
-def _static_page(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
-    from consistency.referee.pages.core_page import compose_plain
-    from consistency.referee.show.as_html import render
-
-    text = render(compose_plain(records, judged, title))
-    return lambda at: write_file(at / "report.html", text.encode("utf-8"))
 
 
 def write_text_file(document: Document, path: Path, overwrite: bool) -> Path:
@@ -150,6 +145,19 @@ def require_plot(path: Path, overwrite: bool) -> None:
         raise InputError(f"--plot {path}: must end in {', '.join(KINDS)}")
     require("a plot", "plot")
     require_writable(path, overwrite)
+
+
+def plotted(sheet: Sheet, path: str | Path | None) -> Any:
+    """A figure of Matplotlib, which is written to ``path`` as well; needs ``[plot]``."""
+    require("a plot", "plot")
+    from consistency.referee.show.with_matplotlib import drawn, picture
+
+    figure = drawn(sheet)
+    if path is not None:
+        path = Path(path)
+        require_plot(path, overwrite=True)
+        write_file(path, picture(figure, path.suffix.lower().removeprefix(".")))
+    return figure
 
 
 def write_monitor_plot(path: Path, shown: Watched | Sequence[GateRatios]) -> None:

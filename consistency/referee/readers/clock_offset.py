@@ -11,8 +11,7 @@ from scipy import optimize
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.errors import InputError
-from consistency.referee.readers.alignment.align import Aligned
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.matching import Aligned, Poses
 from consistency.referee.types import Array
 
 REACH = 1.0  # s, the largest offset that is looked for
@@ -92,20 +91,16 @@ def clock_shift(name: str, runs: Sequence[Poses], wanted: float | str | None) ->
         return wanted, [f"{name}: {wanted:g} s are added to the timestamps of the estimates"] if wanted else []
     found = offset_of(runs)
     if wanted is None:
-        return 0.0, [_named(name, found)] if found is not None and found.found else []
+        if found is None or not found.found:
+            return 0.0, []
+        share = f"{100.0 * found.explained:.0f} % of the NEES; if so, add --time-offset {found.value:.4g}"
+        return 0.0, [f"{name}: the clocks of estimates and truth seem to differ by {found}, which makes {share}"]
     if found is None:
         raise InputError(f"--time-offset estimate: nothing moves in {name}, so that the clocks cannot be compared")
     return found.value, [
         f"{name}: the clocks differ by {found}; so much is added to the timestamps of the estimates, which takes "
         f"{100.0 * found.explained:.0f} % of the NEES away"
     ]
-
-
-def _named(name: str, found: Offset) -> str:
-    return (
-        f"{name}: the clocks of estimates and truth seem to differ by {found}, which makes "
-        f"{100.0 * found.explained:.0f} % of the NEES; if so, add --time-offset {found.value:.4g}"
-    )
 
 
 def offset_of(runs: Sequence[Poses]) -> Offset | None:

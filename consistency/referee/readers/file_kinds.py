@@ -78,14 +78,6 @@ def trajectory_files(folder: Path) -> list[Path]:
     return named or [p for p in files if is_spatial(p) or is_solution(p)]
 
 
-def _is_table(path: Path, r: Reading) -> bool:
-    return (path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path))) or is_plane(path)
-
-
-def _is_trajectory(path: Path, r: Reading) -> bool:
-    return path.suffix.lower() in (*TRAJECTORIES, ".csv", ".pos") or path.is_dir()
-
-
 class Kind(NamedTuple):
     """A kind of files: how one is told, options that do not go with it, and ``module:function`` of what reads it."""
 
@@ -112,13 +104,15 @@ KINDS = (  # a file is of the first that knows it
         "referee.readers.formats.numpy_archive:archive_poses",
     ),
     Kind(
-        _is_table,
+        lambda path, r: (
+            (path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path))) or is_plane(path)
+        ),
         (*OF_BAGS, *OF_TRAJECTORIES),
         "referee.readers.formats.table:read_tables",
         "referee.readers.formats.table:table_poses",
     ),
     Kind(
-        _is_trajectory,
+        lambda path, r: path.suffix.lower() in (*TRAJECTORIES, ".csv", ".pos") or path.is_dir(),
         (*OF_BAGS, "state"),
         "referee.readers.formats.tum:read_tum",
         "referee.readers.formats.tum:trajectory_poses",

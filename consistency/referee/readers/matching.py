@@ -1,15 +1,22 @@
-"""Matching of estimates to the truth, which is interpolated on its manifold, and to the steps of other runs."""
+"""Matching of estimates to the truth, which is interpolated on its manifold, and to the steps of other runs.
+
+:class:`Poses` is a run before any error is taken.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from consistency.referee.diagnostics import Evidence
 from consistency.referee.geometry import wrap
+from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.formats.named_columns import UNIT_NAMES, unit_of
+from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.types import Array, Indices
 
 Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more
@@ -138,3 +145,113 @@ def _bends(position: Array, after: Indices) -> Array:
     both = [np.clip(after + side, 1, last) for side in (0, 1)]
     second = [np.linalg.norm(position[i + 1] - 2.0 * position[i] + position[i - 1], axis=1) for i in both]
     return np.asarray(np.maximum(*second) / 8.0)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """One run; N estimates and M samples of the truth.
+
+    ``convention`` is that of the error which the covariance describes. Broken values are NaN.
+    """
+
+    place: Places  # (N,), "est.csv, line 7"
+    t: Array  # (N,), s, increasing
+    estimate: Array  # (N, m)
+    covariance: Array  # (N, n, n)
+    stated: Array  # (N,) of bool: there is a covariance
+    true_t: Array  # (M,), s, increasing
+    truth: Array  # (M, m)
+    manifold: Manifold
+    convention: str
+    max_dt: float  # s
+    cross: Array | None = None  # (N, n, n), E e_before e' with the row before; dropped where rows are chosen
+    true_covariance: Array | None = None  # (M, n, n), of the truth's own error in the convention; NaN where it has none
+
+    def known(self, shift: float = 0.0) -> Known:
+        """The truth at the timestamps, ``shift`` s later."""
+        return truth_at(self.t + shift, self.true_t, self.truth, self.manifold, self.max_dt)
+
+    def truth_covariances(self, known: Known, shift: float = 0.0) -> Array | None:
+        """Covariance of the truth at the rows of ``known``, that of the nearest sample, (k, n, n)."""
+        if self.true_covariance is None:
+            return None
+        return self.true_covariance[nearest(self.t[known.rows] + shift, self.true_t, known.before)]
+
+    def errors(self, shift: float = 0.0) -> Array:
+        """Truth less estimate, (N, n), with the truth ``shift`` s later; NaN where one of both is not known."""
+        known = self.known(shift)
+        out = np.full(self.covariance.shape[:2], np.nan)
+        out[known.rows] = self.error_of(known.rows, known.truth)
+        return out
+
+    def error_of(self, rows: Indices, truth: Array) -> Array:
+        """Error (k, n) of some rows; NaN where the estimate is not finite."""
+        estimate = self.estimate[rows]
+        finite = np.isfinite(estimate).all(axis=1)
+        out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
+        error = planar_error
+        if self.manifold == "spatial":
+            from consistency.referee.geometry.groups import state_error as error
+        out[finite] = error(truth[finite], estimate[finite], self.convention)
+        return out
+
+    def later(self, shift: float) -> Poses:
+        return replace(self, t=self.t + shift) if shift else self
+
+    def sound(self) -> Poses:
+        return self._of(
+            np.flatnonzero(np.isfinite(self.estimate).all(axis=1) & np.isfinite(self.covariance).all((1, 2)))
+        )
+
+    def some(self, most: int) -> Poses:
+        """At most ``most`` estimates, evenly chosen."""
+        if len(self.t) <= most:
+            return self
+        return self._of(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
+
+    def alone(self) -> Poses:
+        """Without velocities and biases behind the poses in space."""
+        if self.manifold != "spatial" or self.covariance.shape[-1] == 6:
+            return self
+        return replace(
+            self, estimate=self.estimate[:, :7], covariance=self.covariance[:, :6, :6], truth=self.truth[:, :7]
+        )
+
+    @classmethod
+    def bare(
+        cls, place: Places, t: Array, estimate: Array, true_t: Array, truth: Array, manifold: Manifold, max_dt: float
+    ) -> Poses:
+        """Poses without covariances, which are NaN."""
+        n = 6 if manifold == "spatial" else truth.shape[1]
+        P = np.broadcast_to(np.nan, (len(t), n, n))
+        return cls(place, t, estimate, P, np.zeros(len(t), bool), true_t, truth, manifold, "left", max_dt)
+
+    def _of(self, rows: Indices) -> Poses:
+        return replace(
+            self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
+            covariance=self.covariance[rows], stated=self.stated[rows], cross=None,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Runs in the world of the truth, with notes on the alignment."""
+
+    runs: Sequence[Poses]  # moved estimates, with covariances of the residual errors
+    align: str = "none"  # the mode
+    notes: tuple[str, ...] = ()
+    caption: str = ""  # what the verdict has to say of it
+    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
+    unavailable: tuple[str, ...] = ()  # questions that have no answer
+    unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
+
+    def on(self, recording: Evidence) -> Evidence:
+        return replace(recording, **{key: value for key, value in vars(self).items() if key not in ("runs", "notes")})
+
+
+class NamedPoses(NamedTuple):
+    """A run of a file without its covariances, by name."""
+
+    name: str
+    poses: Poses
+    clock: Array  # (N,), s, of the estimates; NaN where they are numbered by steps alone

@@ -1,12 +1,16 @@
 """How files of another estimator are read: one record of options, for readers, commands and Python alike."""
 
+# ruff: noqa: RUF009  # an option is a field
+
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
+
+from consistency.referee.errors import InputError
 
 COLUMNS = "columns"  # covariance of the truth: of its own file
 MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
@@ -17,7 +21,6 @@ def _names(text: str) -> list[str]:
 
 
 def _seconds(text: str) -> float | str:
-    """A number where the text is one."""
     try:
         return float(text)
     except ValueError:
@@ -30,109 +33,73 @@ def _lengths(text: str) -> list[float]:
     return [each if isinstance(each, float) else math.nan for each in numbers]
 
 
-def _shown(
+def _option(
     help: str, metavar: str | None = None, parse: Callable[[str], Any] | None = None, flag: str | None = None
-) -> dict[str, Any]:
-    """How the command line shows an option, and what it makes of a text."""
-    return {"help": help, "metavar": metavar, "parse": parse, "flag": flag}
+) -> Any:
+    """An option: how the command line shows it, and what it makes of a text."""
+    return field(default=None, metadata={"help": help, "metavar": metavar, "parse": parse, "flag": flag})
 
 
 @dataclass(frozen=True)
 class Reading:
     """Options of files; None leaves one to the kind of file. :func:`consistency.read` describes them."""
 
-    truth: Path | None = field(
-        default=None, metadata=_shown("Truth of the estimates, in the same form, or a KITTI drive's folder.")
+    truth: Path | None = _option("Truth of the estimates, in the same form, or a KITTI drive's folder.")
+    covariance: Path | None = _option("Covariances of a TUM trajectory: t and 36 or 21 numbers.")
+    error: str | None = _option(
+        "Error that the covariance is of: so2, vector, left, right, so3, so3-body, additive, or guess."
     )
-    covariance: Path | None = field(
-        default=None, metadata=_shown("Covariances of a TUM trajectory: t and 36 or 21 numbers.")
+    state: Sequence[str] | None = _option("Columns that make up the state [x,y,heading].", "A,B,C", _names)
+    covariance_order: str | None = _option("translation-rotation [default] or rotation-translation.")
+    max_dt: float | None = _option(f"Seconds between an estimate and its truth at most [{MAX_DT:g}].")
+    time_offset: float | str | None = _option("Seconds to add to the estimates' timestamps.", "S|estimate", _seconds)
+    axes: Sequence[str] | None = _option(
+        "Components of a trajectory to judge, as x,y,yaw; names here, a number in fit-covariance.", "A,B,C", _names
     )
-    error: str | None = field(
-        default=None,
-        metadata=_shown(
-            "Error that the covariance is of: so2, vector, left, right, so3, so3-body, additive, or guess."
-        ),
+    topic: str | None = _option("Of a ROS bag: Odometry or PoseWithCovarianceStamped.")
+    truth_topic: str | None = _option("Of a ROS bag: poses, or PARENT:CHILD, frames of /tf.")
+    body: str | None = _option("Of a KITTI drive as truth: imu [default], velodyne or camera.")
+    relative: str | float | None = _option(
+        "Judge motions over windows: N steps, seconds (10s), metres (50m).", "N|Ns|Nm", str
     )
-    state: Sequence[str] | None = field(
-        default=None, metadata=_shown("Columns that make up the state [x,y,heading].", "A,B,C", _names)
+    motions: bool | None = _option(
+        "With --relative: each row is a motion with a covariance of its own.", flag="--motions/"
     )
-    covariance_order: str | None = field(
-        default=None, metadata=_shown("translation-rotation [default] or rotation-translation.")
+    windows: str | None = _option("'independent': errors of windows are, so that each is a run.")
+    align: str | None = _option(
+        "Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
+        "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
+        "MODE",
     )
-    max_dt: float | None = field(
-        default=None, metadata=_shown(f"Seconds between an estimate and its truth at most [{MAX_DT:g}].")
+    lever_arm: Sequence[float] | None = _option(
+        "Of a truth of positions alone: its point in the axes of the body, m.", "X,Y,Z", _lengths
     )
-    time_offset: float | str | None = field(
-        default=None, metadata=_shown("Seconds to add to the estimates' timestamps.", "S|estimate", _seconds)
+    split: str | int | None = _option(
+        "Cut one long log into pieces that stand as runs: their number, or 'auto'.", "auto|N", str
     )
-    axes: Sequence[str] | None = field(
-        default=None,
-        metadata=_shown(
-            "Components of a trajectory to judge, as x,y,yaw; names here, a number in fit-covariance.", "A,B,C", _names
-        ),
+    truth_covariance: str | None = _option(
+        "Covariance of the truth: 'columns' of its file, or a file of t and 36 or 21.", "columns|FILE"
     )
-    topic: str | None = field(default=None, metadata=_shown("Of a ROS bag: Odometry or PoseWithCovarianceStamped."))
-    truth_topic: str | None = field(
-        default=None, metadata=_shown("Of a ROS bag: poses, or PARENT:CHILD, frames of /tf.")
+    truth_errors: str | None = _option(
+        "How errors of the truth depend on each other: independent, per-run or common to all runs."
     )
-    body: str | None = field(
-        default=None, metadata=_shown("Of a KITTI drive as truth: imu [default], velodyne or camera.")
+    truth_shared: bool | None = _option("The estimator has fused the truth.", flag="--truth-shared/")
+    shared: str | None = _option(
+        "Take off errors that all estimates share: a vector, one that grows by the second, or by the metre.",
+        "by-vector|by-time|by-distance",
     )
-    relative: str | float | None = field(
-        default=None,
-        metadata=_shown("Judge motions over windows: N steps, seconds (10s), metres (50m).", "N|Ns|Nm", str),
-    )
-    motions: bool | None = field(
-        default=None,
-        metadata=_shown("With --relative: each row is a motion with a covariance of its own.", flag="--motions/"),
-    )
-    windows: str | None = field(
-        default=None, metadata=_shown("'independent': errors of windows are, so that each is a run.")
-    )
-    align: str | None = field(
-        default=None,
-        metadata=_shown(
-            "Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
-            "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
-            "MODE",
-        ),
-    )
-    lever_arm: Sequence[float] | None = field(
-        default=None,
-        metadata=_shown("Of a truth of positions alone: its point in the axes of the body, m.", "X,Y,Z", _lengths),
-    )
-    split: str | int | None = field(
-        default=None,
-        metadata=_shown("Cut one long log into pieces that stand as runs: their number, or 'auto'.", "auto|N", str),
-    )
-    truth_covariance: str | None = field(
-        default=None,
-        metadata=_shown("Covariance of the truth: 'columns' of its file, or a file of t and 36 or 21.", "columns|FILE"),
-    )
-    truth_errors: str | None = field(
-        default=None,
-        metadata=_shown("How errors of the truth depend on each other: independent, per-run or common to all runs."),
-    )
-    truth_shared: bool | None = field(
-        default=None, metadata=_shown("The estimator has fused the truth.", flag="--truth-shared/")
-    )
-    shared: str | None = field(
-        default=None,
-        metadata=_shown(
-            "Take off errors that all estimates share: a vector, one that grows by the second, or by the metre.",
-            "by-vector|by-time|by-distance",
-        ),
-    )
-    shared_from: Path | None = field(
-        default=None, metadata=_shown("Drives that --shared is fitted to [the first half of the estimates].", "DRIVES")
-    )
-    shared_truth: Path | None = field(
-        default=None, metadata=_shown("Truth of these drives [that of --truth].", "TRUTH")
-    )
+    shared_from: Path | None = _option("Drives that --shared is fitted to [the first half of the estimates].", "DRIVES")
+    shared_truth: Path | None = _option("Truth of these drives [that of --truth].", "TRUTH")
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""
         return [name for name in names or [each.name for each in fields(self)] if getattr(self, name) is not None]
+
+    def refuse(self, flag: str, others: Mapping[str, str]) -> None:
+        """Refuse options that do not go with ``flag``, each with its reason."""
+        for name, why in others.items():
+            if getattr(self, name):
+                raise InputError(f"{flag}: does not go with {flag_of(name)}{why}")
 
     @property
     def tolerance(self) -> float:

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
+from consistency.referee.extras import function_at
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
-from consistency.referee.outside import function_at
 from consistency.referee.parsing import require_name
-from consistency.referee.readers.alignment.align import require_alignment
 from consistency.referee.readers.file_kinds import (
     OF_BAGS,
     OF_TRAJECTORIES,
@@ -35,11 +34,12 @@ if TYPE_CHECKING:
     from consistency.referee.readers.windows import Relative
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
+ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
 GUESS = "guess"  # judge every convention
 NO_GUESS = {
-    "truth_covariance": "whose covariance is of a declared error too",
-    "shared": "which is fitted to a declared error",
-    "relative": "which judges motions in one error; name the conventions one by one",
+    "truth_covariance": ", whose covariance is of a declared error too",
+    "shared": ", which is fitted to a declared error",
+    "relative": ", which judges motions in one error; name the conventions one by one",
 }
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_SHARED = ("shared", "shared_from", "shared_truth")
@@ -92,9 +92,7 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Evidence]:
     true = frame_rows(truth, "truth") if hasattr(truth, "columns") else truth if truth is None else Path(truth)
     r = _checked(replace(reading, truth=cast(Any, true)), over)
     _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
-    if r.error == GUESS:
-        return guessed("tables", r, lambda kind: _asked(read_tables(sheet, replace(r, error=kind), over), r, over))
-    return _asked(read_tables(sheet, r, over), r, over)
+    return _asked("tables", r, over, lambda kind: read_tables(sheet, replace(r, error=kind), over))
 
 
 def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evidence]:
@@ -140,14 +138,26 @@ def _cut_by(reason: str) -> tuple[Path, int] | None:
 
 
 def _read(estimates: Path, r: Reading) -> list[Evidence]:
-    """Recordings of files as they stand, with the options given."""
     over = _windows(r)
     r = _checked(r, over)
-    if r.error == GUESS:
-        return guessed(
-            str(estimates), r, lambda kind: _asked(_by_kind(estimates, replace(r, error=kind), over), r, over)
-        )
-    return _asked(_by_kind(estimates, r, over), r, over)
+    return _asked(str(estimates), r, over, lambda kind: _by_kind(estimates, replace(r, error=kind), over))
+
+
+def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]]) -> list[Evidence]:
+    """Records with the same runs under each convention that such poses have, the default of the files first.
+
+    Parameters
+    ----------
+    read : records under a convention, or under the default
+    """
+    r.refuse(f"--error {GUESS}", NO_GUESS)
+    first = read(None)
+    default = first[0].convention
+    if default not in (*PLANAR, *SPATIAL) or default == "vector":
+        raise InputError(f"--error {GUESS}: is for poses; the errors of {name} are plain differences")
+    kinds = [kind for kind in (SPATIAL if default in SPATIAL else PLANAR) if kind not in (default, "vector")]
+    others = {kind: {one.name: one for one in read(kind)} for kind in kinds}
+    return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
 
 
 def _windows(r: Reading) -> Relative | None:
@@ -159,26 +169,16 @@ def _windows(r: Reading) -> Relative | None:
     return relative_of(r.relative, bool(r.motions), r.windows)
 
 
-def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]]) -> list[Evidence]:
-    """Records with the same runs under each convention that such poses have, the default of the files first.
-
-    Parameters
-    ----------
-    read : records under a convention, or under the default
-    """
-    for option, why in NO_GUESS.items():
-        if getattr(r, option):
-            raise InputError(f"--error {GUESS}: does not go with {flag_of(option)}, {why}")
-    first = read(None)
-    default = first[0].convention
-    if default not in (*PLANAR, *SPATIAL) or default == "vector":
-        raise InputError(f"--error {GUESS}: is for poses; the errors of {name} are plain differences")
-    kinds = [kind for kind in (SPATIAL if default in SPATIAL else PLANAR) if kind not in (default, "vector")]
-    others = {kind: {one.name: one for one in read(kind)} for kind in kinds}
-    return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
+def _asked(
+    name: str, r: Reading, over: Relative | None, read: Callable[[str | None], list[Evidence]]
+) -> list[Evidence]:
+    """Records of what is read under a convention, or under each."""
+    if r.error == GUESS:
+        return guessed(name, r, lambda kind: _declared(read(kind), r, over))
+    return _declared(read(r.error), r, over)
 
 
-def _asked(records: list[Evidence], r: Reading, over: Relative | None) -> list[Evidence]:
+def _declared(records: list[Evidence], r: Reading, over: Relative | None) -> list[Evidence]:
     """Records with what is declared of their truth, in pieces or without what all share where that is asked."""
     pieces = pieces_asked(r)
     if r.given(OF_TRUTH) or any(record.truth_covariance is not None for record in records):
@@ -192,7 +192,7 @@ def _asked(records: list[Evidence], r: Reading, over: Relative | None) -> list[E
         return less_shared(records, others, r.shared)
     if pieces is None:
         return records
-    from consistency.referee.diagnostics.records.log_pieces import in_pieces
+    from consistency.referee.diagnostics.planning.single_log import in_pieces
 
     return [in_pieces(record, pieces or None) for record in records]
 
@@ -209,7 +209,11 @@ def _by_kind(estimates: Path, r: Reading, over: Relative | None) -> list[Evidenc
         known = f"{', '.join(SUFFIXES)} (TUM trajectories)"
         hint = HINTS.get(estimates.suffix.lower(), "")
         raise InputError(f"{estimates}: unknown kind of file; known are {known}{hint}")
-    return _with_frame(function_at(kind.records)(estimates, r, over), r)
+    records: list[Evidence] = function_at(kind.records)(estimates, r, over)
+    if r.truth is None or not is_drive(r.truth):
+        return records
+    of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
+    return [replace(records[0], notes=(f"{r.truth}: {of}", *records[0].notes)), *records[1:]]
 
 
 def pieces_asked(r: Reading) -> int | None:
@@ -222,9 +226,7 @@ def pieces_asked(r: Reading) -> int | None:
     """
     if r.split is None:
         return None
-    for option in OF_WINDOWS:
-        if getattr(r, option):
-            raise InputError(f"--split: does not go with {flag_of(option)}, which cuts the log into windows")
+    r.refuse("--split", dict.fromkeys(OF_WINDOWS, ", which cuts the log into windows"))
     if r.align not in (None, "none"):
         raise InputError(f"--split: does not go with --align {r.align}: all pieces would share the error of one frame")
     if r.split == "auto":
@@ -257,22 +259,15 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
         from consistency.referee.readers.shared_calibration import require_shared_options
 
         require_shared_options(r)
-    align = require_alignment(r.align, r.truth or r.truth_topic)
+    if r.align not in (None, *ALIGNMENTS):
+        raise InputError(f"--align {r.align}: must be one of {', '.join(ALIGNMENTS)}")
+    align = None if r.align == "none" else r.align
+    if align is not None and (r.truth or r.truth_topic) is None:
+        raise InputError(f"--align {align} needs --truth, with which the estimates are aligned")
     if over is not None and align is not None:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     pieces_asked(r)  # refused before anything is read
     return replace(r, time_offset=offset, align=align)
-
-
-def _with_frame(recordings: list[Evidence], r: Reading) -> list[Evidence]:
-    """Add a note on the body and the world frame of the poses of a drive."""
-    if r.truth is None or not is_drive(r.truth):
-        return recordings
-    note = (
-        f"{r.truth}: the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first "
-        "packet"
-    )
-    return [replace(recordings[0], notes=(note, *recordings[0].notes)), *recordings[1:]]
 
 
 def _refuse(path: Path, r: Reading, *names: str) -> None:

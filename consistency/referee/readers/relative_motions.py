@@ -58,20 +58,10 @@ class Windows:
     """The windows of one run, W of them."""
 
     track: Track  # with the times of their beginnings
+    error: Array  # (W, n), NaN where the estimate is
+    covariance: Array  # (W, n, n)
     t: Array  # (W,), s, at the end of each
     left_out: int
-
-    @property
-    def error(self) -> Array:
-        """(W, n), NaN where the estimate is."""
-        assert self.track.error is not None
-        return self.track.error
-
-    @property
-    def covariance(self) -> Array:
-        """(W, n, n)."""
-        assert self.track.covariance is not None
-        return self.track.covariance
 
 
 def windows_of(stretch: Stretch, relative: Relative) -> Windows:
@@ -92,7 +82,9 @@ def windows_of(stretch: Stretch, relative: Relative) -> Windows:
     first, last, left_out = windows(s.t, s.truth[:, : s.d], s.rows, relative, s.file)
     sound = _sound(s, relative)
     first, last = first[last < sound], last[last < sound]
-    T, true = _poses(s, sound, relative), matrices(s.truth)
+    T, true = matrices(s.estimate[int(relative.motions) : sound]), matrices(s.truth)
+    if relative.motions:  # from the origin on
+        T = composed(np.concatenate([np.eye(s.d + 1)[None], T]))
     start, end = np.searchsorted(s.rows, first), np.searchsorted(s.rows, last)
     D, M = inverse(T[first]) @ T[last], inverse(true[start]) @ true[end]
     error = log(inverse(D) @ M)
@@ -103,7 +95,7 @@ def windows_of(stretch: Stretch, relative: Relative) -> Windows:
         error = np.concatenate([error, np.full((1, error.shape[1]), 0.0 if finite else np.nan)])
         covariance = np.concatenate([covariance, np.full((1, *s.covariance.shape[1:]), np.nan)])
     track = Track(s.run, np.arange(len(last)), s.place.at(last), error, covariance, t=s.t[first])
-    return Windows(track, s.t[last], left_out)
+    return Windows(track, error, covariance, s.t[last], left_out)
 
 
 def _sound(s: Stretch, relative: Relative) -> int:
@@ -114,14 +106,6 @@ def _sound(s: Stretch, relative: Relative) -> int:
     if relative.motions:
         ok[0] = True
     return len(ok) if ok.all() else int(np.argmin(ok))
-
-
-def _poses(s: Stretch, sound: int, relative: Relative) -> Array:
-    """Estimated poses (sound, d + 1, d + 1); of motions from the origin on."""
-    if not relative.motions:
-        return matrices(s.estimate[:sound])
-    D = matrices(s.estimate[1:sound])
-    return composed(np.concatenate([np.eye(s.d + 1)[None], D]))
 
 
 def _of_motions(s: Stretch, T: Array, first: Indices, last: Indices) -> Array:
@@ -174,7 +158,7 @@ def relative_recording(
         columns, t = common_times(times)
         tracks = [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
     notes = _notes(name, found, axes, stretches[0].convention, relative)
-    of = _independence(found)
+    of = independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
     notes += _doubt(name, of, relative) if relative.independent else []
     record = assemble(name, tracks, t, tuple(axes[i] for i in part), file, KIND, notes)
     if not relative.independent:
@@ -224,10 +208,6 @@ def _widest(found: Sequence[Windows]) -> float:
     angles = P[:, 2:, 2:] if P.shape[-1] == 3 else P[:, 3:, 3:]
     angles = angles[np.isfinite(angles).all(axis=(1, 2))]
     return float(np.median(np.sqrt(np.maximum(np.linalg.eigvalsh(angles)[:, -1], 0.0)))) if len(angles) else 0.0
-
-
-def _independence(found: Sequence[Windows]) -> Independence:
-    return independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
 
 
 def _doubt(name: str, of: Independence, relative: Relative) -> list[str]:

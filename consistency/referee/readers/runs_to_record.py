@@ -5,16 +5,20 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.records.array_blocks import of_runs
+from consistency.referee.diagnostics.records.large_arrays import of_runs
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, asymmetric, classify
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.sheet import Places, refuse
 from consistency.referee.types import Array, Failure, Indices
+
+ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path")  # of a track, as in a record
 
 
 @dataclass(frozen=True)
@@ -23,7 +27,7 @@ class Track:
 
     run: int
     column: Indices  # (k,), increasing, 0..T-1
-    place: Sequence[str]  # (k,), "est.csv, line 7"
+    place: Places  # (k,), "est.csv, line 7"
     error: Array | None = None  # (k, n), NaN where the estimate is
     covariance: Array | None = None  # (k, n, n)
     nis: Array | None = None  # (k,)
@@ -34,7 +38,6 @@ class Track:
     path: Array | None = None  # (k, 2, 2 or 3), m, true and estimated positions
 
     def part(self, index: Sequence[int]) -> Track:
-        """Track of some components of the error."""
         assert self.error is not None
         assert self.covariance is not None
         if len(index) == self.error.shape[1]:
@@ -91,8 +94,8 @@ def assemble(
             "if the filter broke down there, write a row of NaN, so that the failure counts"
         )
 
-    def grid(pick: Callable[[Track], Array | None]) -> Array | None:
-        values = [value for part in parts if (value := pick(part)) is not None]
+    def grid(key: str) -> Array | None:
+        values = [value for part in parts if (value := getattr(part, key)) is not None]
         if not values:
             return None
         out = np.full((len(parts), len(t), *values[0].shape[1:]), np.nan)
@@ -100,25 +103,12 @@ def assemble(
             out[row, part.column] = value
         return out
 
-    error = grid(lambda part: part.error)
+    arrays: dict[str, Any] = {key: grid(key) for key in ARRAYS}
     return Evidence(
-        name=name,
-        runs=np.array([part.run for part in parts], dtype=np.int64),
-        t=t,
-        error=error,
-        covariance=grid(lambda part: part.covariance),
-        nees=grid(lambda part: part.nees),
-        dof=len(axes) if error is not None else 0,
-        nis=grid(lambda part: part.nis),
-        nis_dof=grid(lambda part: part.nis_dof),
-        axes=axes,
-        failures=tuple(failures),
-        convention=convention,
-        notes=tuple(notes),
-        times=grid(lambda part: part.t),
-        truth_covariance=grid(lambda part: part.truth_covariance),
-        path=grid(lambda part: part.path),
-    )
+        name, runs=np.array([part.run for part in parts], dtype=np.int64), t=t, nees=grid("nees"),
+        dof=len(axes) if arrays["error"] is not None else 0, axes=axes, failures=tuple(failures),
+        convention=convention, notes=tuple(notes), times=grid("t"), **arrays,
+    )  # fmt: skip
 
 
 def _require_different(file: str, tracks: Sequence[Track]) -> None:
@@ -141,10 +131,9 @@ def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
     with np.errstate(invalid="ignore"):  # of infinite ones
         for piece in of_runs(out):
             P = covariance[piece]
-            bad = np.flatnonzero(asymmetric(P, ROUNDED))
-            if len(bad):
-                row = piece.start + int(bad[0])
-                raise InputError(f"{place(row)}: the covariance is not symmetric; write P = (P + P') / 2")
+            rows = Places(place, np.arange(piece.start, piece.stop))
+            what = "the covariance is not symmetric; write P = (P + P') / 2"
+            refuse(asymmetric(P, ROUNDED), rows.__getitem__, what)
             out[piece] = 0.5 * (P + np.swapaxes(P, -1, -2))
     return out
 
@@ -191,15 +180,18 @@ def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int
 
 def _cut(track: Track, start: int, end: int) -> Track:
     """Rows before ``end``, with their NEES from ``start`` on."""
-    given = (track.error, track.covariance, track.nis, track.nis_dof, track.t, track.truth_covariance, track.path)
-    error, P, nis, dof, t, of_truth, path = (None if v is None else v[:end] for v in given)
-    values = None
-    if error is not None and P is not None:
-        values = np.full(end, np.nan)
-        values[start:] = nees(error[start:], P[start:])
-        if start:
-            P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
-    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values, t, of_truth, path)
+    arrays: dict[str, Any] = {
+        key: array[:end] for key in ("column", "t", *ARRAYS) if (array := getattr(track, key)) is not None
+    }
+    track = replace(track, place=track.place.at(slice(end)), **arrays)
+    error, P = track.error, track.covariance
+    if error is None or P is None:
+        return track
+    values = np.full(end, np.nan)
+    values[start:] = nees(error[start:], P[start:])
+    if start:
+        P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
+    return replace(track, covariance=P, nees=values)
 
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
@@ -208,15 +200,11 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     if none.all():
         return f"{file}: the covariance is zero in every step; nothing to judge"
     of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})" * bool(none.any())
-    return f"{file}: the covariance is singular in every step{of}; " + (
-        _without(axes, none) if none.any() else "write only the states that the filter estimates by themselves"
-    )
-
-
-def _without(axes: tuple[str, ...], none: Array) -> str:
-    """Advice on the option that leaves out components whose variance is zero."""
     left = ",".join(axis for axis, zero in zip(axes, none, strict=True) if not zero)
-    return f"judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
+    advice = f"judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
+    if not none.any():
+        advice = "write only the states that the filter estimates by themselves"
+    return f"{file}: the covariance is singular in every step{of}; {advice}"
 
 
 def listed(numbers: Sequence[object]) -> str:

@@ -8,7 +8,6 @@ from dataclasses import replace
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import (
     KINDS,
-    SharedError,
     fit_record,
     halves,
     without_shared,
@@ -17,9 +16,9 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of
 
 REFUSED = {
-    "split": "pieces of one log all have what is constant over it",
-    "truth_covariance": "what the truth scatters by is fitted as a floor",
-    "align": "a fitted frame takes a part of what all estimates share",
+    "split": ": pieces of one log all have what is constant over it",
+    "truth_covariance": ": what the truth scatters by is fitted as a floor",
+    "align": ": a fitted frame takes a part of what all estimates share",
 }
 ONE_LOG = "what all estimates share was fitted to one half of the same log, and other drives may have other errors"
 
@@ -32,9 +31,7 @@ def require_shared_options(r: Reading) -> None:
         return
     if r.shared not in KINDS:
         raise InputError(f"--shared {r.shared}: must be {', '.join(KINDS[:-1])} or {KINDS[-1]}")
-    for option, why in REFUSED.items():
-        if getattr(r, option):
-            raise InputError(f"--shared: does not go with {flag_of(option)}: {why}")
+    r.refuse("--shared", REFUSED)
 
 
 def other_drives(r: Reading) -> Reading:
@@ -51,28 +48,26 @@ def less_shared(records: Sequence[Evidence], others: Sequence[Evidence] | None, 
     InputError
         An estimator is not among the others, or what is shared cannot be fitted.
     """
-    if others is None:
-        return [_of_halves(record, kind) for record in records]
-    named = {record.name: record for record in others}
+    named = {record.name: record for record in others or ()}
     found = []
     for record in records:
+        if others is None:
+            first, rest = halves(record)
+            one_log = len(record.run_numbers) == 1
+            less = _less(rest, first, kind, "the first half of the " + ("log" if one_log else "runs"))
+            found.append(replace(less, unshown=less.unshown or ONE_LOG * one_log))
+            continue
         other = others[0] if len(others) == len(records) == 1 else named.get(record.name)
         if other is None:
             raise InputError(f"--shared-from: holds no estimator '{record.name}'; it has {', '.join(named)}")
-        found.append(_said(without_shared(record, fit := fit_record(other, kind), kind), fit, kind, "other drives"))
+        found.append(_less(record, other, kind, "other drives"))
     return found
 
 
-def _of_halves(record: Evidence, kind: str) -> Evidence:
-    first, rest = halves(record)
-    fit = fit_record(first, kind)
-    one_log = len(record.run_numbers) == 1
-    found = _said(without_shared(rest, fit, kind), fit, kind, "the first half of the " + ("log" if one_log else "runs"))
-    return replace(found, unshown=found.unshown or ONE_LOG * one_log)
-
-
-def _said(record: Evidence, fit: SharedError, kind: str, data: str) -> Evidence:
-    """The record with what was fitted among its notes, and a caption of its verdict."""
+def _less(record: Evidence, other: Evidence, kind: str, data: str) -> Evidence:
+    """The record without what another shows, with what was fitted among its notes, and a caption of its verdict."""
+    fit = fit_record(other, kind)
+    record = without_shared(record, fit, kind)
     axes = record.axes or [f"axis {i}" for i in range(len(fit.floor))]
     each = {"by-vector": "", "by-time": " a second", "by-distance": " a metre"}[kind]
     means = ", ".join(f"{axis} {value:.3g}" for axis, value in zip(axes, fit.mean, strict=True))

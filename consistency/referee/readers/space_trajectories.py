@@ -13,10 +13,10 @@ from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.readers.clock_offset import clocks_and_frames
-from consistency.referee.readers.matching import common_times, truth_at, unit_apart
+from consistency.referee.readers.formats.sheet import refuse
+from consistency.referee.readers.matching import Poses, common_times, truth_at, unit_apart
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.runs_to_record import Track, assemble
 from consistency.referee.readers.windows import Relative
@@ -51,7 +51,7 @@ class Match:
     """The estimates of one run that have truth and covariance."""
 
     track: Track
-    t: Array  # (k,)
+    t: Array  # (k,), s
     left_out: int
     angle: float  # rad, median of the rotation error
     bent: float  # sigma, median of what the interpolated truth may be off by
@@ -123,7 +123,6 @@ def recordings_of(
 
 
 def _match(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: float) -> Match:
-    """The estimates of a run that have truth and covariance."""
     known = poses.known(shift)
     if not len(known.rows):
         raise apart(path, poses.t + shift, truth, poses.true_t, poses.max_dt, "truth")
@@ -133,24 +132,25 @@ def _match(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: f
     rows = known.rows[kept]
     error = poses.error_of(rows, known.truth[kept])
     P = poses.covariance if len(rows) == len(poses.t) else poses.covariance[rows]
-    doubts = _doubts(error, P, known.bend[kept])
+    angles, bend = np.linalg.norm(error[:, 3:6], axis=1), known.bend[kept]
+    angle = float(np.nanmedian(angles)) if np.isfinite(angles).any() else 0.0
+    sigma = np.sqrt(np.abs(np.diagonal(P[:, :3, :3], axis1=1, axis2=2)).mean(axis=1))
+    ratio = np.where((sigma > 0) & (bend > 1e-9), bend / np.where(sigma > 0, sigma, 1.0), 0.0)
+    bent = float(np.median(ratio[np.isfinite(ratio)])) if np.isfinite(ratio).any() else 0.0
     t = poses.t[rows]
     of_truth = poses.truth_covariances(known, shift)
     of_truth = None if of_truth is None else of_truth[kept]
     track = Track(run, np.arange(len(rows)), poses.place.at(rows), error, P, t=t, truth_covariance=of_truth)
     track = replace(track, path=np.stack([known.truth[kept, :3], poses.estimate[rows, :3]], axis=1))
-    return Match(track, t, len(poses.t) - len(rows), *doubts)
+    return Match(track, t, len(poses.t) - len(rows), angle, bent)
 
 
 def _stretch(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: float, relative: Relative) -> Stretch:
     """A run before its windows are taken: all its motions, or the poses that have a covariance."""
     rows = np.arange(len(poses.t))
     if relative.motions:
-        bare = np.flatnonzero(~poses.stated[1:])
-        if bare.size:
-            raise InputError(
-                f"{poses.place[int(bare[0]) + 1]}: this motion has no covariance within {poses.max_dt:g} s"
-            )
+        bare = np.append(False, ~poses.stated[1:])
+        refuse(bare, poses.place.__getitem__, f"this motion has no covariance within {poses.max_dt:g} s")
     elif poses.cross is not None:
         rows = rows[poses.stated]
     t = poses.t[rows] + shift
@@ -169,15 +169,6 @@ def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, toleran
     own_span, span = (f"{each[0]:.10g} to {each[-1]:.10g}" for each in (t, other_t))
     where = f"t is {own_span}, but {span} in {other}{unit_apart(t, other_t, (path, other))}"
     return InputError(f"{path}: no estimate has a {what} within {tolerance:g} s (--max-dt): {where}")
-
-
-def _doubts(error: Array, P: Array, bend: Array) -> tuple[float, float]:
-    """Medians over a run: angle of the rotation error, rad; what the interpolated truth may be off by, sigma."""
-    angles = np.linalg.norm(error[:, 3:6], axis=1)
-    angle = float(np.nanmedian(angles)) if np.isfinite(angles).any() else 0.0
-    sigma = np.sqrt(np.abs(np.diagonal(P[:, :3, :3], axis1=1, axis2=2)).mean(axis=1))
-    ratio = np.where((sigma > 0) & (bend > 1e-9), bend / np.where(sigma > 0, sigma, 1.0), 0.0)
-    return angle, float(np.median(ratio[np.isfinite(ratio)])) if np.isfinite(ratio).any() else 0.0
 
 
 def _notes(estimates: Path, matches: Sequence[Match], max_dt: float) -> list[str]:

@@ -15,10 +15,10 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of
 
 REFUSED = {
-    "relative": "neighbouring windows share the truth at their common end, so that its errors are in both",
-    "motions": "a motion has the errors of the truth at both ends, whose cross-covariance no file states",
-    "split": "pieces of one log share the truth's errors, in a way that no log shows",
-    "align": "a frame that is fitted to an uncertain truth takes an unknown share of the truth's errors",
+    "relative": ": neighbouring windows share the truth at their common end, so that its errors are in both",
+    "motions": ": a motion has the errors of the truth at both ends, whose cross-covariance no file states",
+    "split": ": pieces of one log share the truth's errors, in a way that no log shows",
+    "align": ": a frame that is fitted to an uncertain truth takes an unknown share of the truth's errors",
 }
 
 
@@ -32,10 +32,8 @@ def require_truth_options(r: Reading) -> None:
     """
     if r.truth_errors not in (None, *DECLARED):
         raise InputError(f"--truth-errors {r.truth_errors}: must be {', '.join(DECLARED[:-1])} or {DECLARED[-1]}")
-    asked = r.given(["truth_covariance", "truth_errors", "truth_shared"])
-    for option, why in REFUSED.items():
-        if asked and getattr(r, option):
-            raise InputError(f"{flag_of(asked[0])}: does not go with {flag_of(option)}: {why}")
+    if asked := r.given(["truth_covariance", "truth_errors", "truth_shared"]):
+        r.refuse(flag_of(asked[0]), REFUSED)
 
 
 def declared(records: Sequence[Evidence], r: Reading) -> list[Evidence]:

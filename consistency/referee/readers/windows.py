@@ -100,7 +100,6 @@ def windows(t: Array, position: Array, rows: Indices, relative: Relative, file: 
 
 
 def _along(t: Array, position: Array, rows: Indices, relative: Relative, file: str) -> Array:
-    """Where the rows are, in the unit of the windows, (k,)."""
     if relative.unit == "step":
         return rows.astype(float)
     if relative.unit == "s":

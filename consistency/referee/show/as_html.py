@@ -35,25 +35,20 @@ def render(document: Document) -> str:
     parts = [f"<p>{escape(document.answer)}</p>"] if document.answer else []
     parts += map(block, document.opening)
     for chapter in document.chapters:
-        inside = "\n".join(map(block, chapter.blocks))
-        parts.append(f"<section>\n{inside}\n</section>" if chapter.title else inside)
-    return page(document.title, *parts)
-
-
-def page(title: str, *body: str) -> str:
-    """One page of HTML ``body``."""
-    inside = "\n".join(body)
+        blocks = "\n".join(map(block, chapter.blocks))
+        parts.append(f"<section>\n{blocks}\n</section>" if chapter.title else blocks)
+    title, inside = escape(document.title), "\n".join(parts)
     return f"""<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
+<title>{title}</title>
 <style>{STYLE}</style>
 </head>
 <body class="static">
 <main>
-<h1>{escape(title)}</h1>
+<h1>{title}</h1>
 {inside}
 </main>
 </body>
@@ -75,7 +70,11 @@ def block(of: Block) -> str:
         case Heading():
             return f"<h{of.level}>{escape(of.text)}</h{of.level}>"
         case Reasons():
-            return "".join(_reason(entry) for entry in of.entries)
+            return "".join(
+                f"<p><strong>{escape(entry.name)}</strong> is {escape(entry.sentence)}</p>"
+                + (_list(entry.others) if entry.others else "")
+                for entry in of.entries
+            )
         case Facts():
             rows = "".join(f"<tr>{_left('th', name)}{_left('td', value)}</tr>" for name, value in of.rows)
             return f"<table>{rows}</table>"
@@ -98,11 +97,6 @@ def _left(tag: str, text: str) -> str:
 
 def _list(texts: Iterable[str]) -> str:
     return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>"
-
-
-def _reason(entry: Reason) -> str:
-    others = _list(entry.others) if entry.others else ""
-    return f"<p><strong>{escape(entry.name)}</strong> is {escape(entry.sentence)}</p>{others}"
 
 
 def _table(of: Table) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
+from bisect import bisect_right
 from collections.abc import Sequence
 from hashlib import sha256
-from typing import Any
 
 from bokeh.document import Document as BokehDocument
 from bokeh.embed import components
@@ -15,8 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from consistency.referee.document.blocks import Block, Document
-from consistency.referee.document.drawing import Figure, Panel, numbers
-from consistency.referee.document.fewer_points import LIMIT
+from consistency.referee.document.drawing import LIMIT, Figure, numbers
 from consistency.referee.document.wording import written
 from consistency.referee.show.with_bokeh import Screen
 
@@ -32,7 +31,7 @@ LEAST = 120  # points a line below which a curve is no curve
 def render_html(document: Document) -> str:
     """The whole page: style, script, data and words in one string."""
     limit = points_a_line(document)
-    drawn = [_charts(_panels(part), limit) for part in document.parts]
+    drawn = [_charts(part, limit) for part in document.parts]
     charts = {key: markup for _, found in drawn for key, markup in found.items()}
     scripts = [script for script, found in drawn if found]
     longest = max((row[0] for row in _rows(document)), default=0)
@@ -61,12 +60,9 @@ def _sources(page: str) -> list[str]:
     return [f"'sha256-{b64encode(sha256(text.encode()).digest()).decode()}'" for text in texts] or ["'none'"]
 
 
-def _panels(part: Sequence[Block]) -> list[Panel]:
-    return [panel for block in part if isinstance(block, Figure) for panel in block.panels]
-
-
-def _charts(panels: Sequence[Panel], limit: int) -> tuple[Markup, dict[int, Markup]]:
+def _charts(part: Sequence[Block], limit: int) -> tuple[Markup, dict[int, Markup]]:
     """The script of all charts of a chapter, and the place of each panel, by its id."""
+    panels = [panel for block in part if isinstance(block, Figure) for panel in block.panels]
     if not panels:
         return Markup(), {}
     screen = Screen(limit)
@@ -88,10 +84,9 @@ def _rows(document: Document) -> list[tuple[int, int]]:
 def points_a_line(document: Document) -> int:
     """Points that a line may have so that the file stays below its greatest size."""
     rows = _rows(document)
-    room: Any = MAXIMUM - SCRIPT - CHART * sum(len(figure.panels) for figure in document.figures)
-    low, high = LEAST, LIMIT
-    while low < high:
-        middle = (low + high + 1) // 2
-        size = POINT * sum(columns * min(length, middle) for length, columns in rows)
-        low, high = (middle, high) if size <= room else (low, middle - 1)
-    return low
+    room: float = MAXIMUM - SCRIPT - CHART * sum(len(figure.panels) for figure in document.figures)
+
+    def size(limit: int) -> float:
+        return POINT * sum(columns * min(length, limit) for length, columns in rows)
+
+    return LEAST + bisect_right(range(LEAST + 1, LIMIT + 1), room, key=size)

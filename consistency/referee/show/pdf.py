@@ -37,7 +37,10 @@ def render_pdf(document: blocks.Document) -> bytes:
             "title": soft(document.title),
             "answer": soft(document.answer),
             "opening": _blocks(document.opening, "opening", folder),
-            "chapters": [_chapter(chapter, folder) for chapter in document.chapters],
+            "chapters": [
+                {"title": soft(c.title), "summary": soft(c.summary), "blocks": _blocks(c.blocks, c.anchor, folder)}
+                for c in document.chapters
+            ],
         }
         (folder / "data.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8")
         template = resources.files("consistency.referee.show").joinpath("templates").joinpath(TEMPLATE)
@@ -67,14 +70,6 @@ def pdf_beside(document: blocks.Document) -> Iterator[Callable[[], bytes]]:
             process.wait()
 
 
-def _chapter(chapter: blocks.Chapter, folder: Path) -> dict[str, Any]:
-    return {
-        "title": soft(chapter.title),
-        "summary": soft(chapter.summary),
-        "blocks": _blocks(chapter.blocks, chapter.anchor, folder),
-    }
-
-
 def _blocks(part: Sequence[blocks.Block], name: str, folder: Path) -> list[dict[str, Any]]:
     return [_block(block, f"{name}-{i}", folder) for i, block in enumerate(part)]
 
@@ -89,9 +84,17 @@ def _block(block: blocks.Block, name: str, folder: Path) -> dict[str, Any]:
         case blocks.Text():
             content = {"lead": soft(block.lead), "text": soft(block.text)}
         case blocks.Table():
-            content = _table(block)
+            content = {
+                "columns": [{"head": soft(c.short), "width": c.width, "number": c.number} for c in block.columns],
+                "groups": [[soft(title), [list(map(_cell, row)) for row in rows]] for title, rows in block.groups],
+                "caption": soft(block.paper or block.caption), "style": block.style, "whole": block.whole,
+            }  # fmt: skip
         case blocks.Reasons():
-            content = {"entries": [_reason(reason) for reason in block.entries]}
+            entries = [
+                {"name": soft(e.name), "sentence": soft(e.sentence), "others": list(map(soft, e.others))}
+                for e in block.entries
+            ]
+            content = {"entries": entries}
         case blocks.Facts():
             rows = [[soft(key), soft(value)] for key, value in block.rows]
             content = {"rows": rows, "heads": block.heads, "width": block.width}
@@ -114,16 +117,6 @@ def _figure(figure: Figure, name: str, folder: Path) -> dict[str, Any]:
     return {"images": images, "caption": soft(figure.paper or figure.caption), "stacked": figure.stacked}
 
 
-def _table(table: blocks.Table) -> dict[str, Any]:
-    return {
-        "columns": [{"head": soft(c.short), "width": c.width, "number": c.number} for c in table.columns],
-        "groups": [[soft(title), [[_cell(cell) for cell in row] for row in rows]] for title, rows in table.groups],
-        "caption": soft(table.paper or table.caption),
-        "style": table.style,
-        "whole": table.whole,
-    }
-
-
 def _cell(cell: blocks.Cell) -> Any:
     match cell:
         case blocks.Answer():
@@ -136,11 +129,6 @@ def _cell(cell: blocks.Cell) -> Any:
             return {"kind": "Status", "text": soft(cell.text), "note": soft(cell.note)}
         case _:
             return soft(written(cell))
-
-
-def _reason(reason: blocks.Reason) -> dict[str, Any]:
-    others = [soft(other) for other in reason.others]
-    return {"name": soft(reason.name), "sentence": soft(reason.sentence), "others": others}
 
 
 def soft(text: str) -> str:

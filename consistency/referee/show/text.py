@@ -14,7 +14,9 @@ def fragment(*blocks: Block) -> str:
 def _lines(block: Block) -> list[str]:
     match block:
         case Reasons():
-            return [line for entry in block.entries for line in _reason(entry)]
+            return [
+                line for e in block.entries for line in (f"{e.name} is {e.sentence}", *(f"  - {o}" for o in e.others))
+            ]
         case Facts():
             width = max(len(name) for name, _ in block.rows)
             return [f"  {name:<{width}}  {value}" for name, value in block.rows]
@@ -26,10 +28,6 @@ def _lines(block: Block) -> list[str]:
             return [block.text]
         case _:
             return []
-
-
-def _reason(entry: Reason) -> list[str]:
-    return [f"{entry.name} is {entry.sentence}", *(f"  - {other}" for other in entry.others)]
 
 
 def _table(table: Table) -> list[str]:

@@ -61,8 +61,9 @@ class Screen:
             y_axis_type="log" if panel.y.log else "linear", match_aspect=panel.equal,
             **{side: value for side, value in ranges.items() if value is not None},
         )  # fmt: skip
-        for side in "xy":
-            self._keep(getattr(panel, side), getattr(chart, f"{side}_range"))
+        for axis, drawn_range in ((panel.x, chart.x_range), (panel.y, chart.y_range)):
+            if axis.share:
+                self.shared.setdefault(axis.share, drawn_range)
         _dress(chart, panel)
         tips: dict[tuple[tuple[str, str], ...], list[Any]] = {}
         for mark in panel.marks:
@@ -87,10 +88,6 @@ class Screen:
             start, end = _roomy(axis) if arrows else axis.window
             return Range1d(start=start, end=end)
         return None if axis.start is None else DataRange1d(start=axis.start)
-
-    def _keep(self, axis: Axis, value: Any) -> None:
-        if axis.share:
-            self.shared.setdefault(axis.share, value)
 
 
 def _roomy(axis: Axis) -> tuple[float, float]:
@@ -118,19 +115,13 @@ def _dress(chart: Any, panel: Panel) -> None:
         if axis.whole and axis.window:
             low, high = axis.window
             ticks.ticker = FixedTicker(ticks=list(range(int(np.ceil(low)), int(high) + 1)))
-    if panel.x.names:
-        chart.xaxis.ticker = FixedTicker(ticks=list(range(len(panel.x.names))))
-        chart.xaxis.major_label_overrides = dict(enumerate(panel.x.names))
-        chart.grid.visible = False
-    if panel.y.rows:
-        _rows(chart, panel.y.rows)
-
-
-def _rows(chart: Any, labels: tuple[str, ...]) -> None:
-    chart.yaxis.ticker = FixedTicker(ticks=list(range(len(labels))))
-    chart.yaxis.major_label_overrides = dict(enumerate(labels))
-    chart.ygrid.visible = False
-    for row in range(1, len(labels), 2):
+    named = (panel.x.names, chart.xaxis, chart.grid), (panel.y.rows, chart.yaxis, chart.ygrid)
+    for labels, ticks, grid in named:
+        if labels:
+            ticks.ticker = FixedTicker(ticks=list(range(len(labels))))
+            ticks.major_label_overrides = dict(enumerate(labels))
+            grid.visible = False
+    for row in range(1, len(panel.y.rows), 2):
         chart.add_layout(BoxAnnotation(bottom=row - 0.5, top=row + 0.5, fill_color="#f5f5f5", level="image"))
 
 
@@ -151,11 +142,8 @@ def _columns_of(columns: Columns, rows: Array) -> dict[str, Any]:
 
 
 def _stroke(look: Look) -> dict[str, Any]:
-    return {"line_color": look.colour, "line_width": round(STROKE * look.width, 2), "line_dash": _pixels(look.dash)}
-
-
-def _pixels(dash: tuple[float, ...]) -> Any:
-    return [max(1, round(DASH * length)) for length in dash] or "solid"
+    dash = [max(1, round(DASH * length)) for length in look.dash] or "solid"
+    return {"line_color": look.colour, "line_width": round(STROKE * look.width, 2), "line_dash": dash}
 
 
 def _dots(look: Look) -> dict[str, Any]:
@@ -180,13 +168,10 @@ def _line(chart: Any, mark: Line, _: Panel, limit: int) -> Any:
     source = _source(**columns)
     edges = []
     if mark.bound is not None:
-        edge: dict[str, Any] = {
-            "line_color": mark.look.colour,
-            "line_width": 1.3,
-            "line_dash": [5, 4],
-            "line_alpha": 1.0,
-        }
-        edges = [chart.add_glyph(source, glyphs.Line(x="x", y=side, **edge)) for side in ("bound", "below")]
+        edge: dict[str, Any] = {"line_color": mark.look.colour, "line_width": 1.3, "line_dash": [5, 4]}
+        edges = [
+            chart.add_glyph(source, glyphs.Line(x="x", y=side, line_alpha=1.0, **edge)) for side in ("bound", "below")
+        ]
     stroke = _stroke(mark.look)
     curve = glyphs.Step(x="x", y="y", mode="after", **stroke) if mark.steps else glyphs.Line(x="x", y="y", **stroke)
     line = chart.add_glyph(source, curve)

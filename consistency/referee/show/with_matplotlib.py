@@ -17,6 +17,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from consistency.referee.document.drawing import (
+    LIMIT,
     Axis,
     Band,
     Bars,
@@ -32,7 +33,6 @@ from consistency.referee.document.drawing import (
     Tiles,
     kept,
 )
-from consistency.referee.document.fewer_points import LIMIT
 from consistency.referee.show.legends import (
     SMALL,
     dots,
@@ -95,7 +95,9 @@ def draw(sheet: Sheet) -> Figure:
     own = [panel_labels(panel.keys, sheet.width / columns) for panel in panels]
     room = SMALL * sum(max(lines for *_, lines in own[row * columns :][:columns]) for row in range(rows))
     figure = Figure(figsize=(sheet.width, sheet.height + room), layout="constrained")
-    shared = {f"share{side}": _same([getattr(panel, side) for panel in panels]) for side in "xy"}
+    names = ({panel.x.share for panel in panels}, {panel.y.share for panel in panels})
+    sharex, sharey = (len(panels) > 1 and len(some) == 1 and some != {""} for some in names)
+    shared = {"sharex": sharex, "sharey": sharey}
     options: dict[str, Any] = {"squeeze": False, "width_ratios": sheet.widths or None} | shared
     grid = figure.subplots(rows, columns, **options)
     for panel, axes, (labels, many, _) in zip(panels, grid.flat, own, strict=False):
@@ -109,10 +111,6 @@ def draw(sheet: Sheet) -> Figure:
     if sheet.keys:
         legend(figure, sheet)
     return figure
-
-
-def _same(axes: Sequence[Axis]) -> bool:
-    return len(axes) > 1 and bool(axes[0].share) and len({axis.share for axis in axes}) == 1
 
 
 def _outer(grid: Any, panels: int, sharex: bool, sharey: bool) -> None:
@@ -226,13 +224,8 @@ def _intervals(axes: Axes, mark: Intervals, order: float, panel: Panel) -> None:
     for edge, beyond, arrow in ((low, mark.low < start, "<"), (high, mark.high > end, ">")):
         for rows, marker, size in ((~beyond, "|", 4.0), (beyond, arrow, 4.5)):
             if rows.any():
-                ends: dict[str, Any] = {
-                    "color": mark.look.colour,
-                    "markersize": size,
-                    "clip_on": False,
-                    "zorder": order,
-                }
-                axes.plot(edge[rows], mark.y[rows], marker, **ends)
+                ends: dict[str, Any] = {"color": mark.look.colour, "markersize": size, "clip_on": False}
+                axes.plot(edge[rows], mark.y[rows], marker, zorder=order, **ends)
     axes.plot(mark.x, mark.y, zorder=order, **dots(mark.look))
 
 

@@ -56,7 +56,6 @@ def writing(folder: Path, option: str = "--out") -> Iterator[None]:
 
 
 def _above(folder: Path) -> Path:
-    """The nearest folder above that is there."""
     return next(parent for parent in folder.absolute().parents if parent.exists())
 
 

@@ -109,7 +109,8 @@ def foreseen(label: str, seconds: float) -> Iterator[None]:
 
     On a terminal a bar goes by the clock, elsewhere there is one line.
     """
-    said = f"{label}: about {_rounded(seconds)}, once"
+    about = f"{seconds / 60.0:.0f} min" if seconds >= 90.0 else f"{max(seconds, 1.0):.0f} s"
+    said = f"{label}: about {about}, once"
     if sys.stderr is None or not sys.stderr.isatty():
         print(said, file=_Forgiving(), flush=True)
         yield
@@ -128,10 +129,6 @@ def foreseen(label: str, seconds: float) -> Iterator[None]:
         task = bar.add_task(said, total=1)
         yield
         bar.update(task, completed=1)
-
-
-def _rounded(seconds: float) -> str:
-    return f"{seconds / 60.0:.0f} min" if seconds >= 90.0 else f"{max(seconds, 1.0):.0f} s"
 
 
 def _speed(rate: float, unit: str) -> str:

@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from consistency.referee.parsing import HUGE, read_json, reading
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
+from consistency.referee.types import Array
 from consistency.referee.verdicts.options import skip_asked
 from consistency.referee.verdicts.sources import Results, Source, source_of
 
@@ -71,16 +72,12 @@ def baseline(
         record = source.record(each).without_first(first)
         if record.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
-        filters[each] = _summary(record if record.unshown else record.as_runs)
         failures[each], axes[each] = len(record.failures), tuple(record.axes)
+        own = record if record.unshown else record.as_runs
+        world = own.in_world
+        filters[each] = summary(cast(Array, own.nees), own.dof, world.error, world.covariance, own.run_numbers)
     trials = source.trials if truth is None else (_digest(truth), None)
     return Baseline(name, source.scenario, trials, filters, failures, axes, None if first is None else first.option)
-
-
-def _summary(record: Record) -> RunSummary:
-    assert record.nees is not None
-    world = record.in_world
-    return summary(record.nees, record.dof, world.error, world.covariance, record.run_numbers)
 
 
 def _digest(truth: Path) -> str:

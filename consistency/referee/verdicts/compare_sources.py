@@ -28,10 +28,10 @@ class Compared:
 
     @property
     def sentence(self) -> str:
-        """Result of the comparison in a sentence."""
         c = self.comparison
         way = "run by run on the same trials" if c.paired else "as independent samples"
-        text = f"{self.a} is {'less consistent' if c.worse else 'not found less consistent'} than {self._reference}"
+        reference = self.b if self.a != self.b else "the reference"
+        text = f"{self.a} is {'less consistent' if c.worse else 'not found less consistent'} than {reference}"
         text += f": {c.runs} runs, {way}, p {c.p_value:.2g}"
         if c.distance == c.standard_error == 0.0:
             text += "; every run is the same in both"
@@ -59,12 +59,7 @@ class Compared:
         return "no difference shown" + (f"; at most x{np.exp(most):.3g} farther off" if np.isfinite(most) else "")
 
     @property
-    def _reference(self) -> str:
-        return self.b if self.a != self.b else "the reference"
-
-    @property
     def worse(self) -> bool:
-        """Less consistent, or, on the same trials, with more failed runs."""
         return self.comparison.worse or (self.comparison.paired and self.failures.a > self.failures.b)
 
 
@@ -112,7 +107,6 @@ def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, 
 
 
 def document(compared: Sequence[Compared]) -> Document:
-    """A table and a sentence for each pair, and the numbers of all as data."""
     blocks: list[Block] = []
     for each in compared:
         blocks += [comparison_table(each.a, each.b, each.comparison), Text(each.sentence), Text("")]

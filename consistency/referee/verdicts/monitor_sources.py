@@ -12,7 +12,7 @@ import numpy as np
 
 from consistency.referee.diagnostics import Alarm, Monitor
 from consistency.referee.errors import InputError
-from consistency.referee.outside import outside
+from consistency.referee.extras import outside
 from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash, read_stated
 from consistency.referee.readers.formats.innovation_files import NisLog, choose, read_nis, stream_nis
 from consistency.referee.readers.formats.px4_log import SUFFIX, read_ulog
@@ -103,17 +103,13 @@ def watch_lines(lines: Iterable[str], name: str, monitor: Monitor, on_alarm: Cal
     """
     try:
         for place, nis, dof in stream_nis(lines, name):
-            alarm = _updated(monitor, place, nis, dof)
+            try:
+                alarm = monitor.update(nis, dof)  # type: ignore[arg-type]  # refuses what is not whole
+            except ValueError as error:
+                raise InputError(f"{place}: {error}") from None
             if alarm is not None:
                 on_alarm(alarm)
     except UnicodeDecodeError:
         raise InputError(f"{name}: not text; lines of a CSV file are needed") from None
     empty = np.empty(0)
     return Watched(name, monitor, monitor.alarm, math.nan, math.nan, empty, empty, empty, empty)
-
-
-def _updated(monitor: Monitor, place: str, nis: float, dof: float) -> Alarm | None:
-    try:
-        return monitor.update(nis, dof)  # type: ignore[arg-type]  # refuses what is not whole
-    except ValueError as error:
-        raise InputError(f"{place}: {error}") from None

@@ -15,11 +15,9 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
-from consistency.stereo.characterising.coordinate_fit import Levels
+from consistency.stereo.characterising.coordinate_fit import Levels, ResidualTails, rate, ratios, tails
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
-from consistency.stereo.characterising.piecewise_linear import octaves
-from consistency.stereo.characterising.residuals import Residuals, RowSelection, select
-from consistency.stereo.characterising.tails import ResidualTails, rate, ratios, tails
+from consistency.stereo.characterising.residuals import Residuals, RowSelection, octaves, select
 
 NAMES = ("u", "v", "d")
 RATE = 0.01  # chance that any interval misses
@@ -41,7 +39,6 @@ class Coordinate:
     lags: Array  # (lags,), autocorrelation along tracks
     bounds: Array  # (lags,), 95 % bound if white
     residuals: Array  # (N,), whitened and standardised
-    note: str = ""
 
     @property
     def white(self) -> bool | None:
@@ -111,8 +108,8 @@ def characterise(
     InputError
         Too few rows or tracks are left.
     """
-    u, v = _nodes(data, sensor, grid)
-    chosen = select(data, sensor, grid_of(data, u, v).regressors(data))
+    nodes_of_map = _nodes(data, sensor, grid)
+    chosen = select(data, sensor, grid_of(data, *nodes_of_map).regressors(data))
     kept = chosen.kept
     tracks = len(kept.first) if len(kept) else 0
     if len(kept) < LEAST or tracks < LEAST_TRACKS:
@@ -120,7 +117,7 @@ def characterise(
             f"{source}: {len(kept)} observations of {tracks} tracks are left of {len(data)}; a noise takes at least "
             f"{LEAST} of {LEAST_TRACKS}: record more"
         )
-    cells = grid_of(kept, u, v)
+    cells = grid_of(kept, *nodes_of_map)
     nodes = octaves(kept.ideal[:, 2])
     levels = Levels(miss, growth=len(nodes), bias=3 * int(cells.known.sum()))
     X = cells.regressors(kept)
@@ -134,8 +131,9 @@ def characterise(
             nodes, tuple(coordinate_fit.at_nodes(by_disparity, levels.of("growth"))), p_value, shown
         )
         fits[2] = by_disparity if shown else fits[2]
+    u, v, d = (_coordinate(k, each, kept, levels, alone) for k, each in enumerate(fits))
     return Characterisation(
-        sensor, source, _coordinates(fits, kept, levels, alone), growth,
+        sensor, source, (u, v, d), growth,
         estimate_bias(fits, cells, levels.of("bias"), levels.rate / 18),
         rate(chosen.gross, len(kept) + chosen.gross, levels.of("tails")), tracks, len(kept),
         {"near a limit of the sensor": chosen.at_limits, "grossly wrong": chosen.gross, "of no landmark": strange},
@@ -164,13 +162,6 @@ def _fitted(
         return fit(rows, float(chosen.rough[k]), memory=rows.length >= 1.5 and not alone)
     except ValueError as error:
         raise InputError(f"{source}: {error} of {NAMES[k]}; record more or longer tracks") from None
-
-
-def _coordinates(
-    fits: list[LikelihoodFit], kept: Residuals, levels: Levels, alone: bool
-) -> tuple[Coordinate, Coordinate, Coordinate]:
-    u, v, d = (_coordinate(k, fit, kept, levels, alone) for k, fit in enumerate(fits))
-    return u, v, d
 
 
 def _coordinate(k: int, of: LikelihoodFit, kept: Residuals, levels: Levels, alone: bool) -> Coordinate:

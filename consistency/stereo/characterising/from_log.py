@@ -33,6 +33,29 @@ REST = "Only the parts at rest are used: noise while moving may be larger."
 
 
 @dataclass(frozen=True)
+class SourceOptions:
+    """What is known of a source beside its files."""
+
+    grid: tuple[int, int] | None = None
+    at_rest: bool = False
+    free_poses: bool = False
+    calibration: Path | None = None
+    truth: Path | None = None
+    format: str | None = None
+    left: str | None = None
+    right: str | None = None
+    board: tuple[int, int] | None = None  # inner corners across and down
+    square: float | None = None  # m
+    distortion: str | None = None
+    seed: int | None = None
+
+    def of_images(self) -> list[str]:
+        """Options that are given and mean nothing for a log."""
+        names = ("calibration", "truth", "format", "left", "right", "board", "square", "distortion", "seed")
+        return [f"--{name}" for name in names if getattr(self, name) is not None]
+
+
+@dataclass(frozen=True)
 class Measured:
     """A characterisation and what of the source's file stays as it was."""
 
@@ -122,15 +145,9 @@ def _in_space(trial: Trial, path: Path) -> Seen:
     if len(lines.values) != trial.steps + 1:
         raise InputError(f"{path}: {len(lines.values)} poses for steps 0 to {trial.steps}; must hold one for each")
     turns, place = Rotation.from_quat(lines.values[:, 4:8]).as_matrix() @ CAMERA, lines.values[:, 1:4]
-    return seen_from(trial, turns, place)
-
-
-def seen_from(trial: Trial, R: Array, t: Array) -> Seen:
-    """What is seen from poses R (T + 1, 3, 3), world from sensor axes, and t (T + 1, 3), m."""
-    step = trial.step
-    order = np.lexsort((step, trial.landmark))
-    rows = step[order]
-    return Seen(trial.z[order], R[rows], t[rows], trial.landmark[order], rows, np.ones(len(rows), bool))
+    order = np.lexsort((trial.step, trial.landmark))
+    rows = trial.step[order]
+    return Seen(trial.z[order], turns[rows], place[rows], trial.landmark[order], rows, np.ones(len(rows), bool))
 
 
 def _sensor_poses(pose: Array, mount: Mount) -> tuple[Array, Array]:

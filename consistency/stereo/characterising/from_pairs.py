@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +10,14 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation
-from consistency.stereo.characterising.from_log import EXACT, FREE, REST
+from consistency.stereo.characterising.from_log import EXACT, FREE, REST, SourceOptions
 from consistency.stereo.characterising.known_poses import characterise_posed
 from consistency.stereo.characterising.residuals import MAD
 from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
 from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
 from consistency.stereo.frontend.planar_log import CAMERA, observations
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
-from consistency.stereo.visual_odometry.matching import is_rectified
+from consistency.stereo.visual_odometry.features import is_rectified
 from consistency.stereo.visual_odometry.motion import RelativeMotion
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
@@ -29,21 +28,7 @@ CHOSEN = (
 )
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Where a sequence's calibration and truth are, and whether it stood still."""
-
-    calibration: Path | None = None
-    truth: Path | None = None
-    format: str | None = None
-    left: str | None = None
-    right: str | None = None
-    at_rest: bool = False
-    free_poses: bool = False
-    seed: int = 0  # of RANSAC
-
-
-def characterise_images(folder: Path, sources: Sources) -> Characterisation:
+def characterise_images(folder: Path, options: SourceOptions) -> Characterisation:
     """The noise of the features of a folder of stereo pairs.
 
     Raises
@@ -51,25 +36,25 @@ def characterise_images(folder: Path, sources: Sources) -> Characterisation:
     InputError
         As :func:`consistency.vision.sequence.read_sequence`; too few pairs; neither at rest nor with true poses.
     """
-    sequence = read_sequence(folder, sources.calibration, sources.format, sources.left, sources.right)
+    sequence = read_sequence(folder, options.calibration, options.format, options.left, options.right)
     rig = sequence.rectification.rig
     if not is_rectified(rig):
         raise InputError(f"{sequence.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
     if len(sequence) < SHORTEST:
         raise InputError(f"{folder}: holds {len(sequence)} stereo pairs; a noise takes at least {SHORTEST}")
-    R, t = _poses(sequence, sources)
-    motions = visual_odometry(sequence, rng=np.random.default_rng(sources.seed))
+    R, t = _poses(sequence, options)
+    motions = visual_odometry(sequence, rng=np.random.default_rng(options.seed or 0))
     seen = _seen(rig, motions, R, t)
-    free = sources.free_poses or sources.at_rest
-    notes = (*((REST,) if sources.at_rest else ()), FREE if free else EXACT, CHOSEN, rows_note(rig, motions))
+    free = options.free_poses or options.at_rest
+    notes = (*((REST,) if options.at_rest else ()), FREE if free else EXACT, CHOSEN, rows_note(rig, motions))
     return characterise_posed(seen, sensor_of(rig), str(folder), notes, free)
 
 
-def _poses(sequence: Sequence, sources: Sources) -> tuple[Array, Array]:
+def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
     """Poses (n, 3, 3), (n, 3) of the left camera; equal poses at rest."""
-    if sources.at_rest:
+    if options.at_rest:
         return np.broadcast_to(np.eye(3), (len(sequence), 3, 3)), np.zeros((len(sequence), 3))
-    path = sources.truth or find_truth(sequence)
+    path = options.truth or find_truth(sequence)
     if path is None:
         raise InputError(
             f"{sequence.folder}: no true poses; while a camera moves, noise cannot be told from motion: give --truth "

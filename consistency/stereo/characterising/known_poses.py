@@ -19,10 +19,8 @@ from consistency.stereo.characterising.characterise import (
     Coordinate,
     DisparityNoise,
 )
-from consistency.stereo.characterising.coordinate_fit import LAGS, Levels
-from consistency.stereo.characterising.piecewise_linear import octaves
-from consistency.stereo.characterising.residuals import MARGIN
-from consistency.stereo.characterising.tails import rate, ratios, tails
+from consistency.stereo.characterising.coordinate_fit import LAGS, Levels, rate, ratios, tails
+from consistency.stereo.characterising.residuals import MARGIN, octaves, within_limits
 from consistency.stereo.characterising.unknown_landmarks import Fitted, Seen, fit_points, without_gross
 
 FREE = 0.1  # share of a value that the fits must leave for it to tell of the shape of the noise
@@ -52,7 +50,7 @@ def characterise_posed(
     _require_enough(seen, total, source)
     fitted = fit_points(seen, sensor.f, sensor.B, _parts(len(seen.z)), np.ones(3), free_poses)
     good = without_gross(fitted)
-    inside = _inside(fitted, sensor)
+    inside = within_limits(fitted.ideal, MARGIN * fitted.sigma, sensor)
     kept = seen.keep(good & inside).long_enough()
     _require_enough(kept, total, source)
     plain = fit_points(kept, sensor.f, sensor.B, _parts(len(kept.z)), fitted.sigma, free_poses)
@@ -72,7 +70,6 @@ def characterise_posed(
 
 
 def _hidden(coordinates: tuple[Coordinate, ...]) -> tuple[str, ...]:
-    """A note on correlated noise."""
     if all(c.white is not False for c in coordinates):
         return ()
     return ("Where noise is correlated along a track, the fitted points take part of it: sigma is then a lower limit.",)
@@ -89,19 +86,6 @@ def _require_enough(seen: Seen, total: int, source: str) -> None:
 
 def _parts(rows: int) -> Indices:
     return np.tile(np.arange(3), (rows, 1))
-
-
-def _inside(fitted: Fitted, sensor: PicturedSensor) -> Array:
-    """Rows (N,) whose fitted disparity and pixel are far enough from the limits of the sensor."""
-    inside = np.ones(len(fitted.r), bool)
-    margin = MARGIN * fitted.sigma
-    if sensor.disparity is not None:
-        low, high = sensor.disparity
-        inside &= (fitted.ideal[:, 2] >= low + margin[2]) & (fitted.ideal[:, 2] <= high - margin[2])
-    if sensor.image is not None:
-        for k, (size, middle) in enumerate(zip(sensor.image, sensor.centre, strict=True)):
-            inside &= (fitted.ideal[:, k] >= margin[k] - middle) & (fitted.ideal[:, k] <= size - middle - margin[k])
-    return inside
 
 
 def _by_disparity(plain: Fitted, f: float, B: float, free_poses: bool) -> tuple[Array, Fitted | None]:

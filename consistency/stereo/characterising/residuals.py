@@ -12,12 +12,29 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.node_tables import hats
 from consistency.bench.types import Trial
 from consistency.referee.types import Array, Indices
-from consistency.stereo.characterising.piecewise_linear import FEW, octaves
 
+APART = 1.25  # factor between neighbouring nodes of disparity at least
+FEW = 30  # rows that a node takes
+ENDS = 0.005  # of the data lies beyond the first and beyond the last node of disparity
 MARGIN = 4.0  # standard deviations from a limit within which the noise decides whether a row is there at all
 GROSS = 6.0  # robust standard deviations: a Gaussian error is beyond in 2 of 10^9
 MAD = 1.482602218505602  # standard deviation of a Gaussian over its median absolute deviation
 HUBER = 1.345  # standard deviations beyond which a row counts less, Huber (1964)
+
+
+def octaves(d: Array) -> Array:
+    """Nodes (m,) of disparity: the ends of the data and the powers of two between them, px.
+
+    Powers of two are left out until each node has ``FEW`` rows around it; a node by itself is the median.
+    """
+    low, high = np.quantile(d, [ENDS, 1.0 - ENDS])
+    if high < APART * low:
+        return np.array([float(np.median(d))])
+    powers = 2.0 ** np.arange(np.ceil(np.log2(low * APART)), np.floor(np.log2(high / APART)) + 1)
+    nodes = np.array([low, *powers, high])
+    while len(nodes) > 2 and (rows := hats(d, nodes).sum(axis=0)).min() < FEW:
+        nodes = np.delete(nodes, np.clip(rows.argmin(), 1, len(nodes) - 2))
+    return nodes if hats(d, nodes).sum(axis=0).min() >= FEW else np.array([float(np.median(d))])
 
 
 @dataclass(frozen=True)
@@ -99,18 +116,22 @@ def select(data: Residuals, sensor: PicturedSensor, regressors: Array) -> RowSel
     centred = data.r - np.column_stack(fits)
     scale = np.column_stack([_spread(centred[:, 0]), _spread(centred[:, 1]), _local_spread(centred[:, 2], data)])
     rough = np.array([_spread(centred[:, k])[0] for k in range(3)])
-    inside = np.ones(len(data), bool)
-    expected = data.ideal + np.column_stack(fits)
-    if sensor.disparity is not None:
-        low, high = sensor.disparity
-        margin = MARGIN * scale[:, 2]
-        inside &= (expected[:, 2] >= low + margin) & (expected[:, 2] <= high - margin)
-    if sensor.image is not None:
-        for k, (size, middle) in enumerate(zip(sensor.image, sensor.centre, strict=True)):
-            margin = MARGIN * scale[:, k]
-            inside &= (expected[:, k] >= margin - middle) & (expected[:, k] <= size - middle - margin)
+    inside = within_limits(data.ideal + np.column_stack(fits), MARGIN * scale, sensor)
     gross = inside & (np.abs(centred) > GROSS * scale).any(axis=1)
     return RowSelection(data.keep(inside & ~gross), int(gross.sum()), int((~inside).sum()), rough)
+
+
+def within_limits(place: Array, margin: Array, sensor: PicturedSensor) -> Array:
+    """Rows (N,) whose u, v, d (N, 3) are by ``margin``, (N, 3) or (3,), within search range and image."""
+    inside = np.ones(len(place), bool)
+    if sensor.disparity is not None:
+        low, high = sensor.disparity
+        inside &= (place[:, 2] >= low + margin[..., 2]) & (place[:, 2] <= high - margin[..., 2])
+    if sensor.image is not None:
+        for k, (size, middle) in enumerate(zip(sensor.image, sensor.centre, strict=True)):
+            edge = margin[..., k]
+            inside &= (place[:, k] >= edge - middle) & (place[:, k] <= size - middle - edge)
+    return inside
 
 
 def _robust(r: Array, X: Array) -> Array:

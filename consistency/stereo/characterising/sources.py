@@ -2,38 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from consistency.referee.errors import InputError
 from consistency.stereo.characterising.bias import GRID
-from consistency.stereo.characterising.from_log import Measured, characterise_log, is_log
+from consistency.stereo.characterising.from_log import Measured, SourceOptions, characterise_log, is_log
 
 WIDEST = 10.0  # m, of a square of a board; more are millimetres
 NODES, CORNERS = 2, 3  # least numbers across and down, of nodes of a bias map and of corners
-
-
-@dataclass(frozen=True)
-class SourceOptions:
-    """What is known of a source beside its files."""
-
-    grid: tuple[int, int] | None = None
-    at_rest: bool = False
-    free_poses: bool = False
-    calibration: Path | None = None
-    truth: Path | None = None
-    format: str | None = None
-    left: str | None = None
-    right: str | None = None
-    board: tuple[int, int] | None = None  # inner corners across and down
-    square: float | None = None  # m
-    distortion: str | None = None
-    seed: int | None = None
-
-    def of_images(self) -> list[str]:
-        """Options that are given and mean nothing for a log."""
-        names = ("calibration", "truth", "format", "left", "right", "board", "square", "distortion", "seed")
-        return [f"--{name}" for name in names if getattr(self, name) is not None]
 
 
 def characterise_source(source: Path, options: SourceOptions) -> Measured:
@@ -63,26 +39,20 @@ def characterise_source(source: Path, options: SourceOptions) -> Measured:
         raise InputError("--seed: goes with images without a board; nothing is drawn at random from one")
     if options.at_rest or options.truth is not None:
         raise InputError("--board: goes neither with --at-rest nor with --truth; the poses of the board are fitted")
-    from consistency.stereo.characterising.board_residuals import characterise_board
+    from consistency.stereo.characterising.boards import characterise_board
 
     model = options.distortion or "full"
     return Measured(characterise_board(source, options.board, options.square, model, options.grid or GRID), {})
 
 
 def _of_sequence(source: Path, options: SourceOptions) -> Measured:
-    from consistency.stereo.characterising.from_pairs import Sources, characterise_images
+    from consistency.stereo.characterising.from_pairs import characterise_images
 
     if options.distortion is not None:
         raise InputError("--distortion: goes with --board; other images bring their calibration")
     if options.grid is not None:
         raise InputError("--grid: goes with a log or with --board; images of an unknown scene give no bias map")
-    o = options
-    return Measured(
-        characterise_images(
-            source, Sources(o.calibration, o.truth, o.format, o.left, o.right, o.at_rest, o.free_poses, o.seed or 0)
-        ),
-        {},
-    )
+    return Measured(characterise_images(source, options), {})
 
 
 def counts(text: str, option: str, least: int) -> tuple[int, int]:

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.file_kinds import is_drive
-from consistency.referee.readers.formats.kitti_files import NANO, place_of, read_times
-from consistency.referee.readers.formats.kitti_oxts import BODIES, drive_poses
+from consistency.referee.readers.formats.kitti_files import BODIES, NANO, drive_poses, place_of, read_times
 from consistency.referee.readers.formats.tum import UNIT, read_trajectory
 from consistency.referee.readers.matching import associate
 from consistency.referee.types import Array

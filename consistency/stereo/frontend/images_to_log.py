@@ -1,4 +1,7 @@
-"""A sequence of stereo pairs as a log folder: controls, observations of few landmarks, truth, trajectory."""
+"""A sequence of stereo pairs as a log folder: controls, observations of few landmarks, truth, trajectory.
+
+Trajectories are texts that `consistency analyse` and the usual tools read.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +10,19 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from consistency.bench.scenario import Belief
 from consistency.bench.store.folder_tables import write_folder
-from consistency.bench.store.log import View, write_log
+from consistency.bench.store.log import write_log
+from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of
-from consistency.stereo.frontend.tum_output import covariance_text, motions_text, trajectory_text
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig
-from consistency.stereo.visual_odometry.features import opencv
-from consistency.stereo.visual_odometry.matching import is_rectified
+from consistency.stereo.visual_odometry.features import is_rectified, opencv
 from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion
 from consistency.stereo.visual_odometry.odometry import motion_covariances, trajectory, visual_odometry
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
@@ -47,83 +50,68 @@ class FrontendOptions:
 
 
 @dataclass(frozen=True)
-class Logged:
-    """The part of a sequence that is in a log."""
-
-    landmarks: int
-    observations: int
-    sigma_px: tuple[float, ...]  # u, v, d
-    sigma_v: float  # m/s
-    sigma_omega: float  # rad/s
-
-    def lines(self, out: Path) -> list[str]:
-        u, v, d = self.sigma_px
-        return [
-            f"log: {self.landmarks} landmarks, {self.observations} observations; "
-            f"sigma u {u:.2f} v {v:.2f} d {d:.2f} px, v {self.sigma_v:.3g} m/s, omega {self.sigma_omega:.3g} rad/s",
-            "controls come from these images too: a filter that takes both uses the images twice",
-            f"log in {out}; next: consistency run --log {out} --filter ekf-uvd --out RESULTS",
-        ]
-
-
-@dataclass(frozen=True)
 class Summary:
-    """Summary of a built log."""
+    """A built log, and what it is of."""
 
-    frames: int
-    log: Logged | None  # None of fewer pairs than a log takes, and where the motions leave the plane
+    sequence: Sequence
+    motions: list[RelativeMotion]
     plane: Plane | None  # None of fewer pairs than a log takes
-    first: RelativeMotion
-    distance: float  # m along the path
-    inliers: float  # median of the motions
-    noise_ratio: float  # chi2/dof of all motions: measured variance of the pixels over the stated one
-    timed: bool  # whether images had timestamps
-    rate: float  # Hz
+    log: tuple[Trial, Belief] | None  # None of fewer pairs than a log takes, and where the motions leave the plane
     truth: Path | None
-    lacking: tuple[str, ...] = ()  # files without which oxts of a drive is no truth
-    faults: tuple[str, ...] = ()  # of motions that could not be measured
-    doubts: tuple[str, ...] = ()  # of motions whose estimator far points dominate
 
     def lines(self, out: Path) -> list[str]:
         """What a terminal shows, and what to do next."""
-        times = [] if self.timed else [f"the images have no times: {self.rate:g} Hz assumed, --rate says otherwise"]
-        judge = f"consistency analyse {out}/trajectory.tum --truth {out}/truth.tum --covariance {out}/covariance.txt"
-        windows = f"consistency analyse {out}/motions.tum --truth {out}/truth.tum --motions --relative 1"
-        oxts = f": that of oxts takes {' and '.join(self.lacking)} too" if self.lacking else ""
-        judged = (
-            [f"no truth found{oxts}; --truth FILE takes one"]
-            if self.truth is None
-            else [
-                f"truth from {self.truth}; next: {judge} --error so3",
-                f"or motion by motion, whatever the world: {windows}",
-            ]
-        )
-        bridges = f"{len(self.faults)} of {self.frames - 1} motions could not be measured and are bridged"
+        t, motions, plane = self.sequence.t, self.motions, self.plane
+        faults, doubts = [m.fault for m in motions if m.fault], [m.doubt for m in motions if m.doubt]
+        chi2, dof = (sum(values) for values in zip(*((m.chi2, m.dof) for m in motions), strict=True))
+        distance = sum(np.linalg.norm(m.pose.t) for m in motions)
+        inliers = np.median([m.inliers.sum() for m in motions])
+        rate = len(motions) / float(t[-1] - t[0])
+        times = [f"the images have no times: {rate:g} Hz assumed, --rate says otherwise"]
+        bridges = f"{len(faults)} of {len(motions)} motions could not be measured and are bridged"
         return [
-            f"{self.frames} stereo pairs, {self.distance:.2f} m, {self.inliers:.0f} inliers in the median",
-            *([f"{len(self.doubts)} of {self.frames - 1} motions: {self.doubts[0]}"] if self.doubts else []),
-            *([f"{bridges}, with the covariance of that; the first: {self.faults[0]}"] if self.faults else []),
-            f"residuals: chi2/dof {self.noise_ratio:.2f}; 1 where the stated noise of the features "
+            f"{len(t)} stereo pairs, {distance:.2f} m, {inliers:.0f} inliers in the median",
+            *([f"{len(doubts)} of {len(motions)} motions: {doubts[0]}"] if doubts else []),
+            *([f"{bridges}, with the covariance of that; the first: {faults[0]}"] if faults else []),
+            f"residuals: chi2/dof {chi2 / dof:.2f}; 1 where the stated noise of the features "
             "(--sigma-per-scale) is right",
-            *([self.plane.line] if self.plane is not None and not self.plane.holds else []),
+            *([plane.line] if plane is not None and not plane.holds else []),
             *self._log_lines(out),
-            *times,
-            *judged,
+            *([] if self.sequence.timed else times),
+            *self._truth_lines(out),
         ]
 
     def _log_lines(self, out: Path) -> list[str]:
         if self.log is not None:
-            return self.log.lines(out)
+            trial, belief = self.log
+            (u, v, d), motion = belief.sensor.sigma, belief.motion
+            return [
+                f"log: {trial.n_landmarks} landmarks, {len(trial.z)} observations; sigma u {u:.2f} v {v:.2f} "
+                f"d {d:.2f} px, v {motion.sigma_v:.3g} m/s, omega {motion.sigma_omega:.3g} rad/s",
+                "controls come from these images too: a filter that takes both uses the images twice",
+                f"log in {out}; next: consistency run --log {out} --filter ekf-uvd --out RESULTS",
+            ]
         if self.plane is None:
-            return _motion_lines(self.first, out)
+            return _motion_lines(self.motions[0], out)
         return [
             f"no planar log of a camera that is not on a robot in the plane: trajectory and motions are in {out}; "
             "--planar writes the log nevertheless"
         ]
 
+    def _truth_lines(self, out: Path) -> list[str]:
+        if self.truth is None:
+            lacking = missing_of_drive(self.sequence)  # files without which oxts of a drive is no truth
+            oxts = f": that of oxts takes {' and '.join(lacking)} too" if lacking else ""
+            return [f"no truth found{oxts}; --truth FILE takes one"]
+        judge = f"consistency analyse {out}/trajectory.tum --truth {out}/truth.tum --covariance {out}/covariance.txt"
+        windows = f"consistency analyse {out}/motions.tum --truth {out}/truth.tum --motions --relative 1"
+        return [
+            f"truth from {self.truth}; next: {judge} --error so3",
+            f"or motion by motion, whatever the world: {windows}",
+        ]
+
 
 def _motion_lines(motion: RelativeMotion, out: Path) -> list[str]:
-    """A single motion with its standard deviations."""
     scale = np.repeat([1e3, 180.0 / np.pi], 3)
     values, sigmas = scale * motion.pose.vector, scale * np.sqrt(np.diagonal(motion.covariance))
     said = [f"{name} {value:+.2f} +- {sigma:.2g}" for name, value, sigma in zip(AXES, values, sigmas, strict=True)]
@@ -175,27 +163,12 @@ def write_frontend_log(images: Path, out: Path, options: FrontendOptions, overwr
         plane = plane_of(motions, trial, belief)
         manifest["plane"] = plane.fields
     if plane is not None and (plane.holds or options.planar):
-        view = _view(sequence.rectification.rig)
+        rig, logged = sequence.rectification.rig, (trial, belief)
+        view = rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2]))
         write_log(out, [trial], belief, None, manifest, overwrite, view, files)
-        noise = belief.sensor.sigma, belief.motion.sigma_v, belief.motion.sigma_omega
-        logged = Logged(trial.n_landmarks, len(trial.z), *noise)
     else:
         write_folder(out, {}, manifest, lambda at: _write_texts(at, files), overwrite)
-    chi2, dof = (sum(values) for values in zip(*((m.chi2, m.dof) for m in motions), strict=True))
-    return Summary(
-        len(sequence), logged, plane, motions[0],
-        distance=float(sum(np.linalg.norm(m.pose.t) for m in motions)),
-        inliers=float(np.median([m.inliers.sum() for m in motions])),
-        noise_ratio=chi2 / dof, timed=sequence.timed,
-        rate=(len(sequence) - 1) / float(sequence.t[-1] - sequence.t[0]), truth=path,
-        lacking=() if path else tuple(missing_of_drive(sequence)),
-        faults=tuple(m.fault for m in motions if m.fault), doubts=tuple(m.doubt for m in motions if m.doubt),
-    )  # fmt: skip
-
-
-def _view(rig: StereoRig) -> View:
-    """Image size and principal point of the left camera."""
-    return rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2]))
+    return Summary(sequence, motions, plane, logged, path)
 
 
 def _write_texts(folder: Path, files: dict[str, str]) -> None:
@@ -222,3 +195,31 @@ def trajectory_files(
         back = true_R[0].T
         files["truth.tum"] = trajectory_text(sequence.t, back @ true_R, (true_t - true_t[0]) @ back.T)
     return files
+
+
+def trajectory_text(stamps: Array, R: Array, t: Array) -> str:
+    """Lines ``t tx ty tz qx qy qz qw`` of poses (n, 3, 3), (n, 3)."""
+    quaternion = Rotation.from_matrix(R).as_quat(canonical=True)
+    return _lines(stamps, np.column_stack([t, quaternion]))
+
+
+def covariance_text(stamps: Array, P: Array) -> str:
+    """Lines of t and 36 numbers of covariances (n, 6, 6), translation first; a start known exactly has none."""
+    known = P.any(axis=(1, 2))
+    return _lines(stamps[known], P[known].reshape(-1, 36))
+
+
+def motions_text(stamps: Array, R: Array, t: Array, P: Array) -> str:
+    """Lines of t, the motion since the line before (7 numbers) and 36 of its covariance, translation first.
+
+    The first line is where the motions (T, 3, 3), (T, 3), (T, 6, 6) start, for T + 1 stamps.
+    """
+    quaternion = Rotation.from_matrix(R).as_quat(canonical=True)
+    rows = np.column_stack([t, quaternion, P.reshape(-1, 36)])
+    start = np.concatenate([np.zeros((1, 6)), np.ones((1, 1)), np.zeros((1, 36))], axis=1)
+    return _lines(stamps, np.concatenate([start, rows]))
+
+
+def _lines(stamps: Array, values: Array) -> str:
+    rows = (" ".join([f"{t:.9f}", *(f"{x:.17g}" for x in row)]) for t, row in zip(stamps, values, strict=True))
+    return "\n".join(rows) + "\n"

@@ -1,4 +1,7 @@
-"""Relative motions and matches as a planar log: controls, few landmarks, and the noise that a filter believes."""
+"""Relative motions and matches as a planar log: controls, few landmarks, and the noise that a filter believes.
+
+Motions in space become those of a robot on a plane: forward, left, up, and the heading about up.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,11 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.models import point, stereo
+from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.motion import RelativeMotion
 from consistency.stereo.visual_odometry.pose import RelativePose, angular
@@ -26,6 +29,8 @@ MOST_SLOTS = 64  # landmarks at once
 # rad: as many such tilts, at random, come to 1 / NEAR within a landmark's life
 LEAVES = 1.0 / (NEAR * np.sqrt(MAX_AGE))
 CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # right, down, forward <- forward, left, up
+WITHIN = 30.0  # degrees between optical axis and motion; a camera that looks elsewhere does not tell what is forward
+MOVED = 0.1  # m over the whole sequence; below, a rig that stands still has no direction
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,6 @@ class Plane:
 
     @property
     def leaving(self) -> int:
-        """Motions that tilt by more than LEAVES."""
         return int((self.tilts > LEAVES).sum())
 
     @property
@@ -63,7 +67,6 @@ class Plane:
 
     @property
     def fields(self) -> dict[str, object]:
-        """Entries of a manifest."""
         tilts = np.rad2deg(self.tilts)
         return {
             "holds": self.holds, "sigma_px": self.sigma, "limit_px": self.limit, "motions": len(tilts),
@@ -220,3 +223,48 @@ def relative(R: Array, t: Array) -> tuple[Array, Array]:
     """Motions from frame to frame of poses (n, 3, 3), (n, 3)."""
     back = np.swapaxes(R[:-1], 1, 2)
     return back @ R[1:], np.einsum("nij,nj->ni", back, np.diff(t, axis=0))
+
+
+def robot_axes(t: Array) -> Array:
+    """Axes forward, left, up of the robot in those of the camera (right, down, forward), rows, (3, 3).
+
+    Forward is the mean direction of the motions, so that the robot goes where it heads; the camera's rows are level.
+    Where the rig moves less than 10 cm in all, or more than 30 degrees off the optical axis, forward is the optical
+    axis.
+
+    Parameters
+    ----------
+    t : (T, 3), translations from frame to frame in camera axes, m
+    """
+    total = t.sum(axis=0)
+    forward = total * np.where(total[2] < 0.0, -1.0, 1.0) / max(float(np.linalg.norm(total)), 1e-12)
+    if np.linalg.norm(total) < MOVED or forward[2] < np.cos(np.deg2rad(WITHIN)):
+        return CAMERA.T.copy()
+    left = np.cross([0.0, -1.0, 0.0], forward)
+    left /= np.linalg.norm(left)
+    return np.array([forward, left, np.cross(forward, left)])
+
+
+def in_robot_axes(R: Array, t: Array, axes: Array, lever: float) -> tuple[Array, Array]:
+    """Motions (T, 3, 3), (T, 3) of the camera as those of a robot point ``lever`` m behind it, in robot axes."""
+    ahead = np.array([lever, 0.0, 0.0])
+    turn = axes @ R @ axes.T
+    return turn, t @ axes.T + ahead - turn @ ahead
+
+
+def planar_motions(R: Array, t: Array) -> Array:
+    """Forward, left (m) and turn (rad) of motions (T, 3, 3), (T, 3) in robot axes, (T, 3).
+
+    Height, roll and pitch are left out step by step: a slope is unrolled, nothing of it adds up.
+    """
+    return np.column_stack([t[:, :2], np.arctan2(R[:, 1, 0], R[:, 0, 0])])
+
+
+def planar_path(motions: Array) -> Array:
+    """Poses x, y, heading (T + 1, 3) from :func:`planar_motions`, from the origin on; the heading is not wrapped."""
+    ones = np.ones(len(motions))
+    along = dead_reckoning(np.zeros(3), np.column_stack([ones, motions[:, 0], motions[:, 2]]))
+    heading = along[:-1, 2]
+    aside = np.cumsum(motions[:, 1:2] * np.column_stack([-np.sin(heading), np.cos(heading)]), axis=0)
+    along[1:, :2] += aside
+    return along

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 
 from consistency.bench.pages.exhibits import extra_table
 from consistency.bench.pages.report_input import Report
@@ -24,94 +25,44 @@ KEYS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Scene:
-    """N times the mean NEES of one scene over its degrees of freedom, as Valencia & Andrade-Cetto (2018) fig. 2.3."""
-
-    far: float  # m
-    noise: float  # px
-    repetitions: int
-    ratio: float  # mean of the repetitions; 1 is right
-    spread: tuple[float, float]  # of the middle 95 % of the repetitions
-
-    @property
-    def label(self) -> str:
-        """Depth, noise and number of repetitions."""
-        return f"{self.far:g} m, {self.noise:g} px ({self.repetitions}×)"
-
-
-@dataclass(frozen=True)
-class Scenes:
-    """All scenes, and what is the same in them."""
-
-    scenes: tuple[Scene, ...]
-    region: tuple[float, float]  # where one repetition lies, of the degrees of freedom
-    confidence: float  # of the region
-    near: float  # m
-    points: int
-    samples: int  # of a repetition
-    dof: int
-
-    @property
-    def window(self) -> tuple[float, float]:
-        """Drawn range: all values, the region and some room."""
-        ends = [end for scene in self.scenes for end in (scene.ratio, *scene.spread)]
-        return min(self.region[0], *ends) - 0.03, max(self.region[1], *ends) + 0.03
-
-
-def read(report: Report) -> Scenes | None:
-    """The table of the folder; None where the file does not exist.
+def read(report: Report) -> pd.DataFrame | None:
+    """The table of the folder, a row for each scene; None where the file does not exist.
 
     Raises
     ------
     InputError
         The file is damaged or lacks a column.
     """
-    table = extra_table(report.folder / FILE, COLUMNS)
-    if table is None:
-        return None
-    same = table.iloc[0]
-    return Scenes(
-        scenes=tuple(
-            Scene(
-                row["far"], row["noise"], int(row["repetitions"]), row["ratio"], (row["ratio_least"], row["ratio_most"])
-            )
-            for row in table.to_dict("records")
-        ),
-        region=(float(same["region_low"]), float(same["region_high"])),
-        confidence=float(same["confidence"]),
-        near=float(same["near"]),
-        points=int(same["points"]),
-        samples=int(same["samples"]),
-        dof=int(same["dof"]),
-    )
+    return extra_table(report.folder / FILE, COLUMNS)
 
 
-def figures(found: Scenes) -> tuple[Figure, ...]:
-    """A row for each scene."""
-    ratio, low, high = np.array([(scene.ratio, *scene.spread) for scene in found.scenes]).T
-    labels = tuple(scene.label for scene in found.scenes)
+def figures(found: pd.DataFrame) -> tuple[Figure, ...]:
+    """A row for each scene: N times the mean NEES over its degrees of freedom, 1 is right."""
+    same, ends = found.iloc[0], found[["ratio_least", "ratio", "ratio_most"]].to_numpy()
+    low, ratio, high = ends.T
+    region = float(same["region_low"]), float(same["region_high"])
+    labels = tuple(f"{scene.far:g} m, {scene.noise:g} px ({scene.repetitions:.0f}×)" for scene in found.itertuples())
     tips = (("scene", "@scene"), ("mean", "@x{0.000}"), ("middle 95 %", "@low{0.000} to @high{0.000}"))
     marks = Intervals(np.arange(len(labels)), ratio, low, high, MEASURED, tips=tips, columns={"scene": labels})
+    window = min(region[0], float(ends.min())) - 0.03, max(region[1], float(ends.max())) + 0.03
     panel = Panel(
-        Axis(f"N times mean NEES / {found.dof}", window=found.window), Axis("", rows=labels),
-        (Span("x", *found.region, SHADE), Rule("x", 1.0, EXPECTED), marks),
+        Axis(f"N times mean NEES / {same['dof']:.0f}", window=window), Axis("", rows=labels),
+        (Span("x", *region, SHADE), Rule("x", 1.0, EXPECTED), marks),
         "N times mean NEES over what is expected, by scene", height=80 + 30 * len(labels),
     )  # fmt: skip
     sheet = Sheet((panel,), 0.55 + 0.22 * len(labels), keys=KEYS)
     return (Figure("A registration, by scene (fig. 2.3)", caption(found), (panel,), (sheet,), KEYS),)
 
 
-def caption(found: Scenes) -> str:
-    """What the figure of scenes shows."""
-    percent = f"{100 * found.confidence:g} %"
+def caption(found: pd.DataFrame) -> str:
+    same = found.iloc[0]
+    percent = f"{100 * same['confidence']:g} %"
     return (
-        f"N times the mean NEES of {found.samples} registrations (SVD) of {found.points} points over the {found.dof} "
-        "that is expected, by the scene's greatest depth and the noise, in brackets the number of repetitions; as "
-        f"Valencia & Andrade-Cetto (2018) fig. 2.3. Scenes begin at {found.near:g} m. Dot: mean of the repetitions; "
-        "bar: their middle 95 %. "
-        f"Shaded: the {percent} region of one repetition, which a right covariance leaves in "
-        f"{100 * (1 - found.confidence):.2g} % of them. Above 1 is overconfident."
+        f"N times the mean NEES of {same['samples']:.0f} registrations (SVD) of {same['points']:.0f} points over the "
+        f"{same['dof']:.0f} that is expected, by the scene's greatest depth and the noise, in brackets the number of "
+        f"repetitions; as Valencia & Andrade-Cetto (2018) fig. 2.3. Scenes begin at {same['near']:g} m. Dot: mean of "
+        f"the repetitions; bar: their middle 95 %. Shaded: the {percent} region of one repetition, which a right "
+        f"covariance leaves in {100 * (1 - same['confidence']):.2g} % of them. Above 1 is overconfident."
     )
 
 

@@ -29,7 +29,7 @@ from consistency.referee.document.drawing import (
 from consistency.referee.pages.provenance import facts
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
-from consistency.stereo.characterising.wording import counted, interval, sentences
+from consistency.stereo.characterising.writing import counted, interval, sentences
 
 MEASURED, NORMAL, STUDENT = Look(COLOURS[0]), Look("#333333"), Look(COLOURS[1], (5.0, 2.0))
 LOCAL = Look("#7f7f7f", marker="s", size=3.4)
@@ -101,7 +101,6 @@ def local_spread(of: Characterisation) -> tuple[Array, Array]:
 
 
 def _bias_map(of: Characterisation) -> Figure:
-    """Bias of u, v, d along the rows of nodes, as fig. 8."""
     assert of.bias is not None
     grid = of.bias.grid
     reach = 1.15 * max(float(np.nanmax(np.abs(of.bias.value) + of.bias.half)), 0.1)

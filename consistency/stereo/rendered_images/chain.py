@@ -11,25 +11,27 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
 from consistency.stereo.rendered_images.camera import StereoCamera
-from consistency.stereo.rendered_images.correspondence import (
+from consistency.stereo.rendered_images.render import StereoFrame
+from consistency.stereo.rendered_images.scene import Scene, to_camera
+from consistency.stereo.rendered_images.stages import (
     BlockMatching,
     Correspondence,
+    FeatureSelection,
+    GoodFeatures,
+    Klt,
     KltAcross,
     KnownDisparity,
-    SemiGlobal,
-)
-from consistency.stereo.rendered_images.filtering import (
+    KnownProjection,
     LeftRightCheck,
     ObservationFilter,
     PairObservations,
+    SemiGlobal,
+    Spread,
+    Tracking,
     TrackResidual,
     dissimilarity,
     patches,
 )
-from consistency.stereo.rendered_images.render import StereoFrame
-from consistency.stereo.rendered_images.scene import Scene, to_camera
-from consistency.stereo.rendered_images.selection import FeatureSelection, GoodFeatures, Spread
-from consistency.stereo.rendered_images.tracking import Klt, KnownProjection, Tracking
 
 KEPT, NO_DISPARITY, REJECTED = 0, 1, 2  # flags of an observation
 POINT, JUNCTION, MISMATCH, DRIFTED = 0, 1, 2, 3  # labels of an observation, which only the truth tells
@@ -211,7 +213,6 @@ def _follow(chain: Chain, state: _State, frame: StereoFrame, camera: StereoCamer
 
 
 def _observed(chain: Chain, state: _State, number: int, frame: StereoFrame, camera: StereoCamera) -> Tracks:
-    """Rows of one frame."""
     real = camera.real(to_camera(frame.pose, state.anchors))
     d = _disparities(chain, frame, state.uv, real)
     now = patches(frame.left, state.uv, np.where(np.isfinite(d * state.d), d / state.d, 1.0))

@@ -11,8 +11,7 @@ from consistency.referee.types import Array
 from consistency.stereo.rendered_images.camera import StereoCamera
 from consistency.stereo.rendered_images.chain import Chain, Tracks, joined
 from consistency.stereo.rendered_images.render import film
-from consistency.stereo.rendered_images.scene import Layer, Scene
-from consistency.stereo.rendered_images.texture import Blobs, Painted, RandomTexture, Texture
+from consistency.stereo.rendered_images.scene import Blobs, Layer, Painted, RandomTexture, Scene, Texture
 
 FINEST, OCTAVES, CONTRAST = 0.1, 4, 12.0  # m, number, grey values: a wall without fine detail
 

@@ -15,8 +15,7 @@ from scipy.special import ndtr
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.camera import Camera, StereoCamera
-from consistency.stereo.rendered_images.scene import Layer, Scene
-from consistency.stereo.rendered_images.texture import MIDDLE
+from consistency.stereo.rendered_images.scene import MIDDLE, Layer, Scene
 
 BLUR = 0.7  # px, sd of the point spread: it leaves 9 % at half the sampling rate, and nothing that could alias
 REACH = 4.0  # sd of the point spread beyond which the border of a layer is not seen

@@ -1,17 +1,137 @@
-"""Scenes of flat layers at several depths; near ones hide far ones."""
+"""Scenes of flat layers at several depths; near ones hide far ones.
+
+What is painted on a layer: grey values over two coordinates in metres, blurred as a lens would.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array, Indices
-from consistency.stereo.rendered_images.texture import Texture
 
+SAMPLES = 4  # of a tile in the shortest wavelength of its octave
+TILE = 256  # samples along the side of a tile: 64 of its shortest wavelengths, after which an octave repeats
+FAINT = 1e-3  # an octave that the lens leaves less of than this is not sampled
+MIDDLE = 128.0  # grey value about which a texture varies
 NOWHERE = -1  # layer of a ray that hits none
+
+
+class Texture(Protocol):
+    """Grey values of a surface."""
+
+    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
+        """Grey values (N,) at ``a``, ``b`` (N,), m, seen through a Gaussian point spread of sd ``blur`` in m."""
+
+
+@dataclass(frozen=True)
+class Plain:
+    """One grey value everywhere."""
+
+    value: float = MIDDLE
+
+    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
+        return np.full(a.shape, self.value, np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class RandomTexture:
+    """Sum of octaves of Gaussian noise with the same contrast in each, as natural surfaces have it.
+
+    Each octave is a periodic tile; between its samples the surface is bilinear, in whichever camera it is seen, so that
+    geometry is exact. The lens weakens an octave by the transfer of its point spread at the octave's middle frequency.
+    So a near surface shows detail that a far one does not, and an image holds next to nothing beyond half its sampling
+    rate.
+    """
+
+    tiles: tuple[Array, ...]  # (TILE, TILE) each, float32, sd 1
+    wavelengths: tuple[float, ...]  # shortest of each octave, m
+    contrast: float  # sd of each octave, grey values
+
+    @classmethod
+    def draw(
+        cls, rng: np.random.Generator, finest: float = 0.012, octaves: int = 7, contrast: float = 14.0
+    ) -> RandomTexture:
+        """A texture with wavelengths from ``finest`` to ``finest * 2**octaves``, m."""
+        frequency = np.fft.fftfreq(TILE)
+        radius = np.hypot(frequency[:, None], frequency[None])
+        ring = (radius > 0.5 / SAMPLES) & (radius <= 1.0 / SAMPLES)
+        tiles = []
+        for _ in range(octaves):
+            tile = np.fft.ifft2(np.fft.fft2(rng.standard_normal((TILE, TILE))) * ring).real
+            tiles.append((tile / tile.std()).astype(np.float32))
+        return cls(tuple(tiles), tuple(finest * 2.0**k for k in range(octaves)), contrast)
+
+    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
+        total = np.full(a.shape, MIDDLE, np.float32)
+        for tile, shortest in zip(self.tiles, self.wavelengths, strict=True):
+            kept = np.exp(-2.0 * (np.pi * np.asarray(blur) * 0.75 / shortest) ** 2)  # 0.75: middle of the octave
+            if np.max(kept) > FAINT:
+                scale = SAMPLES / shortest
+                total += np.float32(self.contrast) * kept.astype(np.float32) * sampled(tile, scale * b, scale * a)
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class Blobs:
+    """Dark Gaussian spots on a bright surface, one at a random place in each cell of a grid that repeats.
+
+    A spot stays clear of the border of its cell by 3 times ``radius``, so that a point sees the spot of its own cell
+    and no other; through a lens it is a Gaussian again, wider and fainter.
+    """
+
+    offsets: Array  # (n, n, 2), of the spots from the middle of their cells, m
+    cell: float  # m
+    radius: float  # sd of a spot, m
+    depth: float = 90.0  # grey values in the middle of a spot
+    ground: float = 170.0
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, cell: float = 0.35, radius: float = 0.035, count: int = 64) -> Blobs:
+        """Spots in ``count`` by ``count`` cells of side ``cell``."""
+        room = max(0.5 * cell - 3.0 * radius, 0.0)
+        return cls(rng.uniform(-room, room, (count, count, 2)), cell, radius)
+
+    def centres(self, i: Array, j: Array) -> Array:
+        """Middle of the spots (N, 2), a and b in m, in cells ``i`` along a and ``j`` along b."""
+        n = len(self.offsets)
+        offset = self.offsets[np.mod(j, n), np.mod(i, n)]
+        return np.asarray(np.stack([i + 0.5, j + 0.5], axis=-1) * self.cell + offset)
+
+    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
+        i, j = np.floor(a / self.cell).astype(int), np.floor(b / self.cell).astype(int)
+        off = np.stack([a, b], axis=-1) - self.centres(i, j)
+        variance = self.radius**2 + np.square(blur)
+        spot = self.radius**2 / variance * np.exp(-0.5 * np.square(off).sum(axis=-1) / variance)
+        return np.asarray(self.ground - self.depth * spot, np.float32)
+
+
+@dataclass(frozen=True)
+class Painted:
+    """One texture on another, whose values are added."""
+
+    ground: Texture
+    marks: Texture
+
+    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
+        return self.ground.grey(a, b, blur) + self.marks.grey(a, b, blur) - MIDDLE
+
+
+def sampled(tile: Array, row: Array, column: Array) -> Array:
+    """Bilinear values (N,) of a periodic tile (n, n), n a power of 2, at rows and columns (N,)."""
+    n = tile.shape[0]
+    i, j = np.floor(row), np.floor(column)
+    di, dj = (row - i).astype(np.float32), (column - j).astype(np.float32)
+    top, left = i.astype(np.int64) & (n - 1), j.astype(np.int64) & (n - 1)
+    below, right = (top + 1) & (n - 1), (left + 1) & (n - 1)
+    flat = tile.ravel()
+    upper = flat[top * n + left] * (1 - dj) + flat[top * n + right] * dj
+    lower = flat[below * n + left] * (1 - dj) + flat[below * n + right] * dj
+    return np.asarray(upper * (1 - di) + lower * di)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,6 @@
 from .cameras.rig import StereoRig as StereoRig
 from .cameras.rig import triangulable as triangulable
 from .cameras.rig import triangulate as triangulate
-from .consensus import register_ransac as register_ransac
 from .input_errors import ConsensusError as ConsensusError
 from .input_errors import ConvergenceError as ConvergenceError
 from .input_errors import DegenerateError as DegenerateError
@@ -20,4 +19,5 @@ from .refinement import Refined as Refined
 from .refinement import refine_reprojection as refine_reprojection
 from .refinement import register_weighted as register_weighted
 from .registration import register_horn as register_horn
+from .registration import register_ransac as register_ransac
 from .registration import register_svd as register_svd

@@ -11,10 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.models import planar, point, stereo
 from consistency.bench.scenario import Belief, BelievedSensor
+from consistency.bench.store.log import Log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
@@ -33,8 +35,7 @@ class Screened:
     """Trials in which landmarks begin anew where they leave the common motion, and how often they do."""
 
     trials: list[Trial]
-    gate: Array  # (s,), in units of z
-    scale: Array  # (s,), standard deviation of the misfits by their median: what a gate should be some times of
+    scale: Array  # (s,), in units of z, standard deviation of the misfits by their median: a gate is some times it
     offered: int  # observations
     judged: int  # of these, whose landmark was seen in the step before
     broken: int  # of these, that leave the common motion
@@ -61,7 +62,7 @@ def screened(trials: Sequence[Trial], belief: Belief, gate: Array) -> Screened:
     scale = MAD * np.median(every, axis=0) if len(every) else np.zeros(len(gate))
     broken = [rows[1][(e > gate).any(axis=1)] for rows, e in zip(pairs, misfits, strict=True)]
     offered = sum(len(trial.z) for trial in trials)
-    return Screened(_begun_anew(trials, broken), gate, scale, offered, len(every), sum(map(len, broken)))
+    return Screened(_begun_anew(trials, broken), scale, offered, len(every), sum(map(len, broken)))
 
 
 def _pairs(trial: Trial) -> tuple[Indices, Indices]:
@@ -202,3 +203,50 @@ def _renumbered(trial: Trial, landmark: Indices, parent: Indices, new: Array) ->
     if places is not None:
         places = places[parent[parent < len(places)]]
     return replace(trial, landmark=landmark, n_landmarks=len(parent), labels=labels, source=source, landmarks=places)
+
+
+def screened_log(log: Log, gate: str | Array) -> Log:
+    """A log in which landmarks begin anew where they leave the common motion; ``screening`` says how often.
+
+    Parameters
+    ----------
+    gate : (s,) or text, greatest misfit of each value of an observation, in units of z
+
+    Raises
+    ------
+    InputError
+        ``gate`` is not one positive number for each value; the sensor is linear.
+    """
+    values = _numbers(gate) if isinstance(gate, str) else gate
+    size = log.belief.sensor.size
+    if values.shape != (size,) or not (np.isfinite(values) & (values > 0)).all():
+        example = ",".join(["2", "2", "1"][:size])
+        raise InputError(
+            f"--screen {gate}: must be {size} positive numbers for a sensor '{log.belief.sensor.model}', as {example}"
+        )
+    found = screened(log.trials, log.belief, values)
+    counts = {"offered": found.offered, "judged": found.judged, "broken": found.broken}
+    screening = {"gate": values.tolist(), "scale": found.scale.tolist()} | counts
+    landmarks, first = log.landmarks, found.trials[0]
+    if landmarks is not None and first.landmarks is not None and first.labels is not None:
+        places = dict(zip("xyz", first.landmarks.T, strict=True))
+        seen = pd.DataFrame({"landmark": first.labels[: len(first.landmarks)]} | places)
+        landmarks = pd.concat([landmarks, seen]).drop_duplicates("landmark", ignore_index=True)
+    return replace(log, trials=found.trials, landmarks=landmarks, screening=screening)
+
+
+def screening_line(log: Log) -> str:
+    """What a screening found, for a terminal."""
+    found = log.screening or {}
+    gate, scale = (", ".join(f"{value:.2g}" for value in found[name]) for name in ("gate", "scale"))
+    return (
+        f"screen: {found['broken']} of {found['judged']} observations that follow another of their landmark leave the "
+        f"common motion by more than {gate}; a landmark begins anew there (standard deviation of the rest: {scale})"
+    )
+
+
+def _numbers(text: str) -> Array:
+    try:
+        return np.array(text.split(","), float)
+    except ValueError:
+        return np.zeros(0)

@@ -1,4 +1,7 @@
-"""SIFT features of one image (Lowe 2004), by OpenCV; an image is brought to 8-bit grey first."""
+"""SIFT features of images (Lowe 2004), by OpenCV, and their matches; an image is brought to 8-bit grey first.
+
+Matches pass a ratio and a mutual test, an epipolar gate, and the circle over four images.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,16 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig
+from consistency.stereo.visual_odometry.pose import cross_matrix
 
 COUNT = 3000  # strongest features of an image; at 1226 x 370 px that is nearly all of them
 GREY = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601 weights of red, green and blue
+RATIO = 0.8  # distance of the best match over that of the second best, Lowe (2004) sec. 7.1
+EPIPOLAR_PX = 2.0  # distance from the epipolar line; rectified images of a good calibration keep below 1
+BAND = 32  # rows of rectified images that are matched at once; time only
+NEVER = -2.0  # below every cosine
 
 
 @dataclass(frozen=True)
@@ -89,3 +98,113 @@ def sift(image: Array, count: int = COUNT, name: str = "image") -> Features:
         0.5 * np.array([point.size for point in points]),  # OpenCV's size is a diameter
         descriptors / np.maximum(length, 1e-9),
     )
+
+
+@dataclass(frozen=True)
+class StereoFeatures:
+    """Features of both images of a stereo pair and their matches, row by row of ``pairs``."""
+
+    left: Features
+    right: Features
+    pairs: Indices  # (M, 2), rows in left and right; each feature at most once
+
+
+def mutual_matches(first: Array, second: Array, allowed: Array | None = None, ratio: float = RATIO) -> Indices:
+    """Rows (M, 2) of descriptors (N, k) and (K, k) that are each other's nearest, sorted by the first.
+
+    Parameters
+    ----------
+    first, second : descriptors of unit length
+    allowed : (N, K), whether two may match at all, or None for all; what is not allowed is no second best either
+    ratio : the nearest must be closer than ``ratio`` times the second nearest, in the direction first to second
+    """
+    if not len(first) or not len(second):
+        return np.empty((0, 2), np.int64)
+    likeness = np.asarray(first @ second.T)  # cosines
+    if allowed is not None:
+        likeness[~allowed] = NEVER
+    rows, best = np.arange(len(first)), likeness.argmax(axis=1)
+    nearest = likeness[rows, best]
+    mutual = nearest == likeness.max(axis=0)[best]
+    likeness[rows, best] = NEVER
+    further = likeness.max(axis=1)
+    near, far = (np.sqrt(np.maximum(2.0 - 2.0 * value, 0.0)) for value in (nearest, further))
+    good = (nearest > NEVER) & mutual & (near < ratio * far)
+    good &= np.bincount(best[good], minlength=len(second))[best] == 1  # equal descriptors tell nothing
+    return np.asarray(np.column_stack([rows, best])[good], np.int64)
+
+
+def epipolar_gate(rig: StereoRig, left: Array, right: Array, tolerance: float = EPIPOLAR_PX) -> Array:
+    """Whether pixels (N, 2) of the left and (K, 2) of the right image may show one point, shape (N, K).
+
+    The right pixel lies within ``tolerance`` px of the epipolar line of the left one. In rectified images that
+    is a difference of rows, and the right column must not exceed the left one by more than ``tolerance``.
+    """
+    lines = homogeneous(left) @ fundamental(rig).T  # (N, 3) in the right image
+    lines = lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
+    distance = lines.astype(np.float32) @ homogeneous(right).T.astype(np.float32)
+    near = np.abs(distance, out=distance) <= tolerance
+    if is_rectified(rig):
+        furthest = left[:, 0] - (rig.K_left[0, 2] - rig.K_right[0, 2]) + tolerance
+        near &= furthest.astype(np.float32)[:, None] >= right[:, 0].astype(np.float32)
+    return np.asarray(near)
+
+
+def fundamental(rig: StereoRig) -> Array:
+    """F (3, 3) with x_right' F x_left = 0 for homogeneous pixels of one point, Hartley & Zisserman (2003) eq. 9.2."""
+    cross = cross_matrix(-rig.R.T @ rig.t)
+    return np.asarray(np.linalg.inv(rig.K_right).T @ cross @ rig.R.T @ np.linalg.inv(rig.K_left))
+
+
+def is_rectified(rig: StereoRig) -> bool:
+    """Whether rows of both images correspond: same axes and focal lengths, baseline along x within 1 %."""
+    same = np.allclose(rig.R, np.eye(3), atol=1e-6)
+    focal = np.allclose(np.delete(rig.K_left, 2, axis=1), np.delete(rig.K_right, 2, axis=1), rtol=1e-6)
+    rows = abs(rig.K_left[1, 2] - rig.K_right[1, 2]) < 1e-3
+    return bool(same and focal and rows and np.linalg.norm(rig.t[1:]) <= 0.01 * rig.t[0])
+
+
+def homogeneous(uv: Array) -> Array:
+    """Pixels (N, 2) with a 1 behind each, (N, 3)."""
+    return np.column_stack([uv, np.ones(len(uv))])
+
+
+def stereo_matches(
+    rig: StereoRig, left: Features, right: Features, ratio: float = RATIO, tolerance: float = EPIPOLAR_PX
+) -> StereoFeatures:
+    """Features of both images matched within the epipolar gate.
+
+    Rectified images are matched in bands of rows. Around a band, the right features reach ``tolerance`` further and
+    the left ones twice that, so that each left feature of the band and each right one it may match has all its rivals.
+    """
+    height, step = (rig.image_size[1], BAND) if is_rectified(rig) else (1, 1)
+    groups = [np.empty((0, 2), np.int64)]
+    for top in range(0, height, step):
+        ends = (-np.inf if top == 0 else top, np.inf if top + step >= height else top + step)
+        i, j = (_within(f.uv[:, 1], ends, margin * tolerance) for f, margin in ((left, 2), (right, 1)))
+        allowed = epipolar_gate(rig, left.uv[i], right.uv[j], tolerance)
+        matches = mutual_matches(left.descriptors[i], right.descriptors[j], allowed, ratio)
+        pairs = np.column_stack([i[matches[:, 0]], j[matches[:, 1]]])
+        row = left.uv[pairs[:, 0], 1]
+        groups.append(pairs[(row >= ends[0]) & (row < ends[1])])
+    pairs = np.concatenate(groups)
+    return StereoFeatures(left, right, pairs[np.argsort(pairs[:, 0])])
+
+
+def _within(values: Array, ends: tuple[float, float], margin: float) -> Indices:
+    return np.flatnonzero((values >= ends[0] - margin) & (values < ends[1] + margin))
+
+
+def circular_matches(before: StereoFeatures, after: StereoFeatures, ratio: float = RATIO) -> Indices:
+    """Rows (M, 2) in ``before.pairs`` and ``after.pairs`` whose circle left0-right0-right1-left1-left0 closes.
+
+    Left is matched with left and right with right over time, among features that have a stereo match; both must
+    say the same. The two stereo matches of the circle are those of the pairs.
+    """
+    codes = list[Indices]()
+    for side, (was, now) in enumerate(((before.left, after.left), (before.right, after.right))):
+        old, new = before.pairs[:, side], after.pairs[:, side]
+        i, j = mutual_matches(was.descriptors[old], now.descriptors[new], None, ratio).T
+        codes.append(i * len(new) + j)
+    closed = np.intersect1d(codes[0], codes[1], assume_unique=True)
+    return np.asarray(np.column_stack(np.divmod(closed, max(len(after.pairs), 1))), np.int64)

@@ -11,21 +11,22 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulable, triangulate
-from consistency.stereo.visual_odometry.consensus import squared_distances
-from consistency.stereo.visual_odometry.features import COUNT, grey, sift
-from consistency.stereo.visual_odometry.input_errors import ConsensusError, MatchError
-from consistency.stereo.visual_odometry.matching import (
+from consistency.stereo.visual_odometry.features import (
+    COUNT,
     EPIPOLAR_PX,
     RATIO,
     StereoFeatures,
     circular_matches,
+    grey,
     homogeneous,
+    sift,
     stereo_matches,
 )
+from consistency.stereo.visual_odometry.input_errors import ConsensusError, MatchError
 from consistency.stereo.visual_odometry.pose import RelativePose
 from consistency.stereo.visual_odometry.propagation import registration_covariance, triangulation_covariance
 from consistency.stereo.visual_odometry.refinement import Refined, refine_reprojection
-from consistency.stereo.visual_odometry.registration import register_horn, register_svd
+from consistency.stereo.visual_odometry.registration import register_horn, register_svd, squared_distances
 from consistency.stereo.visual_odometry.resection import inliers_within, resect_ransac, squared_reprojections
 
 ESTIMATORS = ("reprojection", "svd", "horn")
@@ -228,7 +229,7 @@ def estimate_motion(
     Raises
     ------
     InputError
-        Shapes do not fit, or OpenCV is not installed.
+        OpenCV is not installed.
     ConsensusError, DegenerateError, ConvergenceError
         As :func:`relative_motion`.
     """

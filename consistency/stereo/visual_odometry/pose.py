@@ -12,6 +12,7 @@ import numpy as np
 
 from consistency.referee import geometry
 from consistency.referee.errors import InputError
+from consistency.referee.geometry.groups import carried
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import input_checks
 from consistency.stereo.visual_odometry.input_errors import GimbalLockError
@@ -127,7 +128,8 @@ def compose(a: RelativePose, S_a: Array, b: RelativePose, S_b: Array) -> tuple[R
     J_a[3:, 3:] = E_inverse @ E_a
     J_b[:3, :3] = a.R
     J_b[3:, 3:] = E_inverse @ a.R @ E_b
-    return both, _symmetric(J_a @ S_a @ J_a.T + J_b @ S_b @ J_b.T)
+    S = J_a @ S_a @ J_a.T + J_b @ S_b @ J_b.T
+    return both, np.asarray(0.5 * (S + S.T))
 
 
 def invert(pose: RelativePose, S: Array) -> tuple[RelativePose, Array]:
@@ -138,13 +140,9 @@ def invert(pose: RelativePose, S: Array) -> tuple[RelativePose, Array]:
     J[:3, :3] = -pose.R.T
     J[:3, 3:] = -pose.R.T @ cross_matrix(pose.t) @ angular(pose)
     J[3:, 3:] = -np.linalg.inv(angular(inverse)) @ pose.R.T @ angular(pose)
-    return inverse, _symmetric(J @ S @ J.T)
+    return inverse, carried(J, S)
 
 
 def cross_matrix(v: Array) -> Array:
     """[v]x (3, 3), with [v]x w = v x w."""
     return np.asarray(np.tensordot(v, AXES, 1))
-
-
-def _symmetric(S: Array) -> Array:
-    return np.asarray(0.5 * (S + S.T))

@@ -1,14 +1,18 @@
 """Maximum-likelihood relative poses: of points with covariances, and of pixels.
 
 Both minimise half the sum of rho(s), with s the squared standardised residual of a point in both frames at its best
-position. Both covariances come from :func:`implicit_covariance` of that cost, with exact second derivatives.
+position. rho is s, or Huber's (1964) or Cauchy's (Lorentzian) robust loss: rho'(s) is the weight that a point keeps,
+rho''(s) what an exact second derivative needs. Both covariances come from :func:`implicit_covariance` of that cost,
+with exact second derivatives.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -18,7 +22,6 @@ from consistency.stereo.visual_odometry.input_errors import ConvergenceError, De
 from consistency.stereo.visual_odometry.pose import RelativePose
 from consistency.stereo.visual_odometry.propagation import implicit_covariance
 from consistency.stereo.visual_odometry.registration import matched, register_svd
-from consistency.stereo.visual_odometry.robust_loss import Robust, loss, threshold
 from consistency.stereo.visual_odometry.two_frame_cost import (
     Derivatives,
     PixelMatches,
@@ -27,10 +30,37 @@ from consistency.stereo.visual_odometry.two_frame_cost import (
     derivatives,
 )
 
+Robust = Literal["huber", "cauchy"]
+TAIL = 0.05  # share of points without fault that Huber's loss treats as outliers
 STEPS = 100  # of Levenberg and Marquardt, at most; ten do for honest matches
 DECREMENT = 1e-12  # twice the predicted decrease of the cost in the last step: 1e-6 standard deviations
 NEAR = 1.0  # the same from which on second derivatives are taken in: one standard deviation
 SLACK = 1e-12  # relative rounding of the cost
+
+
+def threshold(dof: int) -> float:
+    """Standardised residual c, of ``dof`` dimensions, that a point without fault exceeds with probability 0.05."""
+    return float(np.sqrt(stats.chi2.isf(TAIL, dof)))
+
+
+def loss(robust: Robust | None, s: Array, c: float) -> tuple[Array, Array, Array]:
+    """rho, rho' and rho'' at s (N,), all (N,); None is least squares.
+
+    Raises
+    ------
+    InputError
+        No such loss.
+    """
+    if robust is None:
+        return s, np.ones_like(s), np.zeros_like(s)
+    if robust == "huber":
+        far = np.maximum(s, c**2)
+        root = c / np.sqrt(far)
+        return np.minimum(s, c**2) + 2.0 * c * (np.sqrt(far) - c), root, np.where(s > c**2, -0.5 * root / far, 0.0)
+    if robust == "cauchy":
+        weight = 1.0 / (1.0 + s / c**2)
+        return c**2 * np.log1p(s / c**2), weight, -(weight**2) / c**2
+    raise InputError(f"robust: {robust!r}, allowed are 'huber', 'cauchy' and None")
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +223,6 @@ def _minimum(
 def _cost(
     frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None, c: float
 ) -> tuple[float, Array, Array]:
-    """The cost, and rho' and rho'' of each point."""
     rho, weight, bend = loss(robust, frames.squared(pose, q), c)
     return 0.5 * float(rho.sum()), weight, bend
 

@@ -10,13 +10,12 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import input_checks
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
-from consistency.stereo.visual_odometry.consensus import draws_for, fewest
 from consistency.stereo.visual_odometry.features import opencv
 from consistency.stereo.visual_odometry.input_errors import ConsensusError
 from consistency.stereo.visual_odometry.pose import RelativePose
 from consistency.stereo.visual_odometry.propagation import triangulation_covariance
+from consistency.stereo.visual_odometry.registration import draws_for, fewest
 from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches
 
 ROUND = 32  # draws at once
@@ -56,15 +55,10 @@ def resect_ransac(
     Raises
     ------
     InputError
-        Shapes do not fit, or OpenCV is not installed.
+        OpenCV is not installed.
     ConsensusError
         No motion has enough inliers: 4, and a tenth of the matches.
     """
-    uv0, uv1 = input_checks.rows("uv0", uv0, 4), input_checks.rows("uv1", uv1, 4)
-    input_checks.same_length("uv0, uv1", uv0, uv1)
-    sigma0, sigma1 = input_checks.rows("sigma0", sigma0, 4), input_checks.rows("sigma1", sigma1, 4)
-    input_checks.same_length("sigma0, sigma1", sigma0, sigma1)
-    input_checks.same_length("uv0, sigma0", uv0, sigma0)
     least = fewest(len(uv0))
     found, inliers = _search(rig, triangulate(rig, uv0), uv1, sigma0**2 + sigma1**2 + SLACK_PX**2, gate, rng)
     if found is not None:

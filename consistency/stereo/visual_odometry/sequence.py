@@ -15,8 +15,7 @@ from consistency.referee.parsing import HUGE, is_file, read_text, reading
 from consistency.referee.readers.formats.kitti_files import NANO, place_of, read_times
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
-from consistency.stereo.visual_odometry.cameras.camera_pair import Calibration
-from consistency.stereo.visual_odometry.cameras.rectification import Rectification, rectify
+from consistency.stereo.visual_odometry.cameras.camera_pair import Calibration, Rectification, rectify
 from consistency.stereo.visual_odometry.features import opencv
 
 FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")
@@ -112,7 +111,7 @@ def read_sequence(
     _require_pairs(folder, files, t)
     if t is None:
         _require_no_gap(files[0])
-    size = _size_of(files[0][0])
+    size = read_image(files[0][0]).shape[::-1]
     names = [side[0].parent.parent.name if kind == "kitti-raw" else side[0].parent.name for side in files]
     cameras = read_calibration(calibration or home or folder, names[0], names[1], size)
     with reading(cameras.source, "its cameras cannot be rectified"):
@@ -144,19 +143,25 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> Array:
     return np.asarray(image)
 
 
-def _size_of(path: Path) -> tuple[int, int]:
-    height, width = read_image(path).shape
-    return width, height
-
-
 def _recognised(folder: Path) -> str:
-    if any((folder / one).is_dir() and (folder / two).is_dir() for one, two in KITTI_PAIRS):
+    if _pair_of(folder, KITTI_PAIRS):
         return "kitti"
-    if any((folder / one).is_dir() and (folder / two).is_dir() for one, two in RAW_PAIRS):
+    if _pair_of(folder, RAW_PAIRS):
         return "kitti-raw"
     if (folder / "mav0").is_dir() or (folder / "cam0").is_dir():
         return "euroc"
     return "opencv"
+
+
+def _pair_of(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str] | None:
+    """The first two cameras that have folders of their own."""
+    return next((pair for pair in pairs if all((folder / camera).is_dir() for camera in pair)), None)
+
+
+def _required_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
+    if pair := _pair_of(folder, pairs):
+        return pair
+    raise InputError(f"{folder}: holds no folders {' or '.join(' and '.join(pair) for pair in pairs)}")
 
 
 def _images(folder: Path, pattern: str = "*") -> list[Path]:
@@ -202,10 +207,8 @@ def _by_name(folder: Path, left: list[Path], right: list[Path]) -> tuple[list[Pa
 
 
 def _kitti(folder: Path) -> tuple[list[Path], list[Path]]:
-    for one, two in KITTI_PAIRS:
-        if (folder / one).is_dir() and (folder / two).is_dir():
-            return _by_name(folder, _images(folder / one), _images(folder / two))
-    raise InputError(f"{folder}: holds no folders {' or '.join(' and '.join(pair) for pair in KITTI_PAIRS)}")
+    one, two = _required_pair(folder, KITTI_PAIRS)
+    return _by_name(folder, _images(folder / one), _images(folder / two))
 
 
 def _kitti_times(folder: Path) -> Array | None:
@@ -220,12 +223,10 @@ def _kitti_times(folder: Path) -> Array | None:
 
 def _kitti_raw(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
     """Images of the first pair of cameras that is there, and the times of the left one in seconds from the first."""
-    for one, two in RAW_PAIRS:
-        if (folder / one).is_dir() and (folder / two).is_dir():
-            files = _by_name(folder, _images(folder / one / "data"), _images(folder / two / "data"))
-            stamps = read_times(folder / one / "timestamps.txt")
-            return files, (stamps - stamps[0]) * NANO
-    raise InputError(f"{folder}: holds no folders {' or '.join(' and '.join(pair) for pair in RAW_PAIRS)}")
+    one, two = _required_pair(folder, RAW_PAIRS)
+    files = _by_name(folder, _images(folder / one / "data"), _images(folder / two / "data"))
+    stamps = read_times(folder / one / "timestamps.txt")
+    return files, (stamps - stamps[0]) * NANO
 
 
 def read_table(path: Path, delimiter: str | None, refusal: str) -> Array:

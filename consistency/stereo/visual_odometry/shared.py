@@ -16,9 +16,9 @@ from consistency.referee.diagnostics.imperfect_truth import shared_errors
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import SharedError as SharedError
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.bridging import neighbours
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.motion import RelativeMotion, diagonal
+from consistency.stereo.visual_odometry.odometry import neighbours
 from consistency.stereo.visual_odometry.pose import RelativePose, cross_matrix
 from consistency.stereo.visual_odometry.refinement import refine_reprojection
 

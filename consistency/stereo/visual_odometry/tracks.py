@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array, Indices
+from consistency.referee.types import Indices
 
 PIXELS = ["z0", "z1", "z2"]
 
@@ -65,7 +65,9 @@ def thinned(rows: pd.DataFrame, rule: TrackSelection) -> pd.DataFrame:
     InputError
         Nothing is left.
     """
-    rows = rows[rows["step"] >= 1].assign(band=lambda r: band_of(r["z0"].to_numpy(), rule))
+    rows = rows[rows["step"] >= 1].copy()
+    column = (rows["z0"] + rule.width / 2) * rule.bands // rule.width  # of the image, from the left
+    rows["band"] = np.clip(column, 0, rule.bands - 1).astype(np.int64)
     rows["left"] = rows.groupby("piece").cumcount(ascending=False) + 1  # observations to come, with this one
     row_of = {key: i for i, key in enumerate(zip(rows["piece"], rows["step"], strict=True))}
     alive: list[tuple[int, int, int]] = []  # piece, landmark, observations left
@@ -77,7 +79,9 @@ def thinned(rows: pd.DataFrame, rule: TrackSelection) -> pd.DataFrame:
         candidates = step_rows[(step_rows["left"] >= rule.min_life) & ~step_rows["piece"].isin(used)]
         crowd = np.bincount(step_rows.loc[step_rows["piece"].isin(used), "band"], minlength=rule.bands)
         for piece, life in _next_landmarks(candidates, crowd, rule.slots - len(alive), rule):
-            alive.append((piece, started, life if life <= rule.max_age else staggered(started, rule.max_age)))
+            if life > rule.max_age:  # half for every other: cut all in one frame, nothing would link it on
+                life = rule.max_age if started % 2 else rule.max_age // 2
+            alive.append((piece, started, life))
             started += 1
         picked += [(row_of[piece, step], landmark) for piece, landmark, _ in alive]
     if not picked:
@@ -102,13 +106,3 @@ def _next_landmarks(candidates: pd.DataFrame, crowd: Indices, free: int, rule: T
         result.append(queues[band].pop(0))
         crowd[band] += 1
     return result
-
-
-def staggered(landmark: int, max_age: int) -> int:
-    """Life of a piece that is too long, half for every other: cut all in one frame, nothing would link it on."""
-    return max_age if landmark % 2 else max_age // 2
-
-
-def band_of(u: Array, rule: TrackSelection) -> Indices:
-    """Column of the image, 0..bands-1 from the left, of pixels ``u`` (N,) from its middle."""
-    return np.clip((u + rule.width / 2) * rule.bands // rule.width, 0, rule.bands - 1).astype(np.int64)

@@ -8,7 +8,6 @@ that each q is eliminated from the second derivatives by itself (Schur complemen
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -17,27 +16,11 @@ from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.pose import RelativePose, rotation_derivatives
 
 
-class Measure(Protocol):
-    """What a frame measures of points (N, 3) in it: k numbers each."""
-
-    def value(self, p: Array) -> Array:
-        """What is measured of points p (N, 3): (N, k)."""
-        ...
-
-    def jacobian(self, p: Array) -> Array:
-        """Derivative of :meth:`value` by each point p (N, 3): (N, k, 3)."""
-        ...
-
-    def second(self, p: Array, J: Array, w: Array) -> Array:
-        """Sum over the k numbers of w (N, k) times the second derivative, (N, 3, 3); J is the Jacobian at p."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class TwoFrames:
     """Measurements of the same points in two frames."""
 
-    measure: Measure
+    measure: PointMatches | PixelMatches
     z1: Array  # (N, k)
     z2: Array  # (N, k)
     W1: Array  # (N, k, k), inverse covariance
@@ -97,7 +80,9 @@ def derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) ->
     )  # fmt: skip
 
 
-def _frame(measure: Measure, z: Array, W: Array, p: Array, exact: bool) -> tuple[Array, Array, Array, Array]:
+def _frame(
+    measure: PointMatches | PixelMatches, z: Array, W: Array, p: Array, exact: bool
+) -> tuple[Array, Array, Array, Array]:
     """f_p, f_pp, f_pz and f_z of e' W e / 2 in one frame."""
     J = measure.jacobian(p)
     We = (W @ (z - measure.value(p))[:, :, None])[:, :, 0]
@@ -109,7 +94,7 @@ def _frame(measure: Measure, z: Array, W: Array, p: Array, exact: bool) -> tuple
 
 
 class PointMatches:
-    """The measurement of a point is the point."""
+    """The measurement of a point is the point: k is 3."""
 
     def value(self, p: Array) -> Array:
         """The point itself, (N, 3)."""

@@ -23,7 +23,7 @@ from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
 from consistency.bench.store.results import open_results
 from consistency.bench.store.trial_rows import RunOutcome
-from consistency.referee.system.machine import this_machine
+from consistency.referee.system.provenance import this_machine
 
 RUNS = 40
 HERE = {"cpu": "abacus", "blas": "beads"}

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from bench_models import WARM
 from bench_peers import FilterpyEkf, FilterpyUkf, stone_soup
-from bench_trials import Case, Unequal, growing, grown, interleaved, require_equal, steady
+from bench_trials import Case, Unequal, growing, grown, require_equal, steady
 from threadpoolctl import threadpool_limits
 
 import consistency as cs
@@ -146,13 +146,6 @@ def test_main_writes_what_it_prints(
     written = json.loads((tmp_path / "new" / "bench.json").read_text())
     assert written["rows"][0] | {"note": ""} == written["rows"][0]
     assert written["rows"][0]["verdict"] == "missed"
-
-
-def test_medians_of_interleaved_measurements(monkeypatch: pytest.MonkeyPatch) -> None:
-    order: list[str] = []
-    seconds = interleaved({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, repeats=2)
-    assert "".join(order) == "ab" + "ab" + "ba"  # once to warm up, then to and fro
-    assert set(seconds) == {"a", "b"}
 
 
 def test_the_clock_takes_time_and_goes_away() -> None:

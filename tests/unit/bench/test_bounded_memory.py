@@ -18,9 +18,9 @@ import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Evidence, Settings, judge, summary
-from consistency.referee.diagnostics.records import array_blocks
+from consistency.referee.diagnostics.records import large_arrays
+from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.sample import sample_of
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
@@ -76,12 +76,11 @@ def test_a_summary_of_runs_takes_hardly_any() -> None:
 @pytest.mark.parametrize("settings", [Settings(tolerance=1.1), Settings(allow="conservative")], ids=["both", "one"])
 def test_small_blocks_say_what_large_ones_do(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     given = evidence(90, 23)
-    assert given.error is not None
     given.error[::7, 11:] = np.nan
     given.error[40:, 15:] *= 3.0
     whole = judge(given, settings)
-    monkeypatch.setattr(array_blocks, "ROWS", 400)
-    monkeypatch.setattr(array_blocks, "FEWER", 100)
+    monkeypatch.setattr(large_arrays, "ROWS", 400)
+    monkeypatch.setattr(large_arrays, "FEWER", 100)
     parts = judge(given, settings)
     assert parts.reasons == whole.reasons
     np.testing.assert_allclose(numbers(parts.statistics), numbers(whole.statistics), rtol=1e-12)
@@ -94,8 +93,6 @@ def test_errors_about_their_mean() -> None:
     for i in range(3):
         P.entry(i, i)[:] = 1.0 + i
     sample = sample_of(replace(given, covariance=P), Settings())
-    assert sample is not None
-    assert given.error is not None
     about = (given.error - given.error.mean(axis=0)) * np.sqrt(30 / 29)
     nees = (np.square(about) / [1.0, 2.0, 3.0]).sum(axis=-1)
     np.testing.assert_allclose(sample.centred_means(slice(2, None)), nees[:, 2:].mean(axis=1) / 3)

@@ -47,7 +47,6 @@ def test_it_compares_the_last_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = {row[3]: row for row in ceiling.judged(study, "circle", 4.0, 1.0)}
     results = cs.run_trials(world, ["ekf-uvd"], runs=2, seed=3, jobs=1)
     last = results.estimates[results.estimates["step"] == 20]
-    assert results.truth is not None
     truth = results.truth[results.truth["step"] == 20]
     squared = (last["x"].to_numpy() - truth["x"].to_numpy()) ** 2 + (last["y"].to_numpy() - truth["y"].to_numpy()) ** 2
     assert rows["ekf-uvd"][4:8] == pytest.approx((2, 0, last["nees"].mean(), np.sqrt(squared.mean())))

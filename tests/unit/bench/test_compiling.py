@@ -15,11 +15,10 @@ from typing import Any
 import forks
 import pytest
 
-from consistency.bench.filters.compiler import compile_time, disk_cache
-from consistency.bench.filters.compiler.compile_time import FIRST
+from consistency.bench.filters.compiler import disk_cache
 from consistency.bench.filters.compiler.content_key import Content
+from consistency.bench.filters.compiler.disk_cache import FIRST
 from consistency.bench.filters.compiler.jit import Kernel, Outlook
-from consistency.bench.filters.kernel.part_functions import robot_width
 from consistency.bench.runs import compiling
 from consistency.bench.runs.findings import experiments
 from consistency.bench.runs.montecarlo import resolve_filters
@@ -212,25 +211,25 @@ def outer(x: float) -> float:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     disk_cache.folder().mkdir(mode=0o700)
-    return disk_cache.folder() / compile_time.FILE
+    return disk_cache.folder() / disk_cache.FILE
 
 
 def test_seconds_are_those_of_this_machine(cache: Path) -> None:
-    assert compile_time.seconds_for(10_000) == pytest.approx(10_000 * FIRST)
+    assert disk_cache.seconds_for(10_000) == pytest.approx(10_000 * FIRST)
     cache.write_text("1000 2\nnonsense\n1000 4\n0 7\n1000 -1\n1000 nan\n2000 200\n")
-    assert compile_time.seconds_for(10_000) == pytest.approx(40.0)
-    cache.write_text("1 100\n" * 50 + "1000 2\n" * compile_time.RECENT)
-    assert compile_time.seconds_for(10_000) == pytest.approx(20.0)
+    assert disk_cache.seconds_for(10_000) == pytest.approx(40.0)
+    cache.write_text("1 100\n" * 50 + "1000 2\n" * disk_cache.RECENT)
+    assert disk_cache.seconds_for(10_000) == pytest.approx(20.0)
 
 
 def test_what_compiling_took_is_kept(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compile_time.time, "monotonic", iter([0.0, 3.0, 5.0, 6.0, 7.0, 9.0]).__next__)
+    monkeypatch.setattr(disk_cache.time, "monotonic", iter([0.0, 3.0, 5.0, 6.0, 7.0, 9.0]).__next__)
     for size in (1000.0, 500.0):
-        with compile_time.measured(size):
+        with disk_cache.measured(size):
             pass
     assert cache.read_text() == "1000 3.000\n500 1.000\n"
-    monkeypatch.setattr(compile_time, "LONGEST", 5)
-    with compile_time.measured(10.0):
+    monkeypatch.setattr(disk_cache, "LONGEST", 5)
+    with disk_cache.measured(10.0):
         pass
     assert cache.read_text() == "10 2.000\n"
 
@@ -240,22 +239,14 @@ def test_the_size_is_that_of_all_functions() -> None:
     assert sizes == {f"{__name__}.{f.__name__}": len(f.__code__.co_code) for f in (inner, outer)}
 
 
-def of_a_part(part: Any) -> int:
-    return robot_width(part)
-
-
-def test_what_only_chooses_a_body_has_no_size() -> None:
-    assert set(Content(of_a_part, ()).functions) == {f"{__name__}.of_a_part"}
-
-
 def test_functions_that_were_compiled_before_count_less(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compile_time, "seconds_for", lambda size: size)
+    monkeypatch.setattr(disk_cache, "seconds_for", lambda size: size)
     kernel = Kernel(total)
     first = kernel.outlook(1)
     assert (first.is_ready, first.is_shared, first.seconds) == (False, True, len(total.__code__.co_code))
     assert kernel(1.0) == 2.0
     assert kernel.outlook(1.0).is_ready
-    assert kernel.outlook(1) == first._replace(seconds=compile_time.AGAIN * first.seconds)
+    assert kernel.outlook(1) == first._replace(seconds=disk_cache.AGAIN * first.seconds)
     assert float(cache.read_text().split()[0]) == first.seconds
 
 

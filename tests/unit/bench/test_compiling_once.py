@@ -17,8 +17,7 @@ from numba.core.types import functions
 
 import consistency as cs
 from consistency.bench.filters.compiler import jit
-from consistency.bench.filters.compiler.type_inference import remembered_types
-from consistency.bench.filters.kernel import arrays
+from consistency.bench.filters.compiler.whole_program import remembered_types
 from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.runs.trial_work import Simulated, TrialWork
 from consistency.bench.simulation.world import World
@@ -123,12 +122,6 @@ def test_arguments_of_other_types_are_other_kinds() -> None:
             assert jit._kind(a) != jit._kind(b) or numba.typeof(a) == numba.typeof(b), (a, b)
 
 
-def test_types_of_arguments_are_those_of_numba() -> None:
-    for _ in range(2):
-        args = (Small(2.0), np.zeros(3), 4)
-        assert jit._signature(args) == tuple(numba.typeof(arg) for arg in args)
-
-
 def test_content_is_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
     class Unknown:
         unknown, key, found = "something", "", 0
@@ -166,19 +159,3 @@ def test_the_first_trial_is_simulated_once(monkeypatch: pytest.MonkeyPatch) -> N
     trials.ahead(2)
     trials(1)  # of those ahead the last one is kept
     assert [run for run, _ in made] == [1, 1, 1, 2, 1]
-
-
-def test_arrays_of_kernels() -> None:
-    for new, shape in ((arrays.vector(3), (3,)), (arrays.matrix(2, 3), (2, 3)), (arrays.blocks(4, 2, 3), (4, 2, 3))):
-        assert new.shape == shape
-        assert new.dtype == float
-    for new, shape in (
-        (arrays.filled(3, 0.5), (3,)),
-        (arrays.filled_matrix(2, 3, 0.5), (2, 3)),
-        (arrays.filled_blocks(4, 2, 3, 0.5), (4, 2, 3)),
-    ):
-        np.testing.assert_array_equal(new, np.full(shape, 0.5))
-    np.testing.assert_array_equal(arrays.integers(3, -1), np.full(3, -1))
-    assert arrays.integers(3, -1).dtype == np.int64
-    values = np.array([1.0, 1e16, 1.0, -1e16])
-    assert arrays.sum_of(values) == ((1.0 + 1e16) + 1.0) - 1e16

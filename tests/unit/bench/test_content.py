@@ -171,7 +171,7 @@ def key(monkeypatch: pytest.MonkeyPatch) -> Keys:
 
     def of(module: str = "rules", old: str = "", new: str = "", kind: str = "Single") -> str:
         assert not old or TEXTS[module].count(old) == 1
-        for name in ("_parts", "_named_bodies"):
+        for name in ("PARTS", "_named_bodies"):
             monkeypatch.setattr(dispatch, name, {})
         for name, text in TEXTS.items():
             loaded = ModuleType(name)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import tomli_w
+from scenario_files import load, put
 
 import consistency as cs
-from consistency.bench.runs.montecarlo import simulate_log
-from consistency.bench.scenario import DisparityGrowth, data_folder
+from consistency.bench.scenario import DisparityGrowth
 from consistency.bench.simulation import World
-from consistency.bench.store.log import read_log
 
 Small = Callable[..., cs.Scenario]
 GROWTH = {"disparity": [3.0, 5.0, 12.0], "ratio": [0.5, 1.0, 2.4]}
@@ -73,19 +70,6 @@ def test_the_noise_has_the_same_random_numbers_scaled_at_the_true_disparity(smal
     assert np.allclose(b.z[:, 2] - ideal[:, 2], ratio * (a.z[:, 2] - ideal[:, 2]), rtol=0, atol=1e-12)
 
 
-def test_a_log_carries_the_belief(small: Small, tmp_path: Path) -> None:
-    scenario = small("herath2007-stereo", belief__sensor__disparity_growth=GROWTH)
-    simulate_log(scenario, runs=1, seed=0, out=tmp_path / "log")
-    assert read_log(tmp_path / "log").belief == scenario.belief
-
-
-def load(tmp_path: Path, half: str, name: str = "herath2007-stereo", **growth: Any) -> cs.Scenario:
-    data = tomllib.loads((data_folder("scenarios") / f"{name}.toml").read_text(encoding="utf-8"))
-    data[half]["sensor"]["disparity_growth"] = growth
-    (tmp_path / "mine.toml").write_text(tomli_w.dumps(data), encoding="utf-8")
-    return cs.load_scenario(tmp_path / "mine.toml")
-
-
 MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     "not as many": ({"disparity_px": [1.0, 2.0], "ratio": [1.0]}, r"ratio must have a number for each .*got 1 for 2$"),
     "not increasing": ({"disparity_px": [2.0, 2.0], "ratio": [1.0, 2.0]}, r"disparity must increase .*\[2\.0, 2\.0\]$"),
@@ -104,13 +88,13 @@ def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str, half
     with pytest.raises(
         cs.InputError, match=rf"mine\.toml: key '{half}\.sensor\.disparity_growth" + ".*" + complaint
     ) as e:
-        load(tmp_path, half, **growth)
+        load(tmp_path, put(f"{half}.sensor.disparity_growth", growth))
     assert "\n" not in str(e.value)
 
 
 def test_points_in_metres_have_no_disparity(tmp_path: Path) -> None:
     good = {"disparity_px": [1.0], "ratio": [1.0]}
     with pytest.raises(cs.InputError, match=r"'belief\.sensor': disparity_growth is of a sensor 'uvd', not 'xyz'"):
-        load(tmp_path, "belief", "herath2007-xyz", **good)
+        load(tmp_path, put("belief.sensor.disparity_growth", good), name="herath2007-xyz")
     with pytest.raises(cs.InputError, match=r"'truth\.sensor\.disparity_growth': unknown key"):
-        load(tmp_path, "truth", "herath2007-xyz", **good)
+        load(tmp_path, put("truth.sensor.disparity_growth", good), name="herath2007-xyz")

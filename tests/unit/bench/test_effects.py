@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -10,20 +9,18 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pandas as pd
 import pytest
-import tomli_w
+from scenario_files import load, put
 
 import consistency as cs
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.models import point, stereo
 from consistency.bench.runs.montecarlo import run_log, simulate_log
-from consistency.bench.scenario import data_folder
 from consistency.bench.scenario.effects import EFFECTS, Context, FieldOfView, ListedEffect, Observations
 from consistency.bench.scenario.toml_tables import Count, Positive, Triple
 from consistency.bench.simulation import World, draw_landmarks, planned_controls
 from consistency.bench.simulation.sensing import purpose_of
 from consistency.bench.store.log import read_log
 from consistency.bench.store.trial_rows import observations_table
-from consistency.referee.cli.app import app
 from consistency.referee.types import Array
 
 Small = Callable[..., cs.Scenario]
@@ -230,7 +227,7 @@ def test_effects_are_applied_in_order_and_before_the_search_range(small: Small) 
     rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(0, 1)))
     noise = rng.standard_normal((len(plain.z), 3)) * sigma
     assert np.allclose(both.z, 2.0 * (plain.z - noise) + noise + [0.0, 0.0, 10.0], rtol=0, atol=1e-9)
-    found = cs.simulate(with_effects(small, shift, truth__sensor__disparity=(10.0, 20.0)))
+    found = cs.simulate(with_effects(small, FIRST, shift, truth__sensor__disparity=(10.0, 20.0)))
     expected = plain.z[:, 2] + 5.0
     assert np.array_equal(found.landmark, plain.landmark[(expected >= 10.0) & (expected <= 20.0)])
 
@@ -271,12 +268,6 @@ def test_random_numbers_of_an_effect_depend_on_its_name_alone(small: Small) -> N
     assert np.array_equal(drawn(FIRST, run=7, seed=4)["first"], rng.standard_normal(5))
     others = [both["second"], drawn(FIRST, run=1)["first"], drawn(FIRST, seed=1)["first"]]
     assert all(not np.array_equal(other, both["first"]) for other in others)
-
-
-def test_an_effect_leaves_the_numbers_of_the_others_as_they_are(small: Small) -> None:
-    plain, drawing = cs.simulate(with_effects(small)), cs.simulate(with_effects(small, FIRST, SECOND))
-    assert np.array_equal(plain.z, drawing.z)
-    assert np.array_equal(plain.controls, drawing.controls)
 
 
 def test_an_effect_that_says_it_draws_nothing_gets_nothing(small: Small) -> None:
@@ -371,25 +362,6 @@ def test_labels_go_through_a_log(small: Small, tmp_path: Path, effect: dict[str,
     direct = cs.run_trials(scenario, ["ekf-uvd"], runs=2, seed=5, jobs=1)
     logged = run_log(log, ["ekf-uvd"], jobs=1)
     pd.testing.assert_frame_equal(logged.estimates, direct.estimates, check_exact=True)
-
-
-def test_the_command_line_simulates_and_runs_such_a_log(tmp_path: Path) -> None:
-    load(tmp_path, [GHOSTS], steps=60)
-    at = [str(tmp_path / name) for name in ("mine.toml", "log", "results")]
-    for arguments in (
-        ["simulate", at[0], "--runs", "2", "--out", at[1]],
-        ["run", "--log", at[1], "--filter", "ekf-uvd", "--jobs", "1", "--out", at[2]],
-    ):
-        assert not app(arguments, standalone_mode=False)
-    direct = cs.run_trials(cs.load_scenario(tmp_path / "mine.toml"), ["ekf-uvd"], runs=2, jobs=1)
-    logged = cs.read_results(at[2])
-    pd.testing.assert_frame_equal(logged.estimates, direct.estimates, check_exact=True)
-
-
-def test_without_labels_there_is_no_column(small: Small, tmp_path: Path) -> None:
-    simulate_log(with_effects(small, FIRST), runs=1, seed=0, out=tmp_path / "log")
-    assert "source" not in pd.read_parquet(tmp_path / "log" / "observations.parquet")
-    assert read_log(tmp_path / "log").trials[0].source is None
 
 
 def test_a_run_without_spurious_rows_is_labelled_with_the_others(small: Small) -> None:
@@ -497,20 +469,12 @@ MISTAKES: dict[str, tuple[Any, str]] = {
 def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str) -> None:
     effects, complaint = MISTAKES[case]
     with pytest.raises(cs.InputError, match=r"mine\.toml: key 'truth\.sensor" + complaint) as e:
-        load(tmp_path, effects)
+        load(tmp_path, put("truth.sensor.effects", effects))
     assert "\n" not in str(e.value)
 
 
-def load(tmp_path: Path, effects: Any, **truth: Any) -> cs.Scenario:
-    data = tomllib.loads((data_folder("scenarios") / "herath2007-stereo.toml").read_text(encoding="utf-8"))
-    data["truth"]["sensor"]["effects"] = effects
-    data["truth"] |= truth
-    (tmp_path / "mine.toml").write_text(tomli_w.dumps(data), encoding="utf-8")
-    return cs.load_scenario(tmp_path / "mine.toml")
-
-
 def test_an_effect_is_read_with_units_and_name(tmp_path: Path) -> None:
-    scenario = load(tmp_path, [SHIFT, SHIFT | {"name": "again"}])
+    scenario = load(tmp_path, put("truth.sensor.effects", [SHIFT, SHIFT | {"name": "again"}]))
     assert scenario.truth.sensor.effects == (
         Shift(by=(0.0, 0.0, 1.0)),
         Shift(by=(0.0, 0.0, 1.0), name="again"),

@@ -111,12 +111,6 @@ def test_scripts_are_said_as_they_begin(
 
 
 @pytest.mark.usefixtures("forked")
-def test_a_script_that_times_out_is_a_finding(scripts: Path, tmp_path: Path) -> None:
-    write(scripts, 2, ("two",), "OWN_PROCESS = True", "raise TimeoutError('of its own')")
-    assert measured(reproduce(["two"], 5, 0, 2, tmp_path / "out"))["two"] == "TimeoutError: of its own"
-
-
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_script_that_breaks_is_a_finding(scripts: Path, tmp_path: Path, jobs: int) -> None:
     write(scripts, 2, ("two",), "OWN_PROCESS = True", "raise ZeroDivisionError('no')")

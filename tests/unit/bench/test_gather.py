@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from edited import accept_changes
+from edited import accept_changes, content
 
 import consistency as cs
 from consistency.bench.runs import gather, trial_work
@@ -58,10 +58,6 @@ class Halts:
         return cs.Gaussian(state["pose"], -np.eye(3) if state["doomed"] and state["steps"] == 5 else np.eye(3))
 
 
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
-
-
 def damage(path: Path) -> None:
     """Flip a bit in the middle of the column y."""
     group = pq.ParquetFile(path).metadata.row_group(0)
@@ -85,23 +81,6 @@ def written(uvd: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], None]:
-    """What is raised in the place of the trial of that run."""
-
-    def arm(run: int, error: BaseException) -> None:
-        trial = World.trial
-
-        def stopped(self: World, number: int, seed: int) -> Trial:
-            if number == run:
-                raise error
-            return trial(self, number, seed)
-
-        monkeypatch.setattr(World, "trial", stopped)
-
-    return arm
-
-
 # --- the same bytes ----------------------------------------------------------------------------------
 
 
@@ -119,6 +98,7 @@ def test_streamed_is_what_is_written_from_memory(uvd: cs.Scenario, written: Path
 def test_row_groups_do_not_depend_on_the_pieces(uvd: cs.Scenario, tmp_path: Path) -> None:
     stored = cs.run_trials(uvd, [*FILTERS, Halts()], runs=9, seed=3, jobs=1, out=tmp_path / "streamed")
     memory = cs.run_trials(uvd, [*FILTERS, Halts()], runs=9, seed=3, jobs=1)
+    assert 0 < len(memory.failures) < 9
     memory.write(tmp_path / "memory")
     assert content(tmp_path / "streamed") == content(tmp_path / "memory")
     about = pq.ParquetFile(tmp_path / "streamed" / "estimates.parquet").metadata
@@ -127,14 +107,6 @@ def test_row_groups_do_not_depend_on_the_pieces(uvd: cs.Scenario, tmp_path: Path
     assert all(g.column(0).statistics.min == g.column(0).statistics.max for g in groups)
     for name in TABLES:
         pd.testing.assert_frame_equal(getattr(stored, name), getattr(memory, name), check_exact=True)
-
-
-def test_failures_are_streamed_too(uvd: cs.Scenario, tmp_path: Path) -> None:
-    memory = cs.run_trials(uvd, [Halts(), "ekf-uvd"], runs=9, seed=3, jobs=1)
-    assert 0 < len(memory.failures) < 9
-    memory.write(tmp_path / "memory")
-    cs.run_trials(uvd, [Halts(), "ekf-uvd"], runs=9, seed=3, jobs=1, out=tmp_path / "streamed")
-    assert content(tmp_path / "streamed") == content(tmp_path / "memory")
 
 
 # --- memory ------------------------------------------------------------------------------------------
@@ -236,15 +208,6 @@ def test_a_bad_number_is_found_where_it_is(written: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["estimates", "truth"])
-def test_a_cut_file_is_refused_when_the_folder_is_opened(written: Path, tmp_path: Path, name: str) -> None:
-    cs.read_results(written).write(tmp_path / "out")
-    path = tmp_path / "out" / f"{name}.parquet"
-    path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
-        open_results(tmp_path / "out")
-
-
-@pytest.mark.parametrize("name", ["estimates", "truth"])
 def test_changed_bytes_are_refused(written: Path, tmp_path: Path, name: str) -> None:
     """Numbers that hardly compress are stored as they are: a flipped bit would be another number."""
     cs.read_results(written).write(tmp_path / "out")
@@ -308,15 +271,6 @@ def test_resuming_keeps_failures_and_fills_gaps(uvd: cs.Scenario, tmp_path: Path
     part.write(tmp_path / "out")
     cs.run_trials(uvd, filters, runs=9, seed=3, jobs=1, previous=open_results(tmp_path / "out"), out=tmp_path / "out")
     assert content(tmp_path / "out") == content(tmp_path / "whole")
-
-
-def test_an_error_in_odd_letters_is_recorded(uvd: cs.Scenario, tmp_path: Path) -> None:
-    class Reads(Halts):
-        def init(self, problem: Any) -> dict[str, Any]:
-            raise OSError("no such map: caf\udce9.txt")  # as Python gives a file name that is not UTF-8
-
-    stored = cs.run_trials(uvd, [Reads()], runs=1, jobs=1, out=tmp_path / "out")
-    assert list(stored.failures["reason"]) == [r"OSError: no such map: caf\udce9.txt"]
 
 
 def test_a_filter_without_any_row_is_resumed(uvd: cs.Scenario, tmp_path: Path) -> None:
@@ -458,18 +412,14 @@ def test_an_error_in_the_middle_leaves_the_finished_runs(
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
-def test_an_error_in_the_first_run_leaves_nothing(uvd: cs.Scenario, tmp_path: Path, stop_at: Any) -> None:
-    stop_at(0, RuntimeError("out of ideas"))
-    with pytest.raises(RuntimeError, match="out of ideas"):
+@pytest.mark.parametrize("error", [RuntimeError("out of ideas"), KeyboardInterrupt()], ids=["error", "ctrl-c"])
+def test_what_ends_in_the_first_run_leaves_nothing(
+    uvd: cs.Scenario, tmp_path: Path, stop_at: Any, error: BaseException
+) -> None:
+    stop_at(0, error)
+    with pytest.raises((RuntimeError, Interrupted)) as stop:
         cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=tmp_path / "deep" / "out")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_stopped_before_the_first_run_nothing_is_written(uvd: cs.Scenario, tmp_path: Path, stop_at: Any) -> None:
-    stop_at(0, KeyboardInterrupt())
-    with pytest.raises(Interrupted) as stop:
-        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=tmp_path / "out")
-    assert stop.value.results.manifest["finished_runs"] == 0
+    assert stop.type is RuntimeError or stop.value.results.manifest["finished_runs"] == 0
     assert list(tmp_path.iterdir()) == []
 
 

@@ -25,7 +25,6 @@ def test_no_other_filter_is_told_the_truth(uvd: cs.Scenario) -> None:
     for name in ("ekf-uvd", "fej-ekf-uvd", "oc-ekf-uvd"):
         assert problem_for(cs.get_filter(name), trial, uvd.belief) == problem_of(trial, uvd.belief)
     told = problem_for(cs.get_filter("ideal-ekf-uvd"), trial, uvd.belief).truth
-    assert told is not None
     assert told.path is trial.truth
     assert told.landmarks is trial.landmarks
 

@@ -14,8 +14,8 @@ from consistency.bench.filters import get_filter
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.diagnostics import Evidence, JointNees, Settings, Verdict, judge
-from consistency.referee.diagnostics.maps.joint_nees import joint_test, near
-from consistency.referee.diagnostics.maps.map_score import joint_nees
+from consistency.referee.diagnostics.maps.map_nees import joint_nees, joint_test
+from consistency.referee.diagnostics.questions.equivalence import is_tolerated
 from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
 from consistency.referee.geometry.conventions import planar_error, planar_map_error
 from consistency.referee.types import Array
@@ -134,7 +134,7 @@ def test_a_joint_scale_within_the_tolerance_is_excused(ratio: float) -> None:
         settings = Settings(tolerance=tolerance)
         test = joint_test(joint, settings)
         assert test.p_values[JOINT] < 1e-10
-        assert near(test, settings) == excused
+        assert is_tolerated(test.nees, test.score.dof, settings) == excused
         nees = np.random.default_rng(8).chisquare(3, (50, 1))
         v = judge(Evidence("map", nees=nees, dof=3, joint=joint, landmarks=np.arange(1)), settings)
         assert [(a.found, a.tolerated) for a in v.answers if a.question == JOINT] == [(True, excused)]
@@ -234,10 +234,7 @@ def test_landmarks_in_a_plane_have_two_dimensions_in_the_joint_error() -> None:
     trial = cs.simulate(scenario, run=0)
     estimates = get_filter("ekf-xy").run(trial, scenario.belief)
     m, (outcome,) = estimates.map, outcome_of(trial, [estimates]).maps.values()
-    assert m is not None
     assert m.joint is not None
-    assert trial.truth is not None
-    assert trial.landmarks is not None
     error, P = planar_map_error(
         trial.truth[-1], trial.landmarks[m.landmarks], estimates.pose[-1], m.mean, m.joint, estimates.error
     )

@@ -88,7 +88,6 @@ def test_crossings_are_things_of_every_run_with_labels_and_noise(small: Small) -
     assert len(a.things) == a.n_landmarks - 120 == 12
     assert np.all(a.source[a.landmark >= 120] == -1)
     ideal = World(crossed.truth)._shared
-    assert ideal is not None
     thing = ideal.landmark >= 120
     assert thing.sum() > 100
     spread = (a.z - ideal.z)[thing] / np.array(plain.truth.sensor.sigma)

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import json
 import weakref
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
+from edited import content
 
 import consistency as cs
 from consistency.bench.runs import gather, sequential
 from consistency.bench.runs.montecarlo import Interrupted, run_log, simulate_log
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import StoredResults, open_results
 from consistency.bench.store.trial_rows import RunOutcome
-from consistency.bench.types import Trial
 from consistency.referee.diagnostics import Record
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
@@ -39,29 +36,6 @@ def whole(world: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("looks") / "whole"
     run_until_decided(world, ["kf"], out=out, **OPEN)
     return out
-
-
-@pytest.fixture
-def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], list[int]]:
-    """What is raised in the place of a run; gives the list of the runs that are done."""
-
-    def arm(run: int, error: BaseException) -> list[int]:
-        one, done = TrialWork.__call__, list[int]()
-
-        def stopped(self: TrialWork, number: int) -> RunOutcome:
-            if number == run:
-                raise error
-            done.append(number)
-            return one(self, number)
-
-        monkeypatch.setattr(TrialWork, "__call__", stopped)
-        return done
-
-    return arm
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
 
 
 def plan_in(folder: Path) -> Any:
@@ -287,20 +261,3 @@ def test_a_log_whose_runs_are_not_numbered_from_zero(log: Path, tmp_path: Path, 
     assert done == [1, 4, 5]
     assert results.finished_runs(["kf"]) == {1, 4, 5}
     assert results.manifest["runs"] == 3
-
-
-def test_rows_of_a_log_in_any_order(log: Path, tmp_path: Path) -> None:
-    """Trials are those of the runs, however their rows are mixed; of one step they keep their order."""
-    before = read_log(log).trials
-    rng = np.random.default_rng()
-    for name in ("controls", "observations", "truth"):
-        table = pd.read_parquet(log / f"{name}.parquet")
-        table = table.sample(frac=1.0, random_state=int(rng.integers(2**31)))
-        if name == "observations":
-            table = table.sort_values(["step", "landmark"], ascending=[False, True])
-        table.to_parquet(log / f"{name}.parquet", index=False)
-    after = read_log(log).trials
-    for a, b in zip(before, after, strict=True):
-        assert isinstance(b, Trial)
-        for field in ("controls", "first", "landmark", "z", "truth"):
-            assert np.array_equal(getattr(a, field), getattr(b, field)), field

@@ -65,8 +65,6 @@ def test_a_covariance_that_loses_its_rank_ends_the_run(small: Callable[..., cs.S
     trial = cs.Trial(0, np.zeros(3), controls, first, np.zeros(3, int), z, 1, path, landmark[None])
     filter_ = cs.get_filter(name)
     ours, twin = filter_.run(trial, belief), step_through(filter_.textbook, trial, belief)
-    assert ours.failure is not None
-    assert twin.failure is not None
     assert (ours.failure.step, ours.failure.reason) == (4, "the pose covariance is not positive definite")
     assert (twin.failure.step, twin.failure.reason.rpartition(" is ")[2]) == (4, "not positive definite")
     assert ours.map is None

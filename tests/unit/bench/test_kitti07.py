@@ -54,13 +54,6 @@ def test_a_point_to_the_right_and_below_has_positive_u_v_and_disparity() -> None
     np.testing.assert_allclose(rows[["z0", "z1", "z2"]].to_numpy(), [seen])
 
 
-def test_mount_turns_the_sensor_frame_into_the_camera_frame() -> None:
-    roll_pitch_heading = conversion.roll_pitch_heading(KITTI.T @ conversion.KITTI_FROM_SENSOR)
-    np.testing.assert_allclose(roll_pitch_heading, 0.0, atol=1e-12)
-    angles = (0.1, -0.2, 0.3)
-    np.testing.assert_allclose(conversion.roll_pitch_heading(conversion.rotation(*angles)), angles)
-
-
 def test_track_ends_at_a_stale_copy_of_all_four_numbers() -> None:
     slipped = [*moving(3), moving(3)[2], (9.0, 9.0, 30.0), (9.1, 9.0, 30.0)]
     half = [(1.0, 5.0, 20.0), (1.0, 5.0, 21.0), (1.0, 5.0, 22.0)]  # u and v stay, the right camera's u does not
@@ -227,7 +220,6 @@ def test_the_recording_becomes_a_log_that_is_read_back(tmp_path: Path) -> None:
     trial, belief = log.trials[0], log.belief
     assert (trial.steps, trial.n_landmarks) == (1100, 629)
     assert len(experiment.unlinked_steps(trial)) == 92  # the 91 slips, and step 1: nothing is seen in step 0
-    assert trial.truth is not None
     path = np.hypot(*np.diff(trial.truth[:, :2], axis=0).T).sum()
     assert path == pytest.approx(692.0, abs=1.0)
     write_log(tmp_path / "log", [trial], belief, None, manifest_of(kind="log"), view=(data.size, tuple(data.centre)))

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import tomli_w
+from scenario_files import Edit, load, put
 from scipy.interpolate import RegularGridInterpolator
 
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
-from consistency.bench.scenario import BiasMap, data_folder
+from consistency.bench.scenario import BiasMap
 from consistency.bench.scenario.effects import Distortion, LocalBias
 from consistency.bench.simulation import World
 from consistency.bench.store.log import read_log
@@ -98,27 +97,23 @@ def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str, half
     change, complaint = MISTAKES[case]
     where = r"truth\.sensor\.effects\.0" if half == "truth" else r"belief\.sensor\.bias"
     with pytest.raises(cs.InputError, match=rf"mine\.toml: key '{where}" + ".*" + complaint) as e:
-        load(tmp_path, half, MAP | change)
+        load(tmp_path, given(half, MAP | change))
     assert "\n" not in str(e.value)
 
 
-def load(tmp_path: Path, half: str, table: dict[str, Any], name: str = "herath2007-stereo") -> cs.Scenario:
-    data = tomllib.loads((data_folder("scenarios") / f"{name}.toml").read_text(encoding="utf-8"))
-    if half == "truth":
-        data["truth"]["sensor"]["effects"] = [{"kind": "local-bias", **table}]
-    else:
-        data["belief"]["sensor"]["bias"] = table
-    (tmp_path / "mine.toml").write_text(tomli_w.dumps(data), encoding="utf-8")
-    return cs.load_scenario(tmp_path / "mine.toml")
+def given(half: str, table: dict[str, Any]) -> Edit:
+    if half == "belief":
+        return put("belief.sensor.bias", table)
+    return put("truth.sensor.effects", [{"kind": "local-bias", **table}])
 
 
 def test_points_in_metres_have_no_pixel(tmp_path: Path) -> None:
     with pytest.raises(cs.InputError, match=r"'belief\.sensor': bias is of a sensor 'uvd', not 'xyz'"):
-        load(tmp_path, "belief", MAP, "herath2007-xyz")
+        load(tmp_path, given("belief", MAP), name="herath2007-xyz")
     with pytest.raises(
         cs.InputError, match=r"'truth\.sensor': the effect 'local-bias' works on a sensor uvd, not 'xyz'"
     ):
-        load(tmp_path, "truth", MAP, "herath2007-xyz")
+        load(tmp_path, given("truth", MAP), name="herath2007-xyz")
 
 
 # --- distortion ---------------------------------------------------------------------------------------

@@ -108,14 +108,6 @@ def test_order_of_rows_does_not_matter(written: Path, folder: Path) -> None:
             assert np.array_equal(seen.z, shuffled.z[order])
 
 
-def test_landmarks_may_have_any_number(written: Path, folder: Path) -> None:
-    change(folder, "observations", lambda table: table.assign(landmark=1000 + 7 * table["landmark"]))
-    change(folder, "landmarks", lambda table: table.assign(landmark=1000 + 7 * table["landmark"]))
-    for a, b in zip(read_log(written).trials, read_log(folder).trials, strict=True):
-        assert np.array_equal(a.landmark, b.landmark)
-        assert np.array_equal(a.landmarks, b.landmarks)
-
-
 def test_without_truth_there_is_no_nees_but_a_nis(folder: Path) -> None:
     (folder / "truth.parquet").unlink()
     (folder / "landmarks.parquet").unlink()
@@ -149,14 +141,6 @@ def test_runs_may_have_any_number_and_length(folder: Path) -> None:
 
 
 # --- damage --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["controls", "observations", "truth", "landmarks"])
-def test_file_cut_short(folder: Path, name: str) -> None:
-    path = folder / f"{name}.parquet"
-    path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
-        read_log(folder)
 
 
 @pytest.mark.parametrize("name", ["controls.parquet", "observations.parquet", "sensor.toml"])
@@ -236,17 +220,6 @@ def test_bad_sensor_file(folder: Path, case: str) -> None:
         read_log(folder)
     assert "\n" not in str(error.value)
     assert "[type=" not in str(error.value)
-
-
-def test_sensor_file_that_is_not_toml(folder: Path) -> None:
-    (folder / "sensor.toml").write_text("model = \n")
-    with pytest.raises(cs.InputError, match=r"sensor\.toml: not valid TOML"):
-        read_log(folder)
-
-
-def test_filter_that_does_not_fit_the_log(written: Path) -> None:
-    with pytest.raises(cs.InputError, match="filter 'kf' works on a sensor linear, not 'uvd'"):
-        run_log(read_log(written), ["kf"], jobs=1)
 
 
 # --- writing -------------------------------------------------------------------------------------

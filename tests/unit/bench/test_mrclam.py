@@ -69,7 +69,6 @@ def test_the_log_is_the_drive_after_the_calibration(folder: Path) -> None:
     assert belief.sensor.model == "range-bearing"
     assert dropped.gross == 1
     assert trial.steps == pytest.approx((400.0 - conversion.CALIBRATION) / conversion.DT, abs=5)
-    assert trial.landmarks is not None
     pose = trial.truth[trial.step]
     offset = (trial.landmarks[trial.landmark, :2] - pose[:, :2]) @ [1.0, 1j]
     turn = np.angle(np.exp(1j * (trial.z[:, 1] + pose[:, 2])) * np.conj(offset))

@@ -13,7 +13,7 @@ import consistency as cs
 from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.report_input import Report
 from consistency.bench.pages.sections import overview
-from consistency.referee.document.blocks import Document, Name, Status, Table
+from consistency.referee.document.blocks import Name, Status, Table
 from consistency.referee.document.drawing import Figure, Intervals, Span
 from consistency.referee.document.wording import written
 from consistency.referee.show import pdf
@@ -118,11 +118,6 @@ def test_the_answer_counts_where_the_table_names(report: Report) -> None:
     assert "2 studies put 3 pairs of filter and scenario to the test" in text
     assert "ekf-uvd" not in text
     assert "ekf-uvd" in answer(report.studies[:1], ())
-
-
-def test_the_parts_of_a_document_hold_every_figure() -> None:
-    figure = Figure("title", "caption", (), ())
-    assert Document("title", "answer", (), (figure,)).figures == (figure,)
 
 
 def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report: Report) -> None:

@@ -83,30 +83,20 @@ def test_length_and_turns_of_many_laps_are_made_in_full(drive: Drive, shape: str
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_steps_and_speed(drive: Drive, shape: str) -> None:
-    controls = planned_controls(drive(shape, 333))
+    controls, path = planned_controls(drive(shape, 333)), planned_path(drive(shape, 333))
     assert controls.shape == (333, 3)
-    assert planned_path(drive(shape, 333)).shape == (334, 3)
+    assert path.shape == (334, 3)
+    assert np.array_equal(path[0], [*START["start"], START["heading"]])
     assert np.all(controls[:, 0] == DT)
     assert controls[:, 1].max() == pytest.approx(V)
     assert controls[:, 1].min() >= 0.0
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_starts_where_told(drive: Drive, shape: str) -> None:
-    path = planned_path(drive(shape, 50))
-    assert np.array_equal(path[0], [*START["start"], START["heading"]])
-
-
-def test_rectangle_has_its_length_and_width(drive: Drive) -> None:
+def test_rectangle_has_its_size_and_begins_in_the_middle_of_a_long_side(drive: Drive) -> None:
     truth = drive("rounded-rectangle", round(lap_time("rounded-rectangle") / DT), heading=0.0)
-    extent = np.ptp(planned_path(truth)[:, :2], axis=0)
-    assert np.allclose(extent, (9.0, 5.0), rtol=0, atol=V * DT)
-
-
-def test_rectangle_starts_in_the_middle_of_a_long_side(drive: Drive) -> None:
-    path = planned_path(drive("rounded-rectangle", round(lap_time("rounded-rectangle") / DT), heading=0.0))
-    low, high = path[:, 0].min(), path[:, 0].max()
-    assert START["start"][0] == pytest.approx((low + high) / 2, abs=V * DT)
+    path = planned_path(truth)
+    assert np.allclose(np.ptp(path[:, :2], axis=0), (9.0, 5.0), rtol=0, atol=V * DT)
+    assert START["start"][0] == pytest.approx((path[:, 0].min() + path[:, 0].max()) / 2, abs=V * DT)
     assert START["start"][1] == pytest.approx(path[:, 1].min(), abs=V * DT)
 
 
@@ -139,15 +129,11 @@ def test_corridor_comes_back_beside_itself(drive: Drive) -> None:
     assert np.ptp(path[:, 1]) == pytest.approx(2 * 0.5, abs=V * DT)
 
 
-def test_waypoints_are_visited_in_order(drive: Drive) -> None:
+def test_waypoints_are_visited_in_order_and_the_heading_is_that_of_the_start(drive: Drive) -> None:
     path = lap(drive, "waypoints")
     distance = np.hypot(*(path[:, None, :2] - np.array(POINTS)).transpose(2, 0, 1))
     assert np.all(distance.min(axis=0) <= V * DT)
     assert np.all(np.diff(distance.argmin(axis=0)) > 0)
-
-
-def test_waypoints_end_with_the_heading_of_the_start(drive: Drive) -> None:
-    path = lap(drive, "waypoints")
     turn = (path[-1, 2] - START["heading"] + np.pi) % (2 * np.pi) - np.pi
     assert abs(turn) <= SHAPES["waypoints"]["turn_rate"] * DT
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import re
-import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import tomli_w
 from pydantic import ValidationError
+from scenario_files import Edit, drop, load, put
 
 import consistency as cs
-from consistency.bench.scenario import data_folder
+from consistency.bench.scenario import scenario_text
 
 EXPECTED = {
     "esde-xy", "iekf-slam-xy", "ocekf-slam-xy", "range-bearing",
@@ -21,49 +19,9 @@ EXPECTED = {
     "long-loop",
     *(f"herath2007-{issue}" for issue in ("bias", "drift", "fov", "growth", "junction", "mismatch", "selection")),
 }  # fmt: skip
-Edit = Callable[[dict], None]
-
-
-def table(name: str = "herath2007-stereo") -> dict:
-    return tomllib.loads((data_folder("scenarios") / f"{name}.toml").read_text(encoding="utf-8"))
-
-
-def put(path: str, value: object) -> Edit:
-    """Set ``a.b.c`` of a file's data."""
-
-    def edit(data: dict) -> None:
-        *parents, key = path.split(".")
-        for parent in parents:
-            data = data[parent]
-        data[key] = value
-
-    return edit
-
-
-def drop(path: str) -> Edit:
-    def edit(data: dict) -> None:
-        *parents, key = path.split(".")
-        for parent in parents:
-            data = data[parent]
-        del data[key]
-
-    return edit
-
-
-def load(tmp_path: Path, *edits: Edit, name: str = "herath2007-stereo") -> cs.Scenario:
-    data = table(name)
-    for edit in edits:
-        edit(data)
-    path = tmp_path / "mine.toml"
-    path.write_text(tomli_w.dumps(data), encoding="utf-8")
-    return cs.load_scenario(path)
 
 
 # --- what is read --------------------------------------------------------------------------------
-
-
-def test_built_in_scenarios_are_known() -> None:
-    assert set(cs.scenario_names()) >= EXPECTED
 
 
 @pytest.mark.parametrize("name", sorted(EXPECTED))
@@ -97,12 +55,6 @@ def test_degrees_reach_into_lists(tmp_path: Path) -> None:
     mount = {"position_m": [0.1, 0.0, 0.2], "rotation_deg": [0.0, -10.0, 90.0]}
     scenario = load(tmp_path, put("belief.sensor.mount", mount))
     assert np.allclose(scenario.belief.sensor.mount.rotation, np.deg2rad([0.0, -10.0, 90.0]))
-
-
-def test_truth_and_belief_are_apart() -> None:
-    optimistic = cs.load_scenario("herath2007-optimistic")
-    assert optimistic.belief.motion.sigma_v == 0.5 * optimistic.truth.motion.sigma_v
-    assert optimistic.truth == cs.load_scenario("herath2007-xyz").truth
 
 
 # --- identity ------------------------------------------------------------------------------------
@@ -224,6 +176,10 @@ BAD: dict[str, tuple[tuple[Edit, ...], str]] = {
     "box reversed": ((put("truth.landmarks.x_m", [8.0, -8.0]),), r"'truth\.landmarks'.*x must be \[low, high\]"),
     "negative disparity": ((put("truth.sensor.disparity_px", [-1.0, 32.0]),), r"'truth\.sensor\.disparity\.0'"),
     "half a linear world": ((put("truth.motion.model", "linear"),), r"'truth'.*'linear' together"),
+    "disparity reversed": ((put("truth.sensor.disparity_px", [32.0, 1.0]),), r"disparity"),
+    "true is no number": ((put("truth.motion.sigma_v", True),), r"truth\.motion\.sigma_v"),
+    "text is no number": ((put("truth.motion.sigma_v", "0.1"),), r"truth\.motion\.sigma_v"),
+    "two mistakes": ((put("truth.steps", -1), put("belief.motion.sigma_v", -1.0)), r"\(and 1 more\)"),
     "name inside": ((put("name", "other"),), r"'name': not allowed here"),
     "corner too round": (
         (
@@ -245,50 +201,31 @@ def test_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str) -> Non
     assert "\n" not in text
 
 
-def test_reversed_disparity_range_is_refused(tmp_path: Path) -> None:
-    """Nothing could ever be found in it."""
-    with pytest.raises(cs.InputError, match=r"disparity"):
-        load(tmp_path, put("truth.sensor.disparity_px", [32.0, 1.0]))
+@pytest.mark.parametrize(
+    ("name", "edit", "complaint"),
+    [
+        ("linear-gaussian", put("truth.motion.noise_on", "odometry"), "noise_on = 'motion'"),
+        ("herath2007-xyz", drop("truth.sensor.f_px"), r"'truth\.sensor'.*image needs f"),
+    ],
+)
+def test_what_another_world_needs(tmp_path: Path, name: str, edit: Edit, complaint: str) -> None:
+    with pytest.raises(cs.InputError, match=complaint):
+        load(tmp_path, edit, name=name)
 
 
-@pytest.mark.parametrize("value", [True, "0.1"])
-def test_a_number_is_neither_true_nor_text(tmp_path: Path, value: object) -> None:
-    with pytest.raises(cs.InputError, match=r"truth\.motion\.sigma_v"):
-        load(tmp_path, put("truth.motion.sigma_v", value))
-
-
-def test_linear_world_needs_noise_on_motion(tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"noise_on = 'motion'"):
-        load(tmp_path, put("truth.motion.noise_on", "odometry"), name="linear-gaussian")
-
-
-def test_image_needs_a_focal_length(tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"'truth\.sensor'.*image needs f"):
-        load(tmp_path, drop("truth.sensor.f_px"), name="herath2007-xyz")
-
-
-def test_more_than_one_mistake_is_counted(tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"\(and 1 more\)"):
-        load(tmp_path, put("truth.steps", -1), put("belief.motion.sigma_v", -1.0))
-
-
-def test_toml_syntax_error_is_said_with_its_line(tmp_path: Path) -> None:
-    path = tmp_path / "broken.toml"
-    path.write_text("summary = 'x'\n[truth\n", encoding="utf-8")
-    with pytest.raises(cs.InputError, match=r"broken\.toml: not valid TOML.*line 2"):
-        cs.load_scenario(path)
-
-
-def test_not_text_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "binary.toml"
-    path.write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(cs.InputError, match=r"binary\.toml: not valid TOML"):
-        cs.load_scenario(path)
-
-
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"nowhere\.toml: cannot be read \(No such file"):
-        cs.load_scenario(tmp_path / "nowhere.toml")
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"summary = 'x'\n[truth\n", "not valid TOML.*line 2"),
+        (b"\xff\xfe\x00\x01", "not valid TOML"),
+        (None, r"cannot be read \(No such file"),
+    ],
+)
+def test_a_file_that_is_no_table(tmp_path: Path, content: bytes | None, complaint: str) -> None:
+    if content is not None:
+        (tmp_path / "broken.toml").write_bytes(content)
+    with pytest.raises(cs.InputError, match=rf"broken\.toml: {complaint}"):
+        cs.load_scenario(tmp_path / "broken.toml")
 
 
 def test_unknown_name_with_a_suggestion() -> None:
@@ -303,3 +240,30 @@ def test_effects_are_told_the_search_range_of_a_stereo_sensor_alone() -> None:
     assert stereo.search_range == stereo.disparity
     assert stereo.search_range[0] < stereo.search_range[1]
     assert xyz.search_range is None
+
+
+@pytest.mark.parametrize("name", cs.scenario_names())
+def test_a_written_scenario_is_read_as_the_same(name: str, tmp_path: Path) -> None:
+    scenario = cs.load_scenario(name)
+    (tmp_path / "again.toml").write_text(scenario_text(scenario, "two\nlines"), encoding="utf-8")
+    again = cs.load_scenario(tmp_path / "again.toml")
+    assert (again.hash, again.summary, again.name) == (scenario.hash, scenario.summary, "again")
+
+
+def test_every_kind_of_path_landmarks_and_mount_is_written(tmp_path: Path) -> None:
+    """Lists in lists, a mount, and a key that is not given."""
+    scenario = cs.load_scenario("herath2007-stereo").variant(
+        "odd",
+        truth__path={
+            "shape": "waypoints", "points": [(4.0, 0.5), (-1e-7, 2e22)], "turn_rate": 0.5, "start": (0.0, 0.0),
+            "heading": 0.1, "speed": 0.5,
+        },
+        truth__landmarks={"layout": "listed", "points": [(1.0, 2.0, 3.0), (4.0, 5.0, 6.5)]},
+        truth__sensor__mount={"position": (0.1, 0.0, 0.2), "rotation": (0.0, 0.0, 0.3)},
+        belief__sensor__disparity=None,
+    )  # fmt: skip
+    text = scenario_text(scenario)
+    (tmp_path / "odd.toml").write_text(text, encoding="utf-8")
+    assert cs.load_scenario(tmp_path / "odd.toml").hash == scenario.hash
+    assert "position = [0.1, 0.0, 0.2]" in text
+    assert text.startswith("summary")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from edited import change_manifest
 from hostile import RUNS, write_results
 from mutations import copied
 
@@ -66,6 +66,11 @@ TABLES: list[tuple[str, Edit, str]] = [
     ("estimates", value("run == 5 and filter == 'one'", "run", 10**12), r"run 6 of 'one' is not what comes next"),
     ("estimates", value("filter == 'two' and run == 8", "filter", "three"), r"12 of 211 rows are of no filter"),
     ("estimates", value("filter == 'two' and run == 8", "run", 9), r"run 8 of 'two' is missing"),
+    ("estimates", lambda t: t.drop(columns="P_xh"), r"column 'P_xh' is missing; needed: filter, run"),
+    ("estimates", value("run == 5", "P_xx", np.nan), r"column 'P_xx', row \d+: not a finite number"),
+    ("estimates", value("run == 5", "P_xx", np.inf), r"column 'P_xx', row \d+: not a finite number"),
+    ("estimates", lambda t: t.assign(x="far"), r"estimates\.parquet: column 'x', row 0: not a"),
+    ("truth", lambda t: t.assign(step=t["step"] + 0.5), r"column 'step', row 0: not a whole number \(0\.5\)"),
     ("truth", only("step <= 5"), r"truth\.parquet: run 0 has 5 steps, the scenario 12"),
     ("truth", only("run < 8"), r"counts 9 runs, the tables hold 8"),
     ("truth", twice, r"truth\.parquet: step 0 of run 0 is not what comes next"),
@@ -153,24 +158,23 @@ MANIFESTS: list[tuple[dict[str, Any], str]] = [
     ({"optimal_gain": ["three"]}, r"key 'optimal_gain': 'three' is no filter"),
     ({"scenario_hash": "0" * 16}, r"key 'scenario_hash' is not that of key 'scenario'"),
     ({"kind": "log"}, r"key 'kind'"),
+    ({"contents": []}, r"manifest\.json: key 'contents' must have tables as keys"),
+    ({"contents": {"poses": {}}}, r"key 'contents' must have tables as keys"),
+    ({"contents": "all"}, r"key 'contents' must have tables as keys"),
     ({"versions": 5}, r"key 'versions'"),
 ]
 
 
 @pytest.mark.parametrize(("edit", "said"), MANIFESTS, ids=lambda value: str(value)[:40])
 def test_a_changed_manifest_is_refused(folder: Path, edit: dict[str, Any], said: str) -> None:
-    path = folder / "manifest.json"
-    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | edit), encoding="utf-8")
+    change_manifest(folder, **edit)
     with pytest.raises(cs.InputError, match=said):
         cs.read_results(folder)
 
 
 @pytest.mark.parametrize("key", ["filters", "tables", "runs", "failures", "complete", "seed", "kind"])
 def test_a_manifest_without_a_key_is_refused(folder: Path, key: str) -> None:
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_text(encoding="utf-8"))
-    del manifest[key]
-    path.write_text(json.dumps(manifest), encoding="utf-8")
+    change_manifest(folder, key)
     with pytest.raises(
         cs.InputError, match="holds no estimates" if key == "filters" else f"key '{key}': Field required"
     ):
@@ -179,10 +183,8 @@ def test_a_manifest_without_a_key_is_refused(folder: Path, key: str) -> None:
 
 def test_a_log_without_truth_has_runs_of_any_length(written: Path, folder: Path) -> None:
     """Of a log nothing but its filters says how long a run is."""
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_text(encoding="utf-8"))
-    manifest |= {"scenario": None, "scenario_hash": None, "log": "drive", "tables": ["estimates", "failures", "map"]}
-    path.write_text(json.dumps(manifest), encoding="utf-8")
+    tables = ["estimates", "failures", "map"]
+    change_manifest(folder, scenario=None, scenario_hash=None, log="drive", tables=tables)
     for name in ("truth", "landmarks", "rejections"):
         (folder / f"{name}.parquet").unlink()
     change(folder, "estimates", only("run != 1 or step < 6"))

@@ -5,18 +5,16 @@ Statistical tests have a false-alarm rate of at most 1e-6 each.
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import tomli_w
+from scenario_files import load, put
 from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
-from consistency.bench.scenario import data_folder
 from consistency.bench.scenario.effects import Drift, Observations
 from consistency.bench.simulation import World
 from consistency.bench.store.log import read_log
@@ -232,8 +230,6 @@ def test_images_come_after_so_many_steps_in_turn() -> None:
 def test_walls_hide_what_is_behind_them_from_where_the_sensor_is() -> None:
     wall, mount = (3.0, -2.0, 5.0, 3.0), {"position": (0.4, -0.6, 0.0), "rotation": (0.0, 0.0, 0.0)}
     plain, trial = pair({"kind": "occlusion", "walls": [wall]}, truth__sensor__mount=mount)
-    assert plain.truth is not None
-    assert plain.landmarks is not None
     step = plain.step
     heading = plain.truth[step, 2]
     c, s = np.cos(heading), np.sin(heading)
@@ -298,19 +294,12 @@ def test_a_mistake_is_answered_with_file_and_key(
     if "sigma_m" in change:
         del table["sigma_px"]
     with pytest.raises(cs.InputError, match=r"mine\.toml: key 'truth\.sensor\.effects\.0.*" + complaint) as e:
-        load(tmp_path, table | change)
+        load(tmp_path, put("truth.sensor.effects", [table | change]))
     assert "\n" not in str(e.value)
 
 
 @pytest.mark.parametrize("kind", GOOD)
 def test_a_file_is_read_as_it_is_written(tmp_path: Path, kind: str) -> None:
-    scenario = load(tmp_path, {"kind": kind, **GOOD[kind]})
+    scenario = load(tmp_path, put("truth.sensor.effects", [{"kind": kind, **GOOD[kind]}]))
     (tmp_path / "again.toml").write_text(cs.scenario.scenario_text(scenario), encoding="utf-8")
     assert cs.load_scenario(tmp_path / "again.toml").hash == scenario.hash
-
-
-def load(tmp_path: Path, effect: dict[str, Any]) -> cs.Scenario:
-    data = tomllib.loads((data_folder("scenarios") / "herath2007-stereo.toml").read_text(encoding="utf-8"))
-    data["truth"]["sensor"]["effects"] = [effect]
-    (tmp_path / "mine.toml").write_text(tomli_w.dumps(data), encoding="utf-8")
-    return cs.load_scenario(tmp_path / "mine.toml")

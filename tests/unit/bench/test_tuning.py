@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from documents import blocks, commands
+from documents import blocks
 from scipy import stats
 
 import consistency as cs
@@ -110,7 +110,6 @@ def test_the_score_by_nees_is_the_log_density_of_the_errors(uvd: cs.Scenario) ->
     trial = cs.simulate(uvd, seed=SEED)
     estimates = run_filter(cs.get_filter("ekf-uvd"), trial, uvd.belief)
     score = score_of(trial, estimates, "nees")
-    assert trial.truth is not None
     errors = pose_error(trial.truth[1:], estimates.pose)
     assert score.log_density[0] == 0.0  # of rank 2
     wanted = [
@@ -123,8 +122,6 @@ def test_the_score_by_nees_is_the_log_density_of_the_errors(uvd: cs.Scenario) ->
 def test_a_filter_with_an_error_of_its_own_is_scored_in_it(uvd: cs.Scenario) -> None:
     trial = cs.simulate(uvd, seed=SEED)
     estimates = run_filter(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
-    assert estimates.own is not None
-    assert trial.truth is not None
     errors = planar_error(trial.truth[1:], estimates.pose, estimates.error)
     wanted = [stats.multivariate_normal(cov=P).logpdf(e) for e, P in zip(errors[1:], estimates.own[1:], strict=True)]
     own = score_of(trial, estimates, "nees").log_density
@@ -230,7 +227,6 @@ def test_a_drive_is_cut_in_two(uvd: cs.Scenario) -> None:
     whole, first = run_filter(ekf, trial, uvd.belief), run_filter(ekf, part_of(trial, 0, 25), uvd.belief)
     assert np.array_equal(first.pose, whole.pose[:25])
     second = part_of(trial, 25, trial.steps)
-    assert trial.truth is not None
     assert np.array_equal(second.start, trial.truth[25])
     for step in (1, trial.steps - 25):
         assert np.array_equal(second.observation(step).z, trial.observation(25 + step).z)
@@ -274,8 +270,6 @@ def test_factors_are_found_in_a_world_in_which_the_filter_is_exact(tuned: Tuning
 def test_before_and_after_are_judged_on_the_same_fresh_runs(tuned: Tuning) -> None:
     """The belief before is wrong by a factor of 4 in all innovations: NIS says so in any sample."""
     before, after = tuned.before.innovations, tuned.verdict.innovations
-    assert before is not None
-    assert after is not None
     assert before.dof == after.dof
     assert not 0.9 < before.ratio < 1.1
     assert after.ratio == pytest.approx(1.0, abs=0.1)
@@ -389,7 +383,6 @@ def test_the_nearest_setting_is_that_of_the_largest_p_value(tuned: Tuning) -> No
         return replace(tuned.verdict, answers=(answer,))
 
     best = nearest(balanced(np.zeros(2), lambda x: 1.0, judge))
-    assert best is not None
     assert best.log_factors[0] - best.log_factors[1] == pytest.approx(np.log(100.0) / 4.0)
 
 
@@ -511,32 +504,6 @@ def test_a_log_is_tuned_to_a_sensor_file(capsys: pytest.CaptureFixture[str], tmp
 
 # --- the manual --------------------------------------------------------------------------------------
 
-TYPED = [command for command in commands("docs/tuning.md") if not (command.inline or command.synopsis)]
-COMMANDS = [" ".join(command.words[1:]) for command in TYPED if command.words[1:2] == ["tune"]]
-
-
-def test_the_manual_has_commands() -> None:
-    assert len(COMMANDS) == 5
-
-
-def reached(self: Any, by: str) -> None:
-    raise cs.InputError("reached")
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_commands_of_the_manual_are_taken(
-    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, uvd: cs.Scenario
-) -> None:
-    """Up to the fit: names, options and groups are as they must be; the log is one of its sensor."""
-    sensor = {"model": "range-bearing", "sigma": (0.1, 0.01)}
-    plane = uvd.belief.model_copy(update={"sensor": type(uvd.belief.sensor)(**sensor)})
-    belief = plane if "-rb" in command else uvd.belief
-    trial = cs.simulate(uvd, seed=SEED)
-    monkeypatch.setattr("consistency.bench.store.log.read_log", lambda folder: Log(str(folder), [trial], belief, None))
-    monkeypatch.setattr(tuning_module._Tuner, "fitted", reached)
-    status, out, err = status_of(capsys, *command.split()[1:])
-    assert (status, out, err) == (2, "", "consistency: reached\n")
-
 
 def test_the_filterpy_filter_of_the_manual(tmp_path: Path) -> None:
     [block] = blocks("docs/tuning.md", "python")
@@ -564,7 +531,5 @@ def test_one_robot_of_mrclam() -> None:
     trial, belief, _, _ = conversion.log_of(conversion.read_robot(folder, 3))
     tuning = cs.tune(Log("robot 3", [trial], belief, None), "oc-ekf-rb")
     before, after = tuning.before.innovations, tuning.verdict.innovations
-    assert before is not None
-    assert after is not None
     assert abs(np.log(after.ratio)) < abs(np.log(before.ratio))
     assert tuning.no_setting

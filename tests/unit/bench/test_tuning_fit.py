@@ -9,7 +9,7 @@ import pytest
 from scipy import optimize, stats
 
 from consistency.bench.tuning.fit import LIMIT, FactorFit, _derivatives, _Search, maximise
-from consistency.bench.tuning.profile_intervals import UNITS, Profile, _guess
+from consistency.bench.tuning.profile_intervals import UNITS, Profile
 from consistency.referee.types import Array
 
 SIGMAS = 4.8  # bound on a normal number, so that each assertion fails by chance in less than 1e-5 of all runs
@@ -96,13 +96,6 @@ def test_slope_and_curvature_are_those_of_a_parabola() -> None:
     slope, curvature = _derivatives(_Search(score), np.zeros(3), [0, 2])
     assert slope == pytest.approx(A @ top * [1, 0, 1], abs=1e-9)
     assert curvature == pytest.approx(-A * np.outer([1, 0, 1], [1, 0, 1]), abs=1e-9)
-
-
-def test_an_odd_slope_does_not_bend_the_score() -> None:
-    """Of x^3 + y^3 at 0 the second differences vanish, and the first leave the square of the step."""
-    slope, curvature = _derivatives(_Search(lambda x: np.full((1, 1), (x**3).sum())), np.zeros(2), [0, 1])
-    assert curvature == pytest.approx(np.zeros((2, 2)), abs=1e-12)
-    assert slope == pytest.approx(np.full(2, 0.05**2), rel=1e-9)
 
 
 def test_a_noise_that_is_not_there_is_bounded_from_above(rng: np.random.Generator) -> None:
@@ -233,15 +226,3 @@ def test_a_run_that_fails_near_the_best_setting_leaves_an_interval(rng: np.rando
     low, high = fitted(lambda x: None if x[0] > 0.02 else score(x)).interval[0]
     assert -0.4 < low < -0.1
     assert 0.0 < high < 0.1
-
-
-def test_the_end_is_guessed_from_what_was_seen() -> None:
-    assert _guess([(0.0, 0.0), (2.0, 1.6)]) == pytest.approx(1.25)
-    assert _guess([(0.0, 0.0), (1.0, 0.5)]) == pytest.approx(2.0)
-    assert _guess([(0.0, 0.0), (1.0, 0.6), (1.5, 0.8)]) == pytest.approx(2.0)
-    assert _guess([(0.0, 0.0), (1.0, 0.1)]) == pytest.approx(3.0)  # no further than three times as far
-    assert _guess([(0.0, 0.0), (1.0, 0.6), (2.0, 0.5)]) == pytest.approx(6.0)
-    assert _guess([(0.0, 0.0), (1.0, 0.5), (3.0, np.inf)]) == pytest.approx(2.0)
-    assert _guess([(0.0, 0.0), (1.0, 0.5), (2.0, 20.0)]) == pytest.approx(1.1)  # and not too near to either
-    assert _guess([(0.0, 0.0), (1.0, 0.0), (2.0, 1.105)]) == pytest.approx(1.9)
-    assert _guess([(0.0, 0.0), (2.0, 1.05)]) == pytest.approx(2.0 / 1.05)

@@ -10,7 +10,7 @@ import pytest
 from referee import judge
 
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.records import array_blocks
+from consistency.referee.diagnostics.records import large_arrays
 from consistency.referee.types import Array, Failure
 
 RUNS, STEPS = 61, 23
@@ -61,8 +61,8 @@ def test_blocks_do_not_change_the_verdict(
                 arrays[name][failure.run, failure.step - 1 :] = np.nan
     whole = verdicts(arrays, failures=failures)
     before = {name: array.copy() for name, array in arrays.items()}
-    monkeypatch.setattr(array_blocks, "ROWS", size)
-    monkeypatch.setattr(array_blocks, "FEWER", size)
+    monkeypatch.setattr(large_arrays, "ROWS", size)
+    monkeypatch.setattr(large_arrays, "FEWER", size)
     for a, b in zip(whole, verdicts(arrays, failures=failures), strict=True):
         assert (a.status, a.reasons) == (b.status, b.reasons)
         equal(a.statistics, b.statistics)
@@ -88,8 +88,8 @@ def test_a_verdict_needs_less_memory_than_its_arrays_hold(
     arrays = sample(rng, 400, 100)
     peaks = []
     for rows in (1000, 10**9):  # the second is the negative control
-        monkeypatch.setattr(array_blocks, "ROWS", rows)
-        monkeypatch.setattr(array_blocks, "FEWER", rows)
+        monkeypatch.setattr(large_arrays, "ROWS", rows)
+        monkeypatch.setattr(large_arrays, "FEWER", rows)
         tracemalloc.start()
         try:
             assert judge("f", **arrays).status == "overconfident"
@@ -101,7 +101,7 @@ def test_a_verdict_needs_less_memory_than_its_arrays_hold(
 
 @pytest.mark.parametrize(("count", "each"), [(0, 5), (1, 5), (10, 0), (10, 3), (10, 10**9)])
 def test_slices_cover_everything_once(monkeypatch: pytest.MonkeyPatch, count: int, each: int) -> None:
-    monkeypatch.setattr(array_blocks, "ROWS", 7)
-    slices = list(array_blocks.blocks(count, each))
+    monkeypatch.setattr(large_arrays, "ROWS", 7)
+    slices = list(large_arrays.blocks(count, each))
     assert slices
     assert [k for here in slices for k in range(count)[here]] == list(range(count))

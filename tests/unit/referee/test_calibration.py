@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import calibration
 import calibration_cases
+import calibration_monitor
 import calibration_rows
 import calibration_worlds as worlds
 import numpy as np
@@ -20,6 +21,7 @@ from calibration_rows import Row, kept
 from recorded import read_recordings
 from scipy import stats
 
+import consistency as cs
 from consistency.referee.diagnostics import nis_of
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import planar_error
@@ -107,29 +109,6 @@ def test_the_quick_rows_of_a_referee_that_keeps_its_promises_fail_less_than_once
     assert 2e-6 < chance < 2e-4
 
 
-def test_the_quick_rows_see_what_was_wrong_once() -> None:
-    """43 % of false alarms in the body frame, and an all-clear for 19 in 20 of gates that nothing was shown of."""
-    confidence = calibration_cases.quick_confidence(100)
-    claims = {case.world: (case.gates, c) for case in calibration_cases.quick_cases() for c in case.claims}
-    for world, (gates, claim) in claims.items():
-        if claim.bound == "<=":
-            found = round(0.43 * gates)
-            assert not kept(Row(world, "q", 1.0, 1, 1, claim.stated, claim.bound, gates, found), confidence)
-
-
-def test_every_case_counts_something_and_can_be_answered() -> None:
-    for case in [*calibration_cases.cases(), *calibration_cases.quick_cases()]:
-        assert case.world in calibration.ANY
-        assert all(claim.counted in calibration.COUNTED for claim in case.claims)
-        assert all(claim.question in calibration_rows.QUESTIONS for claim in case.claims)
-
-
-def test_all_right_worlds_are_asked_for_false_alarms() -> None:
-    asked = [case for case in calibration_cases.cases() if case.claims[0].question == "false alarm"]
-    for runs, rate, _ in calibration_cases.alarm_plans():
-        assert {c.world for c in asked if (c.runs, c.false_alarm) == (runs, rate)} == set(worlds.WORLDS)
-
-
 # --- worlds -------------------------------------------------------------------------------------------------
 
 
@@ -174,39 +153,10 @@ def test_every_step_of_a_right_world_is_as_stated(name: str) -> None:
 def test_heavy_tails_have_the_stated_covariance(name: str) -> None:
     """Means of squares over 6,000 runs, whose standard error is worked out from the sample: 6 of them."""
     gate = worlds.HEAVY[name].draw(Draw(np.random.default_rng(20070), 6000, 4))
-    assert gate.error is not None
     products = np.einsum("rti,rtj->rij", gate.error, gate.error).reshape(6000, 9) / 4
     away = products.mean(axis=0) - np.eye(3).ravel()
     assert (np.abs(away) < 6 * products.std(axis=0) / np.sqrt(6000)).all()
     assert np.abs(gate.error).max() > 6.0 or name.startswith("t10")  # the tails are there
-
-
-def test_worlds_depend_over_steps_as_they_say() -> None:
-    rng = np.random.default_rng(20070)
-
-    def neighbours(name: str) -> np.ndarray:
-        error = worlds.WORLDS[name].draw(Draw(rng, 400)).error
-        assert error is not None
-        return np.array([np.corrcoef(e[:-1].ravel(), e[1:].ravel())[0, 1] for e in error])
-
-    of_run = neighbours("AR(.) of the run")
-    assert np.quantile(of_run, 0.1) < 0.3 < 0.8 < np.quantile(of_run, 0.9)
-    assert np.std(neighbours("period of the run")) > 0.5
-    slow = worlds.WORLDS["20 % slow, n = 1"].draw(Draw(rng, 1000)).error
-    assert slow is not None
-    share = (slow == slow[:, :1]).all(axis=(1, 2)).mean()
-    assert stats.binomtest(round(1000 * share), 1000, 0.2).pvalue > 1e-6
-    dependent = worlds.WORLDS["fully dependent"].draw(Draw(rng, 3)).error
-    assert dependent is not None
-    assert (dependent == dependent[:, :1]).all()
-
-
-def test_innovations_of_a_gain_that_is_not_optimal_are_not_white() -> None:
-    for name in ("Schmidt-Kalman", "fixed gain"):
-        gate = worlds.WORLDS[name].draw(Draw(np.random.default_rng(20070), 400))
-        u = gate.innovations
-        assert u is not None
-        assert (u[:, 1:] * u[:, :-1]).mean() > 0.1 * np.square(u).mean()
 
 
 def test_errors_of_a_filter_have_its_variance_and_turn_with_it() -> None:
@@ -231,16 +181,6 @@ def test_gates_take_their_own_runs_of_the_pool() -> None:
     grown = calibration.Growing(case, 2, 1)
     grown(10)
     np.testing.assert_array_equal(grown(43).error, gates[2])
-
-
-def test_runs_of_the_pool_are_all_taken_before_any_is_taken_again() -> None:
-    pool, _ = worlds.POOL["linear-gaussian"]
-    rng = np.random.default_rng(0)
-    taken = [worlds.linear_gaussian(Draw(rng, 43, first=43 * gate)).error for gate in range(14)]
-    first, second = np.concatenate(taken[:7]), np.concatenate(taken[7:])
-    for turn in (first, second):
-        assert len(np.unique(turn[:, 0, 0])) == len(pool)
-    assert (first != second).any()
 
 
 # --- planar poses -------------------------------------------------------------------------------------------
@@ -279,7 +219,6 @@ def test_a_gate_depends_on_its_number_and_not_on_how_it_is_drawn() -> None:
     at_once, grown = calibration.Growing(case, 3, 1), calibration.Growing(case, 3, 1)
     for runs in (5, 5, 12, 30, 8):
         part = grown(runs)
-        assert part.error is not None
         assert len(part.error) == len(part.covariance) == runs
     np.testing.assert_array_equal(grown(30).first(12).error, grown(12).error)
     assert not np.array_equal(at_once(5).error, calibration.Growing(case, 4, 1)(5).error)
@@ -318,17 +257,6 @@ def test_outcomes_are_counted_as_each_claim_says() -> None:
     assert {(row.mean_runs, row.late_runs, row.looks, row.gates) for row in rows} == {(40.0, 90.0, 0, 5)}
 
 
-def test_a_right_and_a_wrong_filter_are_told_apart() -> None:
-    """Fixed seed; a right one is found at fault 5 times of 8 with probability below 2e-5."""
-    right = calibration.judged(CASE, range(8), 3)
-    wrong = calibration.judged(replace(CASE, ratio=4.0), range(3), 3)
-    assert sum(outcome.fault for outcome in right) < 5
-    assert [outcome.status for outcome in wrong] == ["overconfident"] * 3
-    (decided,) = calibration.judged(replace(CASE, ratio=4.0, runs=200, mode="until decided"), range(1), 3)
-    assert decided.status == "overconfident"
-    assert decided.runs < 200
-
-
 def test_the_e_process_stops_where_it_crosses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration, "_evidence_values", lambda means, dof: np.cumprod(np.full(len(means), 2.0)))
     (outcome,) = calibration.judged(replace(CASE, mode="e-process", ratio=3.0), range(1), 3)
@@ -340,8 +268,6 @@ def test_the_e_process_stops_where_it_crosses(monkeypatch: pytest.MonkeyPatch) -
 
 def test_means_of_runs_take_the_steps_that_a_run_has() -> None:
     gate = worlds.WORLDS["ragged"].draw(Draw(np.random.default_rng(2), 5, 10))
-    assert gate.error is not None
-    assert gate.covariance is not None
     for run, mean in enumerate(calibration.run_means(gate)):
         there = np.isfinite(gate.error[run, :, 0])
         pairs = zip(gate.error[run, there], gate.covariance[run, there], strict=True)
@@ -412,3 +338,90 @@ def test_a_broken_promise_is_the_exit_status(
     assert f"promises broken: {status} (by chance: less than once in 5,000 runs)" in said
     assert "seed " in said
     assert json.loads((tmp_path / "t.json").read_text())["rows"][0]["found"] == found
+
+
+# --- the monitor's worlds and rows ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gate", [None, 0.99, 0.95])
+@pytest.mark.parametrize("name", list(calibration_monitor.WORLDS))
+def test_monitors_at_once_are_the_monitor(name: str, gate: float | None) -> None:
+    """Step by step, with a fault, so that there are rejections and alarms."""
+    world = calibration_monitor.WORLDS[name](np.random.default_rng(), 4)
+    at_once = [calibration_monitor.Monitors(4, world.dof, tolerance, gate) for tolerance in (1.0, 1.2)]
+    one_by_one = [[cs.Monitor(0.05, tolerance, gate) for _ in range(4)] for tolerance in (1.0, 1.2)]
+    for step in range(150):
+        nis = (1.0 if step < 100 else 2.5) * world.nis()
+        for many, singles in zip(at_once, one_by_one, strict=True):
+            evidence = many.update(nis)
+            for single, value in zip(singles, nis, strict=True):
+                single.update(value, world.dof)
+            np.testing.assert_allclose(evidence, [single.evidence for single in singles], rtol=1e-9)
+        world.move(nis <= at_once[0].limit)
+    if gate is not None:
+        assert sum(single.rejections for single in one_by_one[0])
+
+
+@pytest.mark.parametrize("name", list(calibration_monitor.WORLDS))
+def test_innovations_of_the_filters_are_white_with_the_stated_covariance(name: str) -> None:
+    """Without a gate: the total NIS and the product of neighbouring innovations, two-sided at 1e-6 together."""
+    world = calibration_monitor.WORLDS[name](np.random.default_rng(), 4000)
+    total, product, before = 0.0, [], None
+    for _ in range(20):
+        nis = world.nis()
+        total += nis.sum()
+        whitened = np.atleast_2d(world.innovation) / np.sqrt(world.P[: world.dof] + 1.0)
+        if before is not None:
+            product.append((whitened * before).ravel())
+        before = whitened
+        world.move(np.ones(4000, bool))
+    low, high = stats.chi2.ppf([2.5e-7, 1 - 2.5e-7], 20 * 4000 * world.dof)
+    assert low < total < high
+    products = np.concatenate(product)
+    assert abs(products.mean()) < stats.norm.isf(1.25e-7) * products.std() / np.sqrt(len(products))
+
+
+@pytest.mark.parametrize("name", list(calibration_monitor.WORLDS))
+def test_a_filter_that_misses_a_measurement_knows_it(name: str) -> None:
+    """After five rejections that have nothing to do with the values the NIS still has its degrees of freedom (1e-6)."""
+    world = calibration_monitor.WORLDS[name](np.random.default_rng(), 20_000)
+    before = world.P.copy()
+    for _ in range(5):
+        world.nis()
+        world.move(np.zeros(20_000, bool))
+    assert (world.P[0] > before[0]).all()
+    low, high = stats.chi2.ppf([5e-7, 1 - 5e-7], 20_000 * world.dof)
+    assert low < world.nis().sum() < high
+
+
+def test_rows_are_those_of_the_calibration_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration_monitor, "STEPS", 60)
+    monkeypatch.setattr(calibration_monitor, "PATIENCE", 200)
+    monkeypatch.setattr(calibration_monitor, "QUICK_MISSIONS", {0.05: 20, 0.01: 40})
+    monkeypatch.setattr(calibration_monitor, "WORLDS", {"position": calibration_monitor.Position})
+    rows = [Row(**row) for row in calibration_monitor.rows(quick=True, seed=1)]
+    alarms, found = [row for row in rows if row.ratio == 1.0], [row for row in rows if row.ratio != 1.0]
+    assert [(row.world, row.question[-3:], row.stated, row.gates) for row in alarms] == [
+        (world, tolerance, rate, gates)
+        for world in ("position", "position, gate 0.99")
+        for tolerance in ("e 1", "1.2")
+        for rate, gates in ((0.05, 20), (0.01, 40))
+    ]
+    assert all(row.bound == "<=" and row.found <= row.gates for row in alarms)
+    assert {(row.ratio, row.runs) for row in found} == {
+        (r, n) for (r, _), n in calibration_monitor.FOUND_WITHIN.items()
+    }
+    assert all(row.bound == ">=" and 0 < row.found <= row.gates for row in found)
+    assert {row.world for row in rows} | {row.question for row in rows} <= set(calibration_monitor.ABOUT)
+
+
+def test_a_delay_counts_the_steps_of_the_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So gross a fault is found in its first step; at a rate of 50 % many missions have had an alarm before it."""
+    monkeypatch.setattr(calibration_monitor, "LATE", 20)
+    monkeypatch.setattr(calibration_monitor, "RATIOS", (1e6,))
+    monkeypatch.setattr(calibration_monitor, "DELAY_RATE", 0.5)
+    found = calibration_monitor.delays("position", None, 200, seed=int(np.random.SeedSequence().generate_state(1)[0]))
+    assert set(found) == {(tolerance, 1e6, since) for tolerance in (1.0, 1.2) for since in (1, 21)}
+    assert all((steps == 1).all() for steps in found.values())
+    assert all(len(found[tolerance, 1e6, 1]) == 200 for tolerance in (1.0, 1.2))
+    assert 100 <= len(found[1.0, 1e6, 21]) < 200

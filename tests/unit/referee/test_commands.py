@@ -1,4 +1,4 @@
-"""What is said where optional packages are missing: by commands, by names of the package, by arguments."""
+"""What is said where optional packages are missing: by commands, names, arguments and filters; help of commands."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from pathlib import Path
 
 import pytest
 import typer
+from command import consistency, refused
+from documents import parsed
 
 import consistency as cs
+from consistency.bench import filters
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.referee import extras
-from consistency.referee.cli.app import app, main
+from consistency.referee.cli.app import app
 from consistency.referee.cli.commands import COMMANDS
 from consistency.referee.extras import EXTRAS, MissingPackageError, explained, missing, packages, remedy, require
 from consistency.referee.shipped import summaries
@@ -190,13 +193,6 @@ def test_another_module_that_is_missing_is_not_explained() -> None:
 # --- commands --------------------------------------------------------------------------------------
 
 
-def status_of(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as end:
-        main(list(words))
-    out, err = capsys.readouterr()
-    return int(end.value.code or 0), out, err
-
-
 @pytest.mark.parametrize("name", [name for name, row in COMMANDS.items() if row.extras])
 def test_a_command_without_its_packages(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -204,21 +200,20 @@ def test_a_command_without_its_packages(
     """Whatever its options are; its help is there."""
     module = "bokeh" if name == "report" else "numba"
     without(monkeypatch, module)
-    status, out, err = status_of(capsys, name, "--no-such-option")
-    assert (status, out) == (2, "")
+    err = refused(capsys, name, "--no-such-option")
     assert err.startswith(f"consistency: '{name}' needs {module}: pip install ")
     assert SENTENCE.fullmatch(err)
     for words in ([name, "--help"], [name, "--help", "--help"]):  # the second goes through typer
-        status, out, err = status_of(capsys, *words)
-        assert (status, err) == (0, "")
+        out, err = consistency(capsys, *words)
+        assert err == ""
         assert re.match(rf"Usage: .* {name} ", out)
 
 
 def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    _, before, _ = status_of(capsys, "--help")
+    before, _ = consistency(capsys, "--help")
     assert "[bench]" not in before
     without(monkeypatch, "numba", "bokeh")
-    _, after, _ = status_of(capsys, "--help")
+    after, _ = consistency(capsys, "--help")
     lines = dict(re.findall(r"^  ([a-z-]+) +(\S.*)$", after, re.MULTILINE))
     assert set(COMMANDS) <= set(lines)
     for name, row in COMMANDS.items():
@@ -226,17 +221,15 @@ def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pyt
         assert lines[name].startswith(mark), name
         assert row.extras or not lines[name].startswith("[")
     assert "[report,bench,vision]: needs bokeh, numba: pip install " in after
-    _, alone, _ = status_of(capsys, "-h")
-    assert alone == after
+    assert consistency(capsys, "-h")[0] == after
 
 
 @pytest.mark.parametrize("words", [["plan", "linear-gaussian", "--filter", "kf"], ["analyse", "results"]])
 def test_arguments_that_need_the_bench(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], inside: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "results").mkdir()
-    (tmp_path / "results" / "manifest.json").write_text("{}")
-    monkeypatch.chdir(tmp_path)
+    (inside / "results").mkdir()
+    (inside / "results" / "manifest.json").write_text("{}")
     loaded = {
         n: m
         for n, m in sys.modules.items()
@@ -247,8 +240,7 @@ def test_arguments_that_need_the_bench(
         monkeypatch.setattr(parents[name], name.rpartition(".")[2], module)  # to be what it was after this test
         monkeypatch.delitem(sys.modules, name)
     without(monkeypatch, "pandas")
-    status, out, err = status_of(capsys, *words)
-    assert (status, out) == (2, "")
+    err = refused(capsys, *words)
     assert err.startswith(f"consistency: '{words[0]}' with these arguments needs pandas: pip install ")
 
 
@@ -288,10 +280,88 @@ def test_the_list_says_what_the_files_say() -> None:
 
 
 def test_the_list_on_the_core(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    _, before, silent = status_of(capsys, "list")
+    before, silent = consistency(capsys, "list")
     without(monkeypatch, "numba", "pandas")
-    status, after, err = status_of(capsys, "list")
-    assert (status, after, silent) == (0, before, "")
+    after, err = consistency(capsys, "list")
+    assert (after, silent) == (before, "")
     assert err.startswith("consistency: to run what is listed needs numba, pandas: pip install ")
     assert "herath2007-stereo" in after
     assert "parked-ekf-uvd" in after
+
+
+# --- help -----------------------------------------------------------------------------------------------------
+
+
+COMMAND_LINE = typer.main.get_command(app)
+SUBCOMMANDS = COMMAND_LINE.commands  # type: ignore[attr-defined]
+LINES = [line for row in COMMANDS.values() for line in row.examples]
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_an_example_parses(line: str) -> None:
+    name, values = parsed(shlex.split(line))
+    assert line in SUBCOMMANDS[name].epilog
+    assert values
+
+
+def test_every_command_that_takes_something_has_an_example() -> None:
+    assert {name for name, row in COMMANDS.items() if not row.examples} == {"list"}
+
+
+@pytest.mark.parametrize("name", sorted(SUBCOMMANDS))
+def test_help_is_for_people(name: str) -> None:
+    with COMMAND_LINE.make_context("consistency", [name]) as root:
+        context = SUBCOMMANDS[name].make_context(name, [], parent=root, resilient_parsing=True)
+        text = SUBCOMMANDS[name].get_help(context)
+    assert "list[" not in text
+    assert "-h, --help" in text
+
+
+def test_completion_is_offered() -> None:
+    options = {option for parameter in COMMAND_LINE.params for option in parameter.opts}
+    assert {"--install-completion", "--show-completion"} <= options
+
+
+@pytest.mark.parametrize("name", ["run", "analyse", "tune"])
+def test_help_alone_is_that_of_typer(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = []
+    for words in ([name, "--help"], [name, "--help", "--help"]):  # the second goes through typer
+        shown.append(consistency(capsys, *words)[0])
+    assert f"Usage: consistency {name} " in shown[0]
+    assert [text.partition(f" {name} ")[2] for text in shown] == [shown[0].partition(f" {name} ")[2]] * 2
+
+
+def test_help_of_no_command_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    refused(capsys, "runn", "--help")
+
+
+def test_help_imports_nothing_that_checks_values() -> None:
+    code = "import sys; sys.argv[1:] = ['run', '-h']; from consistency.referee.cli.app import _show_help; \
+_show_help(None) or sys.exit(3); sys.exit('pydantic' in sys.modules or 'numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+# --- a filter of a library that is not installed --------------------------------------------------------------
+
+
+@pytest.fixture
+def lacking(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filters, "EXTRAS", {"external.gtsam": ("no_such_package", "smoothing")})
+
+
+@pytest.mark.usefixtures("lacking")
+def test_without_its_library_a_filter_is_refused() -> None:
+    remedy = "'gtsam-map-uvd' needs no_such_package: pip install "
+    with pytest.raises(cs.InputError, match=remedy):
+        cs.get_filter("gtsam-map-uvd")
+    assert "gtsam-map-uvd" in filters.filter_names()
+    assert set(filters.filter_names()) - set(filters.usable_names()) == {
+        "gtsam-batch-uvd", "gtsam-lag-uvd", "gtsam-map-uvd",
+    }  # fmt: skip
+
+
+@pytest.mark.usefixtures("lacking")
+def test_what_does_not_fit_a_sensor_is_said_without_it(xyz: cs.Scenario) -> None:
+    with pytest.raises(cs.InputError, match="works on a sensor uvd, not 'xyz'; filters that fit: ekf-xyz") as refusal:
+        cs.run_trials(xyz, ["ekf-uvd"], runs=1)
+    assert "gtsam" not in str(refusal.value)

@@ -10,9 +10,9 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from command import consistency, refused
 from scipy import stats
 
-from consistency.referee.cli import main
 from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.ardupilot_log import read_ratios
@@ -120,19 +120,12 @@ def test_the_nis_of_innovations_with_their_variances(tmp_path: Path) -> None:
 
 def test_one_command_from_a_flight_to_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = flight(tmp_path / "a.bin", {"SH": [0.3] * 90 + [1.2] * 10, "SP": [0.1] * 100})
-
-    def run(*options: str) -> tuple[str, str]:
-        with pytest.raises(SystemExit) as end:
-            main(["monitor", str(path), *options])
-        assert not end.value.code
-        return capsys.readouterr()
-
-    out, err = run("--plot", str(tmp_path / "a.png"))
+    out, err = consistency(capsys, "monitor", path, "--plot", tmp_path / "a.png")
     for said in ("hgt", "2 sigma", "10.0%", "100.0% from 18.91 s", "no NIS", "no verdict and no alarm", "≤ 0.05"):
         assert said in " ".join(out.split())
     assert "read as test ratios of XKF4, 100 messages" in err
     assert (tmp_path / "a.png").stat().st_size > 10_000
-    data = json.loads(run("--json", "--filter", "hgt")[0])
+    data = json.loads(consistency(capsys, "monitor", path, "--json", "--filter", "hgt")[0])
     assert list(data["sensors"]) == ["hgt"]
     assert data["sensors"]["hgt"]["above_1"] == pytest.approx(0.1)
     assert data["sensors"]["hgt"]["unusual_above"] == pytest.approx(stats.norm.isf(0.025) / 2.0)
@@ -140,41 +133,33 @@ def test_one_command_from_a_flight_to_a_picture(tmp_path: Path, capsys: pytest.C
     assert "alarm" not in data
 
 
-def refused(capsys: pytest.CaptureFixture[str], *args: str) -> str:
-    with pytest.raises(SystemExit) as end:
-        main(["monitor", *args])
-    assert end.value.code == 2
-    out, err = capsys.readouterr()
-    assert not out
-    assert len(err.splitlines()) == 1, err
-    return err
-
-
 def test_what_cannot_be_used_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.bin"
-    assert "a.bin: no such file" in refused(capsys, str(path))
+    assert "a.bin: no such file" in refused(capsys, "monitor", path)
     for content in (b"", b"not a log", bytes(1000)):
         path.write_bytes(content)
-        assert "a.bin: is no flight log of ArduPilot" in refused(capsys, str(path))
+        assert "a.bin: is no flight log of ArduPilot" in refused(capsys, "monitor", path)
     Flight().write(path)
-    assert "holds no message XKF4 or NKF4" in refused(capsys, str(path))
+    assert "holds no message XKF4 or NKF4" in refused(capsys, "monitor", path)
     flight(path, {"SH": [0.0, 0.0]})
-    assert "the test ratios of XKF4 are 0 throughout" in refused(capsys, str(path))
+    assert "the test ratios of XKF4 are 0 throughout" in refused(capsys, "monitor", path)
     flight(path, {"SH": [0.5, 0.5]})
-    assert "holds no message XKFD" in refused(capsys, str(path), "--innovations", "optimal", "--filter", "odometry")
+    assert "holds no message XKFD" in refused(
+        capsys, "monitor", path, "--innovations", "optimal", "--filter", "odometry"
+    )
     for option in (("--fail-on", "alarm"), ("--gate", "0.99")):
-        said = refused(capsys, str(path), *option)
+        said = refused(capsys, "monitor", path, *option)
         assert f"{option[0]}: {path} holds test ratios, of which nothing is judged, unless --filter names" in said
     back = Flight("XKF4", "XKFD")
     for stamp in (10**7, 10**6):
         back.log("XKF4", stamp, {"SH": 0.4})
         back.log("XKFD", 10**6, {"IVX": -1.0})
     back.write(path)
-    assert "message 2 of XKF4 is older than the one before" in refused(capsys, str(path))
-    said = refused(capsys, str(path), "--innovations", "optimal", "--filter", "odometry")
+    assert "message 2 of XKF4 is older than the one before" in refused(capsys, "monitor", path)
+    said = refused(capsys, "monitor", path, "--innovations", "optimal", "--filter", "odometry")
     assert "XKFD at 1 s: -1 is below 0, beside IX" in said
     with mock.patch.dict(sys.modules, {"pymavlink.DFReader": None}):
-        assert "a log of ArduPilot needs pymavlink: pip install " in refused(capsys, str(path))
+        assert "a log of ArduPilot needs pymavlink: pip install " in refused(capsys, "monitor", path)
 
 
 def test_a_log_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path: Path) -> None:

@@ -1,6 +1,9 @@
-"""NEES, intervals, coverage and normality against scipy and formulas by hand."""
+"""NEES, intervals, coverage, normality and distribution functions against scipy and formulas by hand."""
 
 from __future__ import annotations
+
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,7 +14,21 @@ from scipy.spatial.distance import mahalanobis
 
 import consistency as cs
 from consistency.referee.diagnostics import chi2_mean_interval, detectable_ratio, normality, rmse
-from consistency.referee.diagnostics.statistics.coverage import coverage
+from consistency.referee.diagnostics.questions import lost_runs
+from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
+from consistency.referee.diagnostics.records.validity import (  # fmt: skip
+    DEFICIENT,
+    EXACT,
+    NEGATIVE,
+    ROUNDED,
+    Tolerance,
+    Validity,
+    asymmetric,
+    classify,
+    negative,
+)
+from consistency.referee.diagnostics.statistics import distributions as laws
+from consistency.referee.diagnostics.statistics.accuracy import coverage
 from consistency.referee.types import Array
 
 # exact 95 % intervals of chi-square(3 N) / N, computed outside this project
@@ -57,30 +74,6 @@ def test_a_batch_gives_what_single_ones_give(rng: np.random.Generator, n: int, b
 def test_one_covariance_serves_many_errors(rng: np.random.Generator) -> None:
     e, P = rng.normal(size=(3, 3)), covariances(rng, (), 3)
     assert np.allclose(cs.nees(e, P), [x @ np.linalg.inv(P) @ x for x in e])
-
-
-def test_nees_is_chi_square(rng: np.random.Generator) -> None:
-    """Sum of 5000 values; two-sided chi-square test, false-alarm rate 1e-5."""
-    P = covariances(rng, (5000,), 3)
-    e = np.einsum("kij,kj->ki", np.linalg.cholesky(P), rng.normal(size=(5000, 3)))
-    low, high = stats.chi2.interval(1 - 1e-5, 15000)
-    assert low < cs.nees(e, P).sum() < high
-    assert not low < cs.nees(e, 0.8 * P).sum() < high  # negative control
-
-
-def test_nees_does_not_depend_on_units(rng: np.random.Generator) -> None:
-    """Millimetres and degrees give the same value, with correlations close to one as well."""
-    e, P = np.array([1e-3, -2e-3, 0.01]), np.array([[1e-6, 9.9e-7, 0], [9.9e-7, 1e-6, 0], [0, 0, 1e-4]])
-    D = np.diag([1e3, 1e3, 180 / np.pi])
-    assert cs.nees(D @ e, D @ P @ D) == pytest.approx(float(cs.nees(e, P)), rel=1e-9)
-
-
-def test_nees_leaves_its_arguments_alone(rng: np.random.Generator) -> None:
-    e, P = rng.normal(size=(4, 3)), covariances(rng, (4,), 3)
-    before = e.copy(), P.copy()
-    cs.nees(e, P)
-    assert np.array_equal(e, before[0])
-    assert np.array_equal(P, before[1])
 
 
 NOT_DEFINITE = [np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 0.0, 1.0]), np.ones((3, 3)), np.zeros((3, 3)), -np.eye(3)]
@@ -140,11 +133,6 @@ def test_anees_averages_over_the_runs_that_have_a_value() -> None:
 @pytest.mark.parametrize("runs", INTERVALS)
 def test_anees_interval_equals_the_reference(runs: int) -> None:
     assert cs.anees_interval(3, runs) == pytest.approx(INTERVALS[runs], rel=1e-12)
-
-
-def test_published_interval() -> None:
-    """Herath et al. (2007) sec. 4.5 prints [2.36, 3.72] for 50 runs."""
-    assert tuple(round(end, 2) for end in cs.anees_interval(dof=3, runs=50)) == (2.36, 3.72)
 
 
 @given(st.integers(1, 9), st.integers(1, 500), st.floats(0.5, 0.9999))
@@ -239,3 +227,132 @@ def test_normality_refuses_other_distributions(rng: np.random.Generator) -> None
 def test_normality_refuses_what_it_cannot_judge(sample: Array) -> None:
     with pytest.raises(ValueError, match="at least 20 finite values"):
         normality(sample)
+
+
+# --- distribution functions -----------------------------------------------------------------------------------
+
+
+DOF = np.array([1.0, 2.0, 2.5, 3.0, 6.0, 15.0, 1e3, 1e5])[:, None]
+TAILS = np.concatenate([10.0 ** np.linspace(-14, 0, 60), 1.0 - 10.0 ** np.linspace(-14, -1, 30), [0.0, 0.5, np.nan]])
+VALUES = np.concatenate([np.geomspace(1e-6, 1e4, 80), [-1.0, 0.0, np.inf, np.nan]])
+
+
+@pytest.mark.parametrize("name", ["cdf", "sf"])
+def test_chi_square_and_student(name: str) -> None:
+    for ours, theirs, x in ((laws.chi2, stats.chi2, VALUES), (laws.t, stats.t, np.append(VALUES, -VALUES))):
+        np.testing.assert_array_equal(getattr(ours, name)(x, DOF), getattr(theirs, name)(x, DOF))
+
+
+@pytest.mark.parametrize("name", ["ppf", "isf"])
+def test_quantiles(name: str) -> None:
+    for ours, theirs in ((laws.chi2, stats.chi2), (laws.t, stats.t)):
+        np.testing.assert_array_equal(getattr(ours, name)(TAILS, DOF), getattr(theirs, name)(TAILS, DOF))
+
+
+def test_no_degrees_of_freedom() -> None:
+    assert np.isnan([laws.chi2.sf(1.0, 0.0), laws.chi2.isf(0.5, -1.0), laws.t.sf(1.0, 0.0)]).all()
+
+
+def test_beta(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = np.linspace(0.0, 1.0, 50)
+    right = stats.beta.sf(x, 1.5, DOF / 2)
+    np.testing.assert_allclose(laws.beta.sf(x, 1.5, DOF / 2), right, rtol=1e-12)
+    monkeypatch.delattr("scipy.special.betaincc", raising=False)  # as before SciPy 1.11
+    np.testing.assert_allclose(laws.beta.sf(x, 1.5, DOF / 2), right, rtol=1e-9, atol=1e-300)
+
+
+@pytest.mark.parametrize("N", [1, 2, 3, 7, 20, 59, 100, 140, 141, 5000])
+def test_kolmogorov(N: int) -> None:
+    for distance in (0.5 / N, *np.linspace(0.25, 3.0, 23) / np.sqrt(N), 1.0):
+        assert laws.kolmogorov.sf(distance, N) == pytest.approx(stats.kstwo.sf(distance, N), rel=1e-9, abs=1e-13)
+    for p in (1e-5, 1e-3, 0.05, 0.3, 0.9):
+        assert laws.kolmogorov.isf(p, N) == pytest.approx(stats.kstwo.isf(p, N), rel=1e-9)
+    assert np.isnan(laws.kolmogorov.sf(float("nan"), N))
+
+
+def test_a_gate_does_not_load_scipy_stats() -> None:
+    gate = (
+        "import sys, numpy as np; from consistency.testing import assert_consistent; "
+        "rng = np.random.default_rng(1); e = rng.standard_normal((50, 20, 3)); "
+        "assert_consistent(e, np.broadcast_to(np.eye(3), (50, 20, 3, 3)), false_alarm=1e-9); "
+        "assert 'scipy.stats' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", gate], check=True)
+
+
+def test_ranks_share_the_mean_of_equal_values() -> None:
+    values = np.random.default_rng(2).integers(0, 9, 40).astype(float)
+    np.testing.assert_array_equal(lost_runs._ranks(values), stats.rankdata(values))
+
+
+# --- what can be judged as a covariance -----------------------------------------------------------------------
+
+
+FULL = np.array([[2.0, 0.9, 0.1], [0.9, 1.0, 0.2], [0.1, 0.2, 0.5]])
+NAN, INF = np.diag([1.0, np.nan, 1.0]), np.diag([1.0, np.inf, 1.0])
+
+
+def correlated(rho: float, twist: float = 0.0) -> Array:
+    """Two components; the smallest eigenvalue of the correlation matrix is 1 - rho."""
+    return np.array([[1.0, rho + twist, 0.0], [rho, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0, 1.0), (1e-9, 1.0, 1e6)])
+@pytest.mark.parametrize(
+    ("matrix", "tolerance", "kind"),
+    [
+        (FULL, EXACT, Validity.VALID),
+        (np.diag([1.0, 0.0, 1.0]), EXACT, Validity.DEFICIENT),
+        (np.zeros((3, 3)), EXACT, Validity.DEFICIENT),
+        (correlated(1.0), EXACT, Validity.DEFICIENT),
+        (correlated(1.0 - 2.0 * DEFICIENT), EXACT, Validity.VALID),
+        (correlated(1.0 - 0.5 * DEFICIENT), EXACT, Validity.DEFICIENT),
+        (correlated(1.0 + 0.5 * DEFICIENT), EXACT, Validity.DEFICIENT),
+        (correlated(1.0 + 2.0 * DEFICIENT), EXACT, Validity.INDEFINITE),
+        (correlated(1.0 + 9e-5), ROUNDED, Validity.DEFICIENT),
+        (correlated(1.0 + 1.1e-4), ROUNDED, Validity.INDEFINITE),
+        (correlated(2.0), ROUNDED, Validity.INDEFINITE),
+        (np.diag([1.0, -1.0, 1.0]), ROUNDED, Validity.INDEFINITE),
+        (NAN, EXACT, Validity.NOT_FINITE),
+        (INF, ROUNDED, Validity.NOT_FINITE),
+    ],
+)  # fmt: skip
+def test_kinds_in_any_unit(units: tuple[float, ...], matrix: Array, tolerance: Tolerance, kind: Validity) -> None:
+    assert classify(matrix * np.outer(units, units), tolerance) == kind
+
+
+def test_a_variance_of_zero_with_a_covariance_is_indefinite() -> None:
+    P = np.diag([1.0, 0.0, 1.0])
+    P[0, 1] = P[1, 0] = 0.1
+    assert classify(P) == Validity.INDEFINITE
+
+
+@pytest.mark.parametrize(("tolerance", "within"), [(EXACT, 1e-8), (ROUNDED, 1e-6)])
+def test_asymmetry_is_relative_to_the_largest_entry(tolerance: Tolerance, within: float) -> None:
+    both = 1e6 * np.stack([correlated(0.5, 0.9 * within), correlated(0.5, 1.1 * within)])
+    assert asymmetric(both, tolerance).tolist() == [False, True]
+    assert classify(both, tolerance).tolist() == [Validity.VALID, Validity.ASYMMETRIC]
+    assert asymmetric(np.stack([NAN, INF])).tolist() == [False, False]
+
+
+def test_a_stack_keeps_its_shape_and_is_worked_on_in_pieces() -> None:
+    stack = np.broadcast_to(FULL, (2, ROWS, 3, 3)).copy()
+    stack[1, 7] = NAN
+    kinds = classify(stack)
+    assert kinds.shape == (2, ROWS)
+    assert np.argwhere(kinds != Validity.VALID).tolist() == [[1, 7]]
+    assert classify(stack[:0]).shape == (0, ROWS)
+
+
+def test_negative_is_more_lenient_than_indefinite() -> None:
+    lost, wrong = np.diag([1.0, -0.5 * NEGATIVE, 1.0]), np.diag([1.0, -2.0 * NEGATIVE, 1.0])
+    assert negative(np.stack([FULL, lost, wrong])).tolist() == [False, False, True]
+    assert classify(lost) == Validity.INDEFINITE
+    assert negative(np.empty((0, 3, 3))).shape == (0,)
+
+
+def test_only_files_have_a_variance_below_which_there_is_none() -> None:
+    """A clock error in seconds has such variances; arrays state them to all digits."""
+    small = 1e-13**2 * FULL
+    assert classify(small, EXACT) == Validity.VALID
+    assert classify(small, ROUNDED) == Validity.DEFICIENT

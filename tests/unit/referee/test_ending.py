@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from consistency.referee.system import ending
+from consistency.referee.system import stopping
 from consistency.referee.system.stopping import STOPS, stoppable
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="fork")
@@ -29,12 +29,11 @@ def begun(work: str, ignored: int | None = None) -> subprocess.Popen[str]:
         for number in STOPS:
             signal.signal(number, signal.SIG_IGN if number == ignored else signal.SIG_DFL)
 
-    code = f"from consistency.referee.system.ending import supervised\nsupervised(lambda: exec({work!r}, {{}}))"
+    code = f"from consistency.referee.system.stopping import supervised\nsupervised(lambda: exec({work!r}, {{}}))"
     process = subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True, preexec_fn=as_in_a_terminal,
     )  # fmt: skip
-    assert process.stdout is not None
     process.stdout.readline()
     return process
 
@@ -58,14 +57,14 @@ def test_what_does_not_look_is_killed(number: int, status: int) -> None:
     begin = time.monotonic()
     process.send_signal(number)
     _, error = process.communicate(timeout=30)
-    assert time.monotonic() - begin > ending.GRACE - 0.1
+    assert time.monotonic() - begin > stopping.GRACE - 0.1
     assert process.returncode == status
     assert error == "consistency: stopped\n"
     assert sys.platform != "linux" or session(process.pid) == []
 
 
 def test_the_grace_and_the_rest_are_two_seconds() -> None:
-    assert ending.GRACE + ending.LEAVE < 2.0
+    assert stopping.GRACE + stopping.LEAVE < 2.0
 
 
 def test_before_the_command_takes_signals_it_ends_at_once() -> None:
@@ -112,7 +111,7 @@ def test_a_program_with_handlers_of_its_own_is_not_supervised() -> None:
     here: list[int] = []
     before = signal.signal(signal.SIGTERM, lambda *_: None)
     try:
-        ending.supervised(lambda: here.append(os.getpid()))
+        stopping.supervised(lambda: here.append(os.getpid()))
     finally:
         signal.signal(signal.SIGTERM, before)
     assert here == [os.getpid()]

@@ -15,16 +15,23 @@ import fit_covariance as world
 import numpy as np
 import pytest
 import relative_poses as spatial
+from command import consistency, refused
 from fit_covariance import drives
 
 import consistency as cs
-from consistency.referee.cli.app import main
 from consistency.referee.diagnostics.verdict.as_dictionary import flat, plain
 from consistency.referee.extras import is_installed
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel
-from consistency.referee.fit_covariance.snippets import ceres, gtsam, robot_localization, seconds, straight, toml
-from consistency.referee.fit_covariance.writing import write_model
+from consistency.referee.fit_covariance.writing import (
+    ceres,
+    gtsam,
+    robot_localization,
+    seconds,
+    straight,
+    toml,
+    write_model,
+)
 from consistency.referee.geometry.groups import composed, vectors
 from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array
@@ -217,19 +224,12 @@ def test_noise_toml_has_all_figures(planar: NoiseModel) -> None:
 # --- the command -----------------------------------------------------------------------------------------------
 
 
-def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as end:
-        main(["fit-covariance", *words])
-    shown = capsys.readouterr()
-    return int(end.value.code or 0), shown.out, shown.err
-
-
 def test_the_command_on_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = drives(np.random.default_rng(5), 3, length=300.0)
     estimates, truth = write_tables(made, tmp_path)
-    words = (str(estimates), "--truth", str(truth), "--span", SPAN)
-    code, out, err = run(capsys, *words, "--out", str(tmp_path / "noise"))
-    assert (code, err) == (0, "")
+    words = ("fit-covariance", estimates, "--truth", truth, "--span", SPAN)
+    out, err = consistency(capsys, *words, "--out", tmp_path / "noise")
+    assert err == ""
     assert out.startswith("wheels: at 10 m ")
     for each in ("correct first: way x", "held-out 10 m", "a new drive: ", "analyse counts each judged motion"):
         assert each in out
@@ -244,14 +244,12 @@ def test_the_command_on_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str
     if is_installed("plot"):
         assert page.count("<img ") == 6
         assert "<figcaption>Errors of corrected motions" in page
-    code, out, _ = run(capsys, *words, "--json", "--held-out", "run 3")
-    said = json.loads(out)
+    said = json.loads(consistency(capsys, *words, "--json", "--held-out", "run 3")[0])
     assert said["fitted_drives"] == ["run 1", "run 2"]
     assert said["judged_drives"] == ["run 3"]
     same = cs.fit_covariance(cs.read_drives(estimates, truth), SPAN, held_out="run 3")
     assert said["noise"]["variance_per_m"] == pytest.approx(same.noise.per_m.tolist())
-    code, _, _ = run(capsys, *words, "--held-out", "half", "--fail-on", "inconsistent")
-    assert code == 1
+    consistency(capsys, *words, "--held-out", "half", "--fail-on", "inconsistent", status=1)
 
 
 def test_every_kind_of_file_gives_the_same_drive(tmp_path: Path) -> None:
@@ -339,11 +337,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     before = sorted(path.name for path in tmp_path.iterdir())
     for given, word in cases:
         out = () if "--out" in given or "--overwrite" in given else ("--out", str(tmp_path / "new"))
-        code, shown, err = run(capsys, *given, *out)
-        assert code == 2, given
-        assert shown == ""
-        assert err.count("\n") == 1
-        assert word in err, (given, err)
+        assert word in refused(capsys, "fit-covariance", *given, *out), given
         assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 

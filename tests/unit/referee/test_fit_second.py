@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import consistency
 
 from consistency.bench.runs.findings import sibling
-from consistency.referee.cli.app import main
 from consistency.referee.types import Array
 
 ROOT = Path(__file__).parents[3]
@@ -66,11 +66,9 @@ def test_wheels_and_sightings_of_five_robots_share_no_error(tmp_path: Path, caps
             np.savetxt(path, numbers[once], delimiter=",", header=head, comments="", fmt="%.14g")
     wheels, truth, sights = (str(tmp_path / kind) for kind in ("wheels", "truth", "sights"))
     words = ("fit-covariance", wheels, "--truth", truth, "--span", "1m", "--time-offset", str(LAG), "--json")
-    with pytest.raises(SystemExit):
-        main([*words, "--second", sights])
-    shown = capsys.readouterr()
-    assert shown.err == ""
-    said = json.loads(shown.out)
+    out, err = consistency(capsys, *words, "--second", sights)
+    assert err == ""
+    said = json.loads(out)
     assert said["status"] == "consistent"
     np.testing.assert_allclose(said["second_correlation"], [-0.03, -0.47, 0.28], atol=0.05)
     np.testing.assert_allclose(said["second_size"], [3.1, 5.2, 0.83], rtol=0.1)

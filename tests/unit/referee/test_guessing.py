@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import consistency
 from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.cli import main
 from consistency.referee.diagnostics import judge
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.types import Array
@@ -73,7 +73,8 @@ def test_the_right_convention_is_the_one_that_is_left(tmp_path: Path, convention
     assert v.guesses[convention].ratio.holds(1.0)
 
 
-def test_the_declared_error_has_its_own_status(tmp_path: Path) -> None:
+def test_the_declared_error_has_its_own_status_and_intervals_hold_together(tmp_path: Path) -> None:
+    """Bonferroni over four conventions: wider than the interval of one."""
     files = write(tmp_path, "left")
     (right,), (wrong,), (guess,) = (read_recordings(*files, error=kind) for kind in ("left", "so3", "guess"))
     assert judge(wrong).status not in ("consistent", "undecided")
@@ -82,16 +83,8 @@ def test_the_declared_error_has_its_own_status(tmp_path: Path) -> None:
     assert v.guesses["so3"].status == judge(wrong).status
     assert v.convention is None
     assert not v.answers
-    assert v.equivalence is not None
     assert not v.equivalence.shown
-
-
-def test_intervals_hold_together(tmp_path: Path) -> None:
-    """Bonferroni over four conventions: wider than that of one."""
-    (guess,) = read_recordings(*write(tmp_path, "left"), error="guess")
-    v = judge(guess)
     alone = judge(guess.guesses["left"])
-    assert alone.scale is not None
     value, low, high = v.guesses["left"].ratio
     assert value == pytest.approx(alone.scale.inflation.value)
     assert low < alone.scale.inflation.low
@@ -108,10 +101,7 @@ def test_none_fits(tmp_path: Path) -> None:
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     est, truth = write(tmp_path, "so3-body")
-    with pytest.raises(SystemExit) as stop:
-        main(["analyse", str(est), "--truth", str(truth), "--error", "guess", "--json"])
-    assert not stop.value.code
-    said = json.loads(capsys.readouterr().out)["est"]
+    said = json.loads(consistency(capsys, "analyse", est, "--truth", truth, "--error", "guess", "--json")[0])["est"]
     assert said["status"] == "undecided"
     assert set(said["statistics"]["guesses"]) == set(SPATIAL)
     assert said["statistics"]["guesses"]["so3-body"]["possible"] is True

@@ -24,10 +24,8 @@ def error(rng: np.random.Generator) -> Array:
 def test_arrays_are_judged(error: Array, tmp_path: Path) -> None:
     verdict = cs.judge(error, identities(error), axes=["x", "y"], name="my.filter", false_alarm=SURE)
     assert (verdict.status, verdict.filter, verdict.runs, verdict.steps) == ("consistent", "my.filter", RUNS, STEPS)
-    assert verdict.axes is not None
     assert verdict.axes.names == ("x", "y")
     assert cs.judge(2.0 * error, identities(error), false_alarm=SURE).status == "overconfident"
-    assert verdict.record is not None
     np.testing.assert_array_equal(verdict.record.error, error)
     np.savez(tmp_path / "mine.npz", errors=error, covariances=identities(error), axes=["x", "y"])
     read = cs.judge(str(tmp_path / "mine.npz"), false_alarm=SURE)
@@ -47,7 +45,6 @@ def test_failed_runs_are_counted_and_the_others_judged(error: Array) -> None:
         "estimate is not finite", "covariance is not positive definite", "covariance is not finite",
     ]  # fmt: skip
     assert verdict.reasons[0].startswith("failed: 3 of 60 runs failed, first run 3 in step 13")
-    assert verdict.scale is not None
     assert verdict.scale.alive.tolist() == [59] * 4 + [58] * 8 + [57] * 8
     fault = cs.judge(3.0 * error, P, false_alarm=SURE)
     assert fault.status == "overconfident"
@@ -70,7 +67,6 @@ def test_a_masked_step_has_no_truth(error: Array, tmp_path: Path) -> None:
     P, nees = np.where(mask[..., None, None], np.nan, identities(error)), np.square(error).sum(axis=-1)
     verdict = cs.judge(np.ma.masked_invalid(spoilt), P, false_alarm=SURE)
     assert verdict.status == "consistent"
-    assert verdict.scale is not None
     alive = (~mask).sum(axis=0)
     assert verdict.scale.alive.tolist() == alive.tolist()
     np.testing.assert_allclose(verdict.scale.mean_anees, np.ma.array(nees, mask=mask).mean(axis=1).mean(), rtol=1e-12)
@@ -86,7 +82,6 @@ def test_a_masked_step_has_no_truth(error: Array, tmp_path: Path) -> None:
         np.savez(tmp_path / "mine.npz", mask=mask, **arrays)
         read = cs.judge(tmp_path / "mine.npz", false_alarm=SURE)
         assert (read.status, read.failures) == ("consistent", ())
-        assert read.scale is not None
         assert read.scale.alive.tolist() == alive.tolist()
     np.savez(tmp_path / "mine.npz", estimates=estimates, truth=truth, covariances=identities(error))
     with pytest.raises(cs.InputError, match="run 0, step 5: not finite; 'mask' is true where there is none"):

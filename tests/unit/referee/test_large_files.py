@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from consistency.referee.diagnostics.records.array_blocks import FEWER as ROWS
+from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats import text_blocks
 from consistency.referee.readers.formats.sheet import Block, read_numbers, read_sheet

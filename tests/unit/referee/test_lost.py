@@ -29,7 +29,7 @@ from consistency.referee.diagnostics.planning.number_of_runs import share_limit
 from consistency.referee.diagnostics.questions.lost_runs import lost_evidence, lost_of
 from consistency.referee.gating.watch import Watch, watching
 from consistency.referee.types import Array, Failure
-from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent
+from consistency.testing import InsufficientTrials, assert_consistent
 
 SURE = 1e-5
 
@@ -55,16 +55,6 @@ def test_the_bound_is_the_mean_beyond_the_quantile(dof: int, rate: float) -> Non
     mean, _ = integrate.quad(lambda x: x * stats.chi2.pdf(x, dof), q, np.inf, epsabs=1e-14)
     assert float(lost_bound(dof, rate)) == pytest.approx(mean / rate, rel=1e-6)
     assert float(lost_bound(dof, rate)) > q
-
-
-def test_a_dependence_that_exceeds_the_quantile_keeps_the_bound(rng: np.random.Generator) -> None:
-    """Two steps whose upper tails exclude each other: the mean exceeds a lower quantile more often, not the bound."""
-    u = rng.random(400_000)
-    tail = 0.05
-    other = np.where(u > 1.0 - tail, 2.0 - tail - u, u)  # the tail is turned round
-    mean = 0.5 * (stats.chi2.ppf(u, 1) + stats.chi2.ppf(other, 1))
-    assert (mean > float(stats.chi2.isf(tail, 1)) * 1.2).mean() > 0.045  # a whole tail of means just below the bound
-    assert (mean > float(lost_bound(1, tail))).mean() <= tail
 
 
 # --- the share -------------------------------------------------------------------------------------------
@@ -137,7 +127,6 @@ def test_a_run_beyond_the_bound_is_lost() -> None:
         nees = right(60)
         nees[7] = factor * bound
         lost = verdict_on(nees).lost
-        assert lost is not None
         assert (lost.count, lost.runs) == (count, 60)
         assert lost.bound == pytest.approx(bound)
         assert lost.upper == pytest.approx(share_limit(count, 60))
@@ -153,7 +142,6 @@ def test_a_lost_run_takes_more_runs() -> None:
     assert "(1 run of 93 is lost)" in asked.reasons[0]
     fewer = verdict_on(np.delete(nees, 0, axis=0), lost=0.05)
     assert fewer.status == "undecided"
-    assert fewer.lost is not None
     assert fewer.lost.needed == 93
 
 
@@ -162,7 +150,6 @@ def test_failed_runs_are_lost_and_runs_without_a_value_are_none(rng: np.random.G
     nees[3], nees[5] = np.nan, np.nan
     evidence = Evidence("f", nees=nees, dof=3, failures=(Failure("f", 13, 2, "broke"),), runs=np.arange(60) + 10)
     lost = lost_of(evidence, nees, 3, Settings())
-    assert lost is not None
     assert (lost.count, lost.runs) == (1, 59)
     assert lost_of(Evidence("f", nees=np.full((2, 3), np.nan), dof=3), np.full((2, 3), np.nan), 3, Settings()) is None
 
@@ -191,29 +178,18 @@ def test_the_bet_against_a_share() -> None:
     )
 
 
-def test_the_bet_is_fair() -> None:
-    """The mean of the e-value after 12 runs of which each is lost with the share in question: 1, exactly."""
-    rows = np.array([[bool(k >> i & 1) for i in range(12)] for k in range(2**12)])
-    weight = np.prod(np.where(rows, 0.2, 0.8), axis=1)
-    values = np.array([lost_evidence(row, 0.2)[-1] for row in rows])
-    assert float(weight @ values) == pytest.approx(1.0)
-
-
 def test_until_decided_goes_on_until_the_share_is_excluded() -> None:
     nees = right(400)
     free, runs = follow(Design(3, max_runs=400), lambda n: Evidence("f", nees=nees[:n], dof=3))
     asked, more = follow(Design(3, max_runs=400, lost=0.05), lambda n: Evidence("f", nees=nees[:n], dof=3))
     assert (free.status, asked.status) == ("consistent", "consistent")
     assert runs < more == 96
-    assert asked.lost is not None
     assert asked.lost.upper <= 0.05
     assert asked.reasons[0].count("lost runs") == 1
     early = look(Design(3, lost=0.05), Evidence("f", nees=nees[:48], dof=3), 0.1)
-    assert early.lost is not None
     assert early.lost.upper > 0.05
     assert early.lost.bound == pytest.approx(float(lost_bound(3, 0.05 / (48 * 49))))
     needed = early.lost.needed
-    assert needed is not None
     assert lost_evidence(np.zeros(needed, bool), 0.05)[-1] >= 20.0 > lost_evidence(np.zeros(needed - 1, bool), 0.05)[-1]
 
 
@@ -240,9 +216,3 @@ def test_a_marker_may_ask(rng: np.random.Generator) -> None:
         assert_consistent(error, identities(error))
     assert entries[1].lost == 0.01
     assert entries[1].needed == 299
-
-
-def test_a_fault_is_raised_with_and_without(rng: np.random.Generator) -> None:
-    error = 2.0 * independent(rng, 60, 6, 3)
-    with pytest.raises(ConsistencyError):
-        assert_consistent(error, identities(error), lost=0.01)

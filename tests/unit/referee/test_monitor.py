@@ -72,9 +72,9 @@ def test_alternatives_are_outside_the_tolerance_on_both_sides() -> None:
     for tolerance in (1.0, 1.2, 3.0):
         pairs = alternatives(tolerance)
         above, below = pairs[: len(RATIOS)], pairs[len(RATIOS) :]
-        assert all(pair.edge == tolerance and pair.scale > tolerance for pair in above)
-        assert all(pair.edge == 1 / tolerance and pair.scale < 1 / tolerance for pair in below)
-        np.testing.assert_allclose([a.scale * b.scale for a, b in zip(above, below, strict=True)], 1.0)
+        assert all(edge == tolerance and scale > tolerance for scale, edge in above)
+        assert all(edge == 1 / tolerance and scale < 1 / tolerance for scale, edge in below)
+        np.testing.assert_allclose([a * b for (a, _), (b, _) in zip(above, below, strict=True)], 1.0)
 
 
 def test_shares_add_up_to_one() -> None:
@@ -305,31 +305,12 @@ def test_the_scale_of_an_alarm_allows_for_the_gate() -> None:
     assert "larger than a gate lets see" in str(hidden)
 
 
-# --- rates ---------------------------------------------------------------------------------------------
-
-
-def alarm_share(scale: float, tolerance: float, missions: int, steps: int) -> float:
-    rng = np.random.default_rng()
-    values = scale * rng.chisquare(2, (missions, steps))
-    return sum(bool(fed(cs.Monitor(0.2, tolerance), row, 2)) for row in values.tolist()) / missions
-
-
-def test_alarms_of_right_filters_are_no_more_than_stated() -> None:
-    """200 missions of 200 steps at 20 %, the limit is passed by chance with 1e-6; a scale of 2 is the control."""
-    limit = stats.binom.ppf(1 - 1e-6, 200, 0.2) / 200
-    assert alarm_share(1.0, 1.0, 200, 200) <= limit
-    assert alarm_share(1.2, 1.2, 200, 200) <= limit
-    assert alarm_share(1 / 1.2, 1.2, 200, 200) <= limit
-    assert alarm_share(2.0, 1.2, 40, 200) > limit
-
-
 # --- limits --------------------------------------------------------------------------------------------
 
 
 def test_nothing_overflows() -> None:
     monitor = cs.Monitor()
     alarm = monitor.update(1e300, 1)
-    assert alarm is not None
     assert alarm.direction == "overconfident"
     for value in (1.7e308, 1.7e308, 0.0, 5e-324, 1.7e308):
         monitor.update(value, 3)
@@ -345,22 +326,16 @@ def test_nothing_overflows() -> None:
         assert fed(many, [0.7e5] * 2, 100_000)[0].direction == "conservative"
 
 
-def test_memory_does_not_grow() -> None:
+def test_memory_does_not_grow_and_a_stored_monitor_goes_on() -> None:
     rng = np.random.default_rng()
-    monitor = cs.Monitor(gate=0.99)
-    sizes = []
+    monitor, sizes = cs.Monitor(gate=0.99), []
     for _ in range(2):
         fed(monitor, rng.chisquare(3, 3000).tolist(), 3)
-        sizes.append(len(pickle.dumps(monitor)))
+        stored = pickle.dumps(monitor)
+        sizes.append(len(stored))
     assert sizes[1] < sizes[0] + 200
     assert sizes[1] < 4000
-
-
-def test_a_stored_monitor_goes_on() -> None:
-    rng = np.random.default_rng()
-    monitor = cs.Monitor(gate=0.95)
-    fed(monitor, rng.chisquare(3, 100).tolist(), 3)
-    restored = pickle.loads(pickle.dumps(monitor))
+    restored = pickle.loads(stored)
     for value in rng.chisquare(3, 50).tolist():
         monitor.update(value, 3)
         restored.update(value, 3)

@@ -18,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from consistency.referee.diagnostics import gate_runs
-from consistency.referee.gating.false_alarm_budget import FIRST, final_rate, in_place_rate
 from consistency.referee.gating.session import refusal
+from consistency.referee.gating.watch import FIRST, final_rate, in_place_rate
 
 SAMPLES = '''
 import numpy as np

@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import relative_poses as world
+from command import consistency, refused
 from documents import blocks
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
-from consistency.referee.cli import main as command
 from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
@@ -30,13 +30,6 @@ from consistency.referee.verdicts.sources import analyse
 GROUPS = tuple(world.SIGMA)
 SURE = 1e-5  # false-alarm rate of a verdict in a test
 DATA = Path(os.environ.get("CONSISTENCY_DATA", Path(__file__).parents[4] / "shared" / "data"))
-
-
-def main(arguments: list[str]) -> int:
-    """Exit status of the command."""
-    with pytest.raises(SystemExit) as end:
-        command(arguments)
-    return int(end.value.code or 0)
 
 
 # --- frames ------------------------------------------------------------------------------------------
@@ -89,7 +82,6 @@ def test_another_world_of_either_changes_no_number_of_poses(group: str, rng: np.
         T = matrices(run.estimate)
         # the covariance of the same uncertainty, about the axes of the other world
         J = np.linalg.inv(to_left(G @ T, kind)) @ to_left(T, kind)
-        assert run.cross is not None
         cross = run.cross.copy()
         cross[1:] = J[:-1] @ run.cross[1:] @ np.swapaxes(J[1:], 1, 2)
         turned.append(
@@ -146,7 +138,6 @@ def test_few_windows_do_not_show_independence(rng: np.random.Generator) -> None:
     assert few.answers == ()
     assert few.reasons[0].startswith("undecided: 140 windows are too few windows to show independence, which takes 150")
     assert "the covariance ratio would be" in few.reasons[0]
-    assert few.equivalence is not None
     assert not few.equivalence.shown
     enough = analyse([declared(rng, ENOUGH)])["log"]
     assert enough.status == "overconfident"
@@ -184,7 +175,6 @@ def motion_file(tmp_path: Path, rng: np.random.Generator) -> Path:
 def test_motions_as_tum(motion_file: Path) -> None:
     record = cs.read(motion_file, motion_file.parent / "truth.tum", relative="1s", motions=True)
     assert record.window == "1 s"
-    assert record.error is not None
     assert record.error.shape == (1, 12, 6)
     np.testing.assert_allclose(record.t, np.arange(1, 13), atol=1e-9)
     planar = cs.read(
@@ -196,7 +186,6 @@ def test_motions_as_tum(motion_file: Path) -> None:
 
 def test_poses_with_cross_covariances_as_tum(tmp_path: Path, rng: np.random.Generator) -> None:
     s = pose_stretch(rng, "SE(3)", 9, 5, 1.0, 0)
-    assert s.cross is not None
     lines(tmp_path / "est.tum", s.t, s.estimate)
     lines(tmp_path / "truth.tum", s.t, s.truth)
     cross = np.nan_to_num(s.cross).reshape(-1, 36)
@@ -238,7 +227,6 @@ def test_tables_and_archives_of_motions(tmp_path: Path, rng: np.random.Generator
 
 def test_tables_and_archives_of_poses_with_cross_covariances(tmp_path: Path, rng: np.random.Generator) -> None:
     s = pose_stretch(rng, "SE(2)", 9, 5, 1.0, 0)
-    assert s.cross is not None
     expected = recorded([s], "1", False)
     record = cs.read(table(tmp_path / "p.csv", s, True), tmp_path / "truth.csv", relative=1)
     np.testing.assert_allclose(record.nees, expected.nees, rtol=1e-9)
@@ -274,11 +262,7 @@ def test_marginal_covariances_are_refused_with_the_remedy(
         ("--relative", "2x", "--motions"): "--relative 2x: must be a whole number of steps",
     }
     for options, text in cases.items():
-        assert main(["analyse", *files, *options]) == 2
-        said = capsys.readouterr()
-        assert text in said.err
-        assert len(said.err.strip().splitlines()) == 1
-        assert not said.out
+        assert text in refused(capsys, "analyse", *files, *options)
 
 
 def test_what_has_no_poses_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -296,11 +280,10 @@ def test_what_has_no_poses_is_refused(tmp_path: Path, rng: np.random.Generator) 
 def test_the_command_and_its_report(motion_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = motion_file.parent / "look"
     files = [str(motion_file), "--truth", str(motion_file.parent / "truth.tum"), "--motions", "--relative", "0.5s"]
-    assert main(["analyse", *files, "--report", str(out)]) == 0
-    said = capsys.readouterr()
-    assert "24 windows of 0.5 s" in said.err
-    assert "what is constant over a window" in said.err
-    assert "of 24" in said.out
+    shown, notes = consistency(capsys, "analyse", *files, "--report", out)
+    assert "24 windows of 0.5 s" in notes
+    assert "what is constant over a window" in notes
+    assert "of 24" in shown
     page = (out / "report.html").read_text()
     assert "24 windows of 0.5 s" in page
     assert "NEES of the motion over each window of 0.5 s" in page
@@ -339,7 +322,7 @@ def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[objec
 
 def test_motions_of_the_front_end_are_read_and_right(tmp_path: Path, rng: np.random.Generator) -> None:
     """Without images: 400 motions with large turns; x1.5 is found in all but 1e-5 of all draws."""
-    from consistency.stereo.frontend.tum_output import motions_text
+    from consistency.stereo.frontend.images_to_log import motions_text
     from consistency.stereo.visual_odometry.odometry import motion_covariances
 
     motions, truth = simulated_motions(rng, 400)
@@ -361,20 +344,21 @@ def test_motions_of_the_front_end_are_read_and_right(tmp_path: Path, rng: np.ran
     [("kitti06_f0-50", "poses.txt", "0.5s", 10), ("euroc_static", "groundtruth_first97.csv", "1", 5)],
 )
 @pytest.mark.slow
-def test_a_real_sequence_from_images_to_windows(tmp_path: Path, name: str, truth: str, size: str, count: int) -> None:
+def test_a_real_sequence_from_images_to_windows(
+    tmp_path: Path, name: str, truth: str, size: str, count: int, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Images, motions, windows: the verdict of docs/front-end.md, where the covariance is of pixel noise alone."""
     pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
     if not (DATA / name).is_dir():
         pytest.skip(f"no {DATA / name}; set CONSISTENCY_DATA to the folder that holds {name}")
     log_folder = tmp_path / "log"
-    assert main(["frontend", str(DATA / name), "--truth", str(DATA / name / truth), "--out", str(log_folder)]) == 0
+    consistency(capsys, "frontend", DATA / name, "--truth", DATA / name / truth, "--out", log_folder)
     record = cs.read(log_folder / "motions.tum", log_folder / "truth.tum", relative=size, motions=True)
     verdict = cs.judge(record)
     assert (verdict.runs, verdict.status) == (count, "overconfident")
 
 
-def test_the_example_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_example_of_the_manual(inside: Path) -> None:
     (example,) = (block.text for block in blocks("docs/files.md", "python") if "wheels" in block.text)
     names: dict[str, Evidence] = {}
     exec(example, names)

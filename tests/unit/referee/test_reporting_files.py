@@ -9,22 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command import consistency, refused
 from matplotlib.figure import Figure as Drawn
 from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
-from consistency.referee import cli
 from consistency.referee.document.blocks import Table, Text
 from consistency.referee.document.drawing import Band, Figure, Line, Points
-from consistency.referee.pages.files_report import (
-    clock_of,
-    compose_files,
-    observed_coverage,
-    record_figures,
-    shown_run,
-    unit_of,
-)
+from consistency.referee.pages.files_report import clock_of, compose_files, observed_coverage, record_figures, unit_of
+from consistency.referee.pages.trajectory import shown_run
 from consistency.referee.verdicts.sources import analyse
 
 RUNS, STEPS = 30, 25
@@ -45,15 +39,6 @@ def archive(tmp_path: Path, rng: np.random.Generator) -> Path:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng()
-
-
-def main(arguments: list[str]) -> int:
-    """Exit status of a command."""
-    try:
-        cli.main(arguments)
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
 
 
 def document(path: Path) -> Any:
@@ -81,9 +66,11 @@ def test_what_the_files_do_not_tell_has_no_column(archive: Path) -> None:
     assert [len(row) for _, rows in shown.groups for row in rows] == [len(heads)]
 
 
-def test_the_cells_of_a_wide_table_name_their_heads(archive: Path, tmp_path: Path) -> None:
+def test_the_cells_of_a_wide_table_name_their_heads(
+    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A narrow screen shows each row by itself; a narrow table needs none."""
-    assert main(["analyse", str(archive), "--report", str(tmp_path / "r")]) == 0
+    consistency(capsys, "analyse", archive, "--report", tmp_path / "r")
     source = (tmp_path / "r/report.html").read_text("utf-8")
     (wide,) = re.findall(r'<table class="[^"]*\bwide">.*?</table>', source, re.S)
     heads = [re.sub(r"<.*?>", "", head) for head in re.findall(r"<th scope=\"col\".*?>(.*?)</th>", wide)]
@@ -95,7 +82,6 @@ def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive: Path
     record = read_recordings(archive)[0]
     panels = figures(document(archive))["Errors and stated bounds"].panels
     assert [panel.y.label for panel in panels] == ["x (m)", "yaw (deg)"]
-    assert record.error is not None
     for panel, factor, variance, error in zip(panels, (1.0, 180 / np.pi), (0.1, 0.2), record.error[0].T, strict=True):
         line = panel.marks[-1]
         assert isinstance(line, Line)
@@ -215,23 +201,21 @@ def test_each_of_several_estimators_has_its_sentence(tmp_path: Path, rng: np.ran
 
 def test_one_command_writes_page_paper_and_numbers(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = archive.parent / "deep" / "out"
-    assert main(["analyse", str(archive), "--report", str(out)]) == 0
+    printed, _ = consistency(capsys, "analyse", archive, "--report", out)
     assert sorted(path.name for path in out.iterdir()) == [
         "manifest.json", "report.html", "report.pdf", "verdict.json",
     ]  # fmt: skip
-    printed = capsys.readouterr().out
     assert str(out / "report.html") in printed
     verdict = cs.judge(cs.read(archive))
     assert json.loads((out / "verdict.json").read_text())["mine"]["reasons"] == list(verdict.reasons)
     assert verdict.reasons[0].split(",")[0] in (out / "report.html").read_text()
     assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
-    assert main(["analyse", str(archive), "--report", str(out)]) == 2
-    refused = capsys.readouterr()  # below the verdict
-    assert refused.out == printed.split(str(out))[0]
-    assert refused.err.endswith("exists already; choose another folder or add --overwrite\n")
-    assert main(["analyse", str(archive), "--report", str(out), "--json"]) == 2
-    assert set(json.loads(capsys.readouterr().out)) == {"mine"}
-    assert main(["analyse", str(archive), "--report", str(out), "--overwrite"]) == 0
+    shown, err = consistency(capsys, "analyse", archive, "--report", out, status=2)  # below the verdict
+    assert shown == printed.split(str(out))[0]
+    assert err.endswith("exists already; choose another folder or add --overwrite\n")
+    shown, _ = consistency(capsys, "analyse", archive, "--report", out, "--json", status=2)
+    assert set(json.loads(shown)) == {"mine"}
+    consistency(capsys, "analyse", archive, "--report", out, "--overwrite")
 
 
 def test_a_verdict_that_fails_counts_before_a_report_that_is_refused(
@@ -241,10 +225,9 @@ def test_a_verdict_that_fails_counts_before_a_report_that_is_refused(
     np.savez(tmp_path / "bad.npz", errors=errors, covariances=np.broadcast_to(np.eye(2), (60, 1, 2, 2)))
     taken = tmp_path / "taken"
     taken.mkdir()
-    command = ["analyse", str(tmp_path / "bad.npz"), "--report", str(taken)]
+    command = ["analyse", tmp_path / "bad.npz", "--report", taken]
     for more, status in (([], 2), (["--fail-on", "inconsistent"], 1), (["--fail-on", "inconsistent", "--json"], 1)):
-        assert main([*command, *more]) == status
-        out, err = capsys.readouterr()
+        out, err = consistency(capsys, *command, *more, status=status)
         assert "overconfident" in out
         assert f"consistency: --report {taken}: exists already" in err
         assert "--json" not in more or json.loads(out)["bad"]["status"] == "overconfident"
@@ -252,12 +235,11 @@ def test_a_verdict_that_fails_counts_before_a_report_that_is_refused(
 
 
 def test_what_a_report_is_not_for(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["analyse", str(archive), "--overwrite"]) == 2
-    assert "--overwrite goes with --report" in capsys.readouterr().err
+    assert "--overwrite goes with --report" in refused(capsys, "analyse", archive, "--overwrite")
     scenario = cs.load_scenario("linear-gaussian").variant("short", truth__steps=5)
     cs.run_trials(scenario, ["kf"], runs=2, jobs=1).write(tmp_path / "results")
-    assert main(["analyse", str(tmp_path / "results"), "--report", str(tmp_path / "r")]) == 2
-    assert f"use 'consistency report {tmp_path / 'results'}'" in capsys.readouterr().err
+    _, err = consistency(capsys, "analyse", tmp_path / "results", "--report", tmp_path / "r", status=2)
+    assert f"use 'consistency report {tmp_path / 'results'}'" in err
     assert not (tmp_path / "r").exists()
 
 

@@ -1,4 +1,4 @@
-"""The test of run means against computations of its own: a likelihood maximised, runs left out one by one.
+"""The test of run means, equivalence and plans against computations of their own, such as a likelihood maximised.
 
 Everything random has a fixed seed that was not chosen, and no assertion here depends on luck but the counts, which have
 limits at 1e-5.
@@ -6,14 +6,32 @@ limits at 1e-5.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
-from draws import autoregression, fully_dependent
+from draws import autoregression, independent, verdict_on
 from scipy import optimize, special, stats
 
-from consistency.referee.diagnostics import mean_test, ratio_interval
+from consistency.referee.diagnostics import (
+    Evidence,
+    Settings,
+    e_process,
+    ever,
+    gate_runs,
+    judge,
+    mean_test,
+    pilot_plan,
+    power_of,
+    ratio_interval,
+    required_runs,
+)
+from consistency.referee.diagnostics.questions.equivalence import (
+    equivalence,
+    equivalence_by_betting,
+    equivalence_of_total,
+)
 from consistency.referee.diagnostics.questions.scale import acceptance, run_means, scale_test
 from consistency.referee.types import Array
 
@@ -175,25 +193,6 @@ def test_a_right_filter_has_p_values_near_uniform_at_full_dependence() -> None:
         assert count >= (stats.binom.ppf(SURE, draws, level) if runs < 20 else 1)
 
 
-def test_steps_that_are_the_same_are_one_step() -> None:
-    """Whatever the number of steps, the run means of full dependence are those of one step."""
-    rng = np.random.default_rng(3)
-    error = fully_dependent(rng, 19, 30, 3)
-    nees = np.square(error).sum(axis=-1)
-    many, one = mean_test(nees, 3), mean_test(nees[:, :1], 3)
-    assert (many.above, many.below) == pytest.approx((one.above, one.below))
-
-
-def test_effective_dof_does_not_depend_on_the_unit_far_from_one() -> None:
-    """Where the mean is farther from 1 than chance carries it, on the same side."""
-    rng = np.random.default_rng(4)
-    means = gamma_means(rng, 50, 10.0)
-    for a, b in ((10.0, 1e6), (0.1, 1e-6)):
-        one, other = scale_test(means * a, 2, 100), scale_test(means * b, 2, 100)
-        assert one.effective_dof == pytest.approx(other.effective_dof, rel=1e-9)
-        assert one.spread == pytest.approx(other.spread, rel=1e-9)
-
-
 def test_effective_dof_of_known_worlds() -> None:
     """(tr C)^2 / tr C^2, from below: C_kl = .9^|k - l| in each of 3 components; 2,000 runs."""
     rng = np.random.default_rng(5)
@@ -296,32 +295,12 @@ def test_ratio_interval_of_few_runs() -> None:
     assert ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 6)[2] < ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 1)[2]
 
 
-def test_ratio_interval_of_a_right_filter_says_something() -> None:
-    """20 runs of one component, fully dependent: none in 300 draws from practically 0 to practically infinity."""
-    rng = np.random.default_rng(10)
-    intervals = [ratio_interval(gamma_means(rng, 20, 1.0)) for _ in range(300)]
-    assert max(i.high / max(i.low, 1e-300) for i in intervals) < 1e4
-
-
 def test_ratio_interval_where_there_is_nothing_to_spread() -> None:
     assert np.isnan(ratio_interval(np.empty(0))).all()
     assert ratio_interval(np.zeros(5)) == (0.0, 0.0, 0.0)
     assert ratio_interval(np.full(30, 1.5)) == pytest.approx((1.5, 1.5, 1.5))
     value, low, high = ratio_interval(np.full(5, 1.5), 2)
     assert low < 1.0 < value < 2.0 < high
-
-
-def test_ratio_interval_holds_the_ratio_of_gaussian_errors() -> None:
-    """500 draws each of 3, 12 and 40 runs of one step: misses of either side at most 5 % in all (limits 1e-5)."""
-    rng = np.random.default_rng(8)
-    draws = 500
-    for runs in (3, 12, 40):
-        misses = 0
-        for _ in range(draws):
-            _, low, high = ratio_interval(gamma_means(rng, runs, 3.0, 0.6), 3)
-            misses += not low <= 0.6 <= high
-        assert misses <= stats.binom.isf(SURE, draws, 0.05 if runs < 20 else 0.06)
-        assert misses >= stats.binom.ppf(SURE, draws, 0.02)
 
 
 # --- large and small numbers -------------------------------------------------------------------------------
@@ -357,3 +336,254 @@ def test_means_of_any_size_have_an_interval(size: float) -> None:
         found = ratio_interval(means, 3)
         assert found.low <= found.value <= found.high
     assert ratio_interval(all_, 3).low == pytest.approx(size * ratio_interval(np.ones(30), 3).low)
+
+
+# --- is a right scale shown, and only a right one -------------------------------------------------------------
+
+
+def means_of(rng: np.random.Generator, runs: int, nu: float = 3.0, ratio: float = 1.0) -> Array:
+    return ratio * rng.chisquare(nu, runs) / nu
+
+
+# --- two one-sided tests --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("detect", [1.5, 2.0, 0.5, 1.25])
+@pytest.mark.parametrize("ratio", [0.6, 1.0, 1.4])
+def test_by_hand_below_twenty_runs(detect: float, ratio: float) -> None:
+    """Chi-square of N n degrees of freedom at both ends of the interval."""
+    n, means = 3, means_of(np.random.default_rng(21), 19, ratio=ratio)
+    k, total, d = 19 * n, n * means.sum(), max(detect, 1 / detect)
+    too_large, too_small = stats.chi2.cdf(total / d, k), stats.chi2.sf(total * d, k)
+    both = equivalence(means, n, 50, Settings(detect=detect))
+    assert both.p_value == pytest.approx(max(too_large, too_small), rel=1e-9)
+    assert both.factor == pytest.approx(d)
+    assert both.level == pytest.approx(0.05)
+    one = equivalence(means, n, 50, Settings(detect=detect, allow="conservative"))
+    assert one.p_value == pytest.approx(too_large, rel=1e-9)
+
+
+@pytest.mark.parametrize("allow", [None, "conservative"])
+@pytest.mark.parametrize("ratio", [0.72, 1.0, 1.35])
+def test_by_the_test_of_means_from_twenty_runs_on(ratio: float, allow: str | None) -> None:
+    means = means_of(np.random.default_rng(22), 40, 8.0, ratio)
+    result = equivalence(means, 2, 50, Settings(detect=1.4, allow=allow))
+    below, above = scale_test(means / 1.4, 2, 50).below, scale_test(means * 1.4, 2, 50).above
+    assert result.p_value == pytest.approx(below if allow else max(below, above))
+    assert below != pytest.approx(above, rel=0.01)
+
+
+def test_level_is_one_less_the_power() -> None:
+    means = np.full(19, 1.0) + 1e-9
+    for power in (0.8, 0.95, 0.999):
+        result = equivalence(means, 3, 50, Settings(power=power))
+        assert result.level == pytest.approx(1 - power)
+        assert result.shown == (result.p_value <= 1 - power)
+    at_stake = equivalence(means, 3, 50, Settings()).p_value
+    assert equivalence(means, 3, 50, Settings(power=1 - 1.01 * at_stake)).shown
+    assert not equivalence(means, 3, 50, Settings(power=1 - 0.99 * at_stake)).shown
+
+
+@pytest.mark.parametrize("ratio", [1.5, 1 / 1.5])
+@pytest.mark.parametrize("runs", [12, 40])
+def test_a_ratio_at_the_end_is_seldom_called_equivalent(ratio: float, runs: int) -> None:
+    """Fully dependent, 500 draws at 5 % (Student's t leaves up to .7 % more from 20 runs on)."""
+    rng = np.random.default_rng(24)
+    shown = sum(equivalence(means_of(rng, runs, 3.0, ratio), 3, 50, Settings()).shown for _ in range(500))
+    assert shown <= stats.binom.isf(SURE, 500, 0.057)
+
+
+def test_nothing_is_shown_of_nothing() -> None:
+    result = equivalence(np.empty(0), 3, 0, Settings())
+    assert np.isnan(result.p_value)
+    assert not result.shown
+    assert result.runs is None
+
+
+# --- runs that would decide ----------------------------------------------------------------------------
+
+
+def test_runs_that_would_decide_by_hand() -> None:
+    """2 / nu ((z + z') / distance)^2, to the nearer of 'shown' and 'at fault'."""
+    z = stats.norm.ppf
+    means = means_of(np.random.default_rng(27), 40)
+    for ratio, allow, expected in (
+        (1.0, None, 2 / 3 * (2 * z(0.9) / np.log(1.5)) ** 2),
+        (1.2, None, 2 / 3 * (2 * z(0.9) / np.log(1.5 / 1.2)) ** 2),
+        (1.4, None, 2 / 3 * ((z(0.9) + z(1 - 0.02 / 4)) / np.log(1.4)) ** 2),
+        (1.4, "conservative", 2 / 3 * ((z(0.9) + z(1 - 0.02 / 2)) / np.log(1.4)) ** 2),
+        (0.7, None, 2 / 3 * ((z(0.9) + z(1 - 0.02 / 4)) / np.log(1 / 0.7)) ** 2),
+    ):
+        settings = Settings(false_alarm=0.02, power=0.9, allow=allow)
+        result = equivalence(means / means.mean() * ratio, 3, 1, settings)
+        assert result.runs == max(int(np.ceil(expected)), 20)
+
+
+def test_few_runs_are_taken_for_right() -> None:
+    """19 runs do not know their ratio; what would decide is worked out at 1 and the worst case."""
+    z = stats.norm.ppf
+    result = equivalence(np.full(19, 3.0), 2, 50, Settings())
+    assert result.runs == int(np.ceil((2 * z(0.95) / np.log(1.5)) ** 2))
+
+
+def test_no_advice_where_there_is_none() -> None:
+    assert equivalence(np.zeros(30), 3, 1, Settings()).runs is None
+    near = equivalence(np.full(5, 1.0), 1, 1, Settings(detect=1.0001))
+    assert near.runs is None
+
+
+def test_what_may_be_conservative_is_far_from_the_end() -> None:
+    """One-sided, a ratio of .7 is farther from 1.5 than one of 1; it is no fault, and takes fewer runs to show."""
+    z, means = stats.norm.ppf, means_of(np.random.default_rng(28), 40)
+    result = equivalence(0.7 * means / means.mean(), 3, 1, Settings(allow="conservative", power=0.999))
+    assert result.runs == int(np.ceil(2 / 3 * (2 * z(0.999) / np.log(1.5 / 0.7)) ** 2))
+
+
+# --- by betting, and of innovations -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ratio", [0.85, 1.1])
+@pytest.mark.parametrize("allow", [None, "conservative"])
+def test_by_betting(allow: str | None, ratio: float) -> None:
+    """The e-process of Y / d against 'none is too large', that of Y d against 'none is too small'."""
+    means, d = means_of(np.random.default_rng(29), 60, 20.0, ratio), 1.6
+    result = equivalence_by_betting(means, 3, Settings(detect=d, allow=allow))
+    too_large, too_small = ever(e_process(means / d, 3).down), ever(e_process(means * d, 3).up)
+    assert (too_large < too_small) == (ratio < 1)
+    assert result.p_value == pytest.approx(too_large if allow else max(too_large, too_small))
+    assert (result.factor, result.level, result.runs) == (d, pytest.approx(0.05), None)
+
+
+def test_of_innovations() -> None:
+    rng = np.random.default_rng(31)
+    d, total = 1.2, float((1.05 * rng.chisquare(2, (10, 20))).sum())
+    expected = stats.chi2.cdf(total / d, 400), stats.chi2.sf(total * d, 400)
+    both = equivalence_of_total(total, 400, Settings(), d)
+    assert both.p_value == pytest.approx(max(expected), rel=1e-9)
+    one = equivalence_of_total(total, 400, Settings(allow="conservative", power=0.9), d)
+    assert one.p_value == pytest.approx(expected[0], rel=1e-9)
+    assert one.level == pytest.approx(0.1)
+    nothing = equivalence_of_total(float("nan"), 0, Settings(), d)
+    assert np.isnan(nothing.p_value)
+    assert not nothing.shown
+
+
+# --- in a verdict ---------------------------------------------------------------------------------------
+
+
+def test_consistent_is_shown_and_nothing_else() -> None:
+    rng = np.random.default_rng(32)
+    many = verdict_on(independent(rng, 60, 10, 3), false_alarm=SURE)
+    assert many.status == "consistent"
+    assert many.equivalence.shown
+    narrow = verdict_on(independent(rng, 60, 10, 3), false_alarm=SURE, detect=1.001)
+    assert narrow.status == "undecided"
+    assert not narrow.equivalence.shown
+    assert narrow.faults == ()
+
+
+def test_a_single_honest_log_is_undecided() -> None:
+    rng = np.random.default_rng(33)
+    verdict = verdict_on(independent(rng, 1, 300, 3), false_alarm=SURE)
+    assert verdict.status == "undecided"
+    assert verdict.faults == ()
+    assert "1 run does not show" in verdict.reasons[0]
+
+
+def test_nothing_is_shown_by_innovations_that_are_not_judged() -> None:
+    rng = np.random.default_rng(34)
+    nis, dof = rng.chisquare(2, (40, 50)), np.full((40, 50), 2)
+    assert judge(Evidence("f", nis=nis, nis_dof=dof), Settings(SURE)).status == "undecided"
+    optimal = judge(Evidence("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE))
+    assert optimal.status == "consistent"
+    assert judge(Evidence("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE, 1.0001)).status == "undecided"
+
+
+def test_innovations_of_nearly_the_stated_size_are_tolerated() -> None:
+    """4 % too small in 40,000 innovations is found, shown to lie within 1.1 and not within 1.02; no chance in it."""
+    nis = 1.04 * stats.chi2.ppf((np.random.default_rng(0).permutation(40_000) + 0.5) / 40_000, 2).reshape(400, 100)
+    evidence = Evidence("f", nis=nis, nis_dof=np.full(nis.shape, 2), optimal_gain=True)
+    assert judge(evidence).status == "overconfident"
+    verdict = judge(evidence, Settings(tolerance=1.1))
+    assert (verdict.status, verdict.faults) == ("consistent", ())
+    assert [a.question for a in verdict.answers if a.tolerated] == ["innovation scale"]
+    assert judge(evidence, Settings(tolerance=1.02)).status == "overconfident"
+    assert not judge(replace(evidence, optimal_gain=False), Settings(tolerance=1.1)).answers
+
+
+# --- runs that a verdict takes, from a few runs ---------------------------------------------------------------
+
+
+def pilot(runs: int = 40, nu: float = 20.0, seed: int = 91) -> Array:
+    return np.random.default_rng(seed).chisquare(nu, runs) / nu
+
+
+def chi_square_power(k: float, ratio: float, tail: float) -> float:
+    """Of a test of ratio times chi-square(k), at the side of ``ratio``."""
+    if ratio > 1:
+        return float(stats.chi2.sf(stats.chi2.ppf(1 - tail, k) / ratio, k))
+    return float(stats.chi2.cdf(stats.chi2.ppf(tail, k) / ratio, k))
+
+
+@pytest.mark.parametrize(
+    ("detect", "allow"), [(1.2, None), (1.5, None), (0.67, None), (1.2, "conservative"), (1.5, "conservative")]
+)
+def test_by_hand(detect: float, allow: str | None) -> None:
+    """The least N with the power, at half of the rate and the pilot's nu, times 1.15 and rounded up."""
+    means, dof, false_alarm, power = pilot(), 3, 0.04, 0.9
+    test = scale_test(means / means.mean(), dof, 60)
+    tail = 0.02 if allow else 0.01
+    runs = 1
+    while chi_square_power(runs * test.effective_dof, detect, tail) < power:
+        runs += 1
+    plan = pilot_plan(means, dof, 60, detect, false_alarm, power, allow)
+    assert plan.runs == max(20, int(np.ceil(1.15 * runs)))
+    assert plan.pilot_runs == 40
+    assert plan.effective_dof == pytest.approx(test.effective_dof)
+    assert plan.standard_error == pytest.approx(np.sqrt(2.0 / test.spread))
+    assert 0.0 < plan.standard_error < 1.0
+    assert plan.effective_dof > dof
+
+
+def test_never_more_than_without_a_pilot() -> None:
+    """A pilot whose runs spread as one step does: the plan of the worst case, and no margin on it."""
+    means = pilot(30, 3.0, 92)
+    plan = pilot_plan(means, 3, 60, 1.5)
+    assert plan.effective_dof == 3.0
+    assert plan.standard_error == 0.0
+    assert plan.runs == gate_runs(3, 1.5)
+    assert pilot_plan(means, 3, 60, 1.5, allow="conservative").runs == gate_runs(3, 1.5, allow="conservative")
+    assert gate_runs(3, 1.5, allow="conservative") < gate_runs(3, 1.5)
+
+
+def test_the_scale_of_the_pilot_does_not_matter() -> None:
+    """Many pilots: one that is overconfident by 4 is planned for as a right one is."""
+    for seed in range(20):
+        means = pilot(seed=seed)
+        plans = {c: pilot_plan(c * means, 3, 60, 1.2).runs for c in (0.25, 1.0, 4.0)}
+        assert len(set(plans.values())) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"means": np.ones(19)}, "a pilot needs at least 20 runs, got 19"),
+        ({"detect": 1.0}, "ratio must be positive and not 1"),
+        ({"detect": -2.0}, "ratio must be positive"),
+        ({"detect": 1.000001}, "more than"),
+        ({"false_alarm": 0.0}, "false_alarm must lie between"),
+        ({"power": 1.0}, "power must lie between"),
+        ({"dof": 0}, "dof must be at least 1"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        pilot_plan(**{"means": pilot(), "dof": 3, "steps": 60, "detect": 1.5, **options})
+
+
+def test_power_of_fractional_degrees_of_freedom() -> None:
+    """nu is no whole number; between its neighbours."""
+    low, middle, high = (power_of(nu, 50, 1.2, 0.05) for nu in (7.0, 7.5, 8.0))
+    assert low < middle < high
+    assert required_runs(8.0, 1.2) < required_runs(7.5, 1.2) < required_runs(7.0, 1.2)
+    assert middle == pytest.approx(chi_square_power(50 * 7.5, 1.2, 0.025))

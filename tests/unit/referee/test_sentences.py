@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from draws import fully_dependent, identities, independent, verdict_on
+from draws import fully_dependent, identities, independent
 from scipy import stats
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
@@ -96,7 +96,6 @@ def test_opposite_axes_are_inconsistent(rng: np.random.Generator, factors: tuple
     said = re.search(
         rf"too small by x([\d.]+) \[[^]]+\] in {small}, (?:.*, )?too large by x([\d.]+) \[[^]]+\]", sentence
     )
-    assert said is not None, sentence
     assert float(said[1]) == pytest.approx(max(factors), rel=0.1)
     assert float(said[2]) == pytest.approx(1.0 / min(factors), rel=0.1)
     assert float(re.search(rf"\(ratio ([\d.]+)\) in {large}", sentence)[1]) == pytest.approx(min(factors), rel=0.1)  # type: ignore[index]
@@ -118,7 +117,6 @@ def test_an_axis_that_decides_stands_beside_the_status(
         assert "decided by" not in dict(rows(verdict))
         assert isinstance(cell, Quantity)
         return
-    assert verdict.axes is not None
     interval = verdict.axes.inflation[axis]
     assert verdict.axis == (axis, interval)
     assert verdict.statistics["axis"] == axis
@@ -134,7 +132,6 @@ def test_few_large_errors_do_not_hide_that_the_mean_is_small(times: float, statu
     few, most = (stats.chi2.ppf((np.arange(runs) + 0.5) / runs, 2) for runs in (15, 135))
     nees = 0.36 * np.concatenate([most, times * few])[:, None]
     verdict = judge(Evidence("f", nees=nees, dof=2), Settings(0.01))
-    assert verdict.scale is not None
     assert (verdict.scale.inflation.high < 1.0) == (status == "inconsistent")
     assert verdict.status == status
     if status == "inconsistent":
@@ -152,13 +149,6 @@ def test_an_axis_nearer_to_one_than_the_whole_leaves_it_overconfident(rng: np.ra
     )
 
 
-def test_both_sides_are_named_of_many_axes(rng: np.random.Generator) -> None:
-    verdict = verdict_on(independent(rng, 200, 20, 6) * np.sqrt([1.9, 1.8, 1.7, 1.6, 0.2, 0.2]), false_alarm=SURE)
-    assert verdict.status == "inconsistent"
-    assert verdict.reasons[0].count("too small by") == 2
-    assert verdict.reasons[0].count("too large by") == 1
-
-
 # --- correlations --------------------------------------------------------------------------------------------
 
 
@@ -171,7 +161,6 @@ def test_a_correlation_of_the_wrong_sign_is_called_that(rng: np.random.Generator
     assert verdict.status == "inconsistent"
     sentence = verdict.reasons[0]
     said = re.search(r"correlation of the wrong sign: ([+-][\d.]+), stated ([+-][\d.]+), of x and y; no axis", sentence)
-    assert said is not None, sentence
     assert float(said[1]) == pytest.approx(-stated, abs=0.08)
     assert float(said[2]) == stated
     assert "too small" not in sentence
@@ -243,9 +232,7 @@ def test_the_axes_that_are_named_err_as_the_whole(rng: np.random.Generator) -> N
     """Else one is the main axis of a covariance that is too small, and twelve times too large itself."""
     error, S = correlated(rng, 0.1, -0.99, n=3)
     verdict = judged(error, S * np.sqrt(np.outer([12.0, 12.0, 1.0], [12.0, 12.0, 1.0])))
-    assert verdict.scale is not None
     assert verdict.scale.inflation.low > 1.0
-    assert verdict.location is not None
     assert verdict.location.subset is None
     assert verdict.status == "inconsistent"
 
@@ -276,7 +263,6 @@ def test_the_larger_side_comes_first(rng: np.random.Generator) -> None:
     error[:, 10] *= 0.68
     error[:, 40:43] *= 2.2
     verdict = judged(error)
-    assert verdict.location is not None
     steps = replace(verdict, location=replace(verdict.location, lasting=False), status="overconfident")
     said = scale_text(steps, {"scale in some step": steps.answers[0]})
     worst = np.square(error).mean(axis=(0, 2)).max()
@@ -291,7 +277,6 @@ def test_no_factor_to_the_other_side(rng: np.random.Generator, late: float, stat
     error = independent(rng, 60, 20, 3) * np.sqrt(0.5 if status == "conservative" else 2.0)
     verdict = judged(error)
     assert verdict.status == status
-    assert verdict.scale is not None
     contrary = replace(verdict, scale=replace(verdict.scale, inflation=Interval(late, 0.9 * late, 1.1 * late)))
     sentence = reasons(contrary)[0]
     ratio = verdict.scale.mean_anees / 3
@@ -306,7 +291,6 @@ def test_a_bias_in_a_step_has_a_size(rng: np.random.Generator) -> None:
     error = independent(rng, 100, 30, 3)
     error[:, 11, 1] -= 2.0
     verdict = judged(error)
-    assert verdict.bias is not None
     assert verdict.bias.size == pytest.approx(float(error[:, 11, 1].mean()))
     assert f"biased: mean error {verdict.bias.size:+.2f} sigma in y, in step 12" in verdict.reasons[0]
     assert verdict.statistics["bias_in_step"] == verdict.bias.size
@@ -314,7 +298,6 @@ def test_a_bias_in_a_step_has_a_size(rng: np.random.Generator) -> None:
 
 def test_a_bias_of_no_axis_is_in_a_combination(rng: np.random.Generator) -> None:
     verdict = judged(fully_dependent(rng, 60, 4, 2) + 2.0)
-    assert verdict.bias is not None
     none = replace(verdict, bias=replace(verdict.bias, by_axis={}))
     assert bias_text(none, False).startswith("mean error in a combination of axes; without the bias")
 

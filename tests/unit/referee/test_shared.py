@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import consistency
 from recorded import read_recordings
 from scipy.linalg import block_diag
 
 import consistency as cs
-from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, judge
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import (
     KINDS,
@@ -55,8 +55,6 @@ def test_what_is_shared_is_found_and_taken_off(kind: str) -> None:
     other = drives(kind, rng)
     rest = without_shared(other, fit, kind)
     g = growth(other, kind)
-    assert rest.error is not None
-    assert other.error is not None
     np.testing.assert_allclose(rest.error, other.error - g[..., None] * fit.mean)
     step = np.asarray(rest.covariance)[3, 4]
     np.testing.assert_allclose(step, P + g[3, 4] ** 2 * fit.covariance + np.diag(fit.floor**2))
@@ -67,7 +65,6 @@ def test_the_fit_is_that_of_the_whole_gaussian() -> None:
     """Theta given all errors by the joint covariance of everything, with the fitted floor; steps count as one."""
     record = drives("by-time", np.random.default_rng(), runs=3)
     fit = fit_record(record, "by-time")
-    assert record.error is not None
     g = growth(record, "by-time")
     there = g.ravel() > 0
     e, J = record.error.reshape(-1, N)[there], np.kron(g.ravel()[there][:, None], np.eye(N))
@@ -115,7 +112,6 @@ def table(path: Path, errors: Array, t: Array, stated: bool) -> str:
 
 def written(folder: Path, name: str, kind: str, runs: int, seed: int) -> tuple[str, str]:
     record = drives(kind, np.random.default_rng(seed), runs)
-    assert record.error is not None
     truth = table(folder / f"{name}-truth.csv", 0.0 * record.error, record.t, False)
     return table(folder / f"{name}.csv", -record.error, record.t, True), truth
 
@@ -124,10 +120,7 @@ def test_one_command_with_other_drives(tmp_path: Path, capsys: pytest.CaptureFix
     est, truth = written(tmp_path, "new", "by-time", 40, 1)
     old, old_truth = written(tmp_path, "old", "by-time", 200, 2)
     options = ["--truth", truth, "--state", "a,b,c", "--shared", "by-time"]
-    with pytest.raises(SystemExit) as end:
-        main(["analyse", est, *options, "--shared-from", old, "--shared-truth", old_truth])
-    assert not end.value.code
-    out, err = capsys.readouterr()
+    out, err = consistency(capsys, "analyse", est, *options, "--shared-from", old, "--shared-truth", old_truth)
     assert "errors that all share, fitted to other drives: a 0.5" in " ".join(err.split())
     assert "with the errors that all share taken off, and a floor, as fitted to other drives; a bias is not asked" in (
         " ".join(out.split())
@@ -143,7 +136,6 @@ def test_halves_of_one_log_decide_nothing(tmp_path: Path) -> None:
     for runs, kept in ((1, (1, STEPS // 2)), (10, (5, STEPS))):
         est, truth = written(tmp_path, "log", "by-vector", runs, 3)
         [record] = read_recordings(Path(est), Path(truth), state=["a", "b", "c"], shared="by-vector")
-        assert record.error is not None
         assert record.error.shape[:2] == kept
         assert (record.unshown == ONE_LOG) == (runs == 1)
         plain = cs.read(est, truth=truth, state=["a", "b", "c"])
@@ -152,7 +144,6 @@ def test_halves_of_one_log_decide_nothing(tmp_path: Path) -> None:
         np.testing.assert_allclose(record.error, without_shared(rest, fit, "by-vector").error)
         assert rest.error is not None
         assert first.error is not None
-        assert plain.error is not None
         np.testing.assert_array_equal(np.concatenate([first.error, rest.error], axis=int(runs == 1)), plain.error)
         verdict = cs.judge(record)
         assert runs > 1 or (verdict.status == "undecided" and ONE_LOG in verdict.reasons[0])

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from draws import autoregression
 
 import consistency as cs
 from consistency.referee.diagnostics import gate_runs
@@ -32,9 +33,7 @@ def sample(
     """Errors that follow each other (AR(1), 0.8), and covariances that are theirs over ``true``; of mixed units."""
     A = rng.normal(size=(n, n)) + 2.0 * np.eye(n)
     A[0] *= 1e-3
-    z = rng.normal(size=(runs, steps, n))
-    for k in range(1, steps):
-        z[:, k] = 0.8 * z[:, k - 1] + 0.6 * z[:, k]
+    z = autoregression(rng, runs, steps, n, 0.8)
     P = np.broadcast_to(A @ A.T / true, (runs, steps, n, n))
     return z @ A.T, 0.5 * (P + np.swapaxes(P, -1, -2))
 
@@ -54,7 +53,6 @@ def test_a_wrong_scale_does_not(rng: np.random.Generator, true: float, status: s
     with pytest.raises(ConsistencyError) as caught:
         assert_consistent(*sample(rng, true=true), false_alarm=RARE, name="mine")
     verdict = caught.value.verdict
-    assert verdict is not None
     assert (verdict.status, verdict.filter) == (status, "mine")
     assert verdict.p_value <= RARE
     assert "scale" in verdict.faults
@@ -66,15 +64,6 @@ def test_a_wrong_scale_does_not(rng: np.random.Generator, true: float, status: s
     assert lines[1:] == [f"  - {reason}" for reason in verdict.reasons[1:]]
 
 
-def test_a_bias_does_not(rng: np.random.Generator) -> None:
-    errors, covariances = sample(rng)
-    sigma = np.sqrt(covariances[0, 0, 1, 1])
-    with pytest.raises(ConsistencyError, match="biased") as caught:
-        assert_consistent(errors + np.array([0.0, 1.5 * sigma, 0.0]), covariances, false_alarm=RARE)
-    assert caught.value.verdict is not None
-    assert "bias" in caught.value.verdict.faults
-
-
 def test_a_covariance_too_large_can_be_allowed(rng: np.random.Generator) -> None:
     errors, covariances = sample(rng, true=1 / 3)
     assert assert_consistent(errors, covariances, allow="conservative", false_alarm=RARE).consistent
@@ -82,28 +71,9 @@ def test_a_covariance_too_large_can_be_allowed(rng: np.random.Generator) -> None
         assert_consistent(errors, covariances / 9.0, allow="conservative", false_alarm=RARE)
 
 
-def test_nees_alone(rng: np.random.Generator) -> None:
-    errors, covariances = sample(rng)
-    nees = cs.nees(errors, covariances)
-    assert assert_consistent(nees=nees, dof=3, false_alarm=RARE).consistent
-    with pytest.raises(ConsistencyError):
-        assert_consistent(nees=3.0 * nees, dof=3, false_alarm=RARE)
-
-
 def test_a_subset_is_looked_at(rng: np.random.Generator) -> None:
     verdict = assert_consistent(*sample(rng), false_alarm=RARE, subsets={"first two": [0, 1]}, method="bonferroni")
     assert "first two" in verdict.statistics["groups"]
-
-
-@pytest.mark.parametrize("n", [2, 3])
-def test_as_many_runs_as_components(rng: np.random.Generator, n: int) -> None:
-    """(runs, n) beside (runs, n, n) with runs = n is one matrix of right-hand sides to ``solve``; not here."""
-    errors, covariances = sample(rng, runs=n, n=n)
-    verdict = assert_consistent(errors, covariances, false_alarm=RARE, detect=1e6)
-    expected = np.mean(
-        [[e @ np.linalg.inv(P) @ e for e, P in zip(*run, strict=True)] for run in zip(errors, covariances, strict=True)]
-    )
-    assert verdict.statistic == pytest.approx(expected, rel=1e-9)
 
 
 # --- innovations -----------------------------------------------------------------------------------
@@ -129,10 +99,8 @@ def test_innovations_beside_errors(rng: np.random.Generator) -> None:
     S, v = np.ones((RUNS, 12, 1, 1)), 2.0 * rng.normal(size=(RUNS, 12, 1))
     with pytest.raises(ConsistencyError) as caught:
         assert_consistent(*sample(rng), innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
-    assert caught.value.verdict is not None
     assert caught.value.verdict.faults == ("innovation scale",)
     verdict = assert_consistent(*sample(rng), innovations=v, innovation_covariances=S, false_alarm=RARE)
-    assert verdict.innovations is not None
     assert not verdict.innovations.judged
     assert verdict.innovations.ratio > 3.0
 
@@ -151,7 +119,6 @@ def test_too_few_runs_do_not_pass(rng: np.random.Generator) -> None:
     with pytest.raises(InsufficientTrials) as caught:
         assert_consistent(errors, covariances, false_alarm=RARE)
     assert (caught.value.needed, caught.value.runs) == (RUNS, 5)
-    assert caught.value.verdict is not None
     assert caught.value.verdict.status == "undecided"
     assert f"consistency plan --dof 3 --detect 1.5 --false-alarm {RARE} --power 0.95" in str(caught.value)
     assert "5 runs do not show the covariance ratio" in str(caught.value)
@@ -170,11 +137,6 @@ def test_a_small_fault_can_be_tolerated(rng: np.random.Generator) -> None:
         assert_consistent(errors, covariances, false_alarm=RARE, tolerance=1.1)
     with pytest.raises(ValueError, match="tolerance must be"):
         assert_consistent(errors, covariances, tolerance=-1.0)
-
-
-def test_a_fault_is_a_fault_in_few_runs_too(rng: np.random.Generator) -> None:
-    with pytest.raises(ConsistencyError):
-        assert_consistent(*sample(rng, runs=5, true=100.0), false_alarm=RARE)
 
 
 def test_the_defaults_are_those_of_the_documentation(rng: np.random.Generator) -> None:
@@ -227,31 +189,13 @@ def test_a_run_that_is_no_estimate_has_failed(what: str, reason: str, rng: np.ra
     with pytest.raises(ConsistencyError, match=match) as caught:
         assert_consistent(errors, covariances, false_alarm=RARE, name="mine")
     verdict = caught.value.verdict
-    assert verdict is not None
     assert [(f.filter, f.run, f.step) for f in verdict.failures] == [("mine", 4, 7)]
-    assert verdict.scale is not None
     assert verdict.scale.alive.tolist() == [RUNS] * 6 + [RUNS - 1] * 2
-    assert verdict.lost is not None
     assert (verdict.lost.count, verdict.lost.runs) == (1, RUNS)
     with pytest.raises(ConsistencyError, match=r"1 runs failed, of the reference 0"):
         assert_not_worse(errors, covariances, *spoilt("", rng, RUNS), false_alarm=RARE)
     right = spoilt("", rng, RUNS)
     assert not assert_not_worse(*right, *(part.copy() for part in spoilt(what, rng, RUNS)), detect=9.0).worse
-
-
-def test_a_fault_is_found_beside_failed_runs(rng: np.random.Generator) -> None:
-    errors, covariances = spoilt("error", rng, RUNS)
-    with pytest.raises(ConsistencyError, match="overconfident: covariance too small by x") as caught:
-        assert_consistent(3.0 * errors, covariances, false_alarm=RARE)
-    assert f"1 of {RUNS} runs failed" in str(caught.value)
-
-
-def test_a_known_start_is_no_failure(rng: np.random.Generator) -> None:
-    errors, covariances = spoilt("", rng, RUNS)
-    covariances[:, 0], covariances[:, 1, 2] = 0.0, 0.0
-    verdict = assert_consistent(errors, covariances, false_alarm=RARE)
-    assert verdict.left_out_steps == (1, 2)
-    assert not verdict.failures
 
 
 def test_nees_of_a_failed_run(rng: np.random.Generator) -> None:
@@ -270,9 +214,7 @@ def test_innovations_end_with_a_failed_run(rng: np.random.Generator) -> None:
     S[4, 7], v[4, 7, 0] = -1.0, np.nan
     for step, arrays in ((7, {"nis": nis, "nis_dof": 2}), (8, {"innovations": v, "innovation_covariances": S})):
         record = checked("f", errors, covariances, **arrays)
-        assert record.nis is not None
         assert np.isnan(record.nis[4]).tolist() == [False] * 6 + [True] * 2
-        assert record.nis_dof is not None
         assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
         with pytest.raises(ConsistencyError, match="1 of"):
             assert_consistent(errors, covariances, **arrays, false_alarm=RARE)
@@ -286,7 +228,6 @@ def test_innovations_of_a_start_without_rank(rng: np.random.Generator) -> None:
     S[:, 0] = 0.0
     record = checked("f", innovations=v, innovation_covariances=S, **OPTIMAL)
     assert record.failures == ()
-    assert record.innovations is not None
     assert np.isnan(record.innovations[:, 0]).all()
     assert np.isfinite(record.innovations[:, 1:]).all()
     S[:, 0], S[6, 0] = np.eye(2), 0.0
@@ -320,14 +261,11 @@ def test_runs_fail_by_their_innovations(what: str, reason: str, rng: np.random.G
     with pytest.raises(ConsistencyError, match=f"2 of 40 runs failed, first run 4 in step 7: {reason}") as caught:
         assert_consistent(innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
     verdict = caught.value.verdict
-    assert verdict is not None
     assert verdict.status == "failed"
-    assert verdict.innovations is not None
     assert verdict.innovations.dof == 2 * (40 * 50 - 2 * 44) - 80 * (what == "masked")
     assert verdict.innovations.ratio == pytest.approx(1.0, abs=0.2)  # of the rest; 6 standard errors
     errors, covariances = spoilt("", rng, 40)
     own = checked("f", errors, covariances, innovations=v[:, :8], innovation_covariances=S[:, :8])
-    assert own.nees is not None
     assert np.isnan(own.nees).sum(axis=1).tolist() == [2 * (run in (4, 9)) for run in range(40)]
     assert [(each.run, each.step) for each in own.failures] == [(4, 7), (9, 7)]
 
@@ -337,7 +275,6 @@ def test_nis_count_nothing_from_the_failure_of_their_run_on(rng: np.random.Gener
     nis[4, 6] = np.nan
     record = checked("f", nis=nis, nis_dof=2, optimal_gain=True)
     assert [(each.run, each.step) for each in record.failures] == [(4, 7)]
-    assert record.nis_dof is not None
     assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
     assert (np.delete(record.nis_dof, 4, axis=0) == 2).all()
 
@@ -351,8 +288,6 @@ def test_a_run_fails_where_anything_of_it_failed_first(rng: np.random.Generator)
         (3, 8, True),
         (4, 3, True),
     ]
-    assert record.error is not None
-    assert record.nis_dof is not None
     assert np.isfinite(record.error[4]).all(axis=-1).tolist() == [True] * 2 + [False] * 6
     assert record.nis_dof[[3, 4]].tolist() == [[1] * 7 + [0], [1] * 2 + [0] * 6]
 
@@ -373,7 +308,6 @@ def test_misuse_of_innovations_is_no_failed_run(rng: np.random.Generator) -> Non
     known[:, 0] = 0.0  # a start that is known exactly, and a measurement without noise
     record = checked("f", innovations=v, innovation_covariances=known, optimal_gain=True)
     assert record.failures == ()
-    assert record.nis_dof is not None
     assert record.nis_dof[0].tolist() == [0] + [2] * 7
 
 
@@ -393,13 +327,6 @@ def test_misuse_is_no_failed_run(rng: np.random.Generator) -> None:
         assert_consistent(errors[[0, 1, 1]], covariances[:3])
     with pytest.raises(ValueError, match="not positive definite"):
         cs.nees(errors[0, 0], -covariances[0, 0])
-
-
-def test_nearly_symmetric_is_symmetric(rng: np.random.Generator) -> None:
-    errors, covariances = spoilt("", rng)
-    covariances[4, 6, 0, 1] = 1e-9
-    with pytest.raises(InsufficientTrials):  # judged, that is; false-alarm rate 1e-6
-        assert_consistent(errors, covariances, false_alarm=RARE)
 
 
 E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3), (4, 2, 3, 3))
@@ -452,19 +379,12 @@ def test_unusable_arguments_say_what_is_wrong(arguments: dict[str, Any], said: s
 # --- two filters -----------------------------------------------------------------------------------
 
 
-def test_a_filter_is_not_worse_than_itself(rng: np.random.Generator) -> None:
-    data = sample(rng)
-    assert not assert_not_worse(*data, *data, false_alarm=RARE).worse  # p is 1: no chance in it
-
-
 @pytest.mark.parametrize("true", [2.0, 0.5])
 def test_a_less_consistent_filter_is_worse(rng: np.random.Generator, true: float) -> None:
     errors, covariances = sample(rng)
     with pytest.raises(ConsistencyError, match="worse than the reference: mean NEES") as caught:
         assert_not_worse(errors, covariances / true, errors, covariances, false_alarm=RARE, name="new")
-    assert caught.value.comparison is not None
     assert caught.value.comparison.worse
-    assert caught.value.verdict is not None
     assert caught.value.verdict.filter == "new"
     nees = cs.nees(errors, covariances)
     with pytest.raises(ConsistencyError):
@@ -507,7 +427,6 @@ def stereo() -> cs.Results:
 def test_results_are_judged_as_by_analyse(stereo: cs.Results) -> None:
     with pytest.raises(ConsistencyError) as caught:
         assert_consistent(stereo, filter="ekf-xyz", false_alarm=0.05)
-    assert caught.value.verdict is not None
     assert caught.value.verdict.reasons == cs.analyse(stereo)["ekf-xyz"].reasons
     assert caught.value.verdict.status == "overconfident"
 

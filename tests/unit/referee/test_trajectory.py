@@ -37,21 +37,18 @@ def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> 
 
 
 def ellipses(one: Evidence) -> list[Line]:
-    figure = trajectory(one, 0)
-    assert figure is not None
+    figure = trajectory(one)
     (panel,) = figure.panels
     return [mark for mark in panel.marks if isinstance(mark, Line) and mark.look == ELLIPSE]
 
 
 def test_ellipses_stand_where_the_errors_are_largest() -> None:
     one = record()
-    figure = trajectory(one, 0)
-    assert figure is not None
+    figure = trajectory(one)
     (panel,) = figure.panels
     assert (panel.x.label, panel.y.label, panel.equal) == ("x (m)", "z (m)", True)
     found = ellipses(one)
     assert len(found) == MOST
-    assert one.path is not None
     worst = found[0]  # about the estimate of step 11, the 10th from 0
     np.testing.assert_allclose([worst.x[:-1].mean(), worst.y[:-1].mean()], one.path[0, 10, 1][[0, 2]], atol=1e-9)
     (points,) = [mark for mark in panel.marks if isinstance(mark, Points)]
@@ -76,14 +73,12 @@ def test_an_ellipse_holds_95_percent() -> None:
 def test_no_ellipse_of_errors_about_other_axes() -> None:
     one = record("left")
     assert not ellipses(one)
-    figure = trajectory(one, 0)
-    assert figure is not None
+    figure = trajectory(one)
     assert figure.caption.endswith("No ellipses: the stated covariance is not about the axes of the world.")
 
 
 def test_only_what_is_judged_is_drawn() -> None:
-    figure = trajectory(record(axes=("x", "y")), 0)
-    assert figure is not None
+    figure = trajectory(record(axes=("x", "y")))
     assert figure.panels[0].y.label == "y (m)"
     assert trajectory(record(axes=("z",)), 0) is None
     bare = record()
@@ -111,8 +106,6 @@ def write(folder: Path, steps: int = 40) -> tuple[Path, Path]:
 
 def test_readers_keep_the_path_for_the_pictures(tmp_path: Path) -> None:
     (one,) = read_recordings(*write(tmp_path))
-    assert one.path is not None
-    assert one.error is not None
     np.testing.assert_allclose(one.path[..., 0, :] - one.path[..., 1, :], one.error[..., :3], atol=1e-12)
     v = cs.judge(one)
     titles = [figure.title for figure in record_figures(one, v)]
@@ -121,7 +114,6 @@ def test_readers_keep_the_path_for_the_pictures(tmp_path: Path) -> None:
     assert any(panel.alt == "Trajectory of est" and panel.keys for panel in sheet.panels)
     assert one.of_runs(slice(0, 1)).path is not None
     (pieces,) = read_recordings(*write(tmp_path), split="20")
-    assert pieces.path is not None
     np.testing.assert_array_equal(pieces.path.reshape(-1, 2, 3), one.path[0])
 
 
@@ -130,6 +122,5 @@ def test_tables_keep_it_too(tmp_path: Path) -> None:
     (tmp_path / "est.csv").write_text("t,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh\n" + rows)
     (tmp_path / "truth.csv").write_text("t,x,y,heading\n" + "".join(f"{k},{k + 1},{2 * k},0.1\n" for k in range(1, 9)))
     (one,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
-    assert one.path is not None
     np.testing.assert_array_equal(one.path[0, 3], [[5.0, 8.0], [4.0, 8.0]])
     assert trajectory(one, 0) is not None

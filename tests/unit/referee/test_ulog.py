@@ -9,9 +9,9 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from command import consistency
 from scipy import stats
 
-from consistency.referee.cli import main
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch
@@ -217,10 +217,7 @@ def test_one_command_from_a_flight_to_a_picture(tmp_path: Path, capsys: pytest.C
     """False-alarm rate 1e-3 of the mission is the tool's; here the innovations are their own quantiles."""
     values = np.sqrt(stats.chi2.ppf((np.arange(200) * 77 % 200 + 0.5) / 200, 1))[:, None]
     path = flight(values, np.ones((200, 1)), "baro_vpos").write(tmp_path / "a.ulg")
-    with pytest.raises(SystemExit) as end:
-        main(["monitor", str(path), "--innovations", "optimal", "--plot", str(tmp_path / "a.png")])
-    assert not end.value.code
-    out, err = capsys.readouterr()
+    out, err = consistency(capsys, "monitor", path, "--innovations", "optimal", "--plot", tmp_path / "a.png")
     assert "baro_vpos" in out
     assert "no alarm" in out
     assert "200 innovations in 200 messages" in err

@@ -9,11 +9,11 @@ from pathlib import Path
 import calibration_truth
 import numpy as np
 import pytest
+from command import consistency, refused
+from draws import autoregression
 from recorded import read_recordings
-from scipy import stats
 
 import consistency as cs
-from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
     contrasts,
@@ -21,7 +21,6 @@ from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
     uncertain_truth,
     upper_weights,
 )
-from consistency.referee.diagnostics.questions.shape import weighted_chi_square_tail
 from consistency.referee.document.drawing import Line
 from consistency.referee.pages.files_report import record_figures
 from consistency.referee.types import Array
@@ -45,18 +44,11 @@ def truth_of_share(s: float) -> Array:
     return low * Q
 
 
-def autoregressive(rng: np.random.Generator, rho: float, shape: tuple[int, int, int]) -> Array:
-    w = rng.standard_normal(shape)
-    for k in range(1, shape[1]):
-        w[:, k] = rho * w[:, k - 1] + np.sqrt(1.0 - rho**2) * w[:, k]
-    return w
-
-
 def errors_of_truth(rng: np.random.Generator, kind: str, runs: int, steps: int) -> Array:
     if kind == "white":
         return rng.standard_normal((runs, steps, N))
     if kind == "AR":
-        return autoregressive(rng, 0.9, (runs, steps, N))
+        return autoregression(rng, runs, steps, N, 0.9)
     shape = (1 if kind in ("common", "signs") else runs, 1, N)
     v = np.broadcast_to(rng.standard_normal(shape), (runs, steps, N))
     return v * rng.choice([-1.0, 1.0], (runs, 1, 1)) if kind == "signs" else v
@@ -68,7 +60,7 @@ def record(
 ) -> Evidence:  # fmt: skip
     """Errors of a filter whose covariance is wrong by ``ratio``, against a truth of the share s."""
     of_truth = truth_of_share(s)
-    e = np.sqrt(ratio) * autoregressive(rng, 0.5, (runs, steps, N)) @ np.linalg.cholesky(P).T
+    e = np.sqrt(ratio) * autoregression(rng, runs, steps, N, 0.5) @ np.linalg.cholesky(P).T
     d = e + errors_of_truth(rng, kind, runs, steps) @ np.linalg.cholesky(of_truth).T
     shape = (runs, steps, N, N)
     return Evidence(
@@ -92,28 +84,10 @@ def test_a_right_filter_is_rarely_at_fault(kind: str, errors: str | None) -> Non
     assert sum(bool(v.faults) for v in found) <= 12
 
 
-@pytest.mark.parametrize("kind", DECLARED)
-@pytest.mark.parametrize(("ratio", "status"), [(2.0, "overconfident"), (0.5, "conservative")])
-def test_a_wrong_covariance_is_found_where_the_errors_are_declared(kind: str, ratio: float, status: str) -> None:
-    """At s = .2 and 50 runs; `benchmarks/calibration_truth.py` found it in 100 of 100."""
-    found = verdicts(kind, 0.2, ratio, DECLARED[kind], 20, 20260102)
-    assert sum(v.status == status for v in found) >= 18
-
-
-def test_a_wrong_covariance_is_found_without_a_declaration() -> None:
-    """Whatever the truth does, at s = .2 and 50 runs. Of ratios of 2 and 0.5, 71 and 97 of 100 are found at least."""
-    for kind in ("white", "common", "signs"):
-        small = verdicts(kind, 0.2, 3.0, None, 20, 20260103)
-        assert sum(v.status == "overconfident" for v in small) >= 15
-        large = verdicts(kind, 0.2, 0.4, None, 20, 20260104)
-        assert sum(v.status == "conservative" for v in large) >= 15
-
-
 def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherwise() -> None:
     """The error that all runs share has s = .3: an honest filter is biased if the truth is said to be independent."""
     rng = np.random.default_rng(5)
     one = record(rng, "common", 0.3, errors="independent")
-    assert one.error is not None
     wrong = judge(Evidence("est", one.error + 1.5, one.covariance, truth_covariance=one.truth_covariance,
                            truth_errors="independent"))  # fmt: skip
     assert "bias" in wrong.faults
@@ -124,13 +98,11 @@ def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherw
 def test_a_bias_beyond_the_truth_is_found(errors: str | None) -> None:
     rng = np.random.default_rng(8)
     one = record(rng, "common", 0.2, errors=errors)
-    assert one.error is not None
     far = 6.0 * np.sqrt(np.diag(truth_of_share(0.2)))
     v = judge(Evidence("est", one.error + far, one.covariance, axes=one.axes, truth_covariance=one.truth_covariance,
                        truth_errors=errors))  # fmt: skip
     assert v.status == "biased"
     assert {"bias", "bias in some step"} <= set(v.faults)
-    assert v.bias is not None
     assert min(v.bias.by_axis["x"].value, v.bias.by_axis["y"].value) > 1.0
 
 
@@ -150,13 +122,10 @@ def test_the_ratio_is_that_of_the_estimate() -> None:
     rng = np.random.default_rng(3)
     one = record(rng, "white", 0.499, 2.0, "independent", runs=2000, steps=1)
     v = judge(one)
-    assert v.scale is not None
-    assert v.truth is not None
     assert v.scale.mean_anees / N == pytest.approx(1.5, abs=0.06)
     assert v.scale.inflation.value == pytest.approx(2.0, abs=0.12)
     assert v.truth.share == pytest.approx(0.499, abs=1e-6)
     assert v.scale.inflation.value == pytest.approx((v.scale.mean_anees / N - 0.499) / 0.501, rel=1e-6)
-    assert v.axes is not None
     for axis, interval in v.axes.inflation.items():
         assert interval.low < interval.value < interval.high
         assert v.truth.by_axis[axis] > 0.1
@@ -166,7 +135,6 @@ def test_a_share_of_an_axis_is_of_that_axis() -> None:
     one = record(np.random.default_rng(3), "white", 0.2, 1.0, "independent")
     truth = uncertain_truth(one)
     T = truth_of_share(0.2)
-    assert truth is not None
     assert truth.share("y") == pytest.approx(T[1, 1] / (P + T)[1, 1], rel=1e-9)
     assert truth.share("position" if "position" in truth.by_group else "x") == pytest.approx(T[0, 0] / (P + T)[0, 0])
 
@@ -175,8 +143,6 @@ def test_consistent_needs_the_interval_of_the_estimate() -> None:
     """At s = .45 the sum lies in [1 / 1.5, 1.5] where P is off by x1.7."""
     v = judge(record(np.random.default_rng(1), "white", 0.45, 1.0, "independent", runs=30, steps=1))
     plain = judge(Evidence("est", *_sum(record(np.random.default_rng(1), "white", 0.45, 1.0, runs=30, steps=1))))
-    assert v.equivalence is not None
-    assert plain.equivalence is not None
     assert v.equivalence.p_value > plain.equivalence.p_value
     sure = judge(record(np.random.default_rng(1), "white", 0.2, 1.0, "independent", runs=200))
     assert sure.status == "consistent"
@@ -184,7 +150,6 @@ def test_consistent_needs_the_interval_of_the_estimate() -> None:
 
 def _sum(one: Evidence) -> tuple[Array, Array]:
     assert one.error is not None
-    assert one.truth_covariance is not None
     return one.error, np.asarray(one.covariance) + one.truth_covariance
 
 
@@ -225,8 +190,6 @@ def test_pictures_are_of_both_covariances() -> None:
     one = record(np.random.default_rng(2), "white", 0.2, errors="independent")
     v = judge(one)
     drawn = of_both(one)
-    assert drawn.nees is not None
-    assert v.scale is not None
     np.testing.assert_allclose(drawn.nees.mean(axis=0), v.scale.anees)
     figures = record_figures(replace(one, t=np.arange(float(STEPS)), dof=N), v)
     assert {figure.title for figure in figures} == {"Errors and stated bounds", "NEES", "Coverage"}
@@ -258,30 +221,17 @@ def test_contrasts_do_not_have_what_runs_share() -> None:
     np.testing.assert_allclose(product, np.eye(4), atol=0.05)
 
 
-def test_the_bound_holds_for_any_dependence_of_the_truth() -> None:
-    """The tail of the mean NEES, whatever v does: shares beyond the 1 % point, 4,000 draws; 4.3 sigma at each of 6."""
-    rng, runs, s = np.random.default_rng(6), 10, 0.3
-    T = truth_of_share(s)
+def test_the_weights_of_the_bound_by_hand() -> None:
+    runs, T = 10, truth_of_share(0.3)
     L = np.linalg.cholesky(P + T)
     values = np.linalg.eigvalsh(np.linalg.solve(L, np.linalg.solve(L, T).T))[::-1]
     weights = upper_weights(np.broadcast_to(values, (runs, N)))
     assert weights.sum() == pytest.approx(1.0)
     assert weights[0] == pytest.approx(values[0] / N + (1.0 - values[-1]) / (N * runs))
-    bar = 1.0 + 4.0 * weights.max()
-    while weighted_chi_square_tail(bar, weights) > 0.01:
-        bar += 0.01
-    for kind in ("white", "AR", "per run", "common", "signs"):
-        count = 0
-        for _ in range(4000):
-            e = rng.standard_normal((runs, 1, N)) @ np.linalg.cholesky(P).T
-            d = (e + errors_of_truth(rng, kind, runs, 1) @ np.linalg.cholesky(T).T)[:, 0]
-            count += float(np.square(np.linalg.solve(L, d.T)).sum() / (N * runs)) > bar
-        assert count <= stats.binom.isf(1e-5, 4000, 0.01)
 
 
 def test_common_to_a_single_run_is_bounded() -> None:
     truth = uncertain_truth(record(np.random.default_rng(2), "common", 0.2, errors="common", runs=1))
-    assert truth is not None
     assert truth.bounded
     assert judge(record(np.random.default_rng(2), "common", 0.2, errors="common", runs=1)).status == "undecided"
 
@@ -320,7 +270,6 @@ def test_a_trajectory_whose_truth_states_its_covariance(tmp_path: Path) -> None:
     est, truth, stated = write_tum(tmp_path, 3)
     for source in ("columns", str(stated)):
         (one,) = read_recordings(est, truth, truth_covariance=source, axes=["x", "y", "z"], truth_errors="per-run")
-        assert one.truth_covariance is not None
         np.testing.assert_allclose(one.truth_covariance, np.broadcast_to(np.eye(3) / 400.0, (3, 40, 3, 3)))
         assert (one.truth_errors, one.truth_shared) == ("per-run", False)
     (ignored,) = read_recordings(est, truth, axes=["x", "y", "z"])
@@ -336,17 +285,13 @@ def test_estimates_without_a_covariance_of_the_truth_are_left_out(tmp_path: Path
     (one,) = read_recordings(est, truth, truth_covariance=str(stated), axes=["x", "y", "z"], truth_errors="per-run")
     assert "est: 10 estimates whose truth has no covariance are left out" in one.notes
     v = judge(one)
-    assert v.scale is not None
     assert v.scale.judged_steps == 30
 
 
 def test_the_verdict_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     est, truth, _ = write_tum(tmp_path, 40, 6, 4.0)
-    arguments = ["analyse", str(est), "--truth", str(truth), "--axes", "x,y,z", "--truth-covariance", "columns"]
-    with pytest.raises(SystemExit) as stop:
-        main([*arguments, "--truth-errors", "independent", "--json"])
-    assert not stop.value.code
-    said = json.loads(capsys.readouterr().out)["est"]
+    options = "--axes", "x,y,z", "--truth-covariance", "columns", "--truth-errors", "independent", "--json"
+    said = json.loads(consistency(capsys, "analyse", est, "--truth", truth, *options)[0])["est"]
     assert said["status"] == "overconfident"
     assert said["statistics"]["truth_share"] == pytest.approx(0.2)
     assert said["statistics"]["ratio"] == pytest.approx(4.0, abs=1.0)
@@ -367,10 +312,7 @@ def test_the_verdict_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[st
 )
 def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str) -> None:
     est, truth, _ = write_tum(tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        main(["analyse", str(est), "--truth", str(truth), *options])
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err
+    assert message in refused(capsys, "analyse", est, "--truth", truth, *options)
 
 
 def test_a_covariance_of_the_truth_that_is_none_is_refused() -> None:
@@ -387,7 +329,6 @@ def test_interpolated_truth_has_the_covariance_of_the_nearer_sample(tmp_path: Pa
     (tmp_path / "truth.csv").write_text("t,a,P_a_a\n" + "".join(f"{k},0,{k}\n" for k in range(1, 5)))
     files = tmp_path / "est.csv", tmp_path / "truth.csv"
     (one,) = read_recordings(*files, state=["a"], truth_covariance="columns", max_dt=0.5)
-    assert one.truth_covariance is not None
     np.testing.assert_array_equal(one.truth_covariance[0, :, 0, 0], [1.0, 3.0])
 
 
@@ -401,7 +342,6 @@ def test_a_table_and_an_archive_state_it(tmp_path: Path) -> None:
     (tmp_path / "truth.csv").write_text("\n".join(true) + "\n")
     files = tmp_path / "est.csv", tmp_path / "truth.csv"
     (one,) = read_recordings(*files, state=["a", "b"], truth_covariance="columns")
-    assert one.truth_covariance is not None
     np.testing.assert_array_equal(one.truth_covariance[2, 1], [[3.0, 0.5], [0.5, 3.0]])
     with pytest.raises(cs.InputError, match="for tables it is 'columns'"):
         read_recordings(*files, state=["a", "b"], truth_covariance="other.csv")
@@ -414,5 +354,4 @@ def test_a_table_and_an_archive_state_it(tmp_path: Path) -> None:
     with pytest.raises(cs.InputError, match=r"bad: the covariance of the truth in run 0, step 1 is no covariance"):
         read_recordings(tmp_path / "bad.npz")
     in_memory = cs.judge(v, P2, truth_covariances=one.truth_covariance, truth_errors="common")
-    assert in_memory.truth is not None
     assert in_memory.truth.errors == "common"

@@ -1,4 +1,4 @@
-"""The referee on cases whose answer is known: calibrated, overconfident, conservative, biased, broken."""
+"""The referee on cases whose answer is known, what its settings refuse, and what the properties of a verdict are."""
 
 from __future__ import annotations
 
@@ -7,11 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from draws import autoregression, identities, independent, verdict_on
 from referee import judge
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.diagnostics import anees_interval
+from consistency.referee.diagnostics import Answer, Equivalence, Evidence, Interval, Settings, Verdict, anees_interval
+from consistency.referee.diagnostics import (
+    judge as judge_evidence,
+)
+from consistency.referee.diagnostics.records.skipping import Skip, Skipped
+from consistency.referee.diagnostics.verdict import parts
+from consistency.referee.diagnostics.verdict.answers import ABOUT, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, answers
+from consistency.referee.diagnostics.verdict.parts import Innovations
 from consistency.referee.types import Array, Failure
 
 RUNS, STEPS = 50, 40
@@ -44,10 +52,7 @@ def make(scale: float = 1.0, bias: float = 0.0, runs: int = RUNS, steps: int = S
     Steps of a run are as dependent as those of a filter: an autoregression with coefficient 0.9.
     """
     rng = np.random.default_rng(5)
-    white, e = rng.normal(size=(runs, steps, 3)), np.empty((runs, steps, 3))
-    e[:, 0] = white[:, 0]
-    for k in range(1, steps):
-        e[:, k] = 0.9 * e[:, k - 1] + np.sqrt(1 - 0.81) * white[:, k]
+    e = autoregression(rng, runs, steps, 3, 0.9)
     P = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.003]])
     error = e @ np.linalg.cholesky(P).T + [bias * 0.2, 0.0, 0.0]
     covariance = np.broadcast_to(P / scale, (runs, steps, 3, 3)).copy()
@@ -68,54 +73,6 @@ def broken(case: Case, run: int, step: int) -> Case:
 # --- with truth ----------------------------------------------------------------------------------
 
 
-def test_calibrated_is_consistent() -> None:
-    verdict = make().verdict()
-    assert verdict.status == "consistent"
-    assert verdict.consistent
-    assert verdict.faults == ()
-    assert verdict.reasons[0].startswith("consistent: no fault found in 50 runs, and the covariance ratio ")
-    assert "] is shown to be between 0.67 and 1.50 (worst axis: axis " in verdict.reasons[0]
-    assert verdict.reasons[0].endswith("; lost runs of up to 5.8 % cannot be excluded with 50 runs")
-    assert verdict.first_step is None
-    assert verdict.subset is None
-    assert verdict.statistics["first_outside"] is None
-    assert "steps outside the simultaneous band: none of 40" in verdict.reasons[1]
-    low, high = verdict.threshold
-    assert low < verdict.statistic < high
-
-
-def test_overconfident_is_caught() -> None:
-    verdict = make(scale=2.0).verdict()
-    assert verdict.status == "overconfident"
-    assert not verdict.consistent
-    assert "scale" in verdict.faults
-    assert verdict.statistics["steps_above"] > 0
-    assert verdict.statistics["steps_below"] == 0
-    assert verdict.statistics["mean_anees"] > 5
-    assert "covariance too small by x" in verdict.reasons[0]
-    assert " above of 40" in verdict.reasons[1]
-    assert verdict.inflation == pytest.approx(make(scale=2.0).nees.mean() / 3)
-    assert 1.0 < verdict.inflation_interval[0] < verdict.inflation < verdict.inflation_interval[1]
-    assert verdict.statistic > verdict.threshold[1]
-
-
-def test_conservative_is_caught() -> None:
-    verdict = make(scale=0.5).verdict()
-    assert verdict.status == "conservative"
-    assert "scale" in verdict.faults
-    assert verdict.statistics["steps_below"] > 0
-    assert verdict.statistics["steps_above"] == 0
-    assert verdict.statistics["mean_anees"] < 2
-    assert "covariance too large by x" in verdict.reasons[0]
-    assert " below of 40" in verdict.reasons[1]
-    assert verdict.statistic < verdict.threshold[0]
-
-
-def test_a_covariance_too_large_may_be_allowed() -> None:
-    assert make(scale=0.5).verdict(allow="conservative").status == "consistent"
-    assert make(scale=2.0).verdict(allow="conservative").status == "overconfident"
-
-
 def test_biased_is_caught() -> None:
     """A bias of 1.5 standard deviations in x adds at least 2.25 to the NEES; less the bias the covariance is right."""
     verdict = make(bias=1.5).verdict()
@@ -123,8 +80,6 @@ def test_biased_is_caught() -> None:
     assert {"scale", "bias"} <= set(verdict.faults)
     assert verdict.reasons[0].startswith("biased: mean error +1.")
     assert "too small" not in verdict.reasons[0]
-    assert verdict.bias is not None
-    assert verdict.bias.inflation_without is not None
     assert 0.7 < verdict.bias.inflation_without.value < 1.4 < verdict.inflation
 
 
@@ -133,19 +88,6 @@ def test_a_bias_does_not_hide_a_covariance_too_small() -> None:
     assert verdict.status == "overconfident"
     assert "mean error +" in verdict.reasons[0]
     assert "covariance about the mean too small by x" in verdict.reasons[0]
-
-
-def test_overconfident_in_a_single_step_is_caught() -> None:
-    case = make()
-    case.error[:, 17] *= np.sqrt(3.0)
-    verdict = case.verdict()
-    assert verdict.status == "overconfident"
-    assert "scale in some step" in verdict.faults
-    assert "scale" not in verdict.faults
-    assert verdict.first_step == 18
-    assert verdict.statistics["first_outside"] == 18
-    assert verdict.statistics["since"] is None
-    assert "in 1 of 40 steps, first in step 18" in verdict.reasons[0]
 
 
 def test_statistics_of_a_calibrated_filter() -> None:
@@ -176,35 +118,6 @@ def test_nees_is_worked_out_from_error_and_covariance() -> None:
         assert verdict.status == "overconfident"
 
 
-def test_nees_alone_needs_its_dof() -> None:
-    case = make(scale=2.0)
-    assert judge("f", nees=case.nees, dof=3, false_alarm=FALSE_ALARM).status == "overconfident"
-    with pytest.raises(ValueError, match="nees needs dof"):
-        judge("f", nees=case.nees)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, "nothing to judge"),
-        ({"nees": np.ones((2, 2)), "dof": 1, "allow": "overconfident"}, "allow must be"),
-        ({"nees": np.ones((2, 2)), "dof": 1, "false_alarm": 1.0}, "false_alarm must lie between 0 and 1"),
-        ({"nees": np.ones((2, 2)), "dof": 1, "method": "sidak"}, "method must be 'max' or 'bonferroni'"),
-    ],
-)
-def test_what_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        judge("f", **options)
-
-
-def test_names_and_subsets_that_do_not_fit_are_refused() -> None:
-    case = make()
-    with pytest.raises(ValueError, match="2 names of axes for 3 components"):
-        case.verdict(axes=("x", "y"))
-    with pytest.raises(ValueError, match="subset 'far'"):
-        case.verdict(subsets={"far": [3]})
-
-
 def test_bonferroni_band_over_all_steps() -> None:
     """Its share of the false-alarm rate, as Holm's first step gives it, over the steps and two sides."""
     s = make().verdict(false_alarm=0.1, method="bonferroni").statistics
@@ -213,12 +126,6 @@ def test_bonferroni_band_over_all_steps() -> None:
     assert tail == pytest.approx(0.1 * share / STEPS / 2, rel=1e-6)
     assert np.all(s["simultaneous"][:, 0] < s["band"][:, 0])
     assert np.all(s["simultaneous"][:, 1] > s["band"][:, 1])
-
-
-def test_band_over_all_steps_counts_neighbours_that_move_together_once() -> None:
-    wide, narrow = (make().verdict(method=m).statistics["simultaneous"] for m in ("bonferroni", "max"))
-    assert np.all(narrow[:, 1] < wide[:, 1])
-    assert np.all(narrow[:, 0] > wide[:, 0])
 
 
 def test_false_alarms_stay_below_the_stated_rate() -> None:
@@ -240,34 +147,6 @@ def test_false_alarms_stay_below_the_stated_rate() -> None:
 # --- steps and runs left out -----------------------------------------------------------------------
 
 
-def test_rank_deficient_steps_are_left_out_by_name() -> None:
-    case = make()
-    case.nees[:, :3] = np.nan
-    verdict = case.verdict()
-    assert verdict.status == "consistent"
-    assert verdict.statistics["left_out_steps"] == [1, 2, 3]
-    assert verdict.statistics["judged_steps"] == STEPS - 3
-    assert np.isnan(verdict.statistics["band"][:3]).all()
-    assert np.isnan(verdict.statistics["anees"][:3]).all()
-
-
-def test_nothing_to_judge_is_failed() -> None:
-    case = replace(make(), nees=np.full((RUNS, STEPS), np.nan))
-    verdict = case.verdict()
-    assert verdict.status == "failed"
-    assert "full rank" in verdict.reasons[0]
-
-
-def test_one_failed_run_makes_a_consistent_filter_failed() -> None:
-    case = broken(make(), run=3, step=12)
-    verdict = case.verdict((BROKE,))
-    assert case.verdict().status == "consistent"
-    assert verdict.status == "failed"
-    assert not verdict.consistent
-    assert verdict.reasons[0] == "failed: 1 of 50 runs failed, first run 3 in step 12: LinAlgError: singular"
-    assert verdict.statistics["failures"] == [[3, 12, "LinAlgError: singular"]]
-
-
 def test_a_run_that_fails_midway_counts_only_before() -> None:
     s = broken(make(), run=3, step=12).verdict((BROKE,)).statistics
     assert np.array_equal(s["alive"], [RUNS] * 11 + [RUNS - 1] * (STEPS - 11))
@@ -275,12 +154,6 @@ def test_a_run_that_fails_midway_counts_only_before() -> None:
     # fewer runs, wider band
     assert s["band"][11, 1] > s["band"][10, 1]
     assert s["band"][11] == pytest.approx(anees_interval(3, RUNS - 1))
-
-
-def test_a_failing_overconfident_filter_stays_overconfident_and_names_the_failure() -> None:
-    verdict = broken(make(scale=2.0), 3, 12).verdict((BROKE,))
-    assert verdict.status == "overconfident"
-    assert any("1 of 50 runs failed" in reason for reason in verdict.reasons)
 
 
 def test_all_runs_failed_at_once() -> None:
@@ -321,3 +194,192 @@ def test_without_truth_and_innovations_there_is_no_verdict() -> None:
     verdict = blind(replace(case, nis=np.full_like(case.nis, np.nan)))
     assert verdict.status == "failed"
     assert "neither truth nor innovations" in verdict.reasons[0]
+
+
+# --- settings ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("option", "values"),
+    [
+        ("false_alarm", [0.0, 1.0, -0.1, 2.0, float("nan")]),
+        ("power", [0.0, 1.0, 1.5, float("nan")]),
+        ("detect", [0.0, 1.0, -2.0, float("inf"), float("nan")]),
+        ("tolerance", [0.0, 1.0, -2.0, float("inf"), float("nan")]),
+        ("allow", ["overconfident", "", "Conservative"]),
+        ("method", ["sidak", "", "MAX"]),
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(option: str, values: list[Any]) -> None:
+    for value in values:
+        with pytest.raises(ValueError, match=f"^{option} must"):
+            Settings(**{option: value})
+
+
+def test_settings_at_their_limits_are_taken() -> None:
+    for options in (
+        {"false_alarm": 1e-12},
+        {"power": 0.999999},
+        {"detect": 1.001},
+        {"tolerance": 0.5},
+        {"allow": None},
+    ):
+        assert Settings(**options)
+
+
+def test_ratios_below_one_count_as_their_inverse() -> None:
+    assert Settings(detect=0.5).factor == Settings(detect=2.0).factor == 2.0
+    assert Settings(tolerance=0.8).tolerated == pytest.approx(1.25)
+    assert Settings(tolerance=1.25).tolerated == 1.25
+    assert Settings().tolerated == 1.0
+    assert Settings().factor == 1.5
+
+
+# --- intervals ------------------------------------------------------------------------------------------
+
+
+def test_an_interval_holds_what_lies_inside() -> None:
+    interval = Interval(2.0, 1.0, 3.0)
+    assert [interval.holds(x) for x in (0.99, 1.0, 2.0, 3.0, 3.01)] == [False, True, True, True, False]
+    assert not Interval(1.0, float("nan"), 3.0).holds(2.0)
+    assert not Interval(1.0, 1.0, float("nan")).holds(2.0)
+
+
+def test_equivalence_is_shown_at_its_level() -> None:
+    assert Equivalence(1.5, 0.05, 0.05, None).shown
+    assert not Equivalence(1.5, 0.0501, 0.05, None).shown
+    assert not Equivalence(1.5, float("nan"), 0.05, None).shown
+
+
+# --- the verdict ----------------------------------------------------------------------------------------
+
+
+def of(*given: Answer, **more: Any) -> Verdict:
+    return Verdict("f", "inconsistent", ("inconsistent: so",), 3, 4, Settings(), given, **more)
+
+
+def test_faults_are_what_was_found_and_not_tolerated() -> None:
+    verdict = of(
+        Answer("scale", 1e-9, 0.5, 1e-9, True, tolerated=True),
+        Answer("bias", 1e-9, 0.1, 1e-8, True),
+        Answer("shape", 0.3, 0.4, 0.6, False),
+    )
+    assert verdict.faults == ("bias",)
+    assert verdict.p_value == pytest.approx(1e-8)  # of the bias, over its share
+
+
+def test_the_p_value_is_the_least_over_its_share() -> None:
+    """The rate at which the first question would just be found; Holm has nothing to give it yet."""
+    verdict = of(Answer("scale", 0.02, 0.5, 0.04, True), Answer("bias", 0.01, 0.05, 0.1, False))
+    assert verdict.p_value == pytest.approx(0.04)
+    assert of(Answer("scale", 0.9, 0.5, 1.0, False)).p_value == 1.0
+    assert np.isnan(of().p_value)
+    found = answers({"scale": 0.2, "bias": 0.004, "outliers": 0.5}, 0.05)
+    whole = of(*found.values())
+    assert whole.p_value == pytest.approx(min(a.adjusted for a in found.values()))
+
+
+def test_without_truth_the_numbers_are_those_of_the_innovations() -> None:
+    shown = Equivalence(1.5, 0.01, 0.05, None)
+    verdict = of(innovations=Innovations(1.2, (0.9, 1.1), 400, True, np.zeros(2), 0.1, shown))
+    assert verdict.statistic == 1.2
+    assert verdict.threshold == (0.9, 1.1)
+    assert verdict.equivalence is shown
+    assert np.isnan([verdict.inflation, *verdict.inflation_interval]).all()
+    assert (verdict.first_step, verdict.subset) == (None, None)
+    nothing = of()
+    assert np.isnan([nothing.statistic, *nothing.threshold, nothing.inflation]).all()
+    assert nothing.equivalence is None
+
+
+def test_with_truth_they_are_those_of_the_errors() -> None:
+    rng = np.random.default_rng(1)
+    error = 1.5 * independent(rng, 40, 5, 2)
+    nis = {"nis": rng.chisquare(2, (40, 5)), "nis_dof": np.full((40, 5), 2)}
+    verdict = judge_evidence(Evidence("f", error, identities(error), **nis))
+    nees = np.square(error).sum(axis=-1)
+    assert verdict.statistic == pytest.approx(nees.mean())
+    assert verdict.threshold == verdict.scale.accepted
+    assert verdict.inflation == pytest.approx(nees.mean() / 2)
+    assert verdict.inflation_interval == tuple(verdict.scale.inflation[1:])
+    assert verdict.inflation_interval[0] < verdict.inflation < verdict.inflation_interval[1]
+    assert verdict.equivalence is verdict.scale.equivalence
+    assert verdict.first_step == verdict.location.first_step
+    assert not verdict.consistent
+    assert replace(verdict, status="consistent").consistent
+
+
+def test_scale_counts_the_steps_that_are_judged() -> None:
+    error = independent(np.random.default_rng(2), 10, 6, 2)
+    error[:, 4] = np.nan
+    error[3:, 2] = np.nan
+    verdict = verdict_on(error)
+    assert verdict.scale.judged_steps == 5
+    assert verdict.scale.alive.tolist() == [10, 10, 3, 10, 0, 10]
+    assert np.isnan(verdict.scale.anees).tolist() == [False] * 4 + [True, False]
+
+
+def test_every_status_has_a_meaning_and_every_question_a_share() -> None:
+    assert list(parts.STATUSES) == [
+        "consistent", "overconfident", "conservative", "biased", "heavy-tailed", "inconsistent", "undecided", "failed",
+    ]  # fmt: skip
+    assert set(SHARES) == set(ABOUT)
+    two_sided = {q: s for q, s in SHARES.items() if q not in ("scale in some direction", JOINT, JOINT_DISTRIBUTION)}
+    assert SHARES[MAIN] == 0.5
+    assert sum(two_sided.values()) == pytest.approx(1.0)
+
+
+# --- what is given ---------------------------------------------------------------------------------------
+
+
+def arrays(*shapes: tuple[int, ...]) -> list[Array]:
+    return [np.ones(shape) for shape in shapes]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "nothing to judge"),
+        ({"covariance": np.ones((3, 4, 2, 2))}, "nothing to judge"),
+        ({"nees": np.ones(3), "dof": 1}, r"nees must be \(runs, steps\)"),
+        ({"error": np.ones((3, 4)), "covariance": np.ones((3, 4, 2, 2))}, r"error must be \(runs, steps, n\)"),
+        ({"error": np.ones((3, 4, 2)), "covariance": np.ones((3, 4, 3, 3))}, "do not fit"),
+        ({"error": np.ones((3, 4, 2)), "covariance": np.ones((3, 5, 2, 2))}, "runs and steps differ"),
+        ({"nees": np.ones((3, 4))}, "nees needs dof"),
+        ({"error": np.ones((3, 4, 2)), "covariance": np.ones((3, 4, 2, 2)), "axes": ["x"]}, "1 names of axes for 2"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        judge_evidence(Evidence("f", **given))
+
+
+@pytest.mark.parametrize("index", [[], [2], [-1], [0, 0]])
+def test_subsets_that_do_not_fit_are_refused(index: list[int]) -> None:
+    error = np.ones((3, 4, 2))
+    with pytest.raises(ValueError, match="subset 'odd'"):
+        judge_evidence(Evidence("f", error, identities(error)), Settings(subsets={"odd": index}))
+
+
+def test_nothing_that_is_given_is_changed() -> None:
+    rng = np.random.default_rng(3)
+    error = independent(rng, 25, 4, 3)
+    error[2, 1] = np.nan
+    covariance, nees = identities(error).copy(), np.square(error).sum(axis=-1)
+    before = [error.copy(), covariance.copy(), nees.copy()]
+    judge_evidence(Evidence("f", error, covariance, nees=nees), Settings(subsets={"two": [0, 2]}))
+    for old, new in zip(before, [error, covariance, nees], strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+# --- evidence ------------------------------------------------------------------------------------------
+
+
+def test_steps_without_full_rank_are_counted_from_one(rng: np.random.Generator) -> None:
+    error, nees = independent(rng, 3, 6, 2), np.ones((3, 6))
+    nees[0, :2] = nees[1, 3] = nees[2, 5] = np.nan
+    error[2, 5] = np.nan  # a run that has ended
+    evidence = Evidence("f", error, nees=nees)
+    assert evidence.left_out_steps == [1, 2, 4]
+    assert replace(evidence, skipped=Skipped(Skip(1.0), 1)).left_out_steps == [2, 4]
+    assert Evidence("f", nees=nees, dof=2).left_out_steps == []

@@ -19,11 +19,9 @@ from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias import estimate_bias, grid_of, shrunken
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.coordinate_fit import Levels
+from consistency.stereo.characterising.coordinate_fit import Levels, rate, ratios, tails
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Parameters, Rows, fit, regress
-from consistency.stereo.characterising.piecewise_linear import octaves
-from consistency.stereo.characterising.residuals import Residuals, residuals_of, select
-from consistency.stereo.characterising.tails import rate, ratios, tails
+from consistency.stereo.characterising.residuals import Residuals, octaves, residuals_of, select
 
 LEVEL = 1e-7
 SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=150.0, B=0.09, disparity=(1.0, 32.0), image=(320, 240))
@@ -101,7 +99,6 @@ def test_the_restricted_likelihood_is_that_of_dense_matrices(rng: np.random.Gene
     rows = Rows(rng.standard_normal(20), rng.standard_normal((20, 3)), G, first, gap, ridge)
     a = np.array([0.7, 1.9])
     found = regress(rows, Parameters(a, rho, q))
-    assert found is not None
     beta, value = dense(rows, a, rho, q)
     assert np.allclose(found.beta, beta, rtol=1e-9)
     assert np.isclose(found.value, value, rtol=1e-10)
@@ -154,7 +151,6 @@ def test_a_fit_is_the_top_of_the_likelihood(rng: np.random.Generator) -> None:
         for sign in (-1.0, 1.0):
             theta = found.theta + sign * 0.02 * np.eye(3)[k]
             other = regress(rows, Parameters.of(theta, rows.length))
-            assert other is not None
             assert other.value < found.regression.value
 
 
@@ -211,7 +207,6 @@ def test_tails_are_those_of_student(rng: np.random.Generator) -> None:
 def test_few_wide_errors_are_told_from_students_tails(rng: np.random.Generator) -> None:
     wide = rng.random(8000) < 0.03
     found = tails(rng.standard_normal(8000) * np.where(wide, 5.0, 1.0), LEVEL)
-    assert found.mixture is not None
     assert 0.02 < found.mixture.share < 0.04
     assert np.isclose(found.mixture.wide / found.mixture.core, 5.0, rtol=0.2)
     # both together have the variance of the residuals
@@ -298,7 +293,6 @@ def test_a_bias_is_shown_where_there_is_one_and_zero_where_nothing_is_known(rng:
     r[:, 2] += 0.01 * data.ideal[:, 0]
     biased = Residuals(r, *list(vars(data).values())[1:])
     of = characterise(biased, SENSOR, "test", miss=1e-6)
-    assert of.bias is not None
     assert of.bias.shown.tolist() == [False, False, True]
     u = np.tile(of.bias.grid.u, 4)
     known = of.bias.grid.known
@@ -342,9 +336,7 @@ def test_what_is_simulated_is_recovered_in_all_parameters_together() -> None:
     data, _ = residuals_of(benchmark.trials_of(scenario, world, truth, 3, seed=1), SENSOR)
     of = characterise(data, SENSOR, "test", miss=1e-6)
     assert benchmark.missed(of, scenario, truth) == []
-    assert of.growth is not None
     assert of.growth.shown
-    assert of.bias is not None
     assert of.bias.shown[2]
     assert benchmark.missed(of, scenario, benchmark.Real(None, None)) != []  # negative control
     assert benchmark.bias_rms(of, truth)[2] < 0.1

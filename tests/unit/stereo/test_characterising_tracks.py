@@ -19,8 +19,13 @@ from consistency.bench.scenario import Mount, PicturedSensor
 from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.characterising.board_images import Calibrated, Corners, calibrate, find_corners
-from consistency.stereo.characterising.board_residuals import residuals_about_boards
+from consistency.stereo.characterising.boards import (
+    Calibrated,
+    Corners,
+    calibrate,
+    find_corners,
+    residuals_about_boards,
+)
 from consistency.stereo.characterising.from_log import seen_of as seen_of_log
 from consistency.stereo.characterising.known_poses import characterise_posed, correlations, log_interval
 from consistency.stereo.characterising.unknown_landmarks import Seen, fit_points, without_gross
@@ -121,13 +126,11 @@ def test_correlation_is_found_and_not_that_of_the_fit(rng: np.random.Generator) 
     fitted = fit_points(white, F, B, parts(white), np.ones(3))
     for k in range(3):
         _, _, interval = correlations(fitted, k, LEVEL)
-        assert interval is not None
         assert interval.holds(0.0)
         assert interval.high - interval.low < 0.5
     coloured = seen_of(rng, 200, 30, rho=0.6)
     fitted = fit_points(coloured, F, B, parts(coloured), np.ones(3))
     _, _, interval = correlations(fitted, 0, LEVEL)
-    assert interval is not None
     assert 0.3 < interval.low < interval.value < 0.65
 
 
@@ -209,7 +212,6 @@ def test_short_tracks_are_refused(rng: np.random.Generator) -> None:
 def test_a_log_is_seen_from_the_mount_of_its_sensor(uvd: cs.Scenario, tilted: dict[str, Any]) -> None:
     changes = {"truth__sensor__mount": tilted, "truth__sensor__sigma": (1e-7, 1e-7, 1e-7)}
     trial = simulate(uvd.variant("tilted", **changes))
-    assert trial.landmarks is not None
     seen = seen_of_log([trial, trial], Mount(**tilted))
     assert len(seen.z) == 2 * len(trial.z)
     points = trial.landmarks[seen.track % trial.n_landmarks]

@@ -15,9 +15,8 @@ from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, M
 from consistency.bench.store.log import Log
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
-from consistency.stereo.frontend.log_screening import screened_log, screening_line
 from consistency.stereo.visual_odometry import common_motion
-from consistency.stereo.visual_odometry.common_motion import screened
+from consistency.stereo.visual_odometry.common_motion import screened, screened_log, screening_line
 
 STEPS, COUNT = 12, 14
 MOTION = BelievedMotion(sigma_v=0.1, sigma_omega=0.02)
@@ -187,9 +186,7 @@ def test_numbers_of_landmarks_that_are_known_and_of_things() -> None:
     assert (first.landmark[(trial.landmark == 0) & (step < 6)] == COUNT + 1).all()
     np.testing.assert_array_equal(first.spurious, known.spurious)
     assert set(first.things) == {COUNT + 1, *range(COUNT + 2, COUNT + 9)}
-    assert after.landmarks is not None
     np.testing.assert_array_equal(after.landmarks.set_index("landmark").loc[114], trial.landmarks[1])  # type: ignore[index]
-    assert after.screening is not None
     assert after.screening["broken"] == 16
     assert "screen: 16 of 308 observations" in screening_line(after)
     assert ("Screened", "16 of 308 observations leave the common motion") in facts({"screening": after.screening})

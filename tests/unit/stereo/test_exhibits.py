@@ -16,9 +16,9 @@ from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, l
 from consistency.referee.document.blocks import Block, Column, Heading, Stack, Status, Table
 from consistency.referee.document.drawing import Figure, Line, Points, Rule
 from consistency.referee.pages.section import Part
-from consistency.stereo.pages import biases, image_tracks, images, sensor_issues
+from consistency.stereo.pages import images, sensor_issues
 
-SECTIONS = (biases, sensor_issues, images, image_tracks)
+SECTIONS = (sensor_issues, images)
 SCRIPTS = ("e20_bias_or_noise", "e21_sensor_issues", "e24_image_noise", "e25_image_tracks", "e26_lens_models")
 TEXT = dict.fromkeys(("source", "claim", "statistic", "published", "measured"), "")
 
@@ -127,7 +127,7 @@ def test_a_bias_map_is_drawn_row_by_row(tmp_path: Path) -> None:
     few = many[many["v"].isin([-60.0, 0.0, 10.0])].assign(model="none")
     curves = pd.DataFrame({"belief": ["a", "a", "b"], "step": [1, 2, 2], "nees": [3.0, 4.0, 9.0]})
     tables = {"bias_or_noise_map": many, "lens_models_bias": few, "bias_or_noise_nees": curves}
-    figures = figures_of(biases.SECTION.blocks(build_report(written(tmp_path / "out", tables))))
+    figures = figures_of(sensor_issues.SECTION.blocks(build_report(written(tmp_path / "out", tables))))
     lines = [mark for mark in figures["Bias of disparity"].panels[0].marks if isinstance(mark, Line)]
     np.testing.assert_allclose([line.y[2] for line in lines], [0.0, 20.0, 40.0, 60.0])
     np.testing.assert_allclose(lines[1].x, [-1.0, 0.0, 1.0])
@@ -139,7 +139,7 @@ def test_a_bias_map_is_drawn_row_by_row(tmp_path: Path) -> None:
     assert (rule.at, first.y.tolist(), second.x.tolist()) == (3.0, [3.0, 4.0], [2])
 
 
-@pytest.mark.parametrize(("name", "module"), [("bias_survivors", biases), ("guarded", sensor_issues)])
+@pytest.mark.parametrize(("name", "module"), [("bias_survivors", sensor_issues), ("guarded", sensor_issues)])
 def test_a_table_that_lacks_a_column_is_refused(tmp_path: Path, name: str, module: Any) -> None:
     folder = written(tmp_path / "out", {name: pd.DataFrame({"filter": ["x"]})})
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: column '\w+' is missing"):

@@ -10,7 +10,6 @@ import pytest
 import scripts
 
 import consistency as cs
-from consistency.referee.document.colours import style
 from consistency.stereo.visual_odometry import RelativePose
 
 figures = scripts.experiment("front_end_figures")
@@ -62,13 +61,6 @@ def test_without_data_it_says_what_to_set(
     monkeypatch.delenv("CONSISTENCY_DATA", raising=False)
     assert experiment.main(cs.Study(runs=1)) == []
     assert "CONSISTENCY_DATA" in capsys.readouterr().err
-
-
-def test_an_ellipse_is_where_the_mahalanobis_distance_is_its_scale() -> None:
-    S, centre = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([3.0, -1.0])
-    curve = figures.ellipse(centre, S, 2.0, style(0))
-    e = np.stack([curve.x, curve.y], axis=1) - centre
-    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", e, np.linalg.inv(S), e), 4.0)
 
 
 def test_figures_are_png(rng: np.random.Generator) -> None:

@@ -11,13 +11,15 @@ import consistency as cs
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import StereoRig
-from consistency.stereo.visual_odometry.features import Features, grey, opencv
-from consistency.stereo.visual_odometry.matching import (
+from consistency.stereo.visual_odometry.features import (
+    Features,
     StereoFeatures,
     circular_matches,
     epipolar_gate,
+    grey,
     is_rectified,
     mutual_matches,
+    opencv,
     stereo_matches,
 )
 

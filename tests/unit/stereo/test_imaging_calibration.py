@@ -14,13 +14,12 @@ from consistency.stereo.rendered_images.calibration import (
     TrackMeans,
     bias_map,
     disparity_growth,
-    hats,
     track_means,
 )
 from consistency.stereo.rendered_images.camera import StereoCamera
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Chain, Tracks
 from consistency.stereo.rendered_images.protocols import Stops, stand
-from consistency.stereo.rendered_images.selection import Spread
+from consistency.stereo.rendered_images.stages import Spread
 
 NODES = np.array([2.25, 6.0, 10.0, 13.5])
 U, V = np.array([-90.0, 0.0, 90.0]), np.array([-90.0, 0.0, 90.0])
@@ -102,13 +101,6 @@ def test_a_known_growth_and_map_are_recovered(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(placed.rest[:2], 0.03, rtol=0.3)
 
 
-def test_another_growth_is_told_apart(rng: np.random.Generator) -> None:
-    growth, biases = known()
-    flat = Growth(NODES, np.full(4, 0.12), np.zeros((4, 4)), 1.0)
-    found = disparity_growth(track_means(simulated(rng, flat, biases, 0.65, places(rng, 400))), NODES)
-    assert off(found.sd, growth.sd, found.covariance) < 1e-9
-
-
 def test_standard_errors_are_those_of_repetition(rng: np.random.Generator) -> None:
     """60 repetitions of 150 tracks: mean squared standardised error 1 +- 6 sqrt(2 / 60) for each (below 1e-8)."""
     growth, biases = known()
@@ -141,12 +133,6 @@ def test_means_of_tracks_by_hand() -> None:
     assert means.count.tolist() == [3]
     np.testing.assert_allclose(means.mean, [[3.0, 0.0, 2.0]])
     np.testing.assert_allclose(means.variance, [[4.0, 0.0, 12.0]])
-
-
-def test_hats_interpolate_and_hold() -> None:
-    values = np.array([1.0, 3.0, 2.0])
-    x = np.array([-5.0, 0.0, 0.5, 1.75, 9.0])
-    np.testing.assert_allclose(hats(x, np.array([0.0, 1.0, 2.0])) @ values, [1.0, 1.0, 2.0, 2.25, 2.0])
 
 
 def test_both_levels_agree() -> None:

@@ -24,26 +24,25 @@ from consistency.stereo.rendered_images.chain import (
     joined,
     stage,
 )
-from consistency.stereo.rendered_images.correspondence import (
+from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand, wall_texture
+from consistency.stereo.rendered_images.render import film
+from consistency.stereo.rendered_images.scene import Layer, Plain, RandomTexture, Scene
+from consistency.stereo.rendered_images.stages import (
     BlockMatching,
     Correspondence,
+    GoodFeatures,
+    Klt,
     KltAcross,
     KnownDisparity,
-    SemiGlobal,
-)
-from consistency.stereo.rendered_images.filtering import (
+    KnownProjection,
     LeftRightCheck,
     PairObservations,
+    SemiGlobal,
+    Spread,
     TrackResidual,
     dissimilarity,
     patches,
 )
-from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand, wall_texture
-from consistency.stereo.rendered_images.render import film
-from consistency.stereo.rendered_images.scene import Layer, Scene
-from consistency.stereo.rendered_images.selection import GoodFeatures, Spread
-from consistency.stereo.rendered_images.texture import Plain, RandomTexture
-from consistency.stereo.rendered_images.tracking import Klt, KnownProjection
 
 pytest.importorskip("cv2")
 

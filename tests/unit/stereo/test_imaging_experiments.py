@@ -15,7 +15,7 @@ import consistency as cs
 from consistency.bench.pages.build import build_report
 from consistency.referee.document.blocks import Heading, Table
 from consistency.referee.document.drawing import Bars, Figure, Line, Points, Stems
-from consistency.stereo.pages import image_tracks, images
+from consistency.stereo.pages import images
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Tracks
 from consistency.stereo.rendered_images.protocols import Stops, wall_texture
 from consistency.stereo.rendered_images.scene import Layer, Scene
@@ -82,11 +82,11 @@ def test_tracks_and_their_report(moving: ModuleType, noise: ModuleType, tmp_path
     noise.main(study)
     study.write(tmp_path / "out", found, 0.0)
     report = build_report(tmp_path / "out")
-    blocks = [*images.SECTION.blocks(report), *image_tracks.SECTION.blocks(report)]
+    blocks = images.SECTION.blocks(report)
     figures = {block.title: block for block in blocks if isinstance(block, Figure)}
     tables = {block.label: block for block in blocks if isinstance(block, Table)}
     headings = [block.text for block in blocks if isinstance(block, Heading)]
-    assert len(headings) == len(images.EXHIBITS) + len(image_tracks.EXHIBITS)
+    assert len(headings) == len(images.EXHIBITS)
     curves = [mark for mark in figures["Noise of disparity"].panels[0].marks if isinstance(mark, Line)]
     stops = study.tables["images_stops"].sort_values("disparity")
     np.testing.assert_allclose(curves[2].y, stops[stops["residual"] == 0.005]["within"])
@@ -129,9 +129,9 @@ def test_a_report_without_images_has_no_section(tmp_path: Path) -> None:
     study.tables["images_exp1"] = pd.DataFrame({"frame": [0.0], "tracks": [3.0], "rms_u": [0.1]})
     study.write(tmp_path / "out", [], 0.0)
     with pytest.raises(cs.InputError, match=r"images_exp1\.parquet: column 'rms_v' is missing"):
-        image_tracks.SECTION.read(build_report(tmp_path / "out"))
+        images.SECTION.read(build_report(tmp_path / "out"))
     (tmp_path / "out" / "images_exp1.parquet").unlink()
-    assert image_tracks.SECTION.read(build_report(tmp_path / "out")) is None
+    assert images.SECTION.read(build_report(tmp_path / "out")) is None
 
 
 def test_a_junction_ranks_above_a_point(moving: ModuleType) -> None:

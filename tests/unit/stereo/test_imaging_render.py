@@ -10,8 +10,7 @@ from consistency.referee.geometry import rotation
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.render import digitised, film, render, render_pair
-from consistency.stereo.rendered_images.scene import Layer, Scene, to_camera
-from consistency.stereo.rendered_images.texture import Blobs, Painted, Plain, RandomTexture
+from consistency.stereo.rendered_images.scene import Blobs, Layer, Plain, RandomTexture, Scene, to_camera
 
 WRONG = StereoCamera(Camera(lens=Lens(0.01)), Camera(lens=Lens(-0.01, 0.002), turned=(0.004, -0.003, 0.002)))
 POSE = np.array([0.1, 0.05, -0.02, 0.01, 0.02, -0.03])
@@ -124,11 +123,6 @@ def test_a_texture_is_band_limited_and_blurred() -> None:
     power = np.abs(np.fft.fft2((image - image.mean()) * np.outer(np.hanning(240), np.hanning(320)))) ** 2
     high = np.hypot(np.fft.fftfreq(240)[:, None], np.fft.fftfreq(320)[None]) > 0.45
     assert power[high].sum() < 1e-3 * power.sum()
-
-
-def test_painted_adds_about_the_middle() -> None:
-    a = np.zeros(3)
-    assert Painted(Plain(100.0), Plain(150.0)).grey(a, a, 0.0).tolist() == [122.0] * 3
 
 
 def test_grey_noise_has_its_standard_deviation() -> None:

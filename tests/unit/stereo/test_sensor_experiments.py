@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -98,27 +98,6 @@ def test_statistics_of_runs(issues: ModuleType) -> None:
     assert issues.greater(high, low) < 0.01 < 0.99 < issues.greater(low, high)
 
 
-def test_verdicts_in_order(issues: ModuleType) -> None:
-    ranks = [issues.rank(SimpleNamespace(status=status)) for status in ("consistent", "undecided", "biased", "failed")]
-    assert ranks == [0, 1, 2, 2]
-
-
-def verdict_of(status: str, anees: float, guard: tuple[float, float] | None = None) -> Any:
-    accuracy = SimpleNamespace(rmse_position=0.1 * anees, rmse_heading=np.pi / 180.0 * anees)
-    score = guard and SimpleNamespace(precision=SimpleNamespace(value=guard[0]), recall=SimpleNamespace(value=guard[1]))
-    return SimpleNamespace(status=status, statistic=anees, accuracy=accuracy, rejection=score)
-
-
-def test_outcomes_of_cases(issues: ModuleType) -> None:
-    table = issues.outcomes(
-        {"a": (verdict_of("biased", 4.0), None), "b": (verdict_of("failed", 2.0, (0.9, 0.7)), None)}
-    )
-    assert table["case"].tolist() == ["a", "b"]
-    assert table["status"].tolist() == ["biased", "failed"]
-    numbers = [[4.0, 0.4, 4.0, np.nan, np.nan], [2.0, 0.2, 2.0, 0.9, 0.7]]
-    np.testing.assert_allclose(table.iloc[:, 2:].to_numpy(float), numbers)
-
-
 def test_errors_of_the_first_run(issues: ModuleType) -> None:
     covariance = np.zeros((2, 2, 3, 3))
     covariance[0] = np.diag([4.0, 9.0, np.radians(5.0) ** 2])
@@ -129,20 +108,6 @@ def test_errors_of_the_first_run(issues: ModuleType) -> None:
     expected = [[1, 0, 0, 0, 2, 3, 5], [2, 1, 2, 3, np.nan, 3, 5]]
     np.testing.assert_allclose(table.to_numpy(float), expected)
     assert table.columns.tolist() == ["step", "x", "y", "heading", "sigma_x", "sigma_y", "sigma_heading"]
-
-
-def test_mean_nees_over_steps(bias: ModuleType) -> None:
-    nees = np.array([[np.nan, 2.0, np.nan], [np.nan, 4.0, 5.0]])
-    table = bias.over_steps("a", SimpleNamespace(nees=nees))
-    assert table.to_numpy().tolist() == [["a", 2, 3.0], ["a", 3, 5.0]]
-
-
-def test_nodes_of_the_believed_map(bias: ModuleType) -> None:
-    world = bias.variants(0.005)["mapped"]
-    table = bias.nodes_of(world)
-    assert len(table) == len(bias.NODES_U) * len(bias.NODES_V)
-    (row,) = table[(table["u"] == 80.0) & (table["v"] == 40.0)].to_numpy()
-    assert row[2] == pytest.approx(world.belief.sensor.bias.at(np.array([80.0]), np.array([40.0]))[0, 2])
 
 
 def test_tables_of_the_findings_on_a_bias(bias: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

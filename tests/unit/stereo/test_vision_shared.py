@@ -14,8 +14,8 @@ from consistency.referee.diagnostics.imperfect_truth.shared_errors import poster
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import RelativePose, StereoRig, refine_reprojection
-from consistency.stereo.visual_odometry.bridging import bridged
 from consistency.stereo.visual_odometry.motion import RelativeMotion, diagonal
+from consistency.stereo.visual_odometry.odometry import bridged
 from consistency.stereo.visual_odometry.shared import RIG, SHARED, SharedError, fit_shared, perturbed, sensitivities
 
 K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])

@@ -22,14 +22,14 @@ from numba.core import config, dispatcher, types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
-from consistency.bench.filters.compiler.dispatch import OPTIONS, bodies_of, is_part, is_routine
+from consistency.bench.filters.compiler.dispatch import BODIES, OPTIONS, PARTS, ROUTINES
 
 VERSIONED = ("numba", "llvmlite", "numpy", "scipy")
 FOREIGN = sys.stdlib_module_names | set(VERSIONED)  # covered by their versions
 # decide how code is made
 COMPILING = (
     "../kernel/blas.py",
-    *(f"{name}.py" for name in ("content_key", "dispatch", "type_inference", "jit", "by_reference", "whole_program")),
+    *(f"{name}.py" for name in ("content_key", "dispatch", "jit", "by_reference", "whole_program")),
 )
 SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "LLVM_REFPRUNE_PASS", "LLVM_REFPRUNE_FLAGS", "BOUNDSCHECK",
             "DEBUGINFO_DEFAULT", "ENABLE_AVX", "USING_SVML")  # fmt: skip
@@ -67,7 +67,7 @@ class Content:
     def functions(self) -> dict[str, int]:
         """Bytes of bytecode of each function that is compiled, by its name; those of libraries are left out."""
         seen = [each for each in self._seen.values() if isinstance(each, FunctionType)]
-        own = [each for each in seen if not _is_foreign(each.__module__) and bodies_of(each) is None]
+        own = [each for each in seen if not _is_foreign(each.__module__) and each not in BODIES]
         return {f"{each.__module__}.{each.__qualname__}": len(each.__code__.co_code) for each in own}
 
     def _add(self, value: Any, names: tuple[str, ...] = ()) -> None:
@@ -114,12 +114,14 @@ class Content:
         self._note("function", function.__module__, function.__qualname__)
         if _is_foreign(function.__module__):
             return
-        bodies = bodies_of(function)
+        bodies = BODIES.get(function)
         if bodies is not None:  # those that this kernel cannot choose are left out
-            chosen = [(k, v) for k, v in bodies.items() if all(c in self._classes or not is_part(c) for c in k)]
-            self._each(sorted(chosen, key=lambda item: [cls.__qualname__ for cls in item[0]]))
+            chosen = [
+                (k, v) for k, v in bodies.items() if k is None or k in self._classes or PARTS.get(k.__name__) is not k
+            ]
+            self._each(sorted(chosen, key=lambda item: getattr(item[0], "__qualname__", "")))
             return
-        if is_routine(function):  # Python alone calls the wrapper
+        if function in ROUTINES:  # Python alone calls the wrapper
             function = function.__wrapped__  # type: ignore[attr-defined]
         code = function.__code__
         self._each((code, function.__defaults__, function.__kwdefaults__))

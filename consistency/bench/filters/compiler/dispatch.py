@@ -25,13 +25,13 @@ INNER: dict[str, Any] = OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper
 _overload: Callable[..., Any] = overload
 Function = TypeVar("Function", bound=Callable[..., Any])
 Part = TypeVar("Part", bound=type)
-Bodies = dict[tuple[type, ...], Callable[..., Any]]
+Bodies = dict[type | None, Callable[..., Any]]
 
-_parts: dict[str, type] = {}
+PARTS: dict[str, type] = {}
 _needs: dict[type, dict[str, frozenset[str]]] = {}
-_bodies: dict[Any, Bodies] = {}
+BODIES: dict[Any, Bodies] = {}  # of each generic function by the type that chooses them, None for the default
 _named_bodies: dict[str, Callable[..., Any]] = {}
-_routines: set[Any] = set()
+ROUTINES: set[Any] = set()  # plain Python around the functions that kernels are made of
 
 
 def part(**needs: str) -> Callable[[Part], Part]:
@@ -51,60 +51,60 @@ def part(**needs: str) -> Callable[[Part], Part]:
     def register(cls: Part) -> Part:
         if not (issubclass(cls, tuple) and hasattr(cls, "_fields")) or "<locals>" in cls.__qualname__:
             raise TypeError(f"part '{cls.__qualname__}' must be a NamedTuple at module level")
-        if cls.__name__ in _parts:
-            other = _parts[cls.__name__].__module__
+        if cls.__name__ in PARTS:
+            other = PARTS[cls.__name__].__module__
             raise TypeError(
                 f"a part named '{cls.__name__}' is there already, in {other}; two would share compiled code"
             )
-        _parts[cls.__name__] = cls
+        PARTS[cls.__name__] = cls
         _needs[cls] = {role: frozenset(names.split()) for role, names in needs.items()}
         return cls
 
     return register
 
 
-def generic(deciding: int = 1) -> Callable[[Function], Function]:
-    """Decorator of a function whose body is chosen by the types of its first ``deciding`` arguments.
+def generic(*, default: bool = False) -> Callable[[Function], Function]:
+    """Decorator of a function whose body is chosen by the type of its first argument.
 
-    The decorated body is never run: its signature and docstring say what every implementation does.
+    Its signature and docstring say what every implementation does. Its own body is that of parts that have none, if it
+    is a ``default``, and is never run if not.
     """
 
     def declare(stub: Function) -> Function:
-        bodies: Bodies = {}
+        bodies: Bodies = {None: stub} if default else {}
 
         @wraps(stub)
         def call(*args: Any) -> Any:
-            return _body(stub, bodies, tuple(type(a) for a in args[:deciding]))(*args)
+            return _body(stub, bodies, type(args[0]))(*args)
 
         def choose(*args: Any) -> Any:
-            classes = tuple(getattr(a, "instance_class", None) for a in args[:deciding])
-            return _body(stub, bodies, classes)
+            return _body(stub, bodies, getattr(args[0], "instance_class", None))
 
         _overload(call, strict=False, jit_options=INNER)(choose)
-        _bodies[call] = bodies
+        BODIES[call] = bodies
         chosen: Any = call
         return chosen
 
     return declare
 
 
-def implement(function: Callable[..., Any], *classes: type) -> Callable[[Function], Function]:
-    """Decorator of the body of a generic ``function`` for parts of these types; one body may serve several.
+def implement(function: Callable[..., Any], cls: type) -> Callable[[Function], Function]:
+    """Decorator of the body of a generic ``function`` for parts of this type; one body may serve several.
 
     Raises
     ------
     TypeError
-        The body is a closure, its name is taken, or there is a body for these types.
+        The body is a closure, its name is taken, or there is a body for this type.
     """
 
     def register(body: Function) -> Function:
         name = f"{body.__module__}.{body.__qualname__}"
         if "<locals>" in name or _named_bodies.get(name, body) is not body:
             raise TypeError(f"kernel function '{name}' must stand at module level under a name of its own")
-        if classes in _bodies[function]:
-            raise TypeError(f"'{function.__name__}' has a body for {_named(classes)} already")
+        if cls in BODIES[function]:
+            raise TypeError(f"'{function.__name__}' has a body for {cls.__name__} already")
         _named_bodies[name] = body
-        _bodies[function][classes] = body
+        BODIES[function][cls] = body
         return body
 
     return register
@@ -122,7 +122,7 @@ def routine(function: Function) -> Function:
         return function
 
     _overload(call, strict=False, jit_options=INNER)(choose)
-    _routines.add(call)
+    ROUTINES.add(call)
     called: Any = call
     return called
 
@@ -137,7 +137,7 @@ def require_fitting(parts: Any) -> None:
     """
     for role, value in zip(parts._fields, parts, strict=True):
         cls = type(value)
-        if not is_part(cls):
+        if PARTS.get(cls.__name__) is not cls:
             raise TypeError(f"{role}: '{cls.__name__}' is no registered part")
         for other, names in _needs[cls].items():
             chosen = type(getattr(parts, other)).__name__
@@ -156,30 +156,9 @@ def fits(parts: Any) -> bool:
     return True
 
 
-def is_part(cls: type) -> bool:
-    """Whether a class is a registered part."""
-    return _parts.get(cls.__name__) is cls
-
-
-def is_routine(function: Any) -> bool:
-    """Whether a function is a :func:`routine`: plain Python around the function that kernels are made of."""
-    return function in _routines
-
-
-def bodies_of(function: Any) -> Bodies | None:
-    """Bodies of a generic function by the types that choose them; None for any other function."""
-    return _bodies.get(function)
-
-
-def _body(stub: Any, bodies: Bodies, classes: tuple[Any, ...]) -> Callable[..., Any]:
-    if classes not in bodies:
-        raise TypeError(f"'{stub.__name__}' has no body for {_named(classes)}; there are {_known(bodies)}")
-    return bodies[classes]
-
-
-def _named(classes: tuple[Any, ...]) -> str:
-    return " and ".join(getattr(cls, "__name__", str(cls)) for cls in classes)
-
-
-def _known(bodies: Bodies) -> str:
-    return ", ".join(sorted(_named(classes) for classes in bodies)) or "none"
+def _body(stub: Any, bodies: Bodies, cls: Any) -> Callable[..., Any]:
+    body = bodies.get(cls, bodies.get(None))
+    if body is None:
+        known = ", ".join(sorted(each.__name__ for each in bodies if each is not None)) or "none"
+        raise TypeError(f"'{stub.__name__}' has no body for {getattr(cls, '__name__', cls)}; there are {known}")
+    return body

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
@@ -14,7 +13,7 @@ from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import register_jitable
 
-from consistency.bench.filters.compiler import compile_time, disk_cache
+from consistency.bench.filters.compiler import disk_cache
 from consistency.bench.filters.compiler.content_key import Content
 from consistency.bench.filters.compiler.dispatch import INNER, OPTIONS, Function
 from consistency.bench.filters.compiler.uninterrupted import apart
@@ -91,7 +90,7 @@ class Kernel:
         is_shared = content.unknown is None
         is_kept = is_shared and disk_cache.read(disk_cache.place(content.key)) is not None
         is_ready = signature in self._entries or is_kept
-        return Outlook(content.key, is_ready, is_shared, compile_time.seconds_for(self._size(content)))
+        return Outlook(content.key, is_ready, is_shared, disk_cache.seconds_for(self._size(content)))
 
     def _content(self, signature: tuple[Any, ...]) -> Content:
         jitable.register()
@@ -100,7 +99,7 @@ class Kernel:
     def _size(self, content: Content) -> float:
         """Bytes of bytecode to be compiled; functions that this process has compiled before count less."""
         return sum(
-            size * (compile_time.AGAIN if name in self._functions else 1.0) for name, size in content.functions.items()
+            size * (disk_cache.AGAIN if name in self._functions else 1.0) for name, size in content.functions.items()
         )
 
     def _made(self, signature: tuple[Any, ...]) -> Any:
@@ -113,12 +112,14 @@ class Kernel:
             with disk_cache.one_at_a_time(path):
                 if not self._load(entry, disk_cache.read(path)):
                     self._compiled(entry, signature, content)
-                    _keep(path, entry.overloads[signature])
+                    result = entry.overloads[signature]
+                    if not result.library.has_dynamic_globals and not result.lifted:  # no address of this process
+                        disk_cache.write(path, serialize.dumps(result._reduce()))  # type: ignore[no-untyped-call]
         return entry
 
     def _compiled(self, entry: Any, signature: tuple[Any, ...], content: Content) -> Any:
         names = {self.function.__qualname__, *content.dispatchers}
-        with compile_time.measured(self._size(content)), one_program(names):
+        with disk_cache.measured(self._size(content)), one_program(names):
             entry.compile(signature)
         self._functions |= content.functions.keys()
         return entry
@@ -134,12 +135,6 @@ class Kernel:
             entry.add_overload(result)
         self.loaded += 1
         return True
-
-
-def _keep(path: Path, result: Any) -> None:
-    """Keep what holds no address of this process."""
-    if not result.library.has_dynamic_globals and not result.lifted:
-        disk_cache.write(path, serialize.dumps(result._reduce()))  # type: ignore[no-untyped-call]
 
 
 def _signature(args: tuple[Any, ...]) -> tuple[Any, ...]:

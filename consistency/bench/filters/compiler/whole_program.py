@@ -14,16 +14,18 @@ from graphlib import TopologicalSorter
 from typing import Any
 
 import numba
-from numba.core import codegen, compiler_lock, config
+from numba.core import codegen, compiler_lock, config, targetconfig
 from numba.core.registry import cpu_target
-
-from consistency.bench.filters.compiler.type_inference import remembered_types
+from numba.core.types import functions
 
 TESTED = ("0.61", "0.68")  # lowest and highest series of Numba in which this was tried
 INNER_OPTIMISATION = 1  # level of the passes over a function by itself; the whole is optimised at Numba's level
 _Library: Any = codegen.JITCodeLibrary
 _config: Any = config  # untyped, like what follows
 _lock: Any = compiler_lock
+_Function: Any = functions.BaseFunction
+_flags: Any = targetconfig.ConfigStack
+_known: dict[Any, Any] = {}  # types of calls
 
 
 def is_supported() -> bool:
@@ -104,6 +106,37 @@ def _closure(libraries: Any) -> list[Any]:
             graph[library] = list(library._linking_libraries) if isinstance(library, _Part) else []
             waiting.extend(graph[library])
     return list(TopologicalSorter(graph).static_order())[::-1]
+
+
+@contextmanager
+def remembered_types() -> Iterator[None]:
+    """Types of calls are inferred once for all kernels of a process: while one is compiled, under the compiler's lock.
+
+    For each call in each function, and each time that what it is given becomes known, Numba asks all that is registered
+    for what is called: for ``a * b`` some thirty templates, of strings, lists and dates, before that of numbers.
+
+    A function has one type for arguments of the same types under the same rules for floating-point numbers. A call
+    that has none is asked anew, so that its error says what Numba says.
+    """
+    infer = _Function.get_call_type
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        flags = _flags.top_or_none()
+        if kws or flags is None:
+            return infer(self, context, args, kws)
+        key = (self, args, flags.error_model, frozenset(flags.fastmath.flags))
+        if key not in _known:
+            found = infer(self, context, args, kws)
+            if not all(each.is_precise() for each in args):
+                return found
+            _known[key] = found
+        return _known[key]
+
+    _Function.get_call_type = get_call_type
+    try:
+        yield
+    finally:
+        _Function.get_call_type = infer
 
 
 @contextmanager

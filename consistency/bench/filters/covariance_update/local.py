@@ -38,20 +38,16 @@ from consistency.bench.filters.covariance_update.splitting import (
     wake,
 )
 from consistency.bench.filters.kernel.arrays import copy, fill
-from consistency.bench.filters.kernel.local_state import Factors, make_factors
 from consistency.bench.filters.kernel.part_functions import (
-    Data,
+    Factors,
     Slam,
     State,
     append,
-    held_at,
     landmark_width,
+    make_factors,
     make_local,
     prepare,
-    robot_width,
     settle,
-    spare_width,
-    withhold,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.referee.types import Array, Indices
@@ -62,7 +58,7 @@ OVERHEAD = 1e5  # multiplications (twice over) that the calls of a local step ar
 PAUSE = 16  # steps of dense updating after a local stretch that did not pay; four times as many after the next
 
 
-@part(motion="Unicycle", landmark="WorldPoint", error="Additive")
+@part(landmark="WorldPoint", error="Additive")
 class Local(NamedTuple):
     """Variables in the state from which updates are local.
 
@@ -73,20 +69,10 @@ class Local(NamedTuple):
     start: int
 
 
-@implement(spare_width, Local)
-def local_spares_nothing(covariance: Local, steps: int, n_landmarks: int) -> int:
-    return 0
-
-
-@implement(held_at, Local)
-def held_by_robot(covariance: Local, label: int, local: Factors) -> int:
-    return 0
-
-
 @implement(make_local, Local)
-def make_local_factors(covariance: Local, r: int, w: int, n: int, steps: int, n_landmarks: int) -> Factors:
+def make_local_factors(covariance: Local, w: int, n: int, steps: int, n_landmarks: int) -> Factors:
     if n < covariance.start:
-        return make_factors(r, r, 1)
+        return make_factors(3, 3, 1)
     c = max(n // (2 * w), 1) * w
     return make_factors(c, n, c // w)
 
@@ -96,19 +82,19 @@ def prepare_active(
     covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, local: Factors
 ) -> tuple[State, State]:
     """The active part that a step works on, settled first where that is due, and split where it begins."""
-    r, w, home, offset = robot_width(slam.motion), landmark_width(slam.landmark), whole.offset, state.offset
+    w, home, offset = landmark_width(slam.landmark), whole.offset, state.offset
     x, P, n, b = state.x, state.P, state.n, state.base
     if b > 0 and is_due(whole.n, n, b, w * len(labels), local):
         join(slam, whole, n, b, local)
         count_settling(whole.n, n, b, local)
         x, P, n, b = whole.x, whole.P, whole.n, 0
         copy(home, offset)
-    if b == 0 and n >= covariance.start and may_split(r, w, len(labels), local):
-        n = split(covariance, r, w, whole, labels, offset, local)
+    if b == 0 and n >= covariance.start and may_split(w, len(labels), local):
+        n = split(covariance, w, whole, labels, offset, local)
         start_counting(n, local)
         x, P, b = local.x, local.P, n
     if b > 0:
-        more = activate(covariance, r, w, whole, labels, State(x, P, n, b, offset), local)
+        more = activate(covariance, w, whole, labels, State(x, P, n, b, offset), local)
         n, b = n + more, b + more
         count(whole.n, n, b, more, w * len(labels), local)
     return whole, State(x, P, n, b, offset)
@@ -123,7 +109,6 @@ def append_factors(
 
 @implement(settle, Local)
 def settle_active(covariance: Local, slam: Slam, whole: State, state: State, local: Factors) -> None:
-    """``whole`` <- what the active part and the factors say, if there is an active part."""
     if state.base > 0:
         join(slam, whole, state.n, state.base, local)
 
@@ -149,33 +134,33 @@ def to_relative_base(covariance: Local, x: Array, p: int, robot: Array, landmark
 
 
 @inner
-def split(covariance: Local, r: int, w: int, whole: State, labels: Indices, offset: Indices, local: Factors) -> int:
+def split(covariance: Local, w: int, whole: State, labels: Indices, offset: Indices, local: Factors) -> int:
     """The robot and the known ones of ``labels`` (m,) become active and the base; returns their number of variables.
 
     ``offset`` (n_landmarks,) <- that of each landmark in the active part, or -1.
     """
     fill(offset, -1)
-    n = r
+    n = 3
     for label in labels:
         if whole.offset[label] >= 0:
-            add_label(label, whole.offset[label], n, n, r, w, local)
+            add_label(label, whole.offset[label], n, n, w, local)
             offset[label] = n
             n += w
-    take_out(covariance, r, w, whole, n, local)
+    take_out(covariance, w, whole, n, local)
     return n
 
 
 @inner
-def activate(covariance: Local, r: int, w: int, whole: State, labels: Indices, active: State, local: Factors) -> int:
+def activate(covariance: Local, w: int, whole: State, labels: Indices, active: State, local: Factors) -> int:
     """Passive ones of ``labels`` (m,) become active and join the base; returns by how many variables both grow."""
     more, n, b, home = 0, active.n, active.base, whole.offset
     for label in labels:
         if home[label] >= 0 and active.offset[label] < 0:
-            add_label(label, home[label], n + more, b + more, r, w, local)
+            add_label(label, home[label], n + more, b + more, w, local)
             active.offset[label] = n + more
             more += w
     if more > 0:
-        wake(covariance, r, w, whole, n, b, more, local)
+        wake(covariance, w, whole, n, b, more, local)
     return more
 
 
@@ -192,16 +177,11 @@ def _work(n: int, b: int, seen: int) -> float:
 
 
 @inner
-def _settling(whole: int, n: int, b: int) -> float:
-    return whole * whole * (b + TRAFFIC) + 2.0 * whole * b * (n + b)
-
-
-@inner
-def may_split(r: int, w: int, seen: int, local: Factors) -> bool:
+def may_split(w: int, seen: int, local: Factors) -> bool:
     """Whether the next steps are to be local; counts the pause down."""
     tally = local.tally
     tally[LEFT] = max(tally[LEFT] - 1.0, 0.0)
-    return tally[LEFT] == 0.0 and 2 * (r + w * seen) <= len(local.x)
+    return tally[LEFT] == 0.0 and 2 * (3 + w * seen) <= len(local.x)
 
 
 @inner
@@ -238,13 +218,7 @@ def is_due(whole: int, n: int, b: int, seen: int, local: Factors) -> bool:
 def count_settling(whole: int, n: int, b: int, local: Factors) -> None:
     """Whether the stretch paid; if not, a pause."""
     tally = local.tally
-    paid = tally[SPENT] + _settling(whole, n, b) < tally[DENSE]
+    settling = whole * whole * (b + TRAFFIC) + 2.0 * whole * b * (n + b)
+    paid = tally[SPENT] + settling < tally[DENSE]
     tally[LONG] = 0.0 if paid else max(4.0 * tally[LONG], PAUSE)
     tally[LEFT] = tally[LONG]
-
-
-@implement(withhold, Local)
-def withhold_nothing_local(
-    covariance: Local, state: State, data: Data, k: int, rejected: Array, anew: Array, local: Factors
-) -> None:
-    """What is active is so whether it is used or not."""

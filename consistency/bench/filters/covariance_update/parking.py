@@ -17,21 +17,20 @@ from consistency.bench.filters.covariance_update.splitting import (
     add_label,
     append_rows,
     join,
-    start_rows,
     take_out,
-    to_base,
     wake,
 )
 from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, fill, fill_matrix, filled_matrix, integers, matrix
 from consistency.bench.filters.kernel.covariance import gather_rows, replace_rows
-from consistency.bench.filters.kernel.local_state import Factors, make_factors
 from consistency.bench.filters.kernel.part_functions import (
     Data,
+    Factors,
     Slam,
     State,
     append,
     held_at,
+    make_factors,
     make_local,
     prepare,
     settle,
@@ -93,10 +92,10 @@ def clones_width(covariance: Parking, steps: int, n_landmarks: int) -> int:
 
 
 @implement(make_local, Parking)
-def make_clones(covariance: Parking, r: int, w: int, n: int, steps: int, n_landmarks: int) -> Clones:
+def make_clones(covariance: Parking, w: int, n: int, steps: int, n_landmarks: int) -> Clones:
     most = _most_clones(covariance, steps, n_landmarks)
     is_local = most > 0 and n >= covariance.start
-    c = max(n // (2 * w), 1) * w if is_local else r
+    c = max(n // (2 * w), 1) * w if is_local else 3
     return Clones(
         integers(n_landmarks, -1),
         integers(n_landmarks, 0),
@@ -111,7 +110,7 @@ def make_clones(covariance: Parking, r: int, w: int, n: int, steps: int, n_landm
         integers(1, 0),
         integers(1, 0),
         filled_matrix(9, n, 0.0),
-        make_factors(c, n if is_local else r, c // w),
+        make_factors(c, n if is_local else 3, c // w),
     )
 
 
@@ -289,17 +288,6 @@ def held_at_clone(covariance: Parking, label: int, local: Clones) -> int:
 # --- local updating ------------------------------------------------------------------------------
 
 
-@implement(start_rows, Parking)
-def start_plain_rows(covariance: Parking, x: Array, width: int, p: int, i: int, j: int, Phi: Array) -> None:
-    for a in range(width):
-        Phi[i + a, j + a] += 1.0
-
-
-@implement(to_base, Parking)
-def to_plain_base(covariance: Parking, x: Array, p: int, robot: Array, landmark: Array) -> None:
-    """The map is relative to the robot already."""
-
-
 @inner
 def _is_worth_it(whole: State, labels: Indices, local: Clones) -> bool:
     """Whether an active part of robot and landmarks in use, with a base as large, is small beside the whole.
@@ -340,10 +328,10 @@ def _split(covariance: Parking, whole: State, offset: Indices, local: Clones) ->
     for label in range(len(local.of)):
         o = whole.offset[label]
         if o >= 0 and local.of[label] < 0:
-            add_label(label, o, n, n, 3, 3, f)
+            add_label(label, o, n, n, 3, f)
             offset[label] = n
             n += 3
-    take_out(covariance, 3, 3, whole, n, f)
+    take_out(covariance, 3, whole, n, f)
     return State(f.x, f.P, n, n, offset)
 
 
@@ -355,14 +343,14 @@ def _call_back(covariance: Parking, whole: State, active: State, labels: Indices
         if whole.offset[label] >= 0 and active.offset[label] < 0:
             number = local.of[label]
             if local.here[number] == 0:
-                add_label(-1 - local.at[number], local.at[number], n + more, b + more, 3, 3, f)
+                add_label(-1 - local.at[number], local.at[number], n + more, b + more, 3, f)
                 local.here[number] = n + more
                 more += 3
-            add_label(label, whole.offset[label], n + more, b + more, 3, 3, f)
+            add_label(label, whole.offset[label], n + more, b + more, 3, f)
             active.offset[label] = n + more
             more += 3
     if more > 0:
-        wake(covariance, 3, 3, whole, n, b, more, f)
+        wake(covariance, 3, whole, n, b, more, f)
     return State(active.x, active.P, n + more, b + more, active.offset)
 
 
@@ -386,7 +374,7 @@ def recentre(state: State, local: Clones) -> None:
         if local.uses[number] > 0:
             o = at[0] = local.at[number]
             left_jacobian(x[o : o + 3], turn)
-            gather_rows(P, n, 3, 3, at, 1, rows[3:])
+            gather_rows(P, n, 3, at, 1, rows[3:])
             for i in range(n):
                 for a in range(3):
                     rows[a, i] = turn[a, 0] * rows[6, i] + turn[a, 1] * rows[7, i] + turn[a, 2] * rows[8, i]

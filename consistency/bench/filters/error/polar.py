@@ -1,6 +1,7 @@
-"""Right-invariant error of the pose, T_true = Exp(xi) T, beside polar errors of landmarks in the frame of the sensor.
+"""A robot-centred map in its polar symmetry: landmarks in the frame of the sensor, m, and their polar error.
 
-A landmark errs by a turn and by the logarithm of a scale: see ``methods/equivariant.py``.
+The error of a landmark is (left, up, s): turns about the axes across the line of sight, in rad, and the logarithm of
+the scale. That of the pose is right-invariant, T_true = Exp(xi) T. See ``methods/equivariant.py``.
 """
 
 from __future__ import annotations
@@ -11,75 +12,129 @@ import numpy as np
 
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.error.invariant_pose import move_pose
-from consistency.bench.filters.error.planar import shifted_covariance
-from consistency.bench.filters.kernel.arrays import fill
-from consistency.bench.filters.kernel.blas import add_gram, add_transposed_times
-from consistency.bench.filters.kernel.covariance import move_block
+from consistency.bench.filters.error.invariant_pose import move_pose, shifted_covariance
+from consistency.bench.filters.kernel.arrays import fill, fill_matrix
+from consistency.bench.filters.kernel.blas import add_transposed_times
+from consistency.bench.filters.kernel.covariance import add_gram_to_state, move_block
 from consistency.bench.filters.kernel.part_functions import (
-    Frame,
-    Sensor,
+    Nine,
     Slam,
     State,
     Triple,
-    insert_error,
-    move,
-    noise_columns,
+    combine,
+    insert,
+    landmark_width,
     pose_covariance,
     propagate,
     retract,
-    robot_frame,
+    to_body,
+    to_body_jacobian,
     to_error,
+    world_point,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.landmark.inverse_range import inward, outward
-from consistency.bench.filters.landmark.sensor_point import SensorPoint, sight
+from consistency.bench.filters.landmark.world_point import combine_world_point
+from consistency.bench.filters.motion.unicycle import Frame, move, noise_columns, robot_frame
 from consistency.bench.models import point
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array
 
 
-@part(motion="Unicycle", landmark="SensorPoint", point="AtEstimate")
+@part(error="Polar", update="EquivariantOutput", covariance="Dense")
+class SensorPoint(NamedTuple):
+    """Where the sensor is mounted on the robot. A landmark is its position in the frame of the sensor, m."""
+
+    mount: Mounting
+
+
+@inner
+def sight(q: Array) -> tuple[Nine, float]:
+    """The unit vectors b1, b2, n of the line of sight to q (3,), and its length in m."""
+    h = np.sqrt(q[0] * q[0] + q[1] * q[1])
+    r = np.sqrt(h * h + q[2] * q[2])
+    c, s = (q[0] / h, q[1] / h) if h > 0.0 else (1.0, 0.0)
+    up, flat = q[2] / r, h / r
+    return (-s, c, 0.0, -up * c, -up * s, flat, flat * c, flat * s, up), r
+
+
+@implement(landmark_width, SensorPoint)
+def sensor_point_width(landmark: SensorPoint) -> int:
+    return 3
+
+
+@implement(to_body, SensorPoint)
+def to_body_of_sensor_point(landmark: SensorPoint, frame: Frame, values: Array) -> Triple:
+    return point.from_sensor(values[0], values[1], values[2], landmark.mount)
+
+
+@implement(to_body_jacobian, SensorPoint)
+def to_body_jacobian_of_sensor_point(
+    landmark: SensorPoint, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
+) -> None:
+    fill(Hp, 0.0)
+    Hl[0], Hl[1], Hl[2] = inward(landmark.mount, row[0], row[1], row[2])
+
+
+@implement(insert, SensorPoint)
+def insert_sensor_point(
+    landmark: SensorPoint, frame: Frame, body: Triple, Jb: Array, mount: Mounting, values: Array, Jp: Array, Jz: Array
+) -> None:
+    """``Jz`` (3, 3) is that of the polar error."""
+    values[0], values[1], values[2] = point.to_sensor(body[0], body[1], body[2], mount)
+    e, r = sight(values)
+    fill_matrix(Jp, 0.0)
+    for j in range(3):
+        x, y, z = inward(mount, Jb[0, j], Jb[1, j], Jb[2, j])
+        for a in range(3):
+            Jz[a, j] = (e[3 * a] * x + e[3 * a + 1] * y + e[3 * a + 2] * z) / r
+
+
+@implement(world_point, SensorPoint)
+def sensor_point_in_world(
+    landmark: SensorPoint, frame: Frame, values: Array, point_: Array, Dp: Array, Dl: Array
+) -> None:
+    mount, c, s = landmark.mount, frame.c, frame.s
+    bx, by, bz = point.from_sensor(values[0], values[1], values[2], mount)
+    point_[0], point_[1], point_[2] = point.turned_to_world(frame.x, frame.y, c, s, bx, by, bz)
+    fill_matrix(Dp, 0.0)
+    Dp[0, 0] = Dp[1, 1] = 1.0
+    Dp[0, 2], Dp[1, 2] = frame.y - point_[1], point_[0] - frame.x
+    for j in range(3):
+        x, y, z = outward(mount, 1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
+        Dl[0, j], Dl[1, j], Dl[2, j] = c * x - s * y, s * x + c * y, z
+
+
+implement(combine, SensorPoint)(combine_world_point)
+
+
+@part(landmark="SensorPoint", point="AtEstimate")
 class Polar(NamedTuple):
     """No parameters. Right-invariant error of the pose; turn and logarithm of the scale of each landmark."""
 
 
-class PolarSlam(NamedTuple):
-    """The parts of such a filter, a :class:`consistency.bench.filters.kernel.part_functions.Slam` of these types."""
-
-    motion: NamedTuple
-    sensor: Sensor
-    landmark: SensorPoint
-    error: Polar
-    point: NamedTuple
-    update: NamedTuple
-    covariance: NamedTuple
-
-
 @implement(propagate, Polar)
 def propagate_polar(
-    error: Polar, slam: PolarSlam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+    error: Polar, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """Pose and landmarks move; P <- F P F' + G Q G', F the identity but for a block for each landmark."""
     x, P, n, G = state.x, state.P, state.n, work.small
-    columns, before = noise_columns(slam.motion, x[:3], u, G), robot_frame(slam.motion, x[:3])
-    move(slam.motion, x[:3], u, x[:3])
-    after, noise = robot_frame(slam.motion, x[:3]), work.rows[:columns, :n]
+    noise_columns(slam.motion, x[:3], u, G)
+    before = robot_frame(x[:3])
+    move(x[:3], u, x[:3])
+    after, noise = robot_frame(x[:3]), work.rows[:2, :n]
     for o in range(3, n, 3):
         body = _move_landmark(slam.landmark.mount, before, after, x[o : o + 3], work.Jz, work.Jb)
         move_block(P, n, o, work.Jz)
-        for i in range(columns):
+        for i in range(2):
             dx = -after.c * G[0, i] - after.s * G[1, i] + G[2, i] * body[1]
             dy = after.s * G[0, i] - after.c * G[1, i] - G[2, i] * body[0]
             for a in range(3):
                 noise[i, o + a] = work.Jb[a, 0] * dx + work.Jb[a, 1] * dy
-    for i in range(columns):
+    for i in range(2):
         turn = G[2, i]
         noise[i, 0], noise[i, 1], noise[i, 2] = G[0, i] + x[1] * turn, G[1, i] - x[0] * turn, turn
-    add_gram(1.0, noise, P[:n, :n])
-    for a in range(3):
-        for b in range(a):
-            P[a, b] = P[b, a]
+    add_gram_to_state(1.0, noise, P, n)
 
 
 @inner
@@ -112,11 +167,6 @@ def to_polar(error: Polar, pose: Array, values: Array, Hp: Array, Hl: Array) -> 
         x, y, z = Hl[a, 0], Hl[a, 1], Hl[a, 2]
         for b in range(3):
             Hl[a, b] = r * (x * e[3 * b] + y * e[3 * b + 1] + z * e[3 * b + 2])
-
-
-@implement(insert_error, Polar)
-def insert_polar(error: Polar, pose: Array, values: Array, Jp: Array) -> None:
-    """A new landmark does not depend on the pose."""
 
 
 @implement(retract, Polar)

@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+from scipy.linalg import block_diag
 
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.filters.textbook.sensors import PointSensor
 from consistency.bench.filters.textbook.ukf import ordered_root
-from consistency.bench.scenario import Belief
 from consistency.bench.types import Control, Info
 from consistency.referee.types import Array
 
@@ -35,47 +36,38 @@ class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
         self.x = self.f(self.x)
 
 
-class FilterpyEkf(basics.WorldPointFilter):
+class FilterpyEkf(ExtendedKalman):
     """EKF-SLAM with filterpy's predict and (Joseph form) update."""
-
-    robot = basics.Unicycle()
 
     def __init__(self, name: str, uvd: bool) -> None:
         super().__init__(name, uvd)
         self.sensors = ("uvd",) if uvd else ("xyz", "uvd")
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
-        ekf = _Ekf(state, lambda x: np.concatenate([self.robot.move(x[:3], control), x[3:]]))
-        F, G = self.robot.jacobians(state.x[:3], control)
+        ekf = _Ekf(state, lambda x: np.concatenate([basics.move(x[:3], control), x[3:]]))
         ekf.F = np.eye(len(state.x))
-        ekf.F[:3, :3] = F
-        ekf.Q = _padded(basics.process_noise(G, state.problem.belief), len(state.x))
+        ekf.F[:3, :3], G = basics.motion_jacobians(state.x[:3], control)
+        ekf.Q = np.pad(basics.process_noise(G, state.problem.belief), (0, len(state.x) - 3))
         ekf.predict()
         return replace(state, x=ekf.x, P=ekf.P)
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         ekf = _Ekf(state, lambda x: x)
         zhat, H = basics.expect(state, seen, self.uvd)
-        ekf.update(z.ravel(), HJacobian=lambda _: H, Hx=lambda _: zhat, R=basics.block_diagonal(R))
+        ekf.update(z.ravel(), HJacobian=lambda _: H, Hx=lambda _: zhat, R=block_diag(*R))
         return replace(state, x=ekf.x, P=ekf.P), Info(ekf.y, ekf.S, ekf.K)
 
 
-class FilterpyUkf(basics.WorldPointFilter):
+class FilterpyUkf(FilterpyEkf):
     """UKF-SLAM with filterpy's unscented transforms over the whole state."""
-
-    robot = basics.Unicycle()
-
-    def __init__(self, name: str, uvd: bool) -> None:
-        super().__init__(name, uvd)
-        self.sensors = ("uvd",) if uvd else ("xyz", "uvd")
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         def f(x: Array, dt: float) -> Array:
-            return np.concatenate([self.robot.move(x[:3], control), x[3:]])
+            return np.concatenate([basics.move(x[:3], control), x[3:]])
 
         ukf = _ukf(state, np.arange(3), f, lambda x: x[:3])
-        _, G = self.robot.jacobians(state.x[:3], control)
-        ukf.Q = _padded(basics.process_noise(G, state.problem.belief), len(state.x))
+        _, G = basics.motion_jacobians(state.x[:3], control)
+        ukf.Q = np.pad(basics.process_noise(G, state.problem.belief), (0, len(state.x) - 3))
         ukf.predict()
         return replace(state, x=ukf.x, P=ukf.P)
 
@@ -85,33 +77,22 @@ class FilterpyUkf(basics.WorldPointFilter):
         involved = np.concatenate([np.arange(3), at.ravel()])
         ukf = _ukf(state, involved, lambda x, dt: x, lambda x: sensor.measure(x[:3], x[at]).ravel(), dim_z=z.size)
         ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)
-        ukf.update(z.ravel(), R=basics.block_diagonal(R))
+        ukf.update(z.ravel(), R=block_diag(*R))
         return replace(state, x=ukf.x, P=ukf.P), Info(ukf.y, ukf.S, ukf.K)
 
 
 def _ukf(
     state: SlamState, involved: Array, f: Callable[..., Array], h: Callable[..., Array], dim_z: int = 3
 ) -> UnscentedKalmanFilter:
-    n = len(state.x)
-    points = _points(n, involved, state.problem.belief)
+    n, set_ = len(state.x), state.problem.belief.sigma_points
+    # filterpy's spread is alpha sqrt(n + kappa): this kappa makes it alpha sqrt(L + the belief's kappa)
+    kappa = len(involved) + set_.kappa - n
+    points = MerweScaledSigmaPoints(
+        n, set_.alpha, set_.beta, kappa, sqrt_method=lambda scaled: ordered_root(scaled, involved).T
+    )
     ukf = UnscentedKalmanFilter(dim_x=n, dim_z=dim_z, dt=1.0, hx=h, fx=f, points=points)
     ukf.x, ukf.P = state.x.copy(), state.P.copy()
     return ukf
-
-
-def _points(n: int, involved: Array, belief: Belief) -> MerweScaledSigmaPoints:
-    set_ = belief.sigma_points
-    # filterpy's spread is alpha sqrt(n + kappa): this kappa makes it alpha sqrt(L + the belief's kappa)
-    kappa = len(involved) + set_.kappa - n
-    return MerweScaledSigmaPoints(
-        n, set_.alpha, set_.beta, kappa, sqrt_method=lambda scaled: ordered_root(scaled, involved).T
-    )
-
-
-def _padded(block: Array, n: int) -> Array:
-    out = np.zeros((n, n))
-    out[:3, :3] = block
-    return out
 
 
 EKF_XYZ = FilterpyEkf("filterpy-ekf-xyz", uvd=False)

@@ -9,7 +9,6 @@ gtsam's smoothers change in place: a state is good for one step forward, and no 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -68,14 +67,12 @@ class SmootherState:
     values: gtsam.Values = field(default_factory=gtsam.Values)  # of new variables
 
     def moved(self, control: Control) -> SmootherState:
-        """With the next step of motion."""
         step, guess = self.step + 1, self.world.moved(self.guess, control)
         self.factors.add(self.world.motion(step, control))
         self.values.insert(pose_key(step), guess)
         return replace(self, step=step, guess=guess)
 
     def seen(self, observation: Observation) -> None:
-        """Add what is seen in this step."""
         for label, z in zip(observation.landmarks, observation.z, strict=True):
             if int(label) not in self.world.origins:
                 self.values.insert(landmark_key(int(label)), self.world.placed(int(label), self.guess, z))
@@ -103,12 +100,11 @@ class SmootherState:
         return Gaussian(marginal.mean, along @ marginal.covariance @ along)
 
     def map(self) -> dict[int, Gaussian]:
-        """Landmarks (3,) in the world by label, m."""
         return {label: self.world.point(label, self.marginal(landmark_key(label))) for label in self.world.origins}
 
 
-class _Stepwise(ABC):
-    """A smoother judged like a filter: in each step the last pose, by the data up to that step."""
+class Incremental:
+    """Maximum a posteriori of all data so far, by iSAM2, judged like a filter: in each step the last pose."""
 
     sensors = ("uvd",)
     innovates = False  # so that no guard can judge what it is given
@@ -139,25 +135,15 @@ class _Stepwise(ABC):
         with _solving():
             return state.map()
 
-    @abstractmethod
-    def _engine(self) -> Any: ...
-
-    @abstractmethod
-    def _solve(self, state: SmootherState) -> None:
-        """Give the smoother what is new, and iterate once."""
-
-
-class Incremental(_Stepwise):
-    """Maximum a posteriori of all data so far, by iSAM2."""
-
     def _engine(self) -> Any:
         return gtsam.ISAM2(_isam(MOVED))
 
     def _solve(self, state: SmootherState) -> None:
+        """Give the smoother what is new, and iterate once."""
         state.engine.update(state.factors, state.values)
 
 
-class FixedLag(_Stepwise):
+class FixedLag(Incremental):
     """Of the poses only the last ``lag`` steps are kept, the landmarks all: older poses are marginalised for good."""
 
     def __init__(self, name: str, lag: int, world: World = PlanarStereo) -> None:

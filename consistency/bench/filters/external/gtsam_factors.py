@@ -31,8 +31,8 @@ import numpy as np
 
 from consistency.bench.filters.believed_noise import bias_at, disparity_sigma
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.inverse_range import untruncated
-from consistency.bench.filters.textbook.sensors import heading_matrix
+from consistency.bench.filters.textbook.inverse_range import rays, untruncated
+from consistency.bench.filters.textbook.sensors import heading_matrix, mounted
 from consistency.bench.models import stereo
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Observation
@@ -74,15 +74,13 @@ class PlanarStereo:
     origins: dict[int, Array] = field(default_factory=dict)  # (3,), the point that each landmark is told from, by label
 
     def __post_init__(self) -> None:
-        sensor = self.problem.belief.sensor
-        mount = sensor.mount.packed()
-        self.offset, self.axes = np.array(mount[:3]), np.reshape(mount[3:], (3, 3))
+        self.offset, self.axes = mounted(self.problem.belief.sensor)
 
     # --- motion ----------------------------------------------------------------------------------
 
     def moved(self, pose: Array, control: Control) -> Array:
         """Pose (3,) after a step without noise."""
-        return basics.Unicycle().move(pose, control)
+        return basics.move(pose, control)
 
     def motion(self, step: int, control: Control) -> gtsam.CustomFactor:
         """From the pose before to that of ``step``: the way in the frame of the pose before, and the turn."""
@@ -194,8 +192,7 @@ class PlanarStereo:
 
     def point(self, label: int, landmark: Gaussian) -> Gaussian:
         """A landmark as a point in the world, m."""
-        (sa, se), (ca, ce), rho = np.sin(landmark.mean[:2]), np.cos(landmark.mean[:2]), landmark.mean[2]
-        ray = np.array([ce * ca, ce * sa, se])
-        J = np.column_stack([[-ce * sa, ce * ca, 0.0], [-se * ca, -se * sa, ce], -ray / rho]) / rho
+        rho, (ray, by_angles) = landmark.mean[2], rays(landmark.mean)
+        J = np.column_stack([by_angles, -ray / rho]) / rho
         P = J @ landmark.covariance @ J.T
         return Gaussian(self.origins[label] + ray / rho, (P + P.T) / 2.0)

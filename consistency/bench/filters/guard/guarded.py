@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.filters.guard.plain_rules import kept
-from consistency.bench.filters.guard.settings import limits_of
+from consistency.bench.filters.guard.plain_rules import kept, limits_of
 from consistency.bench.protocols import Filter, Problem
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Control, Gaussian, Info, Observation
@@ -76,7 +75,7 @@ class Guarded:
         begun |= {labels[i]: first + i for i in begins}
         known_now = state.known.union(observation.landmarks[keep].tolist())
         inner = self._without(state.inner, [labels[i] for i in anew])
-        inner, info = self.filter.update(inner, _some(observation, keep))
+        inner, info = self.filter.update(inner, Observation(observation.landmarks[keep], observation.z[keep]))
         return replace(state, inner=inner, known=known_now, misses=misses, begun=begun, rejected=rejected), info
 
     def _without(self, inner: Any, labels: list[int]) -> Any:
@@ -123,7 +122,3 @@ class Guarded:
 
     def _ask(self, method: str, state: GuardedState) -> Any:
         return getattr(self.filter, method)(state.inner)
-
-
-def _some(observation: Observation, keep: Array) -> Observation:
-    return Observation(observation.landmarks[keep], observation.z[keep])

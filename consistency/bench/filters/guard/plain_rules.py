@@ -1,4 +1,4 @@
-"""Which observations of a step a guard keeps, by innovation and innovation covariance alone, in plain NumPy.
+"""The kinds of guards, and which observations of a step each keeps, by innovation and its covariance, in plain NumPy.
 
 Of m known landmarks with s values each, a guard is given the innovation y (s m,) and its covariance S (s m, s m), both
 as the filter says them. Every decision needs no more than these two:
@@ -17,12 +17,50 @@ as the filter says them. Every decision needs no more than these two:
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
 
-from consistency.bench.filters.guard.settings import Limits
+import numpy as np
+from scipy import special
+
 from consistency.referee.types import Array, Indices
 
+if TYPE_CHECKING:
+    from consistency.bench.scenario import GuardSettings
+
 MOST_NODES = 2000  # of the search for a joint set; some 2 ms in a kernel. Below it the set is the largest
+
+
+KINDS = {
+    "gate": "chi-square gate of each observation by its own innovation",
+    "joint": "largest set of observations that is jointly compatible",
+    "ransac": "one-point RANSAC: the observations that agree with the best hypothesis from one of them",
+}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Squared Mahalanobis distances up to which observations of s values are accepted."""
+
+    joint: Array  # (m + 1,), of 0, 1, ... m observations together
+    support: float  # of what a hypothesis leaves of an observation
+
+    @property
+    def own(self) -> float:
+        """Of an observation alone."""
+        return float(self.joint[1])
+
+
+def limits_of(settings: GuardSettings, s: int, m: int) -> Limits:
+    """Limits of up to ``m`` observations of ``s`` values in a step."""
+    return Limits(np.array(_quantiles(settings.confidence, s, max(m, 1))), settings.threshold**2)
+
+
+@cache
+def _quantiles(confidence: float, s: int, m: int) -> tuple[float, ...]:
+    """Of chi-square with 0, s, ... s m degrees of freedom; asked in every trial, or in every step by a plain filter."""
+    return 0.0, *map(float, 2.0 * special.gammaincinv(0.5 * s * np.arange(1, m + 1), confidence))
 
 
 def kept(kind: str, y: Array, S: Array, s: int, limits: Limits) -> Array:

@@ -1,6 +1,7 @@
 """Arrays of kernels, and what is done with them in loops, which compile in a fraction of the time of NumPy's functions.
 
-NumPy's constructors are compiled anew for each kind of shape, so that kernels call those of this module.
+NumPy's constructors are compiled anew for each kind of shape, so that kernels call those of this module. Where no
+value is given, an array has any. ``copy`` and ``fill`` write to the whole of their target.
 """
 
 from __future__ import annotations
@@ -13,14 +14,12 @@ from consistency.referee.types import Array, Indices
 
 @inner
 def copy(source: Array, target: Array) -> None:
-    """``target`` (n,) <- ``source``."""
     for i in range(len(target)):
         target[i] = source[i]
 
 
 @inner
 def copy_matrix(source: Array, target: Array) -> None:
-    """``target`` (m, n) <- ``source``."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = source[i, j]
@@ -28,14 +27,12 @@ def copy_matrix(source: Array, target: Array) -> None:
 
 @inner
 def fill(target: Array, value: float) -> None:
-    """``target`` (n,) <- ``value``."""
     for i in range(len(target)):
         target[i] = value
 
 
 @inner
 def fill_matrix(target: Array, value: float) -> None:
-    """``target`` (m, n) <- ``value``."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = value
@@ -43,25 +40,21 @@ def fill_matrix(target: Array, value: float) -> None:
 
 @inner
 def vector(n: int) -> Array:
-    """An array (n,), of any values."""
     return np.empty(n)
 
 
 @inner
 def matrix(m: int, n: int) -> Array:
-    """An array (m, n), of any values."""
     return np.empty((m, n))
 
 
 @inner
 def blocks(count: int, m: int, n: int) -> Array:
-    """An array (count, m, n), of any values."""
     return np.empty((count, m, n))
 
 
 @inner
 def integers(n: int, value: int) -> Indices:
-    """An array (n,) of this value."""
     new = np.empty(n, np.int64)
     for i in range(n):
         new[i] = value
@@ -70,7 +63,6 @@ def integers(n: int, value: int) -> Indices:
 
 @inner
 def filled(n: int, value: float) -> Array:
-    """An array (n,) of this value."""
     new = vector(n)
     fill(new, value)
     return new
@@ -78,7 +70,6 @@ def filled(n: int, value: float) -> Array:
 
 @inner
 def filled_matrix(m: int, n: int, value: float) -> Array:
-    """An array (m, n) of this value."""
     new = matrix(m, n)
     fill_matrix(new, value)
     return new
@@ -86,7 +77,6 @@ def filled_matrix(m: int, n: int, value: float) -> Array:
 
 @inner
 def filled_blocks(count: int, m: int, n: int, value: float) -> Array:
-    """An array (count, m, n) of this value."""
     new = blocks(count, m, n)
     for i in range(count):
         fill_matrix(new[i], value)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from inspect import Parameter, Signature
 from typing import Any
 
 import numba
@@ -47,8 +48,9 @@ for _routine, _module in ROUTINES.items():
     binding.add_symbol(f"consistency_{_routine}", _pointer(_module, _routine))
 
 
-def _call(routine: str, flags: bytes, arguments: tuple[Any, ...], has_info: bool = False) -> Any:
-    """Signature and code of a call by reference: flags, then arrays as pointers and numbers through the stack."""
+def _signature_and_code(routine: str, flags: bytes, arguments: tuple[Any, ...]) -> Any:
+    """Of a call by reference: flags, then arrays as pointers, numbers through the stack; LAPACK also gives ``info``."""
+    has_info = ROUTINES[routine] is cython_lapack
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         slots = [_llvm.alloca_once_value(builder, ir.Constant(ir.IntType(8), flag)) for flag in flags]
@@ -70,66 +72,25 @@ def _call(routine: str, flags: bytes, arguments: tuple[Any, ...], has_info: bool
     return (types.int32 if has_info else types.void)(*arguments), generate
 
 
-@_intrinsic
-def _dpotrf_l(_: Any, n: Any, A: Any, lda: Any) -> Any:
-    return _call("dpotrf", b"L", (n, A, lda), has_info=True)
+def _call(name: str, flags: bytes, arguments: str) -> Any:
+    """An intrinsic of BLAS or LAPACK with these ``flags``, and with its ``arguments`` by name."""
+
+    def declare(_: Any, *kinds: Any) -> Any:
+        return _signature_and_code(name, flags, kinds)
+
+    names = ("_", *arguments.split())
+    declare.__signature__ = Signature([Parameter(each, Parameter.POSITIONAL_OR_KEYWORD) for each in names])  # type: ignore[attr-defined]
+    return _intrinsic(declare)
 
 
-@_intrinsic
-def _dtrsm_rltn(_: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any) -> Any:
-    return _call("dtrsm", b"RLTN", (m, n, alpha, A, lda, B, ldb))
-
-
-@_intrinsic
-def _dtrsm_rlnn(_: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any) -> Any:
-    return _call("dtrsm", b"RLNN", (m, n, alpha, A, lda, B, ldb))
-
-
-@_intrinsic
-def _dsyrk_ln(_: Any, n: Any, k: Any, alpha: Any, A: Any, lda: Any, beta: Any, C: Any, ldc: Any) -> Any:
-    return _call("dsyrk", b"LN", (n, k, alpha, A, lda, beta, C, ldc))
-
-
-@_intrinsic
-def _dgemm_nt(
-    _: Any, m: Any, n: Any, k: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
-) -> Any:
-    return _call("dgemm", b"NT", (m, n, k, alpha, A, lda, B, ldb, beta, C, ldc))
-
-
-@_intrinsic
-def _dgemm_nn(
-    _: Any, m: Any, n: Any, k: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
-) -> Any:
-    return _call("dgemm", b"NN", (m, n, k, alpha, A, lda, B, ldb, beta, C, ldc))
-
-
-@_intrinsic
-def _dgemm_tn(
-    _: Any, m: Any, n: Any, k: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
-) -> Any:
-    return _call("dgemm", b"TN", (m, n, k, alpha, A, lda, B, ldb, beta, C, ldc))
-
-
-@_intrinsic
-def _dsymm_ll(
-    _: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
-) -> Any:
-    return _call("dsymm", b"LL", (m, n, alpha, A, lda, B, ldb, beta, C, ldc))
-
-
-@_intrinsic
-def _dsymm_rl(
-    _: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
-) -> Any:
-    return _call("dsymm", b"RL", (m, n, alpha, A, lda, B, ldb, beta, C, ldc))
-
-
-@_intrinsic
-def _dgemv_n(
-    _: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, x: Any, incx: Any, beta: Any, y: Any, incy: Any
-) -> Any:
-    return _call("dgemv", b"N", (m, n, alpha, A, lda, x, incx, beta, y, incy))
+_PRODUCT = "m n k alpha A lda B ldb beta C ldc"
+_SYMMETRIC = "m n alpha A lda B ldb beta C ldc"
+_dpotrf_l = _call("dpotrf", b"L", "n A lda")
+_dtrsm_rltn, _dtrsm_rlnn = (_call("dtrsm", flags, "m n alpha A lda B ldb") for flags in (b"RLTN", b"RLNN"))
+_dsyrk_ln = _call("dsyrk", b"LN", "n k alpha A lda beta C ldc")
+_dgemm_nt, _dgemm_nn, _dgemm_tn = (_call("dgemm", flags, _PRODUCT) for flags in (b"NT", b"NN", b"TN"))
+_dsymm_ll, _dsymm_rl = (_call("dsymm", flags, _SYMMETRIC) for flags in (b"LL", b"RL"))
+_dgemv_n = _call("dgemv", b"N", "m n alpha A lda x incx beta y incy")
 
 
 @routine

@@ -7,24 +7,25 @@ writes P does it here, but for the block and the rows of the robot, which are wh
 from __future__ import annotations
 
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import copy_matrix, fill_matrix
+from consistency.bench.filters.kernel.arrays import copy, copy_matrix
 from consistency.bench.filters.kernel.blas import add_gram, upper_cholesky
 from consistency.bench.filters.kernel.linalg import DEFICIENT
+from consistency.bench.filters.kernel.part_functions import State
 from consistency.referee.types import Array, Indices
 
 
 @inner
-def state_index(r: int, w: int, a: int, at: Indices) -> int:
+def state_index(w: int, a: int, at: Indices) -> int:
     """Index in the state of the a-th of some variables: the robot's, then those of the landmarks at ``at``."""
-    return a if a < r else at[(a - r) // w] + (a - r) % w
+    return a if a < 3 else at[(a - 3) // w] + (a - 3) % w
 
 
 @inner
-def gather_rows(P: Array, n: int, r: int, w: int, at: Indices, m: int, rows: Array) -> None:
-    """``rows`` (r + w m, n) <- whole rows of P (n, n): the robot's, then those of ``m`` landmarks at ``at`` (m,)."""
-    copy_matrix(P[:r, :n], rows[:r, :n])
+def gather_rows(P: Array, n: int, w: int, at: Indices, m: int, rows: Array) -> None:
+    """``rows`` (3 + w m, n) <- whole rows of P (n, n): the robot's, then those of ``m`` landmarks at ``at`` (m,)."""
+    copy_matrix(P[:3, :n], rows[:3, :n])
     for i in range(m):
-        o, first = at[i], r + w * i
+        o, first = at[i], 3 + w * i
         for j in range(o):
             for a in range(w):
                 rows[first + a, j] = P[j, o + a]
@@ -36,16 +37,12 @@ def gather_rows(P: Array, n: int, r: int, w: int, at: Indices, m: int, rows: Arr
 
 
 @inner
-def combine_rows(Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
-    """``out`` (s, width) <- H P of the i-th seen landmark, of any number of variables: Hp (s, r), Hl (s, w)."""
-    r, w = Hp.shape[1], Hl.shape[1]
-    fill_matrix(out, 0.0)
-    for a in range(len(Hp)):
-        for c in range(r + w):
-            h = Hp[a, c] if c < r else Hl[a, c - r]
-            row = rows[c] if c < r else rows[r + w * i + c - r]
-            for j in range(out.shape[1]):
-                out[a, j] += h * row[j]
+def gather_all_rows(state: State, Phi: Array, w: int, at: Indices, m: int, rows: Array) -> None:
+    """:func:`gather_rows`, with those of Phi, which are treated alike, in columns n..n + base - 1."""
+    n, base = state.n, state.base
+    gather_rows(state.P, n, w, at, m, rows)
+    for i in range(3 + w * m if base > 0 else 0):
+        copy(Phi[state_index(w, i, at), :base], rows[i, n : n + base])
 
 
 @inner
@@ -60,10 +57,16 @@ def definite_root(A: Array, scale: Array) -> bool:
 
 
 @inner
-def subtract_gram(P: Array, n: int, r: int, W: Array) -> None:
-    """P (n, n) <- P - W' W with W (k, n); the block of the robot, r variables, is valid as a whole."""
-    add_gram(-1.0, W, P[:n, :n])
-    for a in range(r):
+def add_gram_to_state(weight: float, W: Array, P: Array, n: int) -> None:
+    """P (n, n) <- P + weight W' W with W (k, n); the block of the robot is valid as a whole."""
+    add_gram(weight, W, P[:n, :n])
+    mirror(P)
+
+
+@inner
+def mirror(P: Array) -> None:
+    """The lower half of the block of the robot <- its upper half."""
+    for a in range(3):
         for b in range(a):
             P[a, b] = P[b, a]
 
@@ -85,16 +88,9 @@ def replace_rows(P: Array, n: int, o: int, rows: Array, own: Array) -> None:
 def move_block(P: Array, n: int, o: int, F: Array) -> None:
     """P (n, n) <- G P G', with G the identity but for its block F (3, 3) at ``o``, beyond the robot's."""
     for j in range(o):
-        row = P[j]
-        v0, v1, v2 = row[o], row[o + 1], row[o + 2]
-        for a in range(3):
-            row[o + a] = F[a, 0] * v0 + F[a, 1] * v1 + F[a, 2] * v2
+        multiply_columns(P[j], o, F)
+    multiply_rows(P[o : o + 3], F, o + 3, n)
     p0, p1, p2 = P[o], P[o + 1], P[o + 2]
-    for j in range(o + 3, n):
-        v0, v1, v2 = p0[j], p1[j], p2[j]
-        p0[j] = F[0, 0] * v0 + F[0, 1] * v1 + F[0, 2] * v2
-        p1[j] = F[1, 0] * v0 + F[1, 1] * v1 + F[1, 2] * v2
-        p2[j] = F[2, 0] * v0 + F[2, 1] * v1 + F[2, 2] * v2
     xx, xy, xz, yy, yz, zz = p0[o], p0[o + 1], p0[o + 2], p1[o + 1], p1[o + 2], p2[o + 2]
     for a in range(3):
         v0 = F[a, 0] * xx + F[a, 1] * xy + F[a, 2] * xz
@@ -105,21 +101,40 @@ def move_block(P: Array, n: int, o: int, F: Array) -> None:
 
 
 @inner
+def multiply_rows(rows: Array, F: Array, first: int, last: int) -> None:
+    """``rows`` (3, n) <- F rows in columns first..last-1, with F (3, 3)."""
+    p0, p1, p2 = rows[0], rows[1], rows[2]
+    for j in range(first, last):
+        v0, v1, v2 = p0[j], p1[j], p2[j]
+        p0[j] = F[0, 0] * v0 + F[0, 1] * v1 + F[0, 2] * v2
+        p1[j] = F[1, 0] * v0 + F[1, 1] * v1 + F[1, 2] * v2
+        p2[j] = F[2, 0] * v0 + F[2, 1] * v1 + F[2, 2] * v2
+
+
+@inner
+def multiply_columns(row: Array, o: int, F: Array) -> None:
+    """The three entries of ``row`` (n,) at ``o`` <- F times them."""
+    v0, v1, v2 = row[o], row[o + 1], row[o + 2]
+    for a in range(3):
+        row[o + a] = F[a, 0] * v0 + F[a, 1] * v1 + F[a, 2] * v2
+
+
+@inner
 def begin_landmark(P: Array, n: int, o: int, Jp: Array, Jz: Array, R: Array) -> None:
-    """Rows and columns at ``o`` of P (n, n) <- covariance of a new landmark there, Jp (w, r), Jz (w, s), R (s, s)."""
+    """Rows and columns at ``o`` of P (n, n) <- covariance of a new landmark there, Jp (w, 3), Jz (w, s), R (s, s)."""
     w = len(Jp)
     for j in range(o):
         for a in range(w):
-            P[j, o + a] = _across(P, j, Jp, a)
+            P[j, o + a] = across(P, j, Jp, a)
     for a in range(w):
         for j in range(o + w, n):
-            P[o + a, j] = _across(P, j, Jp, a)
+            P[o + a, j] = across(P, j, Jp, a)
         for b in range(a, w):
             P[o + a, o + b] = 0.5 * (_own(P, o, Jp, Jz, R, a, b) + _own(P, o, Jp, Jz, R, b, a))
 
 
 @inner
-def _across(P: Array, j: int, Jp: Array, a: int) -> float:
+def across(P: Array, j: int, Jp: Array, a: int) -> float:
     """Entry (a, j) of Jp P_pose,all, (w, n)."""
     total = 0.0
     for c in range(Jp.shape[1]):
@@ -130,9 +145,9 @@ def _across(P: Array, j: int, Jp: Array, a: int) -> float:
 @inner
 def _own(P: Array, n: int, Jp: Array, Jz: Array, R: Array, a: int, b: int) -> float:
     """Entry (a, b) of Jp P_pose Jp' + Jz R Jz', (w, w)."""
-    r, s, total = Jp.shape[1], Jz.shape[1], 0.0
-    for c in range(max(r, s)):
-        if c < r:
+    s, total = Jz.shape[1], 0.0
+    for c in range(max(3, s)):
+        if c < 3:
             total += P[c, n + a] * Jp[b, c]
         if c < s:
             for d in range(s):

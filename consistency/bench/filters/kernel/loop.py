@@ -8,7 +8,6 @@ import numpy as np
 
 from consistency.bench.filters.compiler.by_reference import by_reference, keep
 from consistency.bench.filters.compiler.jit import Kernel, inner
-from consistency.bench.filters.guard import no_guard as _open  # noqa: F401, registers the bodies of a filter without a guard
 from consistency.bench.filters.kernel.arrays import (
     copy,
     copy_matrix,
@@ -22,7 +21,6 @@ from consistency.bench.filters.kernel.arrays import (
     sum_of,
 )
 from consistency.bench.filters.kernel.covariance import begin_landmark
-from consistency.bench.filters.kernel.gain import HALTED, NOT_FINITE, POSE
 from consistency.bench.filters.kernel.linalg import definiteness_with
 from consistency.bench.filters.kernel.part_functions import (
     Data,
@@ -42,24 +40,24 @@ from consistency.bench.filters.kernel.part_functions import (
     predict,
     prepare,
     rejected_rows,
-    robot_frame,
-    robot_width,
     screen,
     settle,
     spare_width,
     to_error,
     world_point,
 )
+from consistency.bench.filters.kernel.update_steps import HALTED, NOT_FINITE, POSE
 from consistency.bench.filters.kernel.work_arrays import Work, make_work
+from consistency.bench.filters.motion.unicycle import robot_frame
 from consistency.referee.types import Array, Indices
 
 
 class Outcome(NamedTuple):
     """What a filter said of a trial of T steps; NaN from the step of a failure on."""
 
-    pose: Array  # (T, r)
-    covariance: Array  # (T, r, r), of the additive error
-    own: Array  # (T, r, r), of the filter's own error
+    pose: Array  # (T, 3)
+    covariance: Array  # (T, 3, 3), of the additive error
+    own: Array  # (T, 3, 3), of the filter's own error
     nis: Array  # (T,)
     nis_dof: Indices  # (T,)
     log_det: Array  # (T,), of S
@@ -88,7 +86,7 @@ def _insert_new(
     slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple], watch: NamedTuple
 ) -> State:
     """The state with the landmarks that begin in step k + 1: at its end, or anew at their place."""
-    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    w = landmark_width(slam.landmark)
     x, P, n, base, offset = state.x, state.P, state.n, state.base, state.offset
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
@@ -98,7 +96,7 @@ def _insert_new(
                 o = offset[label] = n
                 n += w
             place(slam.point, slam, State(x, P, o, base, offset), k, label, data.z[i], work)
-            insert_error(slam.error, x[:r], x[o : o + w], work.Jp)
+            insert_error(slam.error, x[:3], x[o : o + w], work.Jp)
             append(slam.covariance, slam, State(x, P, n, base, offset), label, local, work)
             begin_landmark(P, n, o, work.Jp, work.Jz, data.R[i])
     return State(x, P, n, base, offset)
@@ -132,36 +130,27 @@ def _most_seen(first: Indices) -> int:
 
 
 @inner
-def _map(
-    motion: NamedTuple,
-    landmark: NamedTuple,
-    error: NamedTuple,
-    covariance: NamedTuple,
-    state: State,
-    local: NamedTuple,
-    points: Array,
-    spread: Array,
-) -> Array:
+def _map(slam: Slam, state: State, local: NamedTuple, points: Array, spread: Array) -> Array:
     """``points``, ``spread`` <- the landmarks in the world, as ``Outcome`` has them; returns its ``joint``, D P D'."""
-    r, w, P = robot_width(motion), landmark_width(landmark), state.P
-    width, count = r + w, 1
+    w, P = landmark_width(slam.landmark), state.P
+    width, count = 3 + w, 1
     for label in range(len(points)):
         count += 1 if state.offset[label] >= 0 else 0
     D, at, block = filled_blocks(count, 3, width, 0.0), integers(count * width, 0), matrix(width, width)
     for a in range(3):
         D[0, a, a], at[a] = 1.0, a
-    to_error(error, state.x[:r], filled(w, 1.0), D[0, :, :r], D[0, :, r:])
+    to_error(slam.error, state.x[:3], filled(w, 1.0), D[0, :, :3], D[0, :, 3:])
     i, n = 0, 3
     for label in range(len(points)):
         o = state.offset[label]
         if o >= 0:
             i += 1
-            pose_at, own = held_at(covariance, label, local), at[width * i : width * i + width]
-            pose, values = state.x[pose_at : pose_at + r], state.x[o : o + w]
-            world_point(landmark, robot_frame(motion, pose), values, points[label], D[i, :, :r], D[i, :, r:])
-            to_error(error, pose, values, D[i, :, :r], D[i, :, r:])
+            pose_at, own = held_at(slam.covariance, label, local), at[width * i : width * i + width]
+            pose, values = state.x[pose_at : pose_at + 3], state.x[o : o + w]
+            world_point(slam.landmark, robot_frame(pose), values, points[label], D[i, :, :3], D[i, :, 3:])
+            to_error(slam.error, pose, values, D[i, :, :3], D[i, :, 3:])
             for a in range(width):
-                own[a] = pose_at + a if a < r else o + a - r
+                own[a] = pose_at + a if a < 3 else o + a - 3
                 n = max(n, own[a] + 1)
             for a in range(width):
                 for b in range(a, width):
@@ -209,19 +198,12 @@ class Memory(NamedTuple):
 
 
 @inner
-def _make_memory(size: int, n_landmarks: int) -> Memory:
-    return Memory(
-        filled(size, 0.0), filled_matrix(size, size, 0.0), integers(n_landmarks, -1), integers(n_landmarks, -1)
-    )
-
-
-@inner
-def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
+def _empty_outcome(T: int, n_landmarks: int) -> Outcome:
     """Outcome of T steps, NaN everywhere."""
     return Outcome(
-        filled_matrix(T, r, np.nan),
-        filled_blocks(T, r, r, np.nan),
-        filled_blocks(T, r, r, np.nan),
+        filled_matrix(T, 3, np.nan),
+        filled_blocks(T, 3, 3, np.nan),
+        filled_blocks(T, 3, 3, np.nan),
         filled(T, np.nan),
         integers(T, 0),
         filled(T, np.nan),
@@ -240,9 +222,8 @@ def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedT
 
     -1 too where the covariance of the additive error has lost its rank to rounding.
     """
-    r = robot_width(slam.motion)
-    copy_matrix(state.P[:r, :r], out.own[k])
-    copy(state.x[:r], out.pose[k])
+    copy_matrix(state.P[:3, :3], out.own[k])
+    copy(state.x[:3], out.pose[k])
     pose_covariance(slam.error, out.pose[k], out.own[k], out.covariance[k])
     rank = definiteness_with(out.own[k], work.small)
     return -1 if rank == 1 and definiteness_with(out.covariance[k], work.small) < 1 else rank
@@ -261,14 +242,6 @@ def _settle_new(labels: Indices, n: int, w: int, state: State, home: Indices) ->
     return n
 
 
-@inner
-def _forget_pose(k: int, out: Outcome) -> None:
-    """NaN in the rows of step k + 1."""
-    fill(out.pose[k], np.nan)
-    fill_matrix(out.covariance[k], np.nan)
-    fill_matrix(out.own[k], np.nan)
-
-
 def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     """Filter a whole trial whose state grows to at most ``size`` variables.
 
@@ -276,14 +249,13 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     would take a tenth of the whole.
     """
     slam, data = by_reference(own_slam), by_reference(own_data)
-    T, r, w = len(data.controls), robot_width(slam.motion), landmark_width(slam.landmark)
+    T, w = len(data.controls), landmark_width(slam.landmark)
     size += spare_width(slam.covariance, T, data.n_landmarks)
-    own_memory, own_out = _make_memory(size, data.n_landmarks), _empty_outcome(T, r, data.n_landmarks)
-    own_work = make_work(slam, size, _most_seen(data.first), T, data.n_landmarks)
-    own_local = make_local(slam.covariance, r, w, size, T, data.n_landmarks)
-    own_watch = make_watch(
-        slam.guard, observed_width(slam.sensor), _most_seen(data.first), len(data.landmark), data.n_landmarks
-    )
+    labels, most = data.n_landmarks, _most_seen(data.first)
+    own_memory = Memory(filled(size, 0.0), filled_matrix(size, size, 0.0), integers(labels, -1), integers(labels, -1))
+    own_out, own_work = _empty_outcome(T, labels), make_work(slam, size, most, T, labels)
+    own_local = make_local(slam.covariance, w, size, T, labels)
+    own_watch = make_watch(slam.guard, observed_width(slam.sensor), most, len(data.landmark), labels)
     memory, work, local, out = (
         by_reference(own_memory),
         by_reference(own_work),
@@ -291,16 +263,16 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
         by_reference(own_out),
     )
     watch = by_reference(own_watch)
-    copy(data.start, memory.x[:r])
-    whole = State(memory.x, memory.P, r, 0, memory.home)
-    state = State(memory.x, memory.P, r, 0, memory.active)  # of a step: the whole, unless it has a base
+    copy(data.start, memory.x[:3])
+    whole = State(memory.x, memory.P, 3, 0, memory.home)
+    state = State(memory.x, memory.P, 3, 0, memory.active)  # of a step: the whole, unless it has a base
     full_rank, step, code = False, 0, 0
     for k in range(T):
         if data.halt[0] != 0:
             step, code = k + 1, HALTED
             break
-        labels = data.landmark[data.first[k] : data.first[k + 1]]
-        whole, state = prepare(slam.covariance, slam, whole, state, labels, local)
+        seen = data.landmark[data.first[k] : data.first[k + 1]]
+        whole, state = prepare(slam.covariance, slam, whole, state, seen, local)
         state, code, m, nis, log_det = _step(slam, state, data, k, local, work, watch)
         if m > 0:
             out.nis[k], out.nis_dof[k], out.log_det[k] = nis, observed_width(slam.sensor) * m, log_det
@@ -308,15 +280,17 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
             rank = _keep_pose(slam, state, k, out, work)
             if rank < 0 or (full_rank and rank == 0):
                 code = POSE
-                _forget_pose(k, out)
+                fill(out.pose[k], np.nan)
+                fill_matrix(out.covariance[k], np.nan)
+                fill_matrix(out.own[k], np.nan)
             full_rank = full_rank or rank == 1
         if code > 0:
             step = k + 1
             break
-        whole = State(memory.x, memory.P, _settle_new(labels, whole.n, w, state, memory.home), 0, memory.home)
+        whole = State(memory.x, memory.P, _settle_new(seen, whole.n, w, state, memory.home), 0, memory.home)
     if code == 0:
         settle(slam.covariance, slam, whole, state, local)
-        joint = _map(slam.motion, slam.landmark, slam.error, slam.covariance, whole, local, out.points, out.spread)
+        joint = _map(slam, whole, local, out.points, out.spread)
     else:
         joint = matrix(0, 0)
     rejected = rejected_rows(slam.guard, own_watch)

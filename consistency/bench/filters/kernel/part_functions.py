@@ -1,14 +1,22 @@
-"""What a filter is made of, and the functions that its parts must provide.
+"""What a filter is made of, and the functions that its parts provide.
 
-The loop and the shared steps call nothing but these. ``generic(n)`` is decided by the types of the first n
-arguments; pose, landmark and covariance arrays are written in place where a docstring says ``<-``.
+The loop and the shared steps call nothing but these. The type of the first argument chooses the body; a function with
+``default=True`` has one for parts that have none of their own. Pose, landmark and covariance arrays are written in
+place where a docstring says ``<-``.
 """
+# mypy: disable-error-code="empty-body"
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from consistency.bench.filters.compiler.dispatch import generic, part
+from consistency.bench.filters.compiler.jit import inner
+from consistency.bench.filters.kernel.arrays import copy_matrix, fill_matrix, filled, integers, matrix, vector
+from consistency.bench.filters.kernel.blas import add_transposed_times
+from consistency.bench.filters.motion.unicycle import Frame, add_motion_noise, move, move_about, propagate_covariance
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array, Indices
 
@@ -18,29 +26,22 @@ Six = tuple[float, float, float, float, float, float]
 Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
-class Sensor(Protocol):
-    """A part that measures points in its own frame."""
-
-    @property
-    def mount(self) -> Mounting: ...
-
-
 @part()
 class Open(NamedTuple):
     """No guard: a filter is given all observations."""
 
 
 class Slam(NamedTuple):
-    """The parts of a filter; the type of each chooses its code."""
+    """The parts of a filter, each a NamedTuple whose type chooses its code. A sensor has its ``mount``."""
 
-    motion: NamedTuple
-    sensor: Sensor
-    landmark: NamedTuple
-    error: NamedTuple
-    point: NamedTuple
-    update: NamedTuple
-    covariance: NamedTuple
-    guard: NamedTuple = Open()
+    motion: Any
+    sensor: Any
+    landmark: Any
+    error: Any
+    point: Any
+    update: Any
+    covariance: Any
+    guard: Any = Open()
 
 
 class Data(NamedTuple):
@@ -52,7 +53,7 @@ class Data(NamedTuple):
     z: Array  # (M, s)
     R: Array  # (M, s, s), noise of each observation
     shift: Array  # (M,), bias in px that was subtracted from each disparity, by which its search range has moved
-    start: Array  # (r,), known exactly
+    start: Array  # (3,), known exactly
     n_landmarks: int
     halt: Indices  # (1,), not 0 once the trial is given up
 
@@ -71,115 +72,76 @@ class State(NamedTuple):
     offset: Indices  # (n_landmarks,) of each landmark in x, or -1
 
 
-class Frame(NamedTuple):
-    """A planar robot: its position in m, cosine and sine of its heading."""
+class Factors(NamedTuple):
+    """The active part, of up to ``c`` variables of ``n``, and what the passive rest is owed: local updating."""
 
-    x: float
-    y: float
-    c: float
-    s: float
-
-
-# --- motion ----------------------------------------------------------------------------------------
-
-
-@generic()
-def robot_width(motion: NamedTuple) -> int:
-    """Number r of variables of the robot; a constant."""
-    raise NotImplementedError
-
-
-@generic()
-def move(motion: NamedTuple, pose: Array, u: Array, out: Array) -> None:
-    """``out`` (r,) <- f of ``pose`` (r,) without noise, under the control ``u`` (3,): dt, s; v, m/s; omega, rad/s."""
-    raise NotImplementedError
+    x: Array  # (c,)
+    P: Array  # (c, c), as ``covariance`` keeps it
+    Phi: Array  # (c, c)
+    Psi: Array  # (c, c), upper half
+    theta: Array  # (c,)
+    label: Indices  # labels of the active landmarks in their order
+    base: Indices  # offsets in the whole state of the landmarks in the base
+    rows: Array  # (c, n) P0_base,all
+    owed: Array  # (c, n) Psi P0_base,all, then Phi P0_base,all
+    cross: Array  # (c, c) P0_l,base of the landmarks l that join
+    gain: Array  # (c, c) P0_l,base Psi
+    tally: Array  # (6,) what the rules for when to settle count
 
 
-@generic()
-def move_about(motion: NamedTuple, at: Array, u: Array, pose: Array) -> None:
-    """``pose`` (r,) <- f(at) + F (pose - at): f to first order about ``at`` (r,), under the control ``u`` (3,)."""
-    raise NotImplementedError
-
-
-@generic()
-def propagate_covariance(motion: NamedTuple, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int) -> None:
-    """P (n, n) <- F P F' and Phi (n, base) <- F Phi, with F (r, r) the Jacobian of f at ``at`` (r,) under ``u`` (3,).
-
-    Of both, the r rows of the robot are changed; in P the block of the robot becomes valid as a whole.
-    """
-    raise NotImplementedError
-
-
-@generic()
-def propagate_covariance_by(motion: NamedTuple, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
-    """:func:`propagate_covariance` with F of a displacement of the robot by (dx, dy) in the world, m."""
-    raise NotImplementedError
-
-
-@generic()
-def add_motion_noise(motion: NamedTuple, at: Array, u: Array, P: Array) -> None:
-    """P[:r, :r] += G Q G', with G the Jacobian of f by the noise at ``at`` (r,) under the control ``u`` (3,)."""
-    raise NotImplementedError
-
-
-@generic()
-def noise_columns(motion: NamedTuple, at: Array, u: Array, G: Array) -> int:
-    """First q columns of ``G`` (r, >= q) <- G Q^(1/2) at ``at`` (r,) under the control ``u`` (3,); returns q."""
-    raise NotImplementedError
-
-
-@generic()
-def robot_frame(motion: NamedTuple, pose: Array) -> Frame:
-    """Position in m and axes of the robot at ``pose`` (r,), which is all that landmarks need to know of it."""
-    raise NotImplementedError
-
-
-@generic()
-def propagate_covariance_root(motion: NamedTuple, P: Array, first: int, last: int, C: Array, F: Array) -> None:
-    """Columns first..last-1 of the robot's rows: P (r, n) <- F C^-1 P for a lower root C (r, r) and F (r, r).
-
-    A direction whose pivot in C is zero carries nothing.
-    """
-    raise NotImplementedError
+@inner
+def make_factors(c: int, width: int, landmarks: int) -> Factors:
+    """Arrays for ``c`` active variables with up to ``landmarks`` landmarks, of ``width`` in all."""
+    return Factors(
+        vector(c),
+        matrix(c, c),
+        matrix(c, c),
+        matrix(c, c),
+        vector(c),
+        integers(landmarks, 0),
+        integers(landmarks, 0),
+        matrix(c, width),
+        matrix(c, width),
+        matrix(c, c),
+        matrix(c, c),
+        filled(6, 0.0),
+    )
 
 
 # --- sensor ----------------------------------------------------------------------------------------
 
 
 @generic()
-def observed_width(sensor: Sensor) -> int:
+def observed_width(sensor: NamedTuple) -> int:
     """Number s of values in an observation; a constant."""
-    raise NotImplementedError
 
 
 @generic()
-def measure(sensor: Sensor, x: float, y: float, z: float) -> Pair | Triple:
+def measure(sensor: NamedTuple, x: float, y: float, z: float) -> Pair | Triple:
     """Observation, s values in the units of the sensor, of a point in the frame of the sensor, in m."""
-    raise NotImplementedError
 
 
 @generic()
-def measure_jacobian(sensor: Sensor, x: float, y: float, z: float) -> Six | Nine:
+def measure_jacobian(sensor: NamedTuple, x: float, y: float, z: float) -> Six | Nine:
     """Jacobian (s, 3) of :func:`measure` by the point, row after row."""
-    raise NotImplementedError
 
 
 @generic()
-def locate(sensor: Sensor, z: Array) -> Triple:
+def locate(sensor: NamedTuple, z: Array) -> Triple:
     """Point in the frame of the sensor, in m, that has the observation z (s,): the inverse of :func:`measure`."""
-    raise NotImplementedError
 
 
 @generic()
-def locate_jacobian(sensor: Sensor, z: Array) -> Six | Nine:
+def locate_jacobian(sensor: NamedTuple, z: Array) -> Six | Nine:
     """Jacobian (3, s) of :func:`locate` by the observation z (s,), row after row."""
-    raise NotImplementedError
 
 
-@generic()
-def wrap_residual(sensor: Sensor, z: Array, about: Array) -> None:
-    """z (s,) <- the same observation, each angle in it by full turns as near as can be to that of ``about`` (s,)."""
-    raise NotImplementedError
+@generic(default=True)
+def wrap_residual(sensor: NamedTuple, z: Array, about: Array) -> None:
+    """z (s,) <- the same observation, each angle in it by full turns as near as can be to that of ``about`` (s,).
+
+    By default nothing wraps.
+    """
 
 
 # --- landmark --------------------------------------------------------------------------------------
@@ -188,24 +150,21 @@ def wrap_residual(sensor: Sensor, z: Array, about: Array) -> None:
 @generic()
 def landmark_width(landmark: NamedTuple) -> int:
     """Number w of variables of a landmark; a constant."""
-    raise NotImplementedError
 
 
 @generic()
 def to_body(landmark: NamedTuple, frame: Frame, values: Array) -> Triple:
     """Position of the landmark ``values`` (w,) in the frame of the robot, in m."""
-    raise NotImplementedError
 
 
 @generic()
 def to_body_jacobian(
     landmark: NamedTuple, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
-    """Rows ``Hp`` (r,) and ``Hl`` (w,) <- derivatives by the variables of robot and landmark, through :func:`to_body`.
+    """Rows ``Hp`` (3,) and ``Hl`` (w,) <- derivatives by the variables of robot and landmark, through :func:`to_body`.
 
     ``row`` holds the derivative by the point in the frame of the robot, ``body`` that point, of :func:`to_body`.
     """
-    raise NotImplementedError
 
 
 @generic()
@@ -214,149 +173,165 @@ def insert(
 ) -> None:
     """``values`` (w,) <- a new landmark seen at ``body``, m in the frame of the robot.
 
-    ``Jp`` (w, r) and ``Jz`` (w, s) <- its Jacobians by robot and observation. ``Jb`` (3, s) is the derivative of
+    ``Jp`` (w, 3) and ``Jz`` (w, s) <- its Jacobians by robot and observation. ``Jb`` (3, s) is the derivative of
     ``body`` by the observation; ``mount`` says where the sensor is on the robot.
     """
-    raise NotImplementedError
 
 
 @generic()
 def world_point(landmark: NamedTuple, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array) -> None:
-    """``point`` (3,) <- position in the world, m, of ``values`` (w,); ``Dp`` (3, r), ``Dl`` (3, w) <- its Jacobians."""
-    raise NotImplementedError
+    """``point`` (3,) <- position in the world, m, of ``values`` (w,); ``Dp`` (3, 3), ``Dl`` (3, w) <- its Jacobians."""
 
 
-@generic()
+@generic(default=True)
 def combine(landmark: NamedTuple, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
-    """``out`` (s, width) <- H P of the i-th seen landmark: Hp (s, r), Hl (s, w) and ``rows`` (r + w m, width) of P."""
-    raise NotImplementedError
+    """``out`` (s, width) <- H P of the i-th seen landmark: Hp (s, 3), Hl (s, w) and ``rows`` (3 + w m, width) of P."""
+    w = Hl.shape[1]
+    fill_matrix(out, 0.0)
+    for a in range(len(Hp)):
+        for c in range(3 + w):
+            h = Hp[a, c] if c < 3 else Hl[a, c - 3]
+            row = rows[c] if c < 3 else rows[w * i + c]
+            for j in range(out.shape[1]):
+                out[a, j] += h * row[j]
 
 
 # --- error -----------------------------------------------------------------------------------------
 
 
-@generic()
-def propagate(error: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
+@generic(default=True)
+def propagate(error: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Any) -> None:
     """x (n,), P (n, n), Phi (n, base) <- one step of motion under the control ``u`` (3,), to step k + 1.
 
-    The Jacobians are taken where the linearisation point asks for them.
+    The Jacobians are taken where the linearisation point asks for them. By default they are
+    those of eq. 9 and 10: x <- f(x) and P <- F P F' + G Q G' in the robot's rows.
     """
-    raise NotImplementedError
+    pose = state.x[:3]
+    at = motion_point(slam.point, pose, k)
+    propagate_covariance_at(slam.point, slam, state, k, u, Phi, work)
+    add_motion_noise(slam.motion, at, u, state.P)
+    if expands(slam.point):
+        move_about(at, u, pose)
+    else:
+        move(pose, u, pose)
 
 
-@generic()
+@generic(default=True)
 def to_error(error: NamedTuple, pose: Array, values: Array, Hp: Array, Hl: Array) -> None:
-    """Rows ``Hp`` (k, r) and ``Hl`` (k, w) <- Jacobians by this error, in place of those by the variables.
+    """Rows ``Hp`` (k, 3) and ``Hl`` (k, w) <- Jacobians by this error, in place of those by the variables.
 
-    The error is that of the robot at ``pose`` (r,) and of the landmark ``values`` (w,).
+    The error is that of the robot at ``pose`` (3,) and of the landmark ``values`` (w,). By default they are the same.
     """
-    raise NotImplementedError
 
 
-@generic()
+@generic(default=True)
 def insert_error(error: NamedTuple, pose: Array, values: Array, Jp: Array) -> None:
-    """``Jp`` (w, r) <- Jacobian between errors, in place of the one between variables, of a new landmark by the robot.
+    """``Jp`` (w, 3) <- Jacobian between errors, in place of the one between variables, of a new landmark by the robot.
 
-    The robot is at ``pose`` (r,), the landmark is ``values`` (w,).
+    The robot is at ``pose`` (3,), the landmark is ``values`` (w,). By default they are the same.
     """
-    raise NotImplementedError
 
 
-@generic()
-def retract(error: NamedTuple, slam: Slam, state: State, A: Array, y: Array, work: NamedTuple) -> None:
-    """x (n,) <- x moved by the error A' y, with A (k, n) and y (k,)."""
-    raise NotImplementedError
+@generic(default=True)
+def retract(error: NamedTuple, slam: Slam, state: State, A: Array, y: Array, work: Any) -> None:
+    """x (n,) <- x moved by the error A' y, with A (k, n) and y (k,).
+
+    By default by a sum.
+    """
+    add_transposed_times(A, y, state.x[: state.n])
 
 
-@generic()
+@generic(default=True)
 def pose_covariance(error: NamedTuple, x: Array, P: Array, out: Array) -> None:
-    """``out`` (r, r) <- covariance of the additive error of the robot at x (n,), from that of this error, P (r, r)."""
-    raise NotImplementedError
+    """``out`` (3, 3) <- covariance of the additive error of the robot at x (n,), from that of this error, P (3, 3).
+
+    By default they are the same.
+    """
+    copy_matrix(P, out)
 
 
 # --- linearisation point -----------------------------------------------------------------------------
 
 
-@generic()
+@generic(default=True)
 def expands(point: NamedTuple) -> bool:
     """Whether f and h are replaced by their first-order expansion about the point; a constant."""
-    raise NotImplementedError
+    return False
 
 
-@generic()
+@generic(default=True)
 def stands_apart(point: NamedTuple) -> bool:
     """Whether only the Jacobians are taken at the point, f and h at the estimate; a constant."""
-    raise NotImplementedError
+    return not expands(point)
 
 
-@generic()
-def make_notes(point: NamedTuple, r: int, w: int, steps: int, labels: int) -> NamedTuple:
+@generic(default=True)
+def make_notes(point: NamedTuple, w: int, steps: int, labels: int) -> Any:
     """What the point remembers of a trial of so many steps and ids of landmarks, ``work.notes``; made once."""
-    raise NotImplementedError
+    return ()
 
 
-@generic()
+@generic(default=True)
 def motion_point(point: NamedTuple, pose: Array, k: int) -> Array:
-    """Pose (r,) at which the noise of step k + 1 acts, and about which f is expanded where the point expands."""
-    raise NotImplementedError
+    """Pose (3,) at which the noise of step k + 1 acts, and about which f is expanded where the point expands."""
+    return pose
 
 
-@generic()
+@generic(default=True)
 def propagate_covariance_at(
-    point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple
+    point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Any
 ) -> None:
     """:func:`propagate_covariance` of P (n, n) and Phi (n, base), with F of step k + 1 as the point asks.
 
-    Called before x (n,) moves under the control ``u`` (3,).
+    Called before x (n,) moves under the control ``u`` (3,). By default it is F at x.
     """
-    raise NotImplementedError
+    propagate_covariance(state.x, u, state.P, state.n, Phi, state.base)
 
 
-@generic()
+@generic(default=True)
 def observation_point(point: NamedTuple, pose: Array, k: int) -> Array:
-    """Pose (r,) at which h of step k + 1 is linearised; ``pose`` (r,) is the estimate."""
-    raise NotImplementedError
+    """Pose (3,) at which h of step k + 1 is linearised; ``pose`` (3,) is the estimate."""
+    return pose
 
 
-@generic()
-def landmark_point(point: NamedTuple, values: Array, label: int, work: NamedTuple) -> Array:
+@generic(default=True)
+def landmark_point(point: NamedTuple, values: Array, label: int, work: Any) -> Array:
     """Landmark (w,) at which h is linearised; ``values`` (w,) is the estimate of landmark ``label``."""
-    raise NotImplementedError
+    return values
 
 
 @generic()
-def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Array, work: NamedTuple) -> None:
-    """x[n:n + w], ``work.Jp`` (w, r), ``work.Jz`` (w, s) <- a new landmark from its observation z (s,); Jacobians."""
-    raise NotImplementedError
+def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Array, work: Any) -> None:
+    """x[n:n + w], ``work.Jp`` (w, 3), ``work.Jz`` (w, s) <- a new landmark from its observation z (s,); Jacobians."""
 
 
 # --- update ----------------------------------------------------------------------------------------
 
 
-@generic()
-def make_room(update: NamedTuple, r: int, w: int, s: int, m: int, n: int) -> NamedTuple:
+@generic(default=True)
+def make_room(update: NamedTuple, w: int, s: int, m: int, n: int) -> Any:
     """Arrays of this update for up to ``m`` landmarks in a step and a state of up to ``n`` variables."""
-    raise NotImplementedError
+    return ()
 
 
-@generic()
-def predict(
-    update: NamedTuple, slam: Slam, state: State, k: int, u: Array, local: NamedTuple, work: NamedTuple
-) -> None:
-    """x (n,), P (n, n), and what ``local`` says of them <- one step of motion under the control ``u`` (3,)."""
-    raise NotImplementedError
+@generic(default=True)
+def predict(update: NamedTuple, slam: Slam, state: State, k: int, u: Array, local: Any, work: Any) -> None:
+    """x (n,), P (n, n), and what ``local`` says of them <- one step of motion under the control ``u`` (3,).
+
+    By default as ``error`` has it.
+    """
+    propagate(slam.error, slam, state, k, u, local.Phi, work)
 
 
 @generic()
 def predict_innovation(
-    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: NamedTuple, work: NamedTuple
+    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Any, work: Any
 ) -> tuple[int, float]:
     """Upper half of ``work.S`` (s m, s m) <- innovation covariance; column n + base of ``work.A`` <- innovation (s m,).
 
     They are those of an update in step k + 1 with the ``m`` landmarks that ``work`` lists, as ``Info`` has them; the
     state stays as it is. Returns a code of REASONS, 0 where all is well, and a sum that is finite if all is.
     """
-    raise NotImplementedError
 
 
 @generic()
@@ -368,27 +343,34 @@ def correct(
     k: int,
     m: int,
     has_innovation: bool,
-    local: NamedTuple,
-    work: NamedTuple,
+    local: Any,
+    work: Any,
 ) -> tuple[int, float, float]:
     """x (n,), P (n, n) <- the joint update in step k + 1 with the ``m`` landmarks that ``work`` lists.
 
     ``has_innovation`` says whether :func:`predict_innovation` has been called for these, and nothing since. Returns
     a code of REASONS, 0 where all is well, the NIS, and log det S of that innovation.
     """
-    raise NotImplementedError
+
+
+@generic()
+def innovate_again(update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, work: Any) -> bool:
+    """A, S without noise, and the innovation about x, for an update that iterates; False where the prior is indefinite.
+
+    From the innovation is taken what the linearisation makes of the way from x to ``work.prior`` (3 + w m,).
+    """
 
 
 # --- guard -----------------------------------------------------------------------------------------
 
 
-@generic()
-def make_watch(guard: NamedTuple, s: int, m: int, rows: int, n_landmarks: int) -> NamedTuple:
+@generic(default=True)
+def make_watch(guard: NamedTuple, s: int, m: int, rows: int, n_landmarks: int) -> Any:
     """What a guard keeps of a trial with so many ``rows`` of observations, up to ``m`` in a step; made once."""
-    raise NotImplementedError
+    return ()
 
 
-@generic()
+@generic(default=True)
 def screen(
     guard: NamedTuple,
     slam: Slam,
@@ -396,88 +378,77 @@ def screen(
     data: Data,
     k: int,
     m: int,
-    local: NamedTuple,
-    work: NamedTuple,
-    watch: NamedTuple,
+    local: Any,
+    work: Any,
+    watch: Any,
 ) -> tuple[int, int, bool]:
     """``work`` lists, of the ``m`` known landmarks of step k + 1, those that the guard keeps; ``watch`` has the others.
 
-    Returns a code of REASONS, 0 where all is well, how many are left, and whether they are foreseen.
+    Returns a code of REASONS, 0 where all is well, how many are left, and whether they are foreseen. By default all are
+    left.
     """
-    raise NotImplementedError
+    return 0, m, False
 
 
-@generic()
-def keep_some(guard: NamedTuple, s: int, m: int, y: Array, S: Array, watch: NamedTuple) -> bool:
-    """``watch.kept`` (m,) <- which of ``m`` observations to keep, by innovation (s m,) and the upper half of S.
-
-    False where S is not positive definite.
-    """
-    raise NotImplementedError
-
-
-@generic()
-def may_enter(guard: NamedTuple, row: int, is_known: bool, watch: NamedTuple) -> bool:
+@generic(default=True)
+def may_enter(guard: NamedTuple, row: int, is_known: bool, watch: Any) -> bool:
     """Whether a landmark begins with the observation in this row of the data; anew, if it is in the state."""
-    raise NotImplementedError
+    return not is_known
 
 
-@generic()
-def rejected_rows(guard: NamedTuple, watch: NamedTuple) -> Array:
+@generic(default=True)
+def rejected_rows(guard: NamedTuple, watch: Any) -> Array:
     """Which rows of the data the filter was not given, (M,), or nothing, (0,), of a filter without a guard."""
-    raise NotImplementedError
+    return np.empty(0, np.bool_)
 
 
 # --- update of the covariance --------------------------------------------------------------------------
 
 
-@generic()
+@generic(default=True)
 def spare_width(covariance: NamedTuple, steps: int, n_landmarks: int) -> int:
     """Variables that the state may need beside robot and landmarks in a trial of so many ``steps``."""
-    raise NotImplementedError
+    return 0
 
 
-@generic()
-def make_local(covariance: NamedTuple, r: int, w: int, n: int, steps: int, n_landmarks: int) -> NamedTuple:
+@generic(default=True)
+def make_local(covariance: NamedTuple, w: int, n: int, steps: int, n_landmarks: int) -> Any:
     """What this covariance update keeps beside a state of up to ``n`` variables."""
-    raise NotImplementedError
+    return make_factors(3, 3, 1)
 
 
-@generic()
+@generic(default=True)
 def prepare(
-    covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: NamedTuple
+    covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: Any
 ) -> tuple[State, State]:
     """The whole state, and the variables to work on in a step that sees the landmarks ``labels`` (m,): all, or a part.
 
-    The whole may grow by what is neither robot nor landmark.
+    The whole may grow by what is neither robot nor landmark. By default all in every step.
     """
-    raise NotImplementedError
+    return whole, state
 
 
-@generic()
-def append(covariance: NamedTuple, slam: Slam, state: State, label: int, local: NamedTuple, work: NamedTuple) -> None:
-    """``local`` <- a landmark that begins at its offset in ``state``, with Jacobian ``work.Jp`` (w, r)."""
-    raise NotImplementedError
+@generic(default=True)
+def append(covariance: NamedTuple, slam: Slam, state: State, label: int, local: Any, work: Any) -> None:
+    """``local`` <- a landmark that begins at its offset in ``state``, with Jacobian ``work.Jp`` (w, 3)."""
 
 
-@generic()
-def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: NamedTuple) -> None:
+@generic(default=True)
+def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: Any) -> None:
     """``whole`` <- all variables as they are after the steps so far, those outside the active part included."""
-    raise NotImplementedError
 
 
-@generic()
-def held_at(covariance: NamedTuple, label: int, local: NamedTuple) -> int:
+@generic(default=True)
+def held_at(covariance: NamedTuple, label: int, local: Any) -> int:
     """Offset of the pose in whose frame a landmark is; 0 is the robot's."""
-    raise NotImplementedError
+    return 0
 
 
-@generic()
+@generic(default=True)
 def withhold(
-    covariance: NamedTuple, state: State, data: Data, k: int, rejected: Array, anew: Array, local: NamedTuple
+    covariance: NamedTuple, state: State, data: Data, k: int, rejected: Array, anew: Array, local: Any
 ) -> None:
     """``local`` <- as if the rows of step k + 1 that are ``rejected`` (M,) had not been seen.
 
     The landmarks of the rows ``anew`` (M,), which are among these, are forgotten: they are about to begin anew.
     """
-    raise NotImplementedError

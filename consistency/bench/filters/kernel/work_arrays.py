@@ -6,25 +6,14 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import blocks, integers, matrix, vector
-from consistency.bench.filters.kernel.part_functions import (
-    Slam,
-    landmark_width,
-    make_notes,
-    make_room,
-    observed_width,
-    robot_width,
-)
+from consistency.bench.filters.kernel.part_functions import Slam, landmark_width, make_notes, make_room, observed_width
 from consistency.referee.types import Array, Indices
 
 Room = TypeVar("Room", covariant=True)
 
 
-class NoNotes(NamedTuple):
-    """Of a linearisation point that remembers nothing."""
-
-
 class Work(NamedTuple, Generic[Room]):
-    """``m``: the most landmarks seen in a step, ``n``: final size of the state, ``L`` = r + w m, s: of ``measure``."""
+    """``m``: the most landmarks seen in a step, ``n``: final size of the state, ``L`` = 3 + w m, s: of ``measure``."""
 
     known: Indices  # (m,) rows of the observations whose landmark is in the state
     at: Indices  # (m,) and its offset there
@@ -35,13 +24,14 @@ class Work(NamedTuple, Generic[Room]):
     A: Array  # (s m, n + 1) Cov(z, x); in the column after the state the innovation
     rows: Array  # (L, n) rows of P of the robot and the seen landmarks
     delta: Array  # (n,) an error of the whole state
-    Hp: Array  # (m, s, r) Jacobians
+    Hp: Array  # (m, s, 3) Jacobians
     Hl: Array  # (m, s, w)
-    Jp: Array  # (w, r) of a new landmark
+    Jp: Array  # (w, 3) of a new landmark
     Jz: Array  # (w, s)
     Jb: Array  # (3, s) of its position in the robot frame
-    pose: Array  # (r,)
-    small: Array  # (r, r)
+    pose: Array  # (3,)
+    prior: Array  # (L,) of the variables involved, for an update that iterates
+    small: Array  # (3, 3)
     room: Room  # what the update alone needs
     notes: Any  # what the linearisation point alone needs, of a type of its own
 
@@ -49,25 +39,26 @@ class Work(NamedTuple, Generic[Room]):
 @inner
 def make_work(slam: Slam, n: int, m: int, steps: int, labels: int) -> Work[NamedTuple]:
     """Arrays for a state of up to ``n`` variables, ``m`` landmarks in a step, and a trial with so many labels."""
-    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
+    w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
     rows = s * m
     return Work(
         integers(m, 0),
         integers(m, 0),
         integers(m, 0),
         vector(rows),
-        vector(max(r + w * m, rows)),
+        vector(max(3 + w * m, rows)),
         matrix(rows, rows),
         matrix(rows, n + 1),
-        matrix(r + w * m, n),
+        matrix(3 + w * m, n),
         vector(n),
-        blocks(m, s, r),
+        blocks(m, s, 3),
         blocks(m, s, w),
-        matrix(w, r),
+        matrix(w, 3),
         matrix(w, s),
         matrix(3, s),
-        vector(r),
-        matrix(r, r),
-        make_room(slam.update, r, w, s, m, n),
-        make_notes(slam.point, r, w, steps, labels),
+        vector(3),
+        vector(3 + w * m),
+        matrix(3, 3),
+        make_room(slam.update, w, s, m, n),
+        make_notes(slam.point, w, steps, labels),
     )

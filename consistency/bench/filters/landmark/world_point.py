@@ -1,13 +1,12 @@
-"""A point in world coordinates, x, y, z in m, seen from a planar robot: Herath et al. (2007) eq. 19."""
+"""A point in world coordinates, m, in space or in the plane of a planar robot: Herath et al. (2007) eq. 19."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 from consistency.bench.filters.compiler.dispatch import implement, part
-from consistency.bench.filters.kernel.arrays import copy, fill_matrix
+from consistency.bench.filters.kernel.arrays import fill, fill_matrix
 from consistency.bench.filters.kernel.part_functions import (
-    Frame,
     Triple,
     combine,
     insert,
@@ -16,6 +15,7 @@ from consistency.bench.filters.kernel.part_functions import (
     to_body_jacobian,
     world_point,
 )
+from consistency.bench.filters.motion.unicycle import Frame
 from consistency.bench.models import point
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array
@@ -23,59 +23,69 @@ from consistency.referee.types import Array
 
 @part()
 class WorldPoint(NamedTuple):
-    """No parameters."""
+    """No parameters. x, y, z."""
+
+
+@part(sensor="RelativeXy RangeBearing")
+class PlanarPoint(NamedTuple):
+    """No parameters. x, y at height zero."""
 
 
 @implement(landmark_width, WorldPoint)
 def world_point_width(landmark: WorldPoint) -> int:
-    """3: x, y, z in m."""
     return 3
 
 
+@implement(landmark_width, PlanarPoint)
+def planar_point_width(landmark: PlanarPoint) -> int:
+    return 2
+
+
+@implement(to_body, PlanarPoint)
 @implement(to_body, WorldPoint)
-def to_body_of_world_point(landmark: WorldPoint, frame: Frame, values: Array) -> Triple:
-    """The point in the frame of the robot, in m, eq. 19."""
-    return point.turned_to_robot(frame.x, frame.y, frame.c, frame.s, values[0], values[1], values[2])
+def to_body_of_point(landmark: NamedTuple, frame: Frame, values: Array) -> Triple:
+    height = values[2] if len(values) > 2 else 0.0
+    return point.turned_to_robot(frame.x, frame.y, frame.c, frame.s, values[0], values[1], height)
 
 
+@implement(to_body_jacobian, PlanarPoint)
 @implement(to_body_jacobian, WorldPoint)
-def to_body_jacobian_of_world_point(
-    landmark: WorldPoint, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
+def to_body_jacobian_of_point(
+    landmark: NamedTuple, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
-    """Hp (3,) <- by x, y, heading, Hl (3,) <- by the point in the world: the ``row`` turned by the heading."""
-    c, s, d0, d1, d2 = frame.c, frame.s, row[0], row[1], row[2]
-    Hl[0], Hl[1], Hl[2] = c * d0 - s * d1, s * d0 + c * d1, d2
+    """The ``row`` turned by the heading."""
+    c, s, d0, d1 = frame.c, frame.s, row[0], row[1]
+    Hl[0], Hl[1] = c * d0 - s * d1, s * d0 + c * d1
+    if len(Hl) > 2:
+        Hl[2] = row[2]
     Hp[0], Hp[1], Hp[2] = -Hl[0], -Hl[1], d0 * body[1] - d1 * body[0]
 
 
+@implement(insert, PlanarPoint)
 @implement(insert, WorldPoint)
-def insert_world_point(
-    landmark: WorldPoint,
-    frame: Frame,
-    body: Triple,
-    Jb: Array,
-    mount: Mounting,
-    values: Array,
-    Jp: Array,
-    Jz: Array,
+def insert_point(
+    landmark: NamedTuple, frame: Frame, body: Triple, Jb: Array, mount: Mounting, values: Array, Jp: Array, Jz: Array
 ) -> None:
-    """values (3,) <- the inverse of eq. 19; Jp (3, 3), Jz (3, 3) <- its Jacobians."""
+    """By the inverse of eq. 19."""
     c, s, bx, by = frame.c, frame.s, body[0], body[1]
-    values[0], values[1], values[2] = point.turned_to_world(frame.x, frame.y, c, s, bx, by, body[2])
+    values[0], values[1], height = point.turned_to_world(frame.x, frame.y, c, s, bx, by, body[2])
     fill_matrix(Jp, 0.0)
     Jp[0, 0] = Jp[1, 1] = 1.0
     Jp[0, 2], Jp[1, 2] = -s * bx - c * by, c * bx - s * by
-    for j in range(3):
-        Jz[0, j], Jz[1, j], Jz[2, j] = c * Jb[0, j] - s * Jb[1, j], s * Jb[0, j] + c * Jb[1, j], Jb[2, j]
+    for j in range(Jz.shape[1]):
+        Jz[0, j], Jz[1, j] = c * Jb[0, j] - s * Jb[1, j], s * Jb[0, j] + c * Jb[1, j]
+        if len(Jz) > 2:
+            values[2], Jz[2, j] = height, Jb[2, j]
 
 
+@implement(world_point, PlanarPoint)
 @implement(world_point, WorldPoint)
-def world_point_itself(landmark: WorldPoint, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array) -> None:
-    """point (3,) <- values (3,); Dp (3, r) <- 0, Dl (3, 3) <- 1."""
-    copy(values, point)
+def point_itself(landmark: NamedTuple, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array) -> None:
+    fill(point, 0.0)
     fill_matrix(Dp, 0.0)
     fill_matrix(Dl, 0.0)
-    Dl[0, 0] = Dl[1, 1] = Dl[2, 2] = 1.0
+    for a in range(len(values)):
+        point[a], Dl[a, a] = values[a], 1.0
 
 
 @implement(combine, WorldPoint)

@@ -6,15 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.covariance import combine_rows
 from consistency.bench.filters.kernel.part_functions import (
-    Frame,
-    Slam,
     Triple,
-    combine,
     insert,
     landmark_width,
     to_body,
@@ -22,13 +18,13 @@ from consistency.bench.filters.kernel.part_functions import (
     world_point,
 )
 from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.motion.unicycle import Frame
 from consistency.bench.filters.textbook.anchored import AnchoredKalman
 from consistency.bench.models.point import Mounting, turned_to_robot
-from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 
-@part(motion="Unicycle", error="Additive", point="AtEstimate", covariance="Dense")
+@part(error="Additive", point="AtEstimate", covariance="Dense")
 class AnchoredInverseDepth(NamedTuple):
     """No parameters."""
 
@@ -47,7 +43,6 @@ def _ray(values: Array) -> Triple:
 
 @implement(to_body, AnchoredInverseDepth)
 def to_body_of_anchored(landmark: AnchoredInverseDepth, frame: Frame, values: Array) -> Triple:
-    """The end of the ray in the frame of the robot, in m."""
     mx, my, mz = _ray(values)
     x, y, z = values[0] + mx / values[5], values[1] + my / values[5], values[2] + mz / values[5]
     return turned_to_robot(frame.x, frame.y, frame.c, frame.s, x, y, z)
@@ -112,7 +107,6 @@ def insert_anchored(
 def anchored_world_point(
     landmark: AnchoredInverseDepth, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array
 ) -> None:
-    """point (3,) <- anchor + ray / inverse depth, m; Dp (3, r) <- 0, Dl (3, 6) <- its Jacobian."""
     m = _ray(values)
     for a in range(3):
         point[a] = values[a] + m[a] / values[5]
@@ -120,21 +114,4 @@ def anchored_world_point(
         _by_values(values, 1.0 if a == 0 else 0.0, 1.0 if a == 1 else 0.0, 1.0 if a == 2 else 0.0, Dl[a])
 
 
-@implement(combine, AnchoredInverseDepth)
-def combine_anchored(landmark: AnchoredInverseDepth, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
-    """out (3, width) <- H P, by the version for any width."""
-    combine_rows(Hp, Hl, rows, i, out)
-
-
-def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``anchored-ekf-xyz``."""
-    return ekf.xyz_parts(problem, controls)._replace(landmark=AnchoredInverseDepth())
-
-
-def uvd_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``anchored-ekf-uvd``."""
-    return ekf.uvd_parts(problem, controls)._replace(landmark=AnchoredInverseDepth())
-
-
-XYZ = Compiled(AnchoredKalman("anchored-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
-UVD = Compiled(AnchoredKalman("anchored-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XYZ, UVD = variants(AnchoredKalman, "anchored-ekf", ekf.parts, "xyz uvd", landmark=AnchoredInverseDepth())

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.error.polar import Polar
-from consistency.bench.filters.kernel.gain import (
+from consistency.bench.filters.error.polar import Polar, SensorPoint, sight
+from consistency.bench.filters.kernel.part_functions import (
+    Data,
+    Factors,
+    Slam,
+    State,
+    correct,
+    locate,
+    measure_jacobian,
+    predict_innovation,
+)
+from consistency.bench.filters.kernel.update_steps import (
     add_noise,
     combine_seen,
     correct_at_once,
@@ -16,24 +26,10 @@ from consistency.bench.filters.kernel.gain import (
     innovate,
     linearise_seen,
 )
-from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.part_functions import (
-    Data,
-    Sensor,
-    Slam,
-    State,
-    correct,
-    locate,
-    make_room,
-    measure_jacobian,
-    predict,
-    predict_innovation,
-)
 from consistency.bench.filters.kernel.work_arrays import Work
-from consistency.bench.filters.landmark.sensor_point import SensorPoint, sight
 from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.sensor.models import Uvd
 from consistency.bench.filters.textbook.equivariant import EquivariantKalman
-from consistency.bench.filters.update.joint_update import NoRoom, joint_room, predict_by_error
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
@@ -43,8 +39,6 @@ class EquivariantOutput(NamedTuple):
     """No parameters. The joint update with C* in the place of the Jacobian."""
 
 
-implement(make_room, EquivariantOutput)(joint_room)
-implement(predict, EquivariantOutput)(predict_by_error)
 implement(correct, EquivariantOutput)(correct_at_once)
 
 
@@ -57,9 +51,8 @@ def predict_innovation_equivariant(
     k: int,
     m: int,
     local: Factors,
-    work: Work[NoRoom],
+    work: Work[NamedTuple],
 ) -> tuple[int, float]:
-    """Innovation and S with C* in the place of the Jacobian."""
     gather(slam, state, m, local, work)
     linearise_seen(slam, state, k, m, work)
     for i in range(m):
@@ -70,7 +63,7 @@ def predict_innovation_equivariant(
 
 
 @inner
-def _average(sensor: Sensor, z: Array, q: Array, H: Array) -> None:
+def _average(sensor: Uvd, z: Array, q: Array, H: Array) -> None:
     """H (3, 3) <- C*, the mean of H, at the estimate q (3,), and of the derivative along the group at z (3,)."""
     if z[2] <= 0.0:  # of no point
         return
@@ -88,10 +81,9 @@ def _average(sensor: Sensor, z: Array, q: Array, H: Array) -> None:
             H[a, b] = 0.5 * (H[a, b] + along)
 
 
-def parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``eqf-uvd``."""
-    slam = ekf.uvd_parts(problem, controls)
+def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
+    slam = ekf.parts(problem, controls, uvd)
     return slam._replace(landmark=SensorPoint(slam.sensor.mount), error=Polar(), update=EquivariantOutput())
 
 
-FILTER = Compiled(EquivariantKalman("eqf-uvd"), parts, sensors=("uvd",), uvd=True, error="right")
+(FILTER,) = variants(EquivariantKalman, "eqf", parts, "uvd")

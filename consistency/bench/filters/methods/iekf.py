@@ -4,33 +4,28 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
-from consistency.bench.filters.compiled import Compiled, planar
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
-from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import vector
-from consistency.bench.filters.kernel.covariance import state_index
-from consistency.bench.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, shift, whiten
-from consistency.bench.filters.kernel.local_state import Factors
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
     correct,
+    innovate_again,
     landmark_width,
-    make_room,
     observed_width,
-    predict,
     predict_innovation,
-    robot_width,
+)
+from consistency.bench.filters.kernel.update_steps import (
+    combine_seen,
+    correct_iterated,
+    innovate,
+    linearise_seen,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.methods.ekf import predict_innovation_linearised
 from consistency.bench.filters.textbook.iekf import PASSES, IteratedKalman
-from consistency.bench.filters.update.joint_update import predict_by_error, predict_innovation_linearised
-from consistency.bench.protocols import Problem
-from consistency.referee.types import Array
 
 
 @part(error="Additive", point="AtEstimate")
@@ -40,79 +35,27 @@ class Iterated(NamedTuple):
     passes: int
 
 
-class PriorRoom(NamedTuple):
-    """The prior of the variables involved, r + w m."""
-
-    prior: Array
-
-
-@implement(make_room, Iterated)
-def iterated_room(update: Iterated, r: int, w: int, s: int, m: int, n: int) -> PriorRoom:
-    return PriorRoom(vector(r + w * m))
-
-
-implement(predict, Iterated)(predict_by_error)
 implement(predict_innovation, Iterated)(predict_innovation_linearised)
+implement(correct, Iterated)(correct_iterated)
 
 
-@implement(correct, Iterated)
-def correct_iterated(
-    update: Iterated,
-    slam: Slam,
-    state: State,
-    data: Data,
-    k: int,
-    m: int,
-    has_innovation: bool,
-    local: Factors,
-    work: Work[PriorRoom],
-) -> tuple[int, float, float]:
-    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-    involved, first_nis, first_log_det = r + w * m, np.nan, np.nan
-    gather(slam, state, m, local, work)
-    for a in range(involved):
-        work.room.prior[a] = state.x[state_index(r, w, a, work.at)]
-    for i in range(update.passes):
-        linearise_seen(slam, state, k, m, work)
-        combine_seen(slam, state, m, work)
-        _relate_to_prior(slam, state, m, innovate(slam, state, data, m, work), work)
-        code, nis, log_det = whiten(slam, state, data, m, work)
-        if code > 0:
-            return code, nis, log_det
-        if i == 0:
-            first_nis, first_log_det = nis, log_det
-        is_last = i == update.passes - 1
-        for a in range(involved):
-            j = state_index(r, w, a, work.at)
-            state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
-    apply(slam, state, m, local, work)
-    return 0, first_nis, first_log_det
-
-
-@inner
-def _relate_to_prior(slam: Slam, state: State, m: int, y: Array, work: Work[PriorRoom]) -> None:
-    """y (s m,) <- z - h(x) - H (prior - x)."""
-    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
-    x, prior = state.x, work.room.prior
+@implement(innovate_again, Iterated)
+def innovate_about_estimate(
+    update: Iterated, slam: Slam, state: State, data: Data, k: int, m: int, work: Work[NamedTuple]
+) -> bool:
+    """The innovation is z - h(x) - H (prior - x)."""
+    w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
+    linearise_seen(slam, state, k, m, work)
+    combine_seen(slam, state, m, work)
+    x, prior, y = state.x, work.prior, innovate(slam, state, data, m, work)
     for i in range(m):
         o = work.at[i]
         for a in range(s):
-            for c in range(r):
+            for c in range(3):
                 y[s * i + a] -= work.Hp[i, a, c] * (prior[c] - x[c])
             for c in range(w):
-                y[s * i + a] -= work.Hl[i, a, c] * (prior[r + w * i + c] - x[o + c])
+                y[s * i + a] -= work.Hl[i, a, c] * (prior[3 + w * i + c] - x[o + c])
+    return True
 
 
-def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``iekf-xyz``, and with landmarks in the plane where the sensor has them."""
-    return ekf.xyz_parts(problem, controls)._replace(update=Iterated(PASSES))
-
-
-def uvd_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``iekf-uvd``."""
-    return ekf.uvd_parts(problem, controls)._replace(update=Iterated(PASSES))
-
-
-XYZ = Compiled(IteratedKalman("iekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
-UVD = Compiled(IteratedKalman("iekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
-XY, RB = planar(IteratedKalman, "iekf", xyz_parts)
+XYZ, UVD, XY, RB = variants(IteratedKalman, "iekf", ekf.parts, update=Iterated(PASSES))

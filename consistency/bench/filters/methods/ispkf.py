@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from consistency.bench.filters.belief_parts import sensor_of
-from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
-from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.covariance import state_index
-from consistency.bench.filters.kernel.gain import POSE, apply, gather, innovate, shift, whiten
-from consistency.bench.filters.kernel.local_state import Factors
 from consistency.bench.filters.kernel.part_functions import (
     Data,
+    Factors,
     Slam,
     State,
     correct,
+    innovate_again,
     landmark_width,
     make_room,
     predict,
     predict_innovation,
-    robot_width,
 )
+from consistency.bench.filters.kernel.update_steps import correct_iterated, innovate
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ukf
 from consistency.bench.filters.textbook.ispkf import PASSES, IteratedPointsKalman
@@ -41,9 +37,8 @@ class IteratedPoints(NamedTuple):
 
 
 @implement(make_room, IteratedPoints)
-def iterated_points_room(update: IteratedPoints, r: int, w: int, s: int, m: int, n: int) -> NamedTuple:
-    """Arrays of sigma points, as for one pass."""
-    return make_room(update.points, r, w, s, m, n)
+def iterated_points_room(update: IteratedPoints, w: int, s: int, m: int, n: int) -> Any:
+    return make_room(update.points, w, s, m, n)
 
 
 @implement(predict, IteratedPoints)
@@ -54,38 +49,7 @@ def predict_by_points(
     predict(update.points, slam, state, k, u, local, work)
 
 
-@implement(correct, IteratedPoints)
-def correct_by_iterated_points(
-    update: IteratedPoints,
-    slam: Slam,
-    state: State,
-    data: Data,
-    k: int,
-    m: int,
-    has_innovation: bool,
-    local: Factors,
-    work: Work[SigmaRoom],
-) -> tuple[int, float, float]:
-    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-    involved, first_nis, first_log_det = r + w * m, np.nan, np.nan
-    gather(slam, state, m, local, work)
-    for a in range(involved):
-        work.room.prior[a] = state.x[state_index(r, w, a, work.at)]
-    for i in range(update.passes):
-        if not innovate_by_points(update.points, slam, state, m, work):
-            return POSE, np.nan, np.nan
-        _relate_to_prior(r, w, state, m, innovate(slam, state, data, m, work), work)
-        code, nis, log_det = whiten(slam, state, data, m, work)
-        if code > 0:
-            return code, nis, log_det
-        if i == 0:
-            first_nis, first_log_det = nis, log_det
-        is_last = i == update.passes - 1
-        for a in range(involved):
-            j = state_index(r, w, a, work.at)
-            state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
-    apply(slam, state, m, local, work)
-    return 0, first_nis, first_log_det
+implement(correct, IteratedPoints)(correct_iterated)
 
 
 @implement(predict_innovation, IteratedPoints)
@@ -96,26 +60,25 @@ def predict_innovation_by_first_points(
     return predict_innovation(update.points, slam, state, data, k, m, local, work)
 
 
-@inner
-def _relate_to_prior(r: int, w: int, state: State, m: int, y: Array, work: Work[SigmaRoom]) -> None:
-    """y (s m,) <- z - z_i - A (prior - x_i)."""
-    for a in range(r + w * m):
-        away = work.room.prior[a] - state.x[state_index(r, w, a, work.at)]
+@implement(innovate_again, IteratedPoints)
+def innovate_about_points(
+    update: IteratedPoints, slam: Slam, state: State, data: Data, k: int, m: int, work: Work[SigmaRoom]
+) -> bool:
+    """The innovation is z - z_i - A (prior - x_i)."""
+    w = landmark_width(slam.landmark)
+    if not innovate_by_points(update.points, slam, state, m, work):
+        return False
+    y = innovate(slam, state, data, m, work)
+    for a in range(3 + w * m):
+        away = work.prior[a] - state.x[state_index(w, a, work.at)]
         for row in range(len(y)):
             y[row] -= work.room.Mt[a, row] * away
+    return True
 
 
-def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ispkf-xyz``."""
-    points = problem.belief.sigma_points
-    update = IteratedPoints(Unscented(points.alpha, points.beta, points.kappa), PASSES)
-    return ukf.xyz_parts(problem, controls)._replace(update=update)
+def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
+    slam = ukf.parts(problem, controls, uvd)
+    return slam._replace(update=IteratedPoints(slam.update, PASSES))
 
 
-def uvd_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ispkf-uvd``."""
-    return xyz_parts(problem, controls)._replace(sensor=sensor_of(problem.belief, uvd=True))
-
-
-XYZ = Compiled(IteratedPointsKalman("ispkf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
-UVD = Compiled(IteratedPointsKalman("ispkf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XYZ, UVD = variants(IteratedPointsKalman, "ispkf", parts, "xyz uvd")

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from consistency.bench.filters.compiled import Compiled, planar
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.error.planar import exponential, shifted_covariance
+from consistency.bench.filters.error.invariant_pose import exponential, shifted_covariance
 from consistency.bench.filters.kernel.arrays import fill
-from consistency.bench.filters.kernel.blas import add_gram, add_transposed_times
+from consistency.bench.filters.kernel.blas import add_transposed_times
+from consistency.bench.filters.kernel.covariance import add_gram_to_state
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     insert_error,
     landmark_width,
-    move,
-    noise_columns,
     pose_covariance,
     propagate,
     retract,
@@ -24,12 +23,12 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.motion.unicycle import move, noise_columns
 from consistency.bench.filters.textbook.riekf import RightInvariantKalman
-from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 
-@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", point="AtEstimate", update="Joint", covariance="Dense")
+@part(landmark="WorldPoint PlanarPoint", point="AtEstimate", update="Joint", covariance="Dense")
 class RightInvariant(NamedTuple):
     """No parameters. Motion moves the error of every landmark, so updating is dense."""
 
@@ -39,20 +38,17 @@ def propagate_right(
     error: RightInvariant, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """x <- f(x) and P <- P + Ad G Q G' Ad': F is the identity, and the noise turns with the world, (n, q)."""
-    x, P, n, w, G = state.x, state.P, state.n, landmark_width(slam.landmark), work.small
-    columns = noise_columns(slam.motion, x[:3], u, G)
-    move(slam.motion, x[:3], u, x[:3])
-    noise = work.rows[:columns, :n]
-    for c in range(columns):
+    x, n, w, G = state.x, state.n, landmark_width(slam.landmark), work.small
+    noise_columns(slam.motion, x[:3], u, G)
+    move(x[:3], u, x[:3])
+    noise = work.rows[:2, :n]
+    for c in range(2):
         turn = G[2, c]
         noise[c, 0], noise[c, 1], noise[c, 2] = G[0, c] + x[1] * turn, G[1, c] - x[0] * turn, turn
         for o in range(3, n, w):
             noise[c, o], noise[c, o + 1] = x[o + 1] * turn, -x[o] * turn
             fill(noise[c, o + 2 : o + w], 0.0)
-    add_gram(1.0, noise, P[:n, :n])
-    for a in range(3):
-        for b in range(a):
-            P[a, b] = P[b, a]
+    add_gram_to_state(1.0, noise, state.P, n)
 
 
 @implement(to_error, RightInvariant)
@@ -63,7 +59,6 @@ def to_right(error: RightInvariant, pose: Array, values: Array, Hp: Array, Hl: A
 
 @implement(insert_error, RightInvariant)
 def insert_right(error: RightInvariant, pose: Array, values: Array, Jp: Array) -> None:
-    """Jp (w, 3) <- Jacobian between the errors of the robot and of a new landmark."""
     for a in range(len(Jp)):
         Jp[a, 2] += pose[0] * Jp[a, 1] - pose[1] * Jp[a, 0]
     Jp[0, 2] += values[1]
@@ -99,18 +94,4 @@ def right_pose_covariance(error: RightInvariant, x: Array, P: Array, out: Array)
     shifted_covariance(x, P, out)
 
 
-def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ri-ekf-xyz``, and with landmarks in the plane where the sensor has them."""
-    return ekf.xyz_parts(problem, controls)._replace(error=RightInvariant())
-
-
-def uvd_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ri-ekf-uvd``."""
-    return ekf.uvd_parts(problem, controls)._replace(error=RightInvariant())
-
-
-XYZ = Compiled(
-    RightInvariantKalman("ri-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False, error="right"
-)
-UVD = Compiled(RightInvariantKalman("ri-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True, error="right")
-XY, RB = planar(RightInvariantKalman, "ri-ekf", xyz_parts, error="right")
+XYZ, UVD, XY, RB = variants(RightInvariantKalman, "ri-ekf", ekf.parts, error=RightInvariant())

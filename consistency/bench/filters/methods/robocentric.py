@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.bench.filters.belief_parts import motion_of, sensor_of
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.error.invariant_pose import InvariantPose
 from consistency.bench.filters.kernel.part_functions import Slam
-from consistency.bench.filters.landmark.inverse_range import InverseRange
-from consistency.bench.filters.sensor.conversion import Pixels
-from consistency.bench.filters.sensor.growth import growth_of
+from consistency.bench.filters.landmark.inverse_range import InverseRange, Pixels
+from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.sensor.models import growth_of
 from consistency.bench.filters.textbook.inverse_range import Corrections, searched
 from consistency.bench.filters.textbook.robocentric import (
     ADRIFT,
@@ -39,7 +38,7 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
     """The filter with its kernel."""
     which = textbook.which
 
-    def parts(problem: Problem, controls: Array) -> Slam:
+    def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
         sensor = problem.belief.sensor
         low, high = searched(sensor, textbook.name) if which.truncation else (0.0, 0.0)
         su, sv, sd = sensor.sigma
@@ -52,17 +51,16 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
         passes, chain = PASSES if which.iteration else 1, PASSES_CHAINED if which.tempering else PASSES_EARLY
         decades, cooling = (0.0, COOLING) if which.tempering else (TEMPERED, COOLING_EARLY)
         waiting = KNOWN if which.waiting else 0.0
-        return Slam(
-            motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
-            InvariantPose(which.moments), Converted(),
-            Converting(
+        return ekf.parts(problem, controls, uvd)._replace(
+            landmark=InverseRange(sensor.mount.packed()), error=InvariantPose(which.moments), point=Converted(),
+            update=Converting(
                 pixels, waiting, passes, chain if which.turning else 0, clones, which.recency, which.curvature,
                 which.spread, decades, cooling,
             ),
-            Parking(every, unseen, doubt, adrift, which.turning, which.patience),
+            covariance=Parking(every, unseen, doubt, adrift, which.turning, which.patience),
         )  # fmt: skip
 
-    return Compiled(textbook, parts, sensors=("uvd",), uvd=True)
+    return Compiled(textbook, parts, textbook.sensors)
 
 
 PARKED = compiled(RobotCentredKalman("parked-ekf-uvd", Corrections()))

@@ -2,42 +2,46 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import sum_of
-from consistency.bench.filters.kernel.gain import combine_seen, correct_at_once, gather, innovate, linearise_seen
-from consistency.bench.filters.kernel.local_state import Factors
 from consistency.bench.filters.kernel.part_functions import (
     Data,
+    Factors,
     Slam,
     State,
     Triple,
     correct,
     locate,
     locate_jacobian,
-    make_room,
     measure,
     measure_jacobian,
     observed_width,
-    predict,
     predict_innovation,
-    wrap_residual,
+)
+from consistency.bench.filters.kernel.update_steps import (
+    combine_seen,
+    correct_at_once,
+    gather,
+    innovate,
+    linearise_seen,
 )
 from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.sensor.growth import Growth, growth_of, ratio_at
-from consistency.bench.filters.sensor.xyz import (
+from consistency.bench.filters.sensor.models import (
+    Growth,
+    growth_of,
     locate_xyz_jacobian,
     measure_xyz,
     measure_xyz_jacobian,
-    xyz_has_no_angle,
-    xyz_width,
+    ratio_at,
+    three_values,
 )
 from consistency.bench.filters.textbook.triangulated import TriangulatedKalman
-from consistency.bench.filters.update.joint_update import NoRoom, joint_room, predict_by_error
 from consistency.bench.models import stereo
 from consistency.bench.models.point import Mounting
 from consistency.bench.protocols import Problem
@@ -57,8 +61,7 @@ class DebiasedXyz(NamedTuple):
     mount: Mounting
 
 
-implement(observed_width, DebiasedXyz)(xyz_width)
-implement(wrap_residual, DebiasedXyz)(xyz_has_no_angle)
+implement(observed_width, DebiasedXyz)(three_values)
 implement(measure, DebiasedXyz)(measure_xyz)
 implement(measure_jacobian, DebiasedXyz)(measure_xyz_jacobian)
 implement(locate_jacobian, DebiasedXyz)(locate_xyz_jacobian)  # the bias is taken as known
@@ -88,8 +91,6 @@ class NoiseAtPrediction(NamedTuple):
     growth: Growth
 
 
-implement(make_room, NoiseAtPrediction)(joint_room)
-implement(predict, NoiseAtPrediction)(predict_by_error)
 implement(correct, NoiseAtPrediction)(correct_at_once)
 
 
@@ -102,7 +103,7 @@ def predict_innovation_with_noise_at_prediction(
     k: int,
     m: int,
     local: Factors,
-    work: Work[NoRoom],
+    work: Work[NamedTuple],
 ) -> tuple[int, float]:
     gather(slam, state, m, local, work)
     linearise_seen(slam, state, k, m, work)
@@ -111,7 +112,7 @@ def predict_innovation_with_noise_at_prediction(
 
 
 @inner
-def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Work[NoRoom]) -> float:
+def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Work[NamedTuple]) -> float:
     """y (3 m,) <- y - bias, S (3 m, 3 m) <- S + R; returns a sum that is finite if all that is given is."""
     total, rows = 0.0, 3 * m
     for i in range(m):
@@ -137,27 +138,16 @@ def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Wor
     return total
 
 
-def predicted_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``predicted-ekf-xyz``."""
-    sensor = problem.belief.sensor
-    su, sv, sd = sensor.sigma
-    noise = NoiseAtPrediction(sensor.f or 0.0, sensor.B or 0.0, su, sv, sd, 0.0, growth_of(sensor))
-    return ekf.xyz_parts(problem, controls)._replace(update=noise)
+def parts(problem: Problem, controls: Array, uvd: bool, debiasing: bool) -> Slam:
+    """Those of the EKF, and the update; with ``debiasing`` also the sensor."""
+    sensor, slam = problem.belief.sensor, ekf.parts(problem, controls, uvd)
+    f, B, growth, (su, sv, sd) = sensor.f or 0.0, sensor.B or 0.0, growth_of(sensor), sensor.sigma
+    rho = sd / (f * B) if debiasing else 0.0
+    slam = slam._replace(update=NoiseAtPrediction(f, B, su, sv, sd, rho, growth))
+    return slam._replace(sensor=DebiasedXyz(rho, growth, f * B, slam.sensor.mount)) if debiasing else slam
 
 
-def debiased_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``debiased-ekf-xyz``."""
-    sensor = problem.belief.sensor
-    f, B = sensor.f or 0.0, sensor.B or 0.0
-    su, sv, sd = sensor.sigma
-    rho = sd / (f * B)
-    growth = growth_of(sensor)
-    noise = NoiseAtPrediction(f, B, su, sv, sd, rho, growth)
-    part_ = DebiasedXyz(rho, growth, f * B, sensor.mount.packed())
-    return ekf.xyz_parts(problem, controls)._replace(sensor=part_, update=noise)
-
-
-PREDICTED = Compiled(
-    TriangulatedKalman("predicted-ekf-xyz", debiasing=False), predicted_parts, sensors=("uvd",), uvd=False
+PREDICTED, DEBIASED = (
+    Compiled(TriangulatedKalman(f"{method}-ekf-xyz", debiasing), partial(parts, debiasing=debiasing), ("uvd",))
+    for method, debiasing in (("predicted", False), ("debiased", True))
 )
-DEBIASED = Compiled(TriangulatedKalman("debiased-ekf-xyz", debiasing=True), debiased_parts, sensors=("uvd",), uvd=False)

@@ -1,32 +1,25 @@
-"""UKF-SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.ukf`."""
+"""UKF-SLAM and cubature SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.ukf`."""
 
 from __future__ import annotations
 
-from consistency.bench.filters.belief_parts import landmark_of, motion_of, sensor_of
-from consistency.bench.filters.compiled import Compiled, planar
-from consistency.bench.filters.covariance_update.dense import Dense
-from consistency.bench.filters.error.additive import Additive
+from functools import partial
+
+from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.kernel.part_functions import Slam
-from consistency.bench.filters.point.at_estimate import AtEstimate
-from consistency.bench.filters.textbook.ukf import UnscentedKalman
+from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.textbook.ukf import CUBATURE, UnscentedKalman
 from consistency.bench.filters.update.unscented import Unscented
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 
-def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ukf-xyz``, and with landmarks in the plane where the sensor has them."""
-    belief = problem.belief
-    points = Unscented(belief.sigma_points.alpha, belief.sigma_points.beta, belief.sigma_points.kappa)
-    sensor = sensor_of(belief, uvd=False)
-    return Slam(motion_of(belief), sensor, landmark_of(belief), Additive(), AtEstimate(), points, Dense())
+def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
+    points = problem.belief.sigma_points
+    return ekf.parts(problem, controls, uvd)._replace(update=Unscented(points.alpha, points.beta, points.kappa))
 
 
-def uvd_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ukf-uvd``."""
-    return xyz_parts(problem, controls)._replace(sensor=sensor_of(problem.belief, uvd=True))
-
-
-XYZ = Compiled(UnscentedKalman("ukf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
-UVD = Compiled(UnscentedKalman("ukf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
-XY, RB = planar(UnscentedKalman, "ukf", xyz_parts)
+XYZ, UVD, XY, RB = variants(UnscentedKalman, "ukf", parts)
+CKF_XYZ, CKF_UVD = variants(
+    partial(UnscentedKalman, points=CUBATURE), "ckf", ekf.parts, "xyz uvd",
+    update=Unscented(CUBATURE.alpha, CUBATURE.beta, CUBATURE.kappa),
+)  # fmt: skip

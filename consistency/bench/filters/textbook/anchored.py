@@ -7,32 +7,23 @@ any distance. The price is a state of twice the size.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
+from consistency.bench.filters.textbook.inverse_range import rays
 from consistency.bench.filters.textbook.sensors import PointSensor, heading_matrix
 from consistency.bench.protocols import Problem
-from consistency.bench.types import Control, Gaussian, Info, Observation
+from consistency.bench.types import Gaussian, Info
 from consistency.referee.types import Array
 
 
-class AnchoredKalman(basics.SlamFilter):
+class AnchoredKalman(ExtendedKalman):
     """EKF-SLAM on anchored landmarks, their Jacobians through the point in the world."""
-
-    def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
 
     def init(self, problem: Problem) -> SlamState:
         return basics.start(problem, width=6)
-
-    def predict(self, state: SlamState, control: Control) -> SlamState:
-        return basics.predict_extended(state, control)
-
-    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
-        return basics.update_jointly(state, observation, self.uvd, self._correct, self._locate)
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         sensor = PointSensor(state.problem.belief.sensor, self.uvd)
@@ -43,9 +34,7 @@ class AnchoredKalman(basics.SlamFilter):
             zhat[rows] = sensor.measure(state.x[:3], point)
             H[rows, :3], by_point = sensor.jacobians(state.x[:3], point)
             H[rows, at] = by_point @ D
-        innovation = z.ravel() - zhat
-        S, W = basics.gain(state.P, H, basics.block_diagonal(R))
-        return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+        return basics.corrected(state, H, z.ravel() - zhat, R)
 
     def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
         point, point_by_pose, point_by_z = basics.locate_point(state, z, self.uvd)
@@ -60,9 +49,6 @@ class AnchoredKalman(basics.SlamFilter):
         by_ray = np.linalg.inv(anchored_point(values)[1][:, 3:])
         Jp = np.vstack([anchor_by_pose, by_ray @ (point_by_pose - anchor_by_pose)])
         return values, Jp, np.vstack([np.zeros((3, 3)), by_ray @ point_by_z])
-
-    def pose(self, state: SlamState) -> Gaussian:
-        return basics.pose_of(state)
 
     def map(self, state: SlamState) -> dict[int, Gaussian]:
         blocks = {label: slice(state.at(label), state.at(label) + 6) for label in state.landmarks}
@@ -80,9 +66,5 @@ class AnchoredKalman(basics.SlamFilter):
 
 def anchored_point(values: Array) -> tuple[Array, Array]:
     """Point (3,) in the world of a landmark's six numbers, with its Jacobian (3, 6)."""
-    azimuth, elevation, rho = values[3:]
-    ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
-    ray = np.array([ce * ca, ce * sa, se])
-    by_azimuth, by_elevation = np.array([-ce * sa, ce * ca, 0.0]), np.array([-se * ca, -se * sa, ce])
-    D = np.column_stack([np.eye(3), by_azimuth / rho, by_elevation / rho, -ray / rho**2])
-    return values[:3] + ray / rho, D
+    rho, (ray, by_angles) = values[5], rays(values[3:])
+    return values[:3] + ray / rho, np.column_stack([np.eye(3), by_angles / rho, -ray / rho**2])

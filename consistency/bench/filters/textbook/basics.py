@@ -1,15 +1,14 @@
 """State and steps that the methods have in common: SLAM after Herath, Kodagoda & Dissanayake (2007) eq. 1-13.
 
-Nothing is shared with the kernels but the models. Each method is a class made of the functions here; those on world
-points with an additive error share :class:`WorldPointFilter`.
+Nothing is shared with the kernels but the models. Each method is a class made of the functions here; those whose state
+is a ``SlamState`` are variations of ``ExtendedKalman``.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -55,19 +54,17 @@ def start(problem: Problem, width: int | None = None) -> SlamState:
     return SlamState(problem.start.copy(), np.zeros((3, 3)), (), problem, width or own)
 
 
-class Unicycle:
-    """Eq. 18."""
+def move(pose: Array, control: Control) -> Array:
+    """Pose (3,) after a step, eq. 18."""
+    return np.array(motion.unicycle(pose[0], pose[1], pose[2], control.dt, control.v, control.omega))
 
-    def move(self, pose: Array, control: Control) -> Array:
-        """Pose (3,) after a step."""
-        return np.array(motion.unicycle(pose[0], pose[1], pose[2], control.dt, control.v, control.omega))
 
-    def jacobians(self, pose: Array, control: Control) -> tuple[Array, Array]:
-        """F (3, 3) with respect to the pose and G (3, 2) with respect to (v, omega)."""
-        c, s, dt = np.cos(pose[2]), np.sin(pose[2]), control.dt
-        F = np.array([[1, 0, -dt * control.v * s], [0, 1, dt * control.v * c], [0, 0, 1]])
-        G = np.array([[dt * c, 0], [dt * s, 0], [0, dt]])
-        return F, G
+def motion_jacobians(pose: Array, control: Control) -> tuple[Array, Array]:
+    """F (3, 3) of eq. 18 with respect to the pose and G (3, 2) with respect to (v, omega)."""
+    c, s, dt = np.cos(pose[2]), np.sin(pose[2]), control.dt
+    F = np.array([[1, 0, -dt * control.v * s], [0, 1, dt * control.v * c], [0, 0, 1]])
+    G = np.array([[dt * c, 0], [dt * s, 0], [0, dt]])
+    return F, G
 
 
 def quarter_turn(v: Array) -> Array:
@@ -81,33 +78,19 @@ def process_noise(G: Array, belief: Belief) -> Array:
     return np.asarray(G @ Q @ G.T)
 
 
-def predict_extended(state: SlamState, control: Control) -> SlamState:
-    """Eq. 9 and 10 with Jacobians at the estimate: the mean moves by f, P <- F P F' + G Q G'."""
-    robot, x, F = Unicycle(), state.x.copy(), np.eye(len(state.x))
-    F[:3, :3], G = robot.jacobians(x[:3], control)
-    x[:3] = robot.move(x[:3], control)
-    P = F @ state.P @ F.T
-    P[:3, :3] += process_noise(G, state.problem.belief)
-    return replace(state, x=x, P=P)
-
-
 def predict_by(state: SlamState, control: Control, displacement: Array, at: Array) -> SlamState:
     """Eq. 9 and 10 with F of another ``displacement`` (2,) of the robot, in m, and G at the pose ``at`` (3,)."""
-    robot, x, F = Unicycle(), state.x.copy(), np.eye(len(state.x))
-    _, G = robot.jacobians(at, control)
-    x[:3] = robot.move(x[:3], control)
+    x, F = state.x.copy(), np.eye(len(state.x))
+    _, G = motion_jacobians(at, control)
+    x[:3] = move(x[:3], control)
     F[:2, 2] = quarter_turn(displacement)
     P = F @ state.P @ F.T
     P[:3, :3] += process_noise(G, state.problem.belief)
     return replace(state, x=x, P=P)
 
 
-class Correct(Protocol):
-    """The update with landmarks already in the state: their labels, z (m, s), R (m, s, s)."""
-
-    def __call__(self, state: SlamState, seen: list[int], z: Array, R: Array, /) -> tuple[SlamState, Info]: ...
-
-
+# The update with landmarks already in the state: their labels, z (m, s), R (m, s, s)
+Correct = Callable[[SlamState, list[int], Array, Array], tuple[SlamState, Info]]
 Locate = Callable[[SlamState, int, Array], tuple[Array, Array, Array]]
 
 
@@ -167,6 +150,12 @@ def innovation_of(state: SlamState, z: Array, zhat: Array, uvd: bool) -> Array:
     return view(state.problem.belief.sensor, uvd).less(z, zhat.reshape(z.shape)).ravel()
 
 
+def corrected(state: SlamState, H: Array, innovation: Array, R: Array) -> tuple[SlamState, Info]:
+    """Eq. 11 to 13: the update by an innovation (s m,) with H (s m, n) and the noise R (m, s, s)."""
+    S, W = gain(state.P, H, block_diag(*R))
+    return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+
+
 def gain(P: Array, H: Array, R: Array) -> tuple[Array, Array]:
     """S = H P H' + R (k, k) and the gain P H' S^-1 (n, k), eq. 11 and 12; P (n, n), H (k, n)."""
     S = H @ P @ H.T + R
@@ -179,9 +168,7 @@ def correct_about(
     """The update of an EKF whose H is that of other values ``at`` (n,) than its estimate."""
     zhat, _ = expect(state, seen, uvd)
     _, H = expect(replace(state, x=at), seen, uvd)
-    innovation = innovation_of(state, z, zhat, uvd)
-    S, W = gain(state.P, H, block_diagonal(R))
-    return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+    return corrected(state, H, innovation_of(state, z, zhat, uvd), R)
 
 
 def locate_point(state: SlamState, z: Array, uvd: bool) -> tuple[Array, Array, Array]:
@@ -198,13 +185,8 @@ def map_of(state: SlamState) -> dict[int, Gaussian]:
     """Landmarks (3,) by label, m, with covariance (3, 3), of a state of world points whose error is additive."""
     w = state.width
     blocks = {label: slice(state.at(label), state.at(label) + w) for label in state.landmarks}
-    return {label: in_space(state.x[at], state.P[at, at]) for label, at in blocks.items()}
-
-
-def in_space(mean: Array, P: Array) -> Gaussian:
-    """A landmark (w,) as a point (3,): one in the plane is known to be at height zero."""
-    missing = 3 - len(mean)
-    return Gaussian(np.pad(mean, (0, missing)), np.pad(P, (0, missing)))
+    up = (0, 3 - w)  # the height of one in the plane is known to be zero
+    return {label: Gaussian(np.pad(state.x[at], up), np.pad(state.P[at, at], up)) for label, at in blocks.items()}
 
 
 def joint_of(state: SlamState) -> Gaussian:
@@ -215,65 +197,23 @@ def joint_of(state: SlamState) -> Gaussian:
     return Gaussian(T @ state.x, T @ state.P @ T.T)
 
 
-class WrappedState(Protocol):
-    """A state that holds a ``SlamState`` of world points, and more."""
-
-    @property
-    def slam(self) -> SlamState: ...
-
-
-class SlamFilter:
-    """A filter whose state is a ``SlamState``."""
-
-    def forget(self, state: SlamState, landmark: int) -> SlamState:
-        return without(state, landmark)
-
-
 class WrappedFilter:
-    """A filter whose state holds a ``SlamState``, such as one with other points to linearise at."""
+    """A filter whose state is a dataclass with a ``SlamState`` of world points as its ``slam``, and more."""
 
     def __init__(self, name: str, uvd: bool) -> None:
         self.name, self.uvd = name, uvd
 
-    def pose(self, state: WrappedState) -> Gaussian:
+    def forget(self, state: Any, landmark: int) -> Any:
+        return replace(state, slam=without(state.slam, landmark))
+
+    def pose(self, state: Any) -> Gaussian:
         return pose_of(state.slam)
 
-    def map(self, state: WrappedState) -> dict[int, Gaussian]:
+    def map(self, state: Any) -> dict[int, Gaussian]:
         return map_of(state.slam)
 
-    def joint(self, state: WrappedState) -> Gaussian:
+    def joint(self, state: Any) -> Gaussian:
         return joint_of(state.slam)
-
-
-class WorldPointFilter(SlamFilter, ABC):
-    """SLAM on points in the world with an additive error; a method adds how it predicts and corrects."""
-
-    def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
-
-    def init(self, problem: Problem) -> SlamState:
-        return start(problem)
-
-    @abstractmethod
-    def predict(self, state: SlamState, control: Control) -> SlamState: ...
-
-    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
-        return update_jointly(state, observation, self.uvd, self._correct, self._locate)
-
-    @abstractmethod
-    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]: ...
-
-    def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
-        return locate_point(state, z, self.uvd)
-
-    def pose(self, state: SlamState) -> Gaussian:
-        return pose_of(state)
-
-    def map(self, state: SlamState) -> dict[int, Gaussian]:
-        return map_of(state)
-
-    def joint(self, state: SlamState) -> Gaussian:
-        return joint_of(state)
 
 
 def require_landmarks(problem: Problem, name: str) -> Array:
@@ -287,12 +227,3 @@ def require_landmarks(problem: Problem, name: str) -> Array:
     if problem.landmarks is None:
         raise InputError(f"filter '{name}' needs the landmarks that its world is linearised about")
     return problem.landmarks
-
-
-def block_diagonal(blocks: Array) -> Array:
-    """(m, s, s) -> (s m, s m)."""
-    m, s = blocks.shape[:2]
-    out = np.zeros((s * m, s * m))
-    for i, block in enumerate(blocks):
-        out[s * i : s * i + s, s * i : s * i + s] = block
-    return out

@@ -31,31 +31,23 @@ from scipy.spatial.transform import Rotation
 
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
-from consistency.bench.filters.textbook.sensors import PointSensor, heading_matrix
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
+from consistency.bench.filters.textbook.riekf import additive_from_right
+from consistency.bench.filters.textbook.sensors import PointSensor, heading_matrix, mounted
 from consistency.bench.models.point import Mounting
-from consistency.bench.protocols import Problem
-from consistency.bench.types import Control, Gaussian, Info, Observation
+from consistency.bench.types import Control, Gaussian, Info
 from consistency.referee.types import Array
 
 
-class EquivariantKalman(basics.SlamFilter):
-    """The equivariant filter as its definitions have it."""
-
+class EquivariantKalman(ExtendedKalman):
     error = "right"
-    robot = basics.Unicycle()
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def init(self, problem: Problem) -> SlamState:
-        return basics.start(problem)
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
-        before, after = state.x[:3], self.robot.move(state.x[:3], control)
-        t, A = _mounted(state)
-        _, G = self.robot.jacobians(before, control)
+        before, after = state.x[:3], basics.move(state.x[:3], control)
+        t, A = mounted(state.problem.belief.sensor)
+        _, G = basics.motion_jacobians(before, control)
         to_sensor = A.T @ heading_matrix(after[2]).T  # of a direction in the world
-        x, F, noise = [after], [np.eye(3)], [np.linalg.inv(_additive_from_right(after)) @ G]
+        x, F, noise = [after], [np.eye(3)], [np.linalg.inv(additive_from_right(after)) @ G]
         for q in state.x[3:].reshape(-1, 3):
             world = _in_world(before, A @ q + t)
             moved = to_sensor @ (world - _in_world(after, t))
@@ -67,9 +59,6 @@ class EquivariantKalman(basics.SlamFilter):
         P = whole @ state.P @ whole.T + basics.process_noise(G, state.problem.belief)
         return replace(state, x=np.concatenate(x), P=P)
 
-    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
-        return basics.update_jointly(state, observation, True, self._correct, self._locate)
-
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         sensor = _in_own_frame(state)
         zhat, H = np.zeros_like(z), np.zeros((3 * len(seen), len(state.x)))
@@ -80,20 +69,18 @@ class EquivariantKalman(basics.SlamFilter):
             halves = [sensor.jacobians(np.zeros(3), p)[1] @ _along_group(q, p) for p in (q, y)]
             H[3 * i : 3 * i + 3, at] = (halves[0] + halves[1]) / 2.0
         innovation = (z - zhat).ravel()
-        S, W = basics.gain(state.P, H, basics.block_diagonal(R))
-        moved = _moved(state.x, W @ innovation)
-        return replace(state, x=moved, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+        after, info = basics.corrected(state, H, innovation, R)
+        return replace(after, x=_moved(state.x, info.gain @ innovation)), info
 
     def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
         q, _, J = _in_own_frame(state).locate(np.zeros(3), z)
         return q, np.zeros((3, 3)), np.linalg.inv(_along_group(q, q)) @ J
 
     def pose(self, state: SlamState) -> Gaussian:
-        T = _additive_from_right(state.x[:3])
+        T = additive_from_right(state.x[:3])
         return Gaussian(state.x[:3], T @ state.P[:3, :3] @ T.T)
 
     def own_covariance(self, state: SlamState) -> Array:
-        """Covariance (3, 3) of the right-invariant error of the pose."""
         return state.P[:3, :3]
 
     def map(self, state: SlamState) -> dict[int, Gaussian]:
@@ -104,8 +91,8 @@ class EquivariantKalman(basics.SlamFilter):
     def joint(self, state: SlamState) -> Gaussian:
         """Robot and landmarks in the world together, (n,) and (n, n), additive errors."""
         pose, mean, D = state.x[:3], state.x.copy(), np.zeros_like(state.P)
-        t, A = _mounted(state)
-        D[:3, :3] = _additive_from_right(pose)
+        t, A = mounted(state.problem.belief.sensor)
+        D[:3, :3] = additive_from_right(pose)
         for label in state.landmarks:
             at = slice(state.at(label), state.at(label) + 3)
             q = state.x[at]
@@ -113,12 +100,6 @@ class EquivariantKalman(basics.SlamFilter):
             D[at, :3] = _by_pose(pose, mean[at]) @ D[:3, :3]
             D[at, at] = heading_matrix(pose[2]) @ A @ _along_group(q, q)
         return Gaussian(mean, D @ state.P @ D.T)
-
-
-def _mounted(state: SlamState) -> tuple[Array, Array]:
-    """Position (3,) of the sensor in the frame of the robot, m, and its axes (3, 3)."""
-    mount = np.array(state.problem.belief.sensor.mount.packed())
-    return mount[:3], mount[3:].reshape(3, 3)
 
 
 def _in_world(pose: Array, body: Array) -> Array:
@@ -162,8 +143,3 @@ def _moved(x: Array, error: Array) -> Array:
         turn = Rotation.from_rotvec(error[o] * one + error[o + 1] * two)
         moved[o : o + 3] = np.exp(error[o + 2]) * turn.apply(x[o : o + 3])
     return moved
-
-
-def _additive_from_right(pose: Array) -> Array:
-    """T (3, 3) with additive error = T right-invariant error, at a pose (3,)."""
-    return np.array([[1.0, 0.0, -pose[1]], [0.0, 1.0, pose[0]], [0.0, 0.0, 1.0]])

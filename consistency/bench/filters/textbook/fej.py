@@ -28,16 +28,12 @@ class FirstState:
 
 
 class FirstEstimateKalman(basics.WrappedFilter):
-    """EKF-SLAM with every variable linearised at its first estimate."""
-
-    robot = basics.Unicycle()
-
     def init(self, problem: Problem) -> FirstState:
         return FirstState(basics.start(problem), problem.start.copy())
 
     def predict(self, state: FirstState, control: Control) -> FirstState:
         pose = state.slam.x[:3]
-        predicted = self.robot.move(pose, control)
+        predicted = basics.move(pose, control)
         slam = basics.predict_by(state.slam, control, predicted[:2] - state.first[:2], pose)
         return FirstState(slam, np.concatenate([predicted, state.first[3:]]))
 

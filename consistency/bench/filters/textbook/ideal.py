@@ -30,10 +30,7 @@ class IdealState:
 
 
 class IdealKalman(basics.WrappedFilter):
-    """EKF-SLAM linearised at the true poses and landmarks."""
-
     realisable = False
-    robot = basics.Unicycle()
 
     def init(self, problem: Problem) -> IdealState:
         return IdealState(basics.start(problem), truth_of(problem), 0)
@@ -59,9 +56,6 @@ class IdealKalman(basics.WrappedFilter):
 
         slam, info = basics.update_jointly(state.slam, observation, self.uvd, correct, locate)
         return replace(state, slam=slam), info
-
-    def forget(self, state: IdealState, landmark: int) -> IdealState:
-        return replace(state, slam=basics.without(state.slam, landmark))
 
 
 def truth_of(problem: Problem) -> TrialTruth:

@@ -8,12 +8,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import log_ndtr
 from scipy.stats import norm
 
 from consistency.bench.filters.believed_noise import disparity_sigma
-from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.sensors import heading_matrix
+from consistency.bench.filters.textbook.sensors import heading_matrix, mounted
 from consistency.bench.scenario.sensor import BelievedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -63,8 +63,7 @@ def carried(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[Array
     -------
     y' (m, 3), dy'/dy (m, 3, 3), dy'/db' (m, 3, 3), and rho times the point in the new frame of the robot, b' (m, 3)
     """
-    mount = sensor.mount.packed()
-    offset, axes = np.array(mount[:3]), np.reshape(mount[3:], (3, 3))
+    offset, axes = mounted(sensor)
     m, dm = rays(y)
     rho = y[:, 2:]
     b = (m @ axes.T + rho * offset) @ R.T + rho * t
@@ -110,8 +109,7 @@ def curvature(
     along : (3,), direction of the drive in the new frame of the robot
     noise : standard deviations of drive (m) and turn (rad)
     """
-    mount = sensor.mount.packed()
-    offset, axes = np.array(mount[:3]), np.reshape(mount[3:], (3, 3))
+    offset, axes = mounted(sensor)
     q, flat = (b - rho[:, None] * offset) @ axes, b * [1.0, 1.0, 0.0]
     by_turn = np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1) @ axes
     of_turn = bent(q, rho, by_turn) - (D @ flat[:, :, None])[:, :, 0]
@@ -119,19 +117,13 @@ def curvature(
     return np.asarray(0.5 * np.square(noise) * np.stack([of_drive, of_turn], axis=2))
 
 
-def exponential(xi: Array) -> tuple[Array, Array]:
-    """Exp of SE(2): rotation (2, 2) and translation (2,) of xi = (x, y, angle)."""
+def moved(pose: Array, xi: Array) -> Array:
+    """Exp(xi) T of a pose (3,), with xi = (x, y, angle) in SE(2)."""
     angle = xi[2]
     along = np.sinc(angle / np.pi)
     across = 0.5 * angle if abs(angle) < 1e-4 else (1.0 - np.cos(angle)) / angle
     V = np.array([[along, -across], [across, along]])
-    return heading_matrix(angle)[:2, :2], V @ xi[:2]
-
-
-def moved(pose: Array, xi: Array) -> Array:
-    """Exp(xi) T of a pose (3,)."""
-    R, t = exponential(xi)
-    return np.array([*(R @ pose[:2] + t), pose[2] + xi[2]])
+    return np.array([*(heading_matrix(angle)[:2, :2] @ pose[:2] + V @ xi[:2]), pose[2] + angle])
 
 
 def moments(C: Array) -> Array:
@@ -177,7 +169,7 @@ def apart(poses: Array, xi: Array, recency: bool = False) -> tuple[Array, Array]
     J = np.array([left_jacobian(x) for x in xi])
     if recency:
         J[-1] = np.eye(3)
-    return np.array([moved(pose, x) for pose, x in zip(poses, xi, strict=True)]), basics.block_diagonal(J)
+    return np.array([moved(pose, x) for pose, x in zip(poses, xi, strict=True)]), block_diag(*J)
 
 
 def chained(poses: Array, xi: Array, on: int) -> tuple[Array, Array]:

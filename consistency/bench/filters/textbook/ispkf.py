@@ -16,8 +16,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from consistency.bench.filters.textbook import basics, ukf
+from consistency.bench.filters.textbook import ukf
 from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.filters.textbook.sensors import view
 from consistency.bench.types import Info
@@ -29,21 +30,17 @@ PASSES = 5  # linearisations of an update; the first is the unscented filter's
 class IteratedPointsKalman(ukf.UnscentedKalman):
     """UKF-SLAM whose update is iterated; it predicts as the unscented filter does."""
 
-    def __init__(self, name: str, uvd: bool, passes: int = PASSES) -> None:
-        super().__init__(name, uvd)
-        self.passes = passes
-
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
         involved = np.concatenate([np.arange(3), at.ravel()])
         sensor = view(state.problem.belief.sensor, self.uvd)
         set_ = state.problem.belief.sigma_points
         x, infos = state.x, []
-        for _ in range(self.passes):
+        for _ in range(PASSES):
             points, wm, wc = ukf.sigma_points(x, state.P, involved, set_)
             Z = sensor.measure(points[:, None, :3], points[:, at]).reshape(len(points), -1)
             zhat = wm @ Z
-            S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + basics.block_diagonal(R)
+            S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + block_diag(*R)
             C = (points - x).T @ (wc[:, None] * (Z - zhat))
             W = np.linalg.solve(S, C.T).T
             # only the involved variables have moved; P of these may be singular in the first steps

@@ -10,7 +10,7 @@ from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.filters.textbook.sensors import PointSensor
 from consistency.bench.protocols import Problem
-from consistency.bench.types import Control, Gaussian, Info, Observation
+from consistency.bench.types import Control, Info, Observation
 from consistency.referee.types import Array
 
 
@@ -22,19 +22,18 @@ class LinearState:
     reference: Array  # (3,)
 
 
-class LinearKalman:
+class LinearKalman(basics.WrappedFilter):
     """Kalman filter of a linear world: every Jacobian at the known reference."""
 
-    name = "kf"
-    robot = basics.Unicycle()
+    innovations = "optimal"
 
     def init(self, problem: Problem) -> LinearState:
         basics.require_landmarks(problem, self.name)
         return LinearState(basics.start(problem), problem.start.copy())
 
     def predict(self, state: LinearState, control: Control) -> LinearState:
-        F, G = self.robot.jacobians(state.reference, control)
-        reference = self.robot.move(state.reference, control)
+        F, G = basics.motion_jacobians(state.reference, control)
+        reference = basics.move(state.reference, control)
         x, P = state.slam.x.copy(), state.slam.P.copy()
         x[:3] = reference + F @ (x[:3] - state.reference)
         P[:3] = F @ P[:3]
@@ -49,8 +48,7 @@ class LinearKalman:
             known = np.concatenate([reference, *(landmarks[label] for label in slam.landmarks)])
             zhat, H = basics.expect(replace(slam, x=known), seen, uvd=False)
             innovation = z.ravel() - (zhat + H @ (slam.x - known))
-            S, W = basics.gain(slam.P, H, basics.block_diagonal(R))
-            return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
+            return basics.corrected(slam, H, innovation, R)
 
         def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
             sensor = PointSensor(slam.problem.belief.sensor, uvd=False)
@@ -61,15 +59,3 @@ class LinearKalman:
 
         slam, info = basics.update_jointly(state.slam, observation, False, correct, locate)
         return replace(state, slam=slam), info
-
-    def forget(self, state: LinearState, landmark: int) -> LinearState:
-        return replace(state, slam=basics.without(state.slam, landmark))
-
-    def pose(self, state: LinearState) -> Gaussian:
-        return basics.pose_of(state.slam)
-
-    def map(self, state: LinearState) -> dict[int, Gaussian]:
-        return basics.map_of(state.slam)
-
-    def joint(self, state: LinearState) -> Gaussian:
-        return basics.joint_of(state.slam)

@@ -27,17 +27,13 @@ class ConstrainedState:
 
 
 class ConstrainedKalman(basics.WrappedFilter):
-    """EKF-SLAM with points that leave a turn of robot and map unobserved."""
-
-    robot = basics.Unicycle()
-
     def init(self, problem: Problem) -> ConstrainedState:
         return ConstrainedState(basics.start(problem), problem.start[None, :2])
 
     def predict(self, state: ConstrainedState, control: Control) -> ConstrainedState:
         x, turned = state.slam.x, state.turned.copy()
         shift = np.mean(x[state.slam.positions] - turned, axis=0)
-        predicted = self.robot.move(x[:3], control)
+        predicted = basics.move(x[:3], control)
         slam = basics.predict_by(state.slam, control, predicted[:2] - (turned[0] + shift), x[:3])  # predicted less p*
         turned[0] = predicted[:2] - shift
         return ConstrainedState(slam, turned)

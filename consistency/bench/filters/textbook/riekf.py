@@ -16,41 +16,30 @@ from scipy.linalg import expm
 
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
-from consistency.bench.protocols import Problem
-from consistency.bench.types import Control, Gaussian, Info, Observation
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
+from consistency.bench.types import Control, Gaussian, Info
 from consistency.referee.types import Array
 
 
-class RightInvariantKalman(basics.SlamFilter):
+class RightInvariantKalman(ExtendedKalman):
     """EKF-SLAM in the right-invariant error, every Jacobian by its definition: T maps the error to the additive one."""
 
     error = "right"
-    robot = basics.Unicycle()
-
-    def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
-
-    def init(self, problem: Problem) -> SlamState:
-        return basics.start(problem)
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         n, x = len(state.x), state.x.copy()
         F, G = np.eye(n), np.zeros((n, 2))
-        F[:3, :3], G[:3] = self.robot.jacobians(x[:3], control)
-        x[:3] = self.robot.move(x[:3], control)
+        F[:3, :3], G[:3] = basics.motion_jacobians(x[:3], control)
+        x[:3] = basics.move(x[:3], control)
         back, w = np.linalg.inv(additive_from_right(x, state.width)), state.width
         F, G = back @ F @ additive_from_right(state.x, w), back @ G
         return replace(state, x=x, P=F @ state.P @ F.T + basics.process_noise(G, state.problem.belief))
 
-    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
-        return basics.update_jointly(state, observation, self.uvd, self._correct, self._locate)
-
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         zhat, H = basics.expect(state, seen, self.uvd)
         innovation = basics.innovation_of(state, z, zhat, self.uvd)
-        S, W = basics.gain(state.P, H @ additive_from_right(state.x, state.width), basics.block_diagonal(R))
-        moved = moved_by_right(state.x, W @ innovation, state.width)
-        return replace(state, x=moved, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+        after, info = basics.corrected(state, H @ additive_from_right(state.x, state.width), innovation, R)
+        return replace(after, x=moved_by_right(state.x, info.gain @ innovation, state.width)), info
 
     def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
         landmark, Jp, Jz = basics.locate_point(state, z, self.uvd)
@@ -63,7 +52,6 @@ class RightInvariantKalman(basics.SlamFilter):
         return Gaussian(state.x[:3], T @ state.P[:3, :3] @ T.T)
 
     def own_covariance(self, state: SlamState) -> Array:
-        """Covariance (3, 3) of the right-invariant error of the pose."""
         return state.P[:3, :3]
 
     def map(self, state: SlamState) -> dict[int, Gaussian]:

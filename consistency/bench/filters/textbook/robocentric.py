@@ -42,6 +42,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from consistency.bench.filters.believed_noise import bias_at, variance_at
 from consistency.bench.filters.textbook import basics
@@ -119,8 +120,7 @@ def raised(HPH: Array, R: Array, which: Array) -> float:
 class RobotCentredKalman:
     """EKF-SLAM in a robot-centred map of inverse ranges, every Jacobian by its definition."""
 
-    robot = basics.Unicycle()
-    sensors = ("uvd",)
+    sensors, uvd = ("uvd",), True
 
     def __init__(self, name: str, which: Corrections) -> None:
         self.name, self.which = name, which
@@ -137,10 +137,10 @@ class RobotCentredKalman:
     def predict(self, state: CentredState, control: Control) -> CentredState:
         belief, x, n = state.problem.belief, state.x.copy(), len(state.x)
         F, G, Q = np.eye(n), np.zeros((n, 2)), np.zeros((n, n))
-        F[:3, :3], G[:3] = self.robot.jacobians(x[:3], control)
+        F[:3, :3], G[:3] = basics.motion_jacobians(x[:3], control)
         sigmas = (control.dt * belief.motion.sigma_v, control.dt * belief.motion.sigma_omega)
         bends = np.zeros((n, 2))
-        x[:3] = self.robot.move(x[:3], control)
+        x[:3] = basics.move(x[:3], control)
         active = [at for label, at in state.places.items() if label not in state.parked]
         if active:
             rows = np.array(active)[:, None] + np.arange(3)
@@ -233,7 +233,7 @@ class RobotCentredKalman:
             gap = y - h
             gap[:, 0] = wrap(gap[:, 0])
             innovation = gap.ravel() + H @ delta
-            S, W = basics.gain(P, H, basics.block_diagonal(R))
+            S, W = basics.gain(P, H, block_diag(*R))
             before, delta = delta, W @ innovation
             is_settled = i > 0 and factor == 1.0
             is_settled = is_settled and bool(np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]))

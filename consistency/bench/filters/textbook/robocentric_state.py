@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from consistency.bench.filters.textbook.inverse_range import apart, carried, left_jacobian, moved, rays, shift_matrix
-from consistency.bench.filters.textbook.sensors import heading_matrix
+from consistency.bench.filters.textbook.sensors import heading_matrix, mounted
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
@@ -167,8 +167,7 @@ def world_point(state: CentredState, label: int) -> tuple[Array, Array]:
     at, frame, pose, to_shift = block(state.places[label]), slice(0, 3), state.x[:3], shift_matrix(state.x[:3])
     if label in state.parked:
         frame, pose, to_shift = clone_of(state, state.parked[label])
-    mount = state.problem.belief.sensor.mount.packed()
-    offset, axes = np.array(mount[:3]), np.reshape(mount[3:], (3, 3))
+    offset, axes = mounted(state.problem.belief.sensor)
     (m,), (dm,) = rays(state.x[at][None])
     rho, R = state.x[at][2], heading_matrix(pose[2])
     point = R @ (axes @ m / rho + offset) + np.array([*pose[:2], 0.0])

@@ -48,7 +48,6 @@ class PointSensor:
         return np.array(point.to_world(pose[0], pose[1], pose[2], *body)), d_pose, robot_to_world @ self.turn @ J
 
     def less(self, z: Array, about: Array) -> Array:
-        """z (..., 3) less another observation (..., 3)."""
         difference: Array = z - about
         return difference
 
@@ -89,6 +88,12 @@ class PlanarSensor:
         if self.bearing:
             difference[..., 1] -= 2.0 * np.pi * np.rint(difference[..., 1] / (2.0 * np.pi))
         return difference
+
+
+def mounted(sensor: BelievedSensor) -> tuple[Array, Array]:
+    """Position (3,) of a sensor in the frame of the robot, m, and its axes (3, 3) as columns."""
+    mount = np.array(sensor.mount.packed())
+    return mount[:3], mount[3:].reshape(3, 3)
 
 
 def view(sensor: BelievedSensor, uvd: bool) -> PointSensor | PlanarSensor:

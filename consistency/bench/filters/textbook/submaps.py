@@ -46,8 +46,6 @@ class Maps:
 
 
 class SubmapKalman:
-    """EKF-SLAM in small maps that are joined."""
-
     def __init__(self, name: str, uvd: bool, steps: int = STEPS) -> None:
         self.name, self.uvd, self.steps = name, uvd, steps
         self.sensors = ("uvd",) if uvd else ("xyz", "uvd")

@@ -18,27 +18,23 @@ The noise of an ``xyz`` sensor does not depend on the point, so these two filter
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from consistency.bench.filters.believed_noise import disparity_sigma, point_noise, variance_at
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.models import stereo
-from consistency.bench.types import Control, Info
+from consistency.bench.types import Info
 from consistency.referee.types import Array
 
 
-class TriangulatedKalman(basics.WorldPointFilter):
+class TriangulatedKalman(ExtendedKalman):
     """EKF-SLAM on triangulated points, with R at the prediction and, where asked, without the bias."""
 
     def __init__(self, name: str, debiasing: bool) -> None:
         super().__init__(name, uvd=False)
         self.debiasing = debiasing
-
-    def predict(self, state: SlamState, control: Control) -> SlamState:
-        return basics.predict_extended(state, control)
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         sensor = state.problem.belief.sensor
@@ -49,9 +45,7 @@ class TriangulatedKalman(basics.WorldPointFilter):
         pixels = np.column_stack(stereo.project(x, y, up, sensor.f or 0.0, sensor.B or 0.0))
         R[front] = point_noise(pixels, variance_at(pixels, sensor), sensor)
         bias = np.where(front, self._bias_ratio(state, expected[:, 0]), 0.0)[:, None] * expected
-        innovation = z.ravel() - zhat - bias.ravel()
-        S, W = basics.gain(state.P, H, basics.block_diagonal(R))
-        return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+        return basics.corrected(state, H, z.ravel() - zhat - bias.ravel(), R)
 
     def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
         return basics.locate_point(state, z / (1.0 + self._bias_ratio(state, z[0])), uvd=False)

@@ -1,20 +1,31 @@
-"""UKF-SLAM, Herath et al. (2007) sec. 4.5; sigma points after Julier & Uhlmann (2004)."""
+"""UKF-SLAM, Herath et al. (2007) sec. 4.5; sigma points after Julier & Uhlmann (2004).
+
+Cubature SLAM, Arasaratnam & Haykin (2009), is the unscented filter with its points fixed to the cubature rule.
+The third-degree spherical-radial rule has 2 L points at +-sqrt(L) columns of a root of P, with weights 1 / (2 L) and no
+centre. Sigma points with alpha = 1, beta = kappa = 0 are these, and are the default of a belief: then ``ckf`` and
+``ukf`` are one filter. ``ckf`` has them whatever the belief says of sigma points. L counts the variables that f or h
+reads, a rule over the whole state would have a spread that grows with the map.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.filters.textbook.sensors import view
 from consistency.bench.scenario import SigmaPoints
 from consistency.bench.types import Control, Info
 from consistency.referee.types import Array
 
+CUBATURE = SigmaPoints(alpha=1.0, beta=0.0, kappa=0.0)
 
-class UnscentedKalman(basics.WorldPointFilter):
+
+class UnscentedKalman(ExtendedKalman):
     """UKF-SLAM over the whole state.
 
     The variables are ordered robot, landmarks seen in this step (as observed), the rest before the
@@ -24,8 +35,6 @@ class UnscentedKalman(basics.WorldPointFilter):
     they are given.
     """
 
-    robot = basics.Unicycle()
-
     def __init__(self, name: str, uvd: bool, points: SigmaPoints | None = None) -> None:
         super().__init__(name, uvd)
         self.points = points
@@ -34,10 +43,10 @@ class UnscentedKalman(basics.WorldPointFilter):
         belief = state.problem.belief
         points, wm, wc = sigma_points(state.x, state.P, np.arange(3), self.points or belief.sigma_points)
         moved = points.copy()
-        moved[:, :3] = [self.robot.move(p[:3], control) for p in points]
+        moved[:, :3] = [basics.move(p[:3], control) for p in points]
         x = wm @ moved
         P = (moved - x).T @ (wc[:, None] * (moved - x))
-        _, G = self.robot.jacobians(state.x[:3], control)
+        _, G = basics.motion_jacobians(state.x[:3], control)
         P[:3, :3] += basics.process_noise(G, belief)
         return replace(state, x=x, P=P)
 
@@ -50,7 +59,7 @@ class UnscentedKalman(basics.WorldPointFilter):
         Z = sensor.measure(points[:, None, :3], points[:, at])
         Z = (Z[0] + sensor.less(Z, Z[0])).reshape(len(points), -1)
         zhat = wm @ Z
-        S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + basics.block_diagonal(R)
+        S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + block_diag(*R)
         W = np.linalg.solve(S, (Z - zhat).T @ (wc[:, None] * (points - state.x))).T
         innovation = basics.innovation_of(state, z, zhat, self.uvd)
         x, P = state.x + W @ innovation, state.P - W @ S @ W.T

@@ -8,24 +8,20 @@ import numpy as np
 
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.covariance_update.parking import Clones, Parking
+from consistency.bench.filters.covariance_update.parking import Clones
 from consistency.bench.filters.kernel.arrays import blocks, copy, fill_matrix, integers, matrix, vector
-from consistency.bench.filters.kernel.blas import add_gram
-from consistency.bench.filters.kernel.part_functions import (
-    Frame,
-    State,
-    make_notes,
-    make_room,
-    move,
-    noise_columns,
-    place,
-    predict,
+from consistency.bench.filters.kernel.covariance import add_gram_to_state, multiply_columns, multiply_rows
+from consistency.bench.filters.kernel.part_functions import Slam, State, make_room, place, predict
+from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.landmark.inverse_range import (
+    Pixels,
+    carried,
+    conversion_jacobian,
+    convert,
+    curvature,
+    subtract_bias,
 )
-from consistency.bench.filters.kernel.work_arrays import NoNotes, Work
-from consistency.bench.filters.landmark.inverse_range import InverseRange, carried, curvature
-from consistency.bench.filters.motion.unicycle import Unicycle
-from consistency.bench.filters.sensor.conversion import Pixels, conversion_jacobian, convert, subtract_bias
-from consistency.bench.filters.sensor.uvd import Uvd
+from consistency.bench.filters.motion.unicycle import Frame, move, noise_columns
 from consistency.referee.types import Array, Indices
 
 
@@ -56,18 +52,6 @@ class Converting(NamedTuple):
 @part(update="Converting")
 class Converted(NamedTuple):
     """No parameters. Observations are linear in the map, so there is no point at which they are linearised."""
-
-
-class CentredSlam(NamedTuple):
-    """The parts of such a filter, a :class:`consistency.bench.filters.kernel.part_functions.Slam` of these types."""
-
-    motion: Unicycle
-    sensor: Uvd
-    landmark: InverseRange
-    error: NamedTuple
-    point: Converted
-    update: Converting
-    covariance: Parking
 
 
 class ConvertingRoom(NamedTuple):
@@ -111,7 +95,7 @@ def _every_third(n: int) -> Indices:
 
 
 @implement(make_room, Converting)
-def converting_room(update: Converting, r: int, w: int, s: int, m: int, n: int) -> ConvertingRoom:
+def converting_room(update: Converting, w: int, s: int, m: int, n: int) -> ConvertingRoom:
     c = max(m, min(update.clones, (n - 3) // 6))
     most = 3 + 3 * (m + c)
     return ConvertingRoom(
@@ -128,7 +112,7 @@ def converting_room(update: Converting, r: int, w: int, s: int, m: int, n: int) 
 @implement(predict, Converting)
 def predict_centred(
     update: Converting,
-    slam: CentredSlam,
+    slam: Slam,
     state: State,
     k: int,
     u: Array,
@@ -136,11 +120,11 @@ def predict_centred(
     work: Work[ConvertingRoom],
 ) -> None:
     x, P, n, room, G = state.x, state.P, state.n, work.room, work.small
-    columns = noise_columns(slam.motion, x[:3], u, G)
-    move(slam.motion, x[:3], u, x[:3])
-    noise = room.noise[: columns + 2 if update.spread else columns, :n]
+    noise_columns(slam.motion, x[:3], u, G)
+    move(x[:3], u, x[:3])
+    noise = room.noise[: 4 if update.spread else 2, :n]
     fill_matrix(noise, 0.0)
-    for c in range(columns):
+    for c in range(2):
         noise[c, 0], noise[c, 1], noise[c, 2] = G[0, c] + x[1] * G[2, c], G[1, c] - x[0] * G[2, c], G[2, c]
     forward, c, s = u[0] * u[1], np.cos(u[0] * u[2]), -np.sin(u[0] * u[2])
     turn = Frame(-c * forward, -s * forward, c, s)
@@ -168,16 +152,14 @@ def predict_centred(
             room.moving[moving] = o
             moving += 1
     _move_rows(P, n, room.moving, room.J, moving)
-    _move_beyond(local.factors.Phi, state.base, room.moving, room.J, moving)
-    add_gram(1.0, noise, P[:n, :n])
+    for i in range(moving if state.base > 0 else 0):
+        multiply_rows(local.factors.Phi[room.moving[i] : room.moving[i] + 3], room.J[i], 0, state.base)
+    add_gram_to_state(1.0, noise, P, n)
     for i in range(moving if update.spread else 0):
         o = room.moving[i]
         for a in range(3):
             for b in range(a, 3):
                 P[o + a, o + b] += room.mixed[i, a] * room.mixed[i, b]
-    for a in range(3):
-        for b in range(a):
-            P[a, b] = P[b, a]
 
 
 @inner
@@ -187,43 +169,18 @@ def _move_rows(P: Array, n: int, at: Indices, J: Array, count: int) -> None:
         o, F = at[i], J[i]
         p0, p1, p2 = P[o], P[o + 1], P[o + 2]
         p1[o], p2[o], p2[o + 1] = p0[o + 1], p0[o + 2], p1[o + 2]
-        for j in range(o, n):
-            v0, v1, v2 = p0[j], p1[j], p2[j]
-            p0[j] = F[0, 0] * v0 + F[0, 1] * v1 + F[0, 2] * v2
-            p1[j] = F[1, 0] * v0 + F[1, 1] * v1 + F[1, 2] * v2
-            p2[j] = F[2, 0] * v0 + F[2, 1] * v1 + F[2, 2] * v2
+        multiply_rows(P[o : o + 3], F, o, n)
     for j in range(n):
         row = P[j]
         for i in range(count):
             o, F = at[i], J[i]
             if o + 2 >= j:
-                v0, v1, v2 = row[o], row[o + 1], row[o + 2]
-                row[o] = F[0, 0] * v0 + F[0, 1] * v1 + F[0, 2] * v2
-                row[o + 1] = F[1, 0] * v0 + F[1, 1] * v1 + F[1, 2] * v2
-                row[o + 2] = F[2, 0] * v0 + F[2, 1] * v1 + F[2, 2] * v2
-
-
-@inner
-def _move_beyond(Phi: Array, base: int, at: Indices, J: Array, count: int) -> None:
-    """Phi <- F Phi, with F as in :func:`_move_rows`."""
-    for i in range(count if base > 0 else 0):
-        o, F = at[i], J[i]
-        p0, p1, p2 = Phi[o], Phi[o + 1], Phi[o + 2]
-        for j in range(base):
-            v0, v1, v2 = p0[j], p1[j], p2[j]
-            p0[j] = F[0, 0] * v0 + F[0, 1] * v1 + F[0, 2] * v2
-            p1[j] = F[1, 0] * v0 + F[1, 1] * v1 + F[1, 2] * v2
-            p2[j] = F[2, 0] * v0 + F[2, 1] * v1 + F[2, 2] * v2
-
-
-@implement(make_notes, Converted)
-def no_notes_converted(point: Converted, r: int, w: int, steps: int, labels: int) -> NoNotes:
-    return NoNotes()
+                multiply_columns(row, o, F)
 
 
 @implement(place, Converted)
 def place_converted(
-    point: Converted, slam: CentredSlam, state: State, k: int, label: int, z: Array, work: Work[ConvertingRoom]
+    point: Converted, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[ConvertingRoom]
 ) -> None:
     sensor, pixels, y = slam.sensor, slam.update.pixels, state.x[state.n : state.n + 3]
     convert(sensor, z[0], z[1], z[2], y)

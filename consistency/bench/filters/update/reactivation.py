@@ -10,18 +10,17 @@ from consistency.bench.filters.covariance_update.parking import Clones, is_in_do
 from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
-from consistency.bench.filters.kernel.covariance import gather_rows, replace_rows, state_index, subtract_gram
-from consistency.bench.filters.kernel.gain import apply_beyond, divide_by_root
-from consistency.bench.filters.kernel.part_functions import Data, Frame, State, correct, predict_innovation, robot_frame
+from consistency.bench.filters.kernel.covariance import add_gram_to_state, gather_all_rows, replace_rows, state_index
+from consistency.bench.filters.kernel.part_functions import Data, Slam, State, correct, predict_innovation
+from consistency.bench.filters.kernel.update_steps import apply_beyond, divide_by_root
 from consistency.bench.filters.kernel.work_arrays import Work
-from consistency.bench.filters.landmark.inverse_range import carried
-from consistency.bench.filters.sensor.conversion import observe_range
-from consistency.bench.filters.update.converting import CentredSlam, Converting, ConvertingRoom
+from consistency.bench.filters.landmark.inverse_range import carried, observe_range
+from consistency.bench.filters.motion.unicycle import Frame, robot_frame
+from consistency.bench.filters.update.converting import Converting, ConvertingRoom
 from consistency.bench.filters.update.retraction_chain import (
     aim_apart,
     aim_chained,
     cast_columns,
-    cast_rows,
     cast_state,
     move_chain,
     unchain,
@@ -34,7 +33,7 @@ SETTLED = 1e-3  # change in standard deviations that ends an iteration
 @implement(correct, Converting)
 def correct_converted(
     update: Converting,
-    slam: CentredSlam,
+    slam: Slam,
     state: State,
     data: Data,
     k: int,
@@ -69,7 +68,7 @@ def correct_converted(
 @implement(predict_innovation, Converting)
 def predict_innovation_converted(
     update: Converting,
-    slam: CentredSlam,
+    slam: Slam,
     state: State,
     data: Data,
     k: int,
@@ -92,7 +91,7 @@ def predict_innovation_converted(
 @inner
 def _aim(
     update: Converting,
-    slam: CentredSlam,
+    slam: Slam,
     state: State,
     data: Data,
     m: int,
@@ -138,7 +137,7 @@ def _gather(state: State, m: int, is_chained: bool, local: Clones, work: Work[Co
     They are those of parked landmarks that are seen, or in a chain all of them in the order of time. There the robot
     hangs on the first with a landmark that was in doubt in the last step, too, or on the last of all.
     """
-    n, base, room, Phi = state.n, state.base, work.room, local.factors.Phi
+    room = work.room
     clones = _list_all(local, room.number) if is_chained else _list_seen(m, local, work)
     for i in range(m):
         room.at[i], room.clone[i] = work.at[i], -1
@@ -150,11 +149,7 @@ def _gather(state: State, m: int, is_chained: bool, local: Clones, work: Work[Co
         room.at[m + c] = local.here[room.number[c]]
         if local.doubted[room.number[c]] == 2:
             room.on[0] = c
-    count = m + clones
-    gather_rows(state.P, n, 3, 3, room.at, count, room.rows)
-    if base > 0:
-        for i in range(3 + 3 * count):
-            copy(Phi[state_index(3, 3, i, room.at), :base], room.rows[i, n : n + base])
+    gather_all_rows(state, local.factors.Phi, 3, room.at, m + clones, room.rows)
     return clones
 
 
@@ -189,7 +184,7 @@ def _list_all(local: Clones, numbers: Indices) -> int:
 @inner
 def _iterate(
     update: Converting,
-    slam: CentredSlam,
+    slam: Slam,
     state: State,
     data: Data,
     m: int,
@@ -210,7 +205,7 @@ def _iterate(
     among, cast, delta = room.among[:size, :size], room.cast[:size, :size], room.delta[:size]
     for i in range(size):
         for j in range(size):
-            among[i, j] = room.rows[i, state_index(3, 3, j, room.at)]
+            among[i, j] = room.rows[i, state_index(3, j, room.at)]
     alone = State(state.x, cast, size, 0, state.offset)
     fill(delta, 0.0)
     for i in range(passes):
@@ -218,8 +213,8 @@ def _iterate(
         copy_matrix(among, cast)
         if is_chained:
             aim_chained(state, m, clones, local, room)
-            cast_rows(cast, size, m, clones, room)
-            cast_columns(cast, room.place, m, clones, room)
+            cast_columns(cast.T, size, room.place, m, clones, room)
+            cast_columns(cast, size, room.place, m, clones, room)
         else:
             aim_apart(state, m, clones, update.recency, local, room)
         _expect(update, slam, state, data, i == 0, m, clones, local, work)
@@ -249,11 +244,9 @@ def _iterate(
 
 
 @inner
-def _seen_from(
-    slam: CentredSlam, clone: Array, pose: Array, y: Array, there: Array, J: Array, shift: Array, D: Array
-) -> None:
+def _seen_from(slam: Slam, clone: Array, pose: Array, y: Array, there: Array, J: Array, shift: Array, D: Array) -> None:
     """``there`` <- a landmark parked at ``clone`` as it is seen from ``pose``; its derivatives by y and by xi."""
-    at, frame = robot_frame(slam.motion, clone), robot_frame(slam.motion, pose)
+    at, frame = robot_frame(clone), robot_frame(pose)
     c, s = frame.c, frame.s
     dx, dy = at.x - frame.x, at.y - frame.y
     turn = Frame(c * dx + s * dy, c * dy - s * dx, c * at.c + s * at.s, c * at.s - s * at.c)
@@ -269,7 +262,7 @@ def _seen_from(
 @inner
 def _expect(
     update: Converting,
-    slam: CentredSlam,
+    slam: Slam,
     state: State,
     data: Data,
     is_first: bool,
@@ -395,13 +388,13 @@ def _move(state: State, m: int, work: Work[ConvertingRoom]) -> None:
     A, delta = work.A[: 3 * m, :n], work.delta[:n]
     fill(delta, 0.0)
     add_transposed_times(A, work.A[: 3 * m, n + state.base], delta)
-    subtract_gram(state.P, n, 3, A)
+    add_gram_to_state(-1.0, A, state.P, n)
     for i in range(3, n):
         x[i] += delta[i]
 
 
 @inner
-def _reactivate(slam: CentredSlam, state: State, label: int, local: Clones, work: Work[ConvertingRoom]) -> None:
+def _reactivate(slam: Slam, state: State, label: int, local: Clones, work: Work[ConvertingRoom]) -> None:
     """A landmark that was parked, in the frame of the sensor again."""
     x, P, n, base, room, Phi = state.x, state.P, state.n, state.base, work.room, local.factors.Phi
     J, shift, D, turned = room.three[0], room.three[1], room.three[2], room.three[3]
@@ -414,9 +407,7 @@ def _reactivate(slam: CentredSlam, state: State, label: int, local: Clones, work
     left_jacobian(x[q : q + 3], D)
     _times(1.0, shift, D, turned)
     room.at[0], room.at[1] = o, q
-    gather_rows(P, n, 3, 3, room.at, 2, room.rows)
-    for i in range(9 if base > 0 else 0):
-        copy(Phi[state_index(3, 3, i, room.at), :base], room.rows[i, n : n + base])
+    gather_all_rows(state, Phi, 3, room.at, 2, room.rows)
     rows, out = room.rows, work.rows
     for i in range(n + base):
         for a in range(3):

@@ -12,8 +12,7 @@ import numpy as np
 
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.covariance_update.parking import Clones
-from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
-from consistency.bench.filters.error.planar import exponential
+from consistency.bench.filters.error.invariant_pose import exponential, left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
 from consistency.bench.filters.kernel.covariance import replace_rows
 from consistency.bench.filters.kernel.part_functions import State, Triple
@@ -98,24 +97,9 @@ def unchain(delta: Array, m: int, clones: int, room: ConvertingRoom) -> None:
 
 
 @inner
-def cast_rows(rows: Array, width: int, m: int, clones: int, room: ConvertingRoom) -> None:
-    """``rows`` (3 + 3 (m + clones), >= width) <- C rows."""
-    for i in range(width):
-        u = v = u_on = v_on = (0.0, 0.0, 0.0)
-        for c in range(clones + 1):
-            p = _place(m, c, clones)
-            if c == clones:
-                u, v = u_on, v_on
-            u, v = _link(room.links[c], (rows[p, i], rows[p + 1, i], rows[p + 2, i]), u, v)
-            rows[p, i], rows[p + 1, i], rows[p + 2, i] = v
-            if c == room.on[0]:
-                u_on, v_on = u, v
-
-
-@inner
-def cast_columns(rows: Array, at: Indices, m: int, clones: int, room: ConvertingRoom) -> None:
-    """``rows`` <- rows C', where ``at`` says where the landmarks, and then the clones, are among the columns."""
-    for i in range(3 + 3 * (m + clones)):
+def cast_columns(rows: Array, count: int, at: Indices, m: int, clones: int, room: ConvertingRoom) -> None:
+    """``rows`` (count, n) <- rows C'; ``at`` says where the landmarks, and then the clones, are among the columns."""
+    for i in range(count):
         row = rows[i]
         u = v = u_on = v_on = (0.0, 0.0, 0.0)
         for c in range(clones + 1):
@@ -144,8 +128,8 @@ def _link(B: Array, here: Triple, last: Triple, cast: Triple) -> tuple[Triple, T
 def cast_state(state: State, m: int, clones: int, room: ConvertingRoom) -> None:
     """P (n, n) <- C P C', and its gathered ``rows`` with it."""
     P, n = state.P, state.n
-    cast_rows(room.rows, n, m, clones, room)
-    cast_columns(room.rows, room.at, m, clones, room)
+    cast_columns(room.rows.T, n, room.place, m, clones, room)
+    cast_columns(room.rows, 3 + 3 * (m + clones), room.at, m, clones, room)
     copy_matrix(room.rows[:3, :n], P[:3, :n])
     for c in range(clones):
         o, p = room.at[m + c], 3 + 3 * (m + c)

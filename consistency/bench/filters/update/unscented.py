@@ -3,7 +3,7 @@
 With the variables ordered robot, seen landmarks (as observed), the rest, the Cholesky factor of P is
 [[C, 0], [G, D]]. A sigma point through a column of D moves only variables that neither f nor h reads, so
 it projects onto the mean: such points add nothing to S or to the cross-covariance, and their weight counts
-as weight of the centre. What is left is 2 L + 1 points over the L = r + w m variables involved; the rest of
+as weight of the centre. What is left is 2 L + 1 points over the L = 3 + w m variables involved; the rest of
 the state follows through G = P_rest,involved C'^-1, so that Cov(z, x) = Cov(z, C-coordinates) C^-1 P_involved,x
 and M = Cov(z, C-coordinates) C^-1, of size s m x L, is all that sees the whole state.
 
@@ -22,28 +22,23 @@ from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import copy, fill, matrix, vector
 from consistency.bench.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
 from consistency.bench.filters.kernel.covariance import definite_root, state_index
-from consistency.bench.filters.kernel.gain import POSE, add_noise, correct_at_once, gather, innovate
 from consistency.bench.filters.kernel.linalg import semidefinite_cholesky
-from consistency.bench.filters.kernel.local_state import Factors
-from consistency.bench.filters.kernel.observation_model import observe
 from consistency.bench.filters.kernel.part_functions import (
     Data,
+    Factors,
     Slam,
     State,
-    add_motion_noise,
     correct,
     landmark_width,
     make_room,
-    move,
     observed_width,
     predict,
     predict_innovation,
-    propagate_covariance_root,
-    robot_frame,
-    robot_width,
     wrap_residual,
 )
+from consistency.bench.filters.kernel.update_steps import POSE, add_noise, correct_at_once, gather, innovate, observe
 from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.motion.unicycle import add_motion_noise, move, propagate_covariance_root, robot_frame
 from consistency.referee.types import Array
 
 
@@ -57,32 +52,30 @@ class Unscented(NamedTuple):
 
 
 class SigmaRoom(NamedTuple):
-    """Arrays of sigma points; L = r + w m."""
+    """Arrays of sigma points; L = 3 + w m."""
 
-    F: Array  # (r, r) Cov(f, C-coordinates)
-    moved: Array  # (2 r + 1, r) sigma points of the robot
+    F: Array  # (3, 3) Cov(f, C-coordinates)
+    moved: Array  # (7, 3) sigma points of the robot
     U: Array  # (L, L) upper root of the prior of the variables involved
     block: Array  # (L, L) that prior, where it is singular
     Z: Array  # (2 L + 1, s m) projected sigma points
     Mt: Array  # (L, s m) transposed statistical linearisation
-    pose: Array  # (r,)
+    pose: Array  # (3,)
     landmark: Array  # (w,)
-    prior: Array  # (L,) mean of that prior, for an update that iterates
 
 
 @implement(make_room, Unscented)
-def sigma_room(update: Unscented, r: int, w: int, s: int, m: int, n: int) -> SigmaRoom:
-    L = r + w * m
+def sigma_room(update: Unscented, w: int, s: int, m: int, n: int) -> SigmaRoom:
+    L = 3 + w * m
     return SigmaRoom(
-        matrix(r, r),
-        matrix(2 * r + 1, r),
+        matrix(3, 3),
+        matrix(7, 3),
         matrix(L, L),
         matrix(L, L),
         matrix(2 * L + 1, s * m),
         matrix(L, s * m),
-        vector(r),
+        vector(3),
         vector(w),
-        vector(L),
     )
 
 
@@ -99,34 +92,34 @@ def _weights(L: int, points: Unscented) -> tuple[float, float, float, float]:
 def predict_unscented(
     update: Unscented, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[SigmaRoom]
 ) -> None:
-    """x, P <- mean and covariance (r, r) of f over 2 r + 1 sigma points of the robot; its rows of P <- F C^-1 P."""
-    x, P, r = state.x, state.P, robot_width(slam.motion)
-    spread, w0m, w0c, w = _weights(r, update)
+    """x, P <- mean and covariance (3, 3) of f over 7 sigma points of the robot; its rows of P <- F C^-1 P."""
+    x, P = state.x, state.P
+    spread, w0m, w0c, w = _weights(3, update)
     C, F, Y = work.small, work.room.F, work.room.moved
-    if not semidefinite_cholesky(P[:r, :r], C):
+    if not semidefinite_cholesky(P[:3, :3], C):
         P[0, 0] = np.nan  # an indefinite prior is reported by the loop
         return
-    copy(x[:r], work.pose)
-    move(slam.motion, work.pose, u, Y[2 * r])
-    for j in range(r):
+    copy(x[:3], work.pose)
+    move(work.pose, u, Y[6])
+    for j in range(3):
         for side in range(2):
             step = spread if side == 0 else -spread
             point = Y[2 * j + side]
-            for a in range(r):
+            for a in range(3):
                 point[a] = x[a] + step * C[a, j]
-            move(slam.motion, point, u, point)
-    for a in range(r):
-        x[a] = w0m * Y[2 * r, a]
-        for i in range(2 * r):
+            move(point, u, point)
+    for a in range(3):
+        x[a] = w0m * Y[6, a]
+        for i in range(6):
             x[a] += w * Y[i, a]
-        for j in range(r):
+        for j in range(3):
             F[a, j] = w * spread * (Y[2 * j, a] - Y[2 * j + 1, a])
-    propagate_covariance_root(slam.motion, P, r, state.n, C, F)
-    propagate_covariance_root(slam.motion, local.Phi, 0, state.base, C, F)
-    for a in range(r):
-        for b in range(r):
-            P[a, b] = w0c * (Y[2 * r, a] - x[a]) * (Y[2 * r, b] - x[b])
-            for i in range(2 * r):
+    propagate_covariance_root(P, 3, state.n, C, F)
+    propagate_covariance_root(local.Phi, 0, state.base, C, F)
+    for a in range(3):
+        for b in range(3):
+            P[a, b] = w0c * (Y[6, a] - x[a]) * (Y[6, b] - x[b])
+            for i in range(6):
                 P[a, b] += w * (Y[i, a] - x[a]) * (Y[i, b] - x[b])
     add_motion_noise(slam.motion, work.pose, u, P)
 
@@ -151,10 +144,10 @@ def innovate_by_points(update: Unscented, slam: Slam, state: State, m: int, work
 
     The points lie about ``state.x`` (n,), which need not be the mean of P; the linearisation is ``work.room.Mt``.
     """
-    r, w, width = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base
-    L, rows = r + w * m, observed_width(slam.sensor) * m
+    w, width = landmark_width(slam.landmark), state.n + state.base
+    L, rows = 3 + w * m, observed_width(slam.sensor) * m
     spread, w0m, w0c, weight = _weights(L, update)
-    if not _root(r, w, L, work):
+    if not _root(w, L, work):
         return False
     _project(slam, state.x, m, spread, work)
     Z, S, Mt, zhat = work.room.Z[: 2 * L + 1, :rows], work.S[:rows, :rows], work.room.Mt[:L, :rows], work.zhat
@@ -182,22 +175,22 @@ def innovate_by_points(update: Unscented, slam: Slam, state: State, m: int, work
 
 
 @inner
-def _root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
+def _root(w: int, L: int, work: Work[SigmaRoom]) -> bool:
     """Upper root U = C' of the prior over the variables involved; False if it is indefinite."""
     rows, at, U = work.rows, work.at, work.room.U[:L, :L]
     for b in range(L):
-        j = state_index(r, w, b, at)
+        j = state_index(w, b, at)
         for a in range(b + 1):
             U[a, b] = rows[a, j]
-    return definite_root(U, work.scale) or _singular_root(r, w, L, work)
+    return definite_root(U, work.scale) or _singular_root(w, L, work)
 
 
 @inner
-def _singular_root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
+def _singular_root(w: int, L: int, work: Work[SigmaRoom]) -> bool:
     """The root of a semidefinite prior: a zero pivot has a zero row."""
     rows, at, U, block = work.rows, work.at, work.room.U[:L, :L], work.room.block[:L, :L]
     for b in range(L):
-        j = state_index(r, w, b, at)
+        j = state_index(w, b, at)
         for a in range(L):
             block[a, b] = rows[a, j]
     if not semidefinite_cholesky(block, U):
@@ -211,27 +204,27 @@ def _singular_root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
 @inner
 def _project(slam: Slam, x: Array, m: int, spread: float, work: Work[SigmaRoom]) -> None:
     """Z <- h of the sigma points, in pairs along the rows of U; the last row is h of the mean."""
-    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
-    L = r + w * m
+    w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
+    L = 3 + w * m
     at, U, Z, pose, landmark = work.at, work.room.U, work.room.Z, work.room.pose, work.room.landmark
     for j in range(L):
-        first = 0 if j < r else r + w * ((j - r) // w)
+        first = 0 if j < 3 else 3 + w * ((j - 3) // w)
         fill(U[j, first:j], 0.0)  # the lower half holds anything, and the variables of a part are moved together
-    mean = robot_frame(slam.motion, x[:r])
+    mean = robot_frame(x[:3])
     for i in range(m):
         observe(slam, mean, x[at[i] : at[i] + w], Z[2 * L, s * i : s * i + s])
     for k in range(2 * L):
         j, step = k // 2, spread if k % 2 == 0 else -spread
-        first = 0 if j < r else (j - r) // w
+        first = 0 if j < 3 else (j - 3) // w
         copy(Z[2 * L, : s * first], Z[k, : s * first])
         frame = mean
-        if j < r:
-            for a in range(r):
+        if j < 3:
+            for a in range(3):
                 pose[a] = x[a] + step * U[j, a]
-            frame = robot_frame(slam.motion, pose)
+            frame = robot_frame(pose)
         for i in range(first, m):
             for a in range(w):
-                landmark[a] = x[at[i] + a] + step * U[j, r + w * i + a]
+                landmark[a] = x[at[i] + a] + step * U[j, 3 + w * i + a]
             projected = Z[k, s * i : s * i + s]
             observe(slam, frame, landmark, projected)
             wrap_residual(slam.sensor, projected, Z[2 * L, s * i : s * i + s])

@@ -12,7 +12,7 @@ import numpy as np
 
 from consistency.bench.pages.report_input import Report
 from consistency.bench.scenario import data_folder
-from consistency.referee.diagnostics.statistics.intervals import binomial_interval
+from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.document.blocks import Block, Cell, Column, Details, Facts, Table, Text
 from consistency.referee.pages.section import Part, Section
 

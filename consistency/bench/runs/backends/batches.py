@@ -13,8 +13,8 @@ from consistency.bench.runs.backends.remote import Part, require_same_versions
 from consistency.bench.runs.trial_work import Outcomes, TrialWork
 from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.referee.errors import InputError
-from consistency.referee.system.machine import in_words
 from consistency.referee.system.progress import say
+from consistency.referee.system.provenance import in_words
 
 
 @dataclass(eq=False)

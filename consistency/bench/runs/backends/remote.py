@@ -23,7 +23,7 @@ from consistency.bench.runs.isolation.isolating import dismiss
 from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.errors import InputError
-from consistency.referee.system.machine import this_machine
+from consistency.referee.system.provenance import this_machine
 
 PACKAGE = Path(__file__).parents[3]
 DECIDING = ("numpy", "scipy", "numba")  # packages whose versions the bits depend on

@@ -34,7 +34,7 @@ from consistency.bench.runs.isolation.standard_streams import AT_ONCE, Printed, 
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
-from consistency.referee.system.ending import die_with_parent
+from consistency.referee.system.stopping import die_with_parent
 from consistency.referee.types import Array
 
 IDLE = 300.0  # s without a study, after which a supervisor ends

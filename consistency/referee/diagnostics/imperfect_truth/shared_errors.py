@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.record import Record, arrays_of
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -184,9 +184,7 @@ def halves(record: Record) -> tuple[Record, Record]:
 
 def _some(record: Record, steps: slice) -> Record:
     """Some steps of the arrays that are judged."""
-    names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times", "path")
-    there = {name: array for name in names if (array := getattr(record, name)) is not None}
-    arrays: dict[str, Any] = {name: np.asarray(array)[:, steps] for name, array in there.items()}
+    arrays: dict[str, Any] = {name: np.asarray(array)[:, steps] for name, array in arrays_of(record).items()}
     return replace(record, **arrays, t=record.t[steps] if len(record.t) else record.t)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -18,9 +18,8 @@ from consistency.referee.diagnostics.questions.shape import weighted_chi_square_
 from consistency.referee.diagnostics.records.sample import Sample, sample_of
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES
+from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES, least
 from consistency.referee.diagnostics.verdict.location import accuracy_of, bias_of
-from consistency.referee.diagnostics.verdict.p_values import least
 from consistency.referee.diagnostics.verdict.parts import Equivalence, Interval, Settings, TruthShare, Verdict
 from consistency.referee.diagnostics.words.headline import at_share
 from consistency.referee.types import Array
@@ -101,7 +100,7 @@ class UncertainTruth:
 
     # --- shares -----------------------------------------------------------------------------------
 
-    def eigenvalues(self, index: Sequence[int]) -> Array:
+    def eigenvalues(self, index: list[int]) -> Array:
         """Those of S^-1/2 P_t S^-1/2 of some components, means over the steps of each run, (runs, k), descending."""
         some = np.ix_(index, index)
         counted = self.total.counted
@@ -113,11 +112,14 @@ class UncertainTruth:
         return mean_of_runs(values)[counted.any(axis=1)].clip(0.0, 1.0)
 
     @cached_property
+    def groups(self) -> Mapping[str, list[int]]:
+        """All components (MAIN), and each group of the sample."""
+        return {MAIN: list(range(self.total.dof))} | dict(self.total.known_errors.groups)
+
+    @cached_property
     def by_group(self) -> Mapping[str, Array]:
-        """:meth:`eigenvalues` of all components (MAIN) and of each group."""
-        assert self.total.errors is not None
-        groups = {MAIN: list(range(self.total.dof))} | dict(self.total.errors.groups)
-        return {key: self.eigenvalues(list(index)) for key, index in groups.items()}
+        """:meth:`eigenvalues` of each group."""
+        return {key: self.eigenvalues(index) for key, index in self.groups.items()}
 
     def share(self, group: str = MAIN) -> float:
         """s of a group: the part of P_t in both covariances; NaN where nothing is judged."""
@@ -158,14 +160,14 @@ class UncertainTruth:
         values = self.by_group[group]
         if not len(values):
             return float("nan")
-        mean = float(self.total.group_means(self._index(group)).mean()) / self._together
+        mean = float(self.total.group_means(self.groups[group]).mean()) / self._together
         return upper_tail(mean, upper_weights(values, ratio))
 
     def below(self, group: str = MAIN, ratio: float = 1.0) -> float:
         """p value of the covariance of e being at least ``ratio`` P, likewise."""
         if self.record.truth_shared:
             return 1.0
-        index = self._index(group)
+        index = self.groups[group]
         return scale_test(self._alone.group_means(index) / ratio, len(index), self.total.longest).below
 
     @cached_property
@@ -175,14 +177,9 @@ class UncertainTruth:
         assert sample is not None
         return sample
 
-    def _index(self, group: str) -> list[int]:
-        assert self.total.errors is not None
-        return list(range(self.total.dof)) if group == MAIN else list(self.total.errors.groups[group])
-
     def _bias(self) -> dict[str, float]:
         """p values of a mean error: by the spread of the runs, and beyond what the truth allows."""
-        assert self.total.errors is not None
-        e, counted = self.total.errors, self.total.counted
+        e, counted = self.total.known_errors, self.total.counted
         runs: Array = np.asarray(counted.any(axis=1))
         steps: Array = np.asarray(counted.any(axis=0))
         if runs.sum() <= self.total.dof:
@@ -198,12 +195,6 @@ class UncertainTruth:
             allowed = self._allowed(mean_k, stated_k, of_truth_k, counted.sum(axis=0)[steps])
             p[BIAS[1]] = least(np.maximum(spreads, allowed))[0]
         return p
-
-    def _clearest_step(self) -> int | None:
-        """The step 1..T with the clearest mean error, whatever the truth allows."""
-        assert self.total.errors is not None
-        w = self.total.errors.whitened
-        return None if w.shape[1] == 1 else least(t_squared(w)[1])[1]
 
     def _allowed(self, mean: Array, P: Array, P_t: Array, runs: Array) -> Array:
         """p values of mean errors (..., n), whose covariance is at most P / runs + P_t, (..., n n) each."""
@@ -236,7 +227,9 @@ class UncertainTruth:
             known = replace(
                 v.accuracy, rmse=size.rmse, rmse_position=size.rmse_position, rmse_heading=size.rmse_heading
             )
-            mean = bias_of(self.total, self._clearest_step(), v.location, answers)
+            w = self.total.known_errors.whitened
+            clearest = None if w.shape[1] == 1 else least(t_squared(w)[1])[1]  # whatever the truth allows
+            mean = bias_of(self.total, clearest, v.location, answers)
             return replace(v, accuracy=known, bias=replace(mean, inflation_without=v.bias.inflation_without))
         within, until, largest = v.scale.within, v.location.until, v.axes.largest
         scale = replace(
@@ -295,7 +288,7 @@ class UncertainTruth:
             most = (
                 s * float(distributions.chi2.ppf(0.5 * (1.0 + CONFIDENCE), k)) / k
             )  # of the truth, if all its errors are one
-            low, high = low - most, high
+            low -= most
             if self.record.truth_shared:
                 low = max(np.sqrt(of_both.low) - np.sqrt(most), 0.0) ** 2
                 high = (np.sqrt(of_both.high) + np.sqrt(most)) ** 2

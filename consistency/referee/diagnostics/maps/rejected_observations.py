@@ -6,7 +6,7 @@ import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.intervals import binomial_interval
+from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.diagnostics.verdict.parts import Interval, RejectionScore
 from consistency.referee.types import Array, Indices
 

@@ -63,13 +63,6 @@ def accepted_scales(tolerance: float) -> str:
     return "x1 is right" if tolerance == 1.0 else f"x{1 / tolerance:.3g} to x{tolerance:.3g} is accepted"
 
 
-class Alternative(NamedTuple):
-    """A scale of the NIS outside the tolerance, and the edge of the tolerance that it is set against."""
-
-    scale: float
-    edge: float
-
-
 class Bet(NamedTuple):
     """Log-likelihood ratios of the alternatives for a number of degrees of freedom: constant + slope x NIS."""
 
@@ -77,10 +70,10 @@ class Bet(NamedTuple):
     terms: tuple[tuple[float, float], ...]  # constant and slope of each alternative
 
 
-def alternatives(tolerance: float) -> tuple[Alternative, ...]:
-    """Scales above the tolerance, then as many below."""
-    above = [Alternative(tolerance * ratio, tolerance) for ratio in RATIOS]
-    return (*above, *(Alternative(1.0 / scale, 1.0 / edge) for scale, edge in above))
+def alternatives(tolerance: float) -> tuple[tuple[float, float], ...]:
+    """Scales of the NIS above the tolerance, then as many below, each with the edge that it is set against."""
+    above = [(tolerance * ratio, tolerance) for ratio in RATIOS]
+    return (*above, *((1.0 / scale, 1.0 / edge) for scale, edge in above))
 
 
 def bet_on(dof: int, tolerance: float = 1.2, gate: float | None = None) -> Bet:
@@ -235,21 +228,27 @@ class Monitor:
         bet = self._bets.get(dof)
         if bet is None:
             bet = self._bets[dof] = bet_on(int(dof), self.tolerance, self.gate)
-        if not value <= bet.limit:  # above it, or NaN
-            if self.gate is not None:
-                self.measurements += 1
-                self.rejections += 1
-                self._skip = self._rest
+        rejected = not value <= bet.limit  # above it, or NaN
+        if rejected and self.gate is None:
             return None
         self.measurements += 1
+        if rejected:
+            self.rejections += 1
+            self._skip = self._rest
+            return None
         if self._skip:
             self._skip -= 1
             return None
         self._judge(value, int(dof), bet)
-        if self.alarm is None and self.evidence >= 1.0 / self.false_alarm:
-            self.alarm = self._raised()
-            return self.alarm
-        return None
+        if self.alarm is not None or self.evidence < self.threshold:
+            return None
+        best = max(range(len(self._R)), key=self._R.__getitem__)
+        reset = self._resets[best]
+        direction = "overconfident" if best < len(RATIOS) else "conservative"
+        self.alarm = Alarm(
+            self.steps, reset.step, direction, self.evidence, self._scale_since(reset), self.false_alarm, self.tolerance
+        )
+        return self.alarm
 
     @property
     def threshold(self) -> float:
@@ -284,14 +283,6 @@ class Monitor:
                 self._resets[i] = here
         self.evidence = total / len(R) + self._unspent
         self.largest = max(self.largest, self.evidence)
-
-    def _raised(self) -> Alarm:
-        best = max(range(len(self._R)), key=self._R.__getitem__)
-        reset = self._resets[best]
-        direction = "overconfident" if best < len(RATIOS) else "conservative"
-        return Alarm(
-            self.steps, reset.step, direction, self.evidence, self._scale_since(reset), self.false_alarm, self.tolerance
-        )
 
     def _scale_since(self, reset: _Reset) -> float:
         count = self.innovations - reset.innovations

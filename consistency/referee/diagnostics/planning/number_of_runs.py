@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,15 +43,13 @@ def required_runs(
     _require(dof, false_alarm, power)
     if not 0.0 < ratio < float("inf") or ratio == 1.0:
         raise ValueError(f"ratio must be positive and not 1, got {ratio}")
-    if power_of(dof, LARGEST, ratio, false_alarm, two_sided) < power:
+
+    def enough(runs: int) -> bool:
+        return power_of(dof, runs, ratio, false_alarm, two_sided) >= power
+
+    if not enough(LARGEST):
         raise ValueError(f"ratio of {ratio} needs more than {LARGEST} runs; ask for one further from 1")
-    low, high = 0, 1
-    while power_of(dof, high, ratio, false_alarm, two_sided) < power:
-        low, high = high, min(2 * high, LARGEST)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if power_of(dof, middle, ratio, false_alarm, two_sided) >= power else (middle, high)
-    return high
+    return 1 + bisect_left(range(1, LARGEST), True, key=enough)
 
 
 def gate_runs(
@@ -89,11 +88,8 @@ def lost_runs(share: float, power: float = POWER, lost: int = 0) -> int:
             raise ValueError(f"{name} must lie between 0 and 1, got {value}")
     if share_limit(lost, LARGEST, power) > share:
         raise ValueError(f"lost of {share} needs more than {LARGEST} runs; ask for a larger share")
-    low, high = lost, LARGEST
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if share_limit(lost, middle, power) <= share else (middle, high)
-    return high
+    few = lost + 1
+    return few + bisect_left(range(few, LARGEST), True, key=lambda runs: share_limit(lost, runs, power) <= share)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
-"""Scale of a single log, if errors go on to decorrelate as they do within it. Reported, never judged."""
+"""One log: its scale if errors go on to decorrelate as they do within it, and its pieces as runs."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
@@ -8,9 +10,13 @@ from scipy import special
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.planning.number_of_runs import MARGIN
 from consistency.referee.diagnostics.questions.equivalence import deciding_runs
-from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest
+from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest, run_means
+from consistency.referee.diagnostics.records.record import Record, arrays_of
+from consistency.referee.diagnostics.records.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.diagnostics.verdict.parts import Interval, Settings, Within
+from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
 REACH = 5.0  # correlation times over which autocorrelations are summed: Sokal (1997), sec. 3
@@ -69,3 +75,137 @@ def correlation_time(series: Array) -> tuple[float, int]:
     enough = np.arange(T) >= REACH * tau
     lag = int(np.argmax(enough)) if enough.any() else T - 1
     return max(1.0, float(tau[lag])), max(lag, 1)
+
+
+# --- pieces that stand as runs -----------------------------------------------------------------------
+
+
+FEWEST = 20  # pieces
+GROWTH = 2.0  # of a stated variance over the log, beyond which pieces are not alike, if it grows steadily
+STEADY = 0.8  # rank correlation of a variance with the time, above which it grows steadily
+CAPTION = "what is constant over the log is not judged, and every piece has it"
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Over how many steps the errors of a log go on."""
+
+    steps: int  # of the log
+    time: float  # integrated correlation time, steps: the larger of both
+    upper: float  # end of its one-sided 95 % interval
+
+    @property
+    def piece(self) -> int:
+        """Least number of steps in a piece."""
+        return max(int(np.ceil(APART * self.upper)), 1) if np.isfinite(self.upper) else self.steps + 1
+
+    @property
+    def pieces(self) -> int:
+        """Advised number of pieces; it does not depend on the size of the errors."""
+        return min(int(self.steps // self.piece), int(MOST))
+
+
+def memory_of(whitened: Array) -> Memory:
+    """Integrated correlation time of the errors of a log about zero, and of their squares about their mean.
+
+    A constant error never decorrelates about zero; about the log's own mean it would not be seen. The largest time of
+    all components and of the NEES counts. Autocorrelations are summed over a window of 5 times (Sokal 1997, sec. 3);
+    the variance of the time is 2 (2 window + 1) / steps of its square (Madras & Sokal 1988).
+
+    Parameters
+    ----------
+    whitened : (T, n), L^-1 e with L L' = P; NaN where there is none
+    """
+    w = whitened[np.isfinite(whitened).all(axis=1)]
+    sizes = np.square(w).sum(axis=1)
+    found = [correlation_time(series) for series in (*w.T, sizes - sizes.mean())] if len(w) > 1 else []
+    z = float(special.ndtri(CONFIDENCE))
+    uppers = [time * np.exp(z * np.sqrt(2.0 * (2.0 * reach + 1.0) / len(w))) for time, reach in found]
+    return Memory(len(whitened), max((time for time, _ in found), default=np.inf), max(uppers, default=np.inf))
+
+
+def in_pieces(record: Record, count: int | None = None) -> Record:
+    """The record of one log with its pieces as runs.
+
+    Nothing is shown (``Record.unshown``) by fewer than 20 pieces, by pieces of fewer than 10 correlation times, or
+    where neighbours do not seem to be independent (:func:`independence.independence` of their mean errors and mean
+    NEES). A bias is not asked: one log does not tell an error that is constant from one that changes slowly.
+
+    Parameters
+    ----------
+    count : number of pieces; None takes the advised one, which depends on correlations alone
+
+    Raises
+    ------
+    InputError
+        There is more than one run, no error, or a stated variance grows over the log.
+    """
+    if record.error is None or record.covariance is None or len(record.error) != 1:
+        raise InputError(f"--split: needs the errors of one log; {record.name} has {len(record.run_numbers)} runs")
+    if record.failures:
+        raise InputError(f"--split: {record.name} failed in step {record.failures[0].step}; cut the log before that")
+    P = np.asarray(record.covariance, float)
+    whitened = whiten(record.error, P)[0]
+    there = np.flatnonzero(np.isfinite(whitened).all(axis=1))
+    if not len(there):
+        raise InputError(f"--split: {record.name} has no step that can be judged")
+    log = slice(int(there[0]), int(there[-1]) + 1)
+    _require_steady(record, P[0, log])
+    memory = memory_of(whitened[log])
+    pieces = max(memory.pieces, FEWEST) if count is None else count
+    length = memory.steps // max(pieces, 1)
+    if length < 1:
+        raise InputError(f"--split {pieces}: {record.name} has only {memory.steps} steps")
+    end = log.start + pieces * length
+    parts = whitened[log.start : end].reshape(pieces, length, -1)
+    arrays = {
+        name: array[0, log.start : end].reshape(pieces, length, *array.shape[2:])
+        for name, array in arrays_of(record).items()
+        if name not in ("covariance", "times", "truth_covariance")
+    }
+    clock = record.times[0] if record.times is not None else record.t
+    times = clock[log.start : end].reshape(pieces, length) if len(clock) else None
+    note = (
+        f"{record.name}: the log is cut into {pieces} pieces of {length} steps, which stand as runs; its errors go on "
+        f"over {memory.time:.3g} steps"
+    )
+    return replace(
+        record, **arrays, covariance=P[0, log.start : end].reshape(pieces, length, *P.shape[2:]), times=times,
+        t=np.full(length, np.nan), runs=np.arange(1, pieces + 1), unit="piece", caption=CAPTION,
+        notes=(*record.notes, note),
+        unavailable=BIAS, unshown=_unshown(memory, pieces, length, parts),
+    )  # fmt: skip
+
+
+def _require_steady(record: Record, P: Array) -> None:
+    """Refuse a log whose stated variances (T, n, n) grow: its errors have no size that pieces share."""
+    blocks = np.array_split(np.diagonal(P, axis1=1, axis2=2), FEWEST)
+    if min(map(len, blocks)) == 0:
+        return
+    medians = np.array([np.nanmedian(block, axis=0) for block in blocks])
+    names = record.axes or [f"axis {i}" for i in range(medians.shape[1])]
+    for axis, values in zip(names, medians.T, strict=True):
+        ratio = float(values[-1] / max(values[1], np.finfo(float).tiny))
+        signs = np.sign(values[None, :] - values[:, None])[np.triu_indices(len(values), 1)]
+        if ratio > GROWTH and signs.mean() > STEADY:  # rank correlation with the order (Kendall 1938)
+            raise InputError(
+                f"--split: the stated variance of {axis} grows by x{ratio:.3g} over the log, so that its pieces are "
+                "not alike; judge motions over windows: --relative 10s"
+            )
+
+
+def _unshown(memory: Memory, pieces: int, length: int, parts: Array) -> str:
+    """Why nothing is shown by these pieces; '' where it may be."""
+    if pieces < FEWEST:
+        return f"{pieces} pieces of one log are too few, at least {FEWEST} are needed to see that they are independent"
+    if length < memory.piece:
+        whole = "as long as the log" if memory.piece > memory.steps else f"{memory.piece} steps"
+        return (
+            f"{pieces} pieces of {length} steps are not shown to be independent: errors go on over {memory.time:.3g} "
+            f"steps (up to {memory.upper:.3g}), about zero or in size, and pieces should be {whole}"
+        )
+    from consistency.referee.diagnostics.questions.independence import independence
+
+    if independence(mean_of_runs(parts), run_means(squared_length(parts))[0]).doubtful:
+        return f"{pieces} pieces of {length} steps do not seem to be independent"
+    return ""

@@ -9,10 +9,10 @@ from scipy import optimize, special
 
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.diagnostics.questions.scale import FEW
-from consistency.referee.diagnostics.records.array_blocks import blocks
+from consistency.referee.diagnostics.records.large_arrays import blocks
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.types import Array, Indices
+from consistency.referee.types import Array
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,10 @@ def simultaneous_band(
     if not len(judged):
         return Band(low, high, float("nan"), none, none)
     sides = 1 if allow == "conservative" else 2
-    slopes = _slopes(nees, judged) if method == "max" and len(nees) >= FEW else None
+    slopes = None
+    if method == "max" and len(nees) >= FEW:
+        parts = (nees[:, judged[b.start : b.stop + 1]] for b in blocks(len(judged) - 1, len(nees)))
+        slopes = np.concatenate([_slopes(part) for part in parts])
 
     def exceedance(c: float) -> float:
         if slopes is None:
@@ -86,13 +89,8 @@ def simultaneous_band(
         return Band(low, high, p_value, curve > high, curve < low)
 
 
-def _slopes(nees: Array, judged: Indices) -> Array:
-    """sqrt((1 - rho) / (1 + rho)) of neighbours among the ``judged`` steps of (runs, steps); rho from 0 to 1."""
-    parts = [_slopes_of(nees[:, judged[here.start : here.stop + 1]]) for here in blocks(len(judged) - 1, len(nees))]
-    return np.concatenate(parts)
-
-
-def _slopes_of(nees: Array) -> Array:
+def _slopes(nees: Array) -> Array:
+    """sqrt((1 - rho) / (1 + rho)) of neighbours among the steps of (runs, steps); rho from 0 to 1."""
     present = np.isfinite(nees)
     both = present[:, 1:] & present[:, :-1]
     shared, alive = both.sum(axis=0), present.sum(axis=0)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.records.array_blocks import blocks
+from consistency.referee.diagnostics.records.large_arrays import blocks
 from consistency.referee.diagnostics.records.whitening import all_finite
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array, Indices

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import special
@@ -14,11 +13,8 @@ from consistency.referee.diagnostics.planning.number_of_runs import LARGEST
 from consistency.referee.diagnostics.questions.scale import FEW, MeanTest, scale_test
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
-from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Settings
+from consistency.referee.diagnostics.verdict.parts import Equivalence, Settings
 from consistency.referee.types import Array
-
-if TYPE_CHECKING:
-    from consistency.referee.diagnostics.questions.innovations import NisTest
 
 
 def equivalence(
@@ -71,18 +67,20 @@ def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equiva
     return equivalent(below, above, factor, settings, None)
 
 
-def equivalence_of_innovations(
-    test: NisTest | Innovations, settings: Settings, factor: float | None = None
-) -> Equivalence:
-    """Equivalence of the scale of the innovations, from the total NIS; innovations are independent over steps too."""
-    factor, total = settings.factor if factor is None else factor, test.ratio * test.dof
-    if not test.dof:
+def equivalence_of_total(total: float, dof: int, settings: Settings, factor: float) -> Equivalence:
+    """Equivalence of the scale from a total that is chi-square with ``dof`` degrees of freedom if the ratio is 1.
+
+    The total NIS is, as innovations are independent over steps too, and so is the joint NEES of pose and map.
+    """
+    if not dof:
         return Equivalence(factor, float("nan"), 1.0 - settings.power, None)
-    below, above = (
-        float(distributions.chi2.cdf(total / factor, test.dof)),
-        float(distributions.chi2.sf(total * factor, test.dof)),
-    )
+    below, above = float(distributions.chi2.cdf(total / factor, dof)), float(distributions.chi2.sf(total * factor, dof))
     return equivalent(below, above, factor, settings, None)
+
+
+def is_tolerated(total: float, dof: int, settings: Settings) -> bool:
+    """Whether the ratio is shown to lie within the tolerance, see :func:`equivalence_of_total`."""
+    return settings.tolerance is not None and equivalence_of_total(total, dof, settings, settings.tolerated).shown
 
 
 def equivalent(below: float, above: float, factor: float, settings: Settings, runs: int | None) -> Equivalence:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.large_arrays import by_runs
 from consistency.referee.diagnostics.records.whitening import all_finite, whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
@@ -120,15 +120,16 @@ def _portmanteau(u: Array, lags: int) -> Whiteness:
     _, steps, m = u.shape
     lags = min(lags, max(steps // 4, 1), max(steps - 1, 0))
     present = all_finite(u)
+    unknown = Whiteness(np.full(0, np.nan), float("nan"), float("nan"), 0, float("nan"))
     if lags == 0 or present.sum() < FEWEST:
-        return Whiteness(np.full(0, np.nan), float("nan"), float("nan"), 0, float("nan"))
+        return unknown
     u = np.where(present[..., None], u, 0.0)
     power = float(np.square(u).sum() / (present.sum() * m))
     statistic, correlation, pairs = 0.0, np.zeros(lags), 0
     for lag in range(1, lags + 1):
         pairs = int((present[:, lag:] & present[:, :-lag]).sum())
         if pairs == 0 or power == 0:
-            return Whiteness(np.full(0, np.nan), float("nan"), float("nan"), 0, float("nan"))
+            return unknown
         C = np.tensordot(u[:, :-lag], u[:, lag:], axes=((0, 1), (0, 1))) / (pairs * power)
         correlation[lag - 1] = np.trace(C) / m
         statistic += pairs * float(np.square(C).sum())

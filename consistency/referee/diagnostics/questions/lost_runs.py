@@ -1,4 +1,4 @@
-"""Lost runs: those that failed or have a NEES beyond chance, and the share of them that is not excluded."""
+"""Lost runs: those that failed or have a NEES beyond chance, the share not excluded, and runs that end early."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from consistency.referee.diagnostics.planning.e_process import ever
 from consistency.referee.diagnostics.planning.number_of_runs import lost_runs, share_limit
 from consistency.referee.diagnostics.questions.scale import run_means
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.parts import Lost, Settings
+from consistency.referee.diagnostics.verdict.parts import EarlyEnds, Lost, Settings
 from consistency.referee.types import Array
 
 PARTS = np.array([0.0, 0.125, 0.25, 0.5])  # of the share in question: what the bet takes the true share to be
@@ -84,3 +84,40 @@ def _next(is_lost: Array, share: float, level: float) -> int | None:
     further[: len(is_lost)] = is_lost[:FURTHEST]
     reached = np.flatnonzero(lost_evidence(further, share) >= 1.0 / (1.0 - level))
     return int(reached[0]) + 1 if len(reached) else None
+
+
+def early_ends(nees: Array) -> EarlyEnds:
+    """Test whether runs that end early have a larger NEES in their last step than the runs that go on.
+
+    In each step in which runs end, the NEES of all runs that have reached it are ranked. Given these values, each run
+    is equally likely to end if ends do not depend on errors, however the steps depend on each other. So the sum of
+    their ranks has the mean and variance of Wilcoxon (1945), and those of different steps are uncorrelated (Prentice
+    1978, Biometrika 65). The sum over all steps is taken as normal, which for few runs is on the safe side.
+
+    Parameters
+    ----------
+    nees : (runs, steps), NaN where a run has no value
+    """
+    there = np.isfinite(nees)
+    last = np.where(there.any(axis=1), nees.shape[1] - 1 - np.argmax(there[:, ::-1], axis=1), -1)
+    runs, above, gap, variance = 0, 0.0, 0.0, 0.0
+    for step in np.unique(last[(last >= 0) & (last < last.max(initial=-1))]):
+        reached = there[:, step]
+        ending, R = last[reached] == step, int(reached.sum())
+        d = int(ending.sum())
+        if d == R:
+            continue
+        ranks = float(_ranks(nees[reached, step])[ending].sum())
+        runs += d
+        above += (ranks - 0.5 * d * (d + 1)) / (R - d)
+        gap += ranks - 0.5 * d * (R + 1)
+        variance += d * (R - d) * (R + 1) / 12.0
+    if not runs:
+        return EarlyEnds(0, float("nan"), float("nan"))
+    return EarlyEnds(runs, above / runs, float(special.ndtr(-gap / np.sqrt(variance))))
+
+
+def _ranks(values: Array) -> Array:
+    """Ranks from 1, equal values sharing the mean of theirs."""
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(count) - 0.5 * (count - 1))[place])

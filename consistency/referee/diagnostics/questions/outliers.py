@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.referee.diagnostics.questions.bias import Moments, moments
-from consistency.referee.diagnostics.records.array_blocks import blocks
+from consistency.referee.diagnostics.records.large_arrays import blocks
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
 

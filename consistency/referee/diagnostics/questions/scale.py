@@ -8,9 +8,10 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.records.array_blocks import by_runs, by_steps
+from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps
+from consistency.referee.diagnostics.records.whitening import mean_and_count
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.intervals import anees_interval
+from consistency.referee.diagnostics.statistics.nees import anees_interval
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.types import Array, Indices
 
@@ -81,8 +82,11 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
     ratio = float(means.mean())
     nu, spread = float(dof), float("inf")
     if runs >= FEW and (steps > 1 or not gaussian) and means.min() > 0:
-        log_nu, variance = _log_nu(means)
-        log_nu = min(log_nu, float(np.log(dof * steps)))
+        by_spread, left_out = _log_nu_of_means(means)
+        by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / runs)
+        by_likelihood, error = _log_nu_of_gamma(means)
+        safe = by_spread - float(np.sqrt(variance)), float(by_likelihood - error)
+        log_nu = min(*safe, float(np.log(dof * steps)))
         if log_nu > np.log(dof) or not gaussian:
             nu, spread = float(np.exp(log_nu)), 2.0 / variance
     above, below = _tails(ratio, runs * nu, spread)
@@ -124,10 +128,7 @@ def run_means(nees: Array) -> tuple[Array, Array]:
 
 def means_and_counts(nees: Array) -> Array:
     """Means and counts of :func:`run_means` as one array, (runs, steps) -> (runs, 2)."""
-    present = np.isfinite(nees)
-    count = present.sum(axis=1)
-    total = np.where(present, nees, 0.0).sum(axis=1)
-    return np.stack([np.where(count > 0, total / np.maximum(count, 1), np.nan), count], axis=-1)
+    return np.stack(mean_and_count(nees, 1), axis=-1)
 
 
 def acceptance(test: MeanTest, dof: int, false_alarm: float, allow: str | None = None) -> tuple[float, float]:
@@ -166,14 +167,6 @@ def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -
     z, k = float(distributions.t.isf(tail, spread)), len(means) * nu
     low, high = (float(distributions.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
     return Interval(ratio, ratio * k / low, ratio * k / max(high, 1e-300))
-
-
-def _log_nu(means: Array) -> tuple[float, float]:
-    """The smaller of both estimates of log nu on the safe side, and the variance of the first."""
-    by_spread, left_out = _log_nu_of_means(means)
-    by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
-    by_likelihood, error = _log_nu_of_gamma(means)
-    return min(by_spread - float(np.sqrt(variance)), float(by_likelihood - error)), variance
 
 
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped, without_first
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 
@@ -39,9 +38,9 @@ class MapRecord(NamedTuple):
     dof: int  # of a landmark: 3, or 2 in the plane
     record: Callable[[Array | None], Record | None]  # what is judged, of the last NEES of the pose of each run, (runs,)
 
-    def of_runs(self, runs: int | None) -> MapRecord:
-        """Those of runs 0 to ``runs`` - 1, or of all."""
-        some = self.run < (np.inf if runs is None else runs)
+    def of_runs(self, runs: int) -> MapRecord:
+        """Those of runs 0 to ``runs`` - 1."""
+        some = self.run < runs
         return self._replace(run=self.run[some], nees=self.nees[some])
 
 
@@ -143,14 +142,19 @@ class Record:
     @property
     def ends(self) -> Record:
         """Each run by the last NEES that it has, (runs, 1): what a verdict on the maps needs of the poses."""
-        nees = None if self.nees is None else by_runs(_last_value, self.nees)[:, None]
+
+        def last(nees: Array) -> Array:
+            if not nees.size:
+                return np.full(len(nees), np.nan)
+            step = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
+            return np.asarray(nees[np.arange(len(nees)), step])
+
+        nees = None if self.nees is None else by_runs(last, self.nees)[:, None]
         return Record(self.name, nees=nees, failures=self.failures, runs=self.run_numbers, map=self.map)
 
     def of_runs(self, rows: slice | Indices) -> Record:
         """Some of the runs, by their rows, with maps and rejections of all."""
-        names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times",
-                 "truth_covariance", "path")  # fmt: skip
-        arrays = {name: array[rows] for name in names if (array := getattr(self, name)) is not None}
+        arrays = {name: array[rows] for name, array in arrays_of(self).items()}
         numbers = self.run_numbers[rows]
         failures = tuple(failure for failure in self.failures if failure.run in numbers)
         world = None if self.world is None else self.world.of_runs(rows)
@@ -171,14 +175,14 @@ class Record:
         """
         names = ("covariance", "nees", "nis", "nis_dof", "innovations")
         arrays = {name: getattr(self, name) for name in names}
-        if self.world is not None:
-            arrays |= {"world covariance": self.world.covariance, "world nees": self.world.nees}
+        world = self.world
+        if world is not None:
+            arrays |= {"world covariance": world.covariance, "world nees": world.nees}
         t = self.times if self.times is not None else self.t if len(self.t) else None
         try:
             rest, skipped = without_first(skip, arrays, self.name, t)
         except ValueError as error:
             raise InputError(f"--{error}") from None
-        world = self.world
         if world is not None:
             world = replace(world, covariance=rest.pop("world covariance"), nees=rest.pop("world nees"))
         guesses = {kind: one.without_first(skip) for kind, one in self.guesses.items()}
@@ -252,12 +256,11 @@ def shown_by(function: str, *arguments: Any) -> Any:
     return getattr(import_module("consistency.referee.notebook.showing"), function)(*arguments)
 
 
-def _last_value(nees: Array) -> Array:
-    """The last value of each run that is a number, (runs, steps) -> (runs,); NaN where none is."""
-    if not nees.size:
-        return np.full(len(nees), np.nan)
-    last = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
-    return np.asarray(nees[np.arange(len(nees)), last])
+def arrays_of(record: Record) -> dict[str, Any]:
+    """Arrays over runs and steps that a record has, by name."""
+    names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times",
+             "truth_covariance", "path")  # fmt: skip
+    return {name: array for name in names if (array := getattr(record, name)) is not None}
 
 
 def each_alone(record: Record) -> Record:

@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
-from consistency.referee.diagnostics.records.array_blocks import by_runs, by_steps, of_runs
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs, by_steps, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.records.symmetric import Symmetric
 from consistency.referee.diagnostics.records.validity import negative
-from consistency.referee.diagnostics.records.whitening import all_finite, entries, squared_length, subset, whiten
+from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, subset, whiten
 from consistency.referee.diagnostics.verdict.parts import Settings
 from consistency.referee.types import Array
 
@@ -41,7 +40,7 @@ class Errors:
     def covariance(self) -> Symmetric:
         """(N, T, n, n)."""
         assert self.record.covariance is not None
-        return entries(self.record.covariance)
+        return Symmetric.of(self.record.covariance)
 
 
 class Centre(NamedTuple):
@@ -54,9 +53,6 @@ class Centre(NamedTuple):
         """Errors (runs, T, n) about the mean; NaN where they are not ``counted`` (runs, T)."""
         return np.where(counted[..., None], (error - self.mean) * self.factor, np.nan)
 
-    def of_steps(self, steps: slice) -> Centre:
-        return Centre(self.mean[steps], self.factor[steps])
-
 
 @dataclass(frozen=True)
 class Sample:
@@ -68,6 +64,12 @@ class Sample:
     nees: Array  # (N, T), NaN where nothing counts
     dof: int
     errors: Errors | None = None
+
+    @property
+    def known_errors(self) -> Errors:
+        """Errors of a sample that has them."""
+        assert self.errors is not None
+        return self.errors
 
     @cached_property
     def counted(self) -> Array:
@@ -84,11 +86,11 @@ class Sample:
         """Steps of the longest run."""
         return int(self.counted.sum(axis=1).max(initial=0))
 
-    def group_means(self, index: Sequence[int], steps: slice = slice(None)) -> Array:
-        """Mean NEES of a group of components alone, over its number of components."""
-        assert self.errors is not None
-        e, index = self.errors, list(index)
-        centre = None if e.centre is None else e.centre.of_steps(steps)
+    def group_means(self, index: Sequence[int], steps: slice = slice(None), centre: Centre | None = None) -> Array:
+        """Mean NEES of a group of components alone, of errors about the ``centre``, over its number of components."""
+        e, index = self.known_errors, list(index)
+        centre = e.centre if centre is None else centre
+        centre = None if centre is None else Centre(centre.mean[steps], centre.factor[steps])
 
         def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
             error = error if centre is None else centre.about(error, counted)
@@ -99,34 +101,23 @@ class Sample:
 
     def centre(self) -> Centre:
         """Mean error over runs in each step."""
-        assert self.errors is not None
-        N = self.counted.sum(axis=0)[:, None]
-        total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), self.errors.error, self.counted)
+        error, N = self.known_errors.error, self.counted.sum(axis=0)[:, None]
+        total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), error, self.counted)
         factor = np.sqrt(N / np.maximum(N - 1, 1))
         return Centre(total / np.maximum(N, 1), np.where(N > 1, factor, np.nan))
 
     def centred_means(self, steps: slice) -> Array:
         """:meth:`means` of errors less their mean over runs in each step."""
-        assert self.errors is not None
-        centre = self.centre().of_steps(steps)
-
-        def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
-            return means_and_counts(squared_length(whiten(centre.about(error, counted), P)))
-
-        e = self.errors
-        means, counts = by_runs(of_block, e.error[:, steps], e.covariance[:, steps], self.counted[:, steps]).T
-        return np.asarray(means[counts > 0] / self.dof)
+        return self.group_means(range(self.dof), steps, self.centre())
 
     def centred(self) -> Sample:
         """Errors less their mean over runs in each step, with the variance that they would have without a bias.
 
         Overwrites this sample's NEES and whitened errors in place; do not use it afterwards.
         """
-        assert self.errors is not None
-        e, centre = self.errors, self.centre()
-        counted = self.counted
-        for here in of_runs(counted):
-            w = whiten(centre.about(e.error[here], counted[here]), e.covariance[here])
+        e, centre = self.known_errors, self.centre()
+        for here in of_runs(self.counted):
+            w = whiten(centre.about(e.error[here], self.counted[here]), e.covariance[here])
             e.whitened[here], self.nees[here] = w, squared_length(w)
         return Sample(self.nees, self.dof, replace(e, centre=centre))
 
@@ -146,7 +137,7 @@ def sample_of(evidence: Record, settings: Settings) -> Sample | None:
         if not e.dof:
             raise ValueError("nees needs dof, the dimension of the error")
         return Sample(e.nees, e.dof)
-    n, P = e.error.shape[-1], entries(e.covariance)
+    n, P = e.error.shape[-1], Symmetric.of(e.covariance)
     names = names_of(e)
     groups = groups_of(names, settings.subsets)
     whitened, nees = np.empty(e.error.shape), np.empty(e.error.shape[:2])
@@ -237,4 +228,4 @@ def impossible(e: Record, counted: Array) -> Array:
         odd[suspect] = negative(np.asarray(P[suspect]))
         return odd
 
-    return by_runs(of_block, e.error, entries(e.covariance), counted)
+    return by_runs(of_block, e.error, Symmetric.of(e.covariance), counted)

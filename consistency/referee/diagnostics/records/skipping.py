@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.types import Array
 
 FORMS = "a whole number of steps (20) or seconds (2s)"
@@ -109,33 +109,27 @@ def without_first(
     ValueError
         Nothing is left, or seconds are asked for and there are no times.
     """
-    there = [value for value in arrays.values() if value is not None]
+    there = {key: value for key, value in arrays.items() if value is not None}
     if skip is None or not there:
         return dict(arrays), None
-    shape = there[0].shape[:2]
-    mask = skip.mask((int(shape[0]), int(shape[1])), t)
-    counted = np.zeros(shape, bool)
-    for key, value in arrays.items():
-        if value is not None and not key.endswith("dof"):
-            counted |= _finite(value)
+    runs, steps = next(iter(there.values())).shape[:2]
+    mask = skip.mask((int(runs), int(steps)), t)
+    counted = np.zeros(mask.shape, bool)
+    for key, value in there.items():
+        if isinstance(value, Symmetric):
+            counted |= value.where_all(np.isfinite)
+        elif not key.endswith("dof"):
+            counted |= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
     left = (counted & ~mask).any(axis=1)
     if not left.any():
         last = int(np.flatnonzero(counted.any(axis=0)).max(initial=-1)) + 1
         raise ValueError(f"skip {skip.option}: nothing of {name} is left, whose last step is {last}; leave out less")
     lost = Skipped(skip, int(mask.sum(axis=1).max()), int((counted.any(axis=1) & ~left).sum()))
-    return {key: _blank(value, mask, 0 if key.endswith("dof") else np.nan) for key, value in arrays.items()}, lost
-
-
-def _finite(value: Array | Symmetric) -> Array:
-    """Where all of a step is finite, (runs, steps) of bool."""
-    if isinstance(value, Symmetric):
-        return value.where_all(np.isfinite)
-    return np.asarray(np.isfinite(value).all(axis=tuple(range(2, value.ndim))))
-
-
-def _blank(value: Array | Symmetric | None, mask: Array, fill: float) -> Array | Symmetric | None:
-    if value is None:
-        return None
-    if isinstance(value, Symmetric):
-        return value.without(mask)
-    return np.where(mask.reshape(*mask.shape, *[1] * (value.ndim - 2)), np.asarray(fill, value.dtype), value)
+    rest = dict(arrays)
+    for key, value in there.items():
+        if isinstance(value, Symmetric):
+            rest[key] = value.without(mask)
+        else:
+            fill = np.asarray(0 if key.endswith("dof") else np.nan, value.dtype)
+            rest[key] = np.where(mask.reshape(*mask.shape, *[1] * (value.ndim - 2)), fill, value)
+    return rest, lost

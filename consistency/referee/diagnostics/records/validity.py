@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.large_arrays import by_runs
 from consistency.referee.types import Array, Indices
 
 DEFICIENT = 1e-12  # eigenvalue of a correlation matrix below which a direction carries no uncertainty

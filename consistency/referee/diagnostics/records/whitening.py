@@ -7,8 +7,7 @@ import operator
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.array_blocks import by_runs
-from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
 from consistency.referee.types import Array
 
 FEW = 7  # components that NumPy adds one after the other; sums over so short an axis are slow
@@ -20,14 +19,9 @@ def whiten(error: Array, covariance: Array | Symmetric) -> Array:
     Shapes (..., n) and (..., n, n) -> (..., n). Rows that hold a NaN, or whose covariance is not positive
     definite, come back as NaN.
     """
-    e, P = np.asarray(error, float), entries(covariance)
+    e, P = np.asarray(error, float), Symmetric.of(covariance)
     P = P if P.shape[:-1] == e.shape else P.broadcast(e.shape[:-1])
     return by_runs(_whiten, e, P) if e.ndim > 1 else _whiten(e, P)
-
-
-def entries(covariance: Array | Symmetric) -> Symmetric:
-    """Covariances (..., n, n) by entries; those of an array are not copied."""
-    return covariance if isinstance(covariance, Symmetric) else Symmetric.of(np.asarray(covariance, float))
 
 
 def _whiten(e: Array, P: Symmetric) -> Array:
@@ -64,7 +58,7 @@ def standardise(error: Array, covariance: Array | Symmetric) -> Array:
         return out
 
     e = np.asarray(error, float)
-    return by_runs(of_block, e, entries(covariance)) if e.ndim > 1 else of_block(e, entries(covariance))
+    return by_runs(of_block, e, Symmetric.of(covariance)) if e.ndim > 1 else of_block(e, Symmetric.of(covariance))
 
 
 def subset(error: Array, covariance: Array | Symmetric, index: list[int]) -> Array:
@@ -74,18 +68,18 @@ def subset(error: Array, covariance: Array | Symmetric, index: list[int]) -> Arr
         e, P = e[..., index], P.part(index)
         return standardise(e, P) if len(index) == 1 else whiten(e, P)
 
-    return by_runs(of_block, error, entries(covariance))
+    return by_runs(of_block, error, Symmetric.of(covariance))
 
 
 def squared_length(whitened: Array) -> Array:
     """(runs, steps, n) -> (runs, steps): the NEES, if nothing is missing."""
-    return by_runs(_squared_length, whitened)
 
+    def of_block(w: Array) -> Array:
+        if w.shape[-1] > FEW:
+            return np.asarray(np.square(w).sum(axis=-1))
+        return functools.reduce(operator.add, (np.square(w[..., i]) for i in range(w.shape[-1])))
 
-def _squared_length(w: Array) -> Array:
-    if w.shape[-1] > FEW:
-        return np.asarray(np.square(w).sum(axis=-1))
-    return functools.reduce(operator.add, (np.square(w[..., i]) for i in range(w.shape[-1])))
+    return by_runs(of_block, whitened)
 
 
 def all_finite(values: Array) -> Array:
@@ -93,15 +87,17 @@ def all_finite(values: Array) -> Array:
     return functools.reduce(operator.and_, (np.isfinite(values[..., i]) for i in range(values.shape[-1])))
 
 
+def mean_and_count(values: Array, axis: int) -> tuple[Array, Array]:
+    """Mean of the finite values along an axis, NaN where there is none, and how many there are."""
+    present = np.isfinite(values)
+    count = present.sum(axis=axis)
+    total = np.where(present, values, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan), count
+
+
 def mean_of_runs(values: Array) -> Array:
     """Mean over the steps that a run has, (runs, steps, n) -> (runs, n); NaN where it has none."""
-
-    def mean(block: Array) -> Array:
-        present = ~np.isnan(block)
-        total, count = np.where(present, block, 0.0).sum(axis=1), present.sum(axis=1)
-        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-    return by_runs(mean, values)
+    return by_runs(lambda block: mean_and_count(block, 1)[0], values)
 
 
 def spread_steps(present: Array) -> Array:
@@ -112,15 +108,12 @@ def spread_steps(present: Array) -> Array:
     number of runs and does not depend on the data.
     """
     present = np.asarray(present, bool)
-    place = np.mod(0.5 + np.arange(len(present)) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0)
-    return by_runs(_at_place, present, place)
 
+    def of_block(present: Array, place: Array) -> Array:
+        count = present.sum(axis=1)
+        rank = np.minimum((place * count).astype(int), np.maximum(count - 1, 0))
+        nth = np.cumsum(present, axis=1) - 1
+        step = np.argmax(present & (nth == rank[:, None]), axis=1) if present.shape[1] else np.zeros(len(present), int)
+        return np.where(count > 0, step, -1)
 
-def _at_place(present: Array, place: Array) -> Array:
-    """The step of each run that has a share ``place`` (runs,) of its present ones before it; -1 where none."""
-    runs, steps = present.shape
-    count = present.sum(axis=1)
-    rank = np.minimum((place * count).astype(int), np.maximum(count - 1, 0))
-    nth = np.cumsum(present, axis=1) - 1
-    step = np.argmax(present & (nth == rank[:, None]), axis=1) if steps else np.zeros(runs, int)
-    return np.where(count > 0, step, -1)
+    return by_runs(of_block, present, np.mod(0.5 + np.arange(len(present)) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0))

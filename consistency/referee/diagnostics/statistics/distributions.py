@@ -19,26 +19,22 @@ Value = Any  # a number or an array; what comes back has the shape to which all 
 
 
 class ChiSquare:
-    """The chi-square distribution; NaN where ``dof`` is not positive."""
+    """The chi-square distribution, by the methods of :mod:`scipy.stats`; NaN where ``dof`` is not positive."""
 
     @staticmethod
     def cdf(x: Value, dof: Value) -> Value:
-        """Probability of at most x."""
         return special.chdtr(_positive(dof), np.maximum(x, 0.0))
 
     @staticmethod
     def sf(x: Value, dof: Value) -> Value:
-        """Probability of more than x."""
         return special.chdtrc(_positive(dof), np.maximum(x, 0.0))
 
     @staticmethod
     def ppf(p: Value, dof: Value) -> Value:
-        """Inverse of :meth:`cdf`."""
         return 2.0 * special.gammaincinv(_positive(dof) / 2.0, p)
 
     @staticmethod
     def isf(p: Value, dof: Value) -> Value:
-        """Inverse of :meth:`sf`."""
         return special.chdtri(_positive(dof), p)
 
 
@@ -47,24 +43,20 @@ class Student:
 
     @staticmethod
     def cdf(x: Value, dof: Value) -> Value:
-        """Probability of at most x."""
         return special.stdtr(_positive(dof), x)
 
     @staticmethod
     def sf(x: Value, dof: Value) -> Value:
-        """Probability of more than x."""
         return special.stdtr(_positive(dof), np.negative(x))
 
     @staticmethod
     def ppf(p: Value, dof: Value) -> Value:
-        """Inverse of :meth:`cdf`."""
         p = np.asarray(p, float)
         ends = np.where(p > 0.0, np.inf, -np.inf)
         return np.where((p == 0.0) | (p == 1.0), ends, special.stdtrit(_positive(dof), p))[()]
 
     @staticmethod
     def isf(p: Value, dof: Value) -> Value:
-        """Inverse of :meth:`sf`."""
         return -Student.ppf(p, dof)
 
 
@@ -73,7 +65,6 @@ class Beta:
 
     @staticmethod
     def sf(x: Value, a: Value, b: Value) -> Value:
-        """Probability of more than x."""
         if hasattr(special, "betaincc"):  # from SciPy 1.11
             return special.betaincc(a, b, x)
         return special.betainc(b, a, 1.0 - np.asarray(x))

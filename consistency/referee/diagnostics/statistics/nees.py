@@ -1,18 +1,61 @@
-"""Normalized estimation error squared, Bar-Shalom, Li & Kirubarajan (2001) sec. 5.4, and a test of its distribution."""
+"""Normalized estimation error squared, Bar-Shalom, Li & Kirubarajan (2001) sec. 5.4, its intervals and distribution."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from scipy import special
 
-from consistency.referee.defaults import FALSE_ALARM
-from consistency.referee.diagnostics.records.array_blocks import by_steps
+from consistency.referee.defaults import CONFIDENCE, FALSE_ALARM
+from consistency.referee.diagnostics.records.large_arrays import by_steps
 from consistency.referee.diagnostics.records.validity import asymmetric
-from consistency.referee.diagnostics.records.whitening import spread_steps, whiten
+from consistency.referee.diagnostics.records.whitening import mean_and_count, spread_steps, whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
+
+
+def anees_interval(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Two-sided interval [r1, r2] of the average NEES of one step, Herath et al. (2007) eq. 17.
+
+    Parameters
+    ----------
+    dof : dimension of the error
+    runs : number of independent runs averaged
+    confidence : probability that a consistent filter's average lies inside
+
+    Raises
+    ------
+    ValueError
+        dof or runs below 1, confidence outside (0, 1).
+    """
+    if dof < 1 or runs < 1:
+        raise ValueError(f"dof and runs must be at least 1, got {dof} and {runs}")
+    low, high = chi2_mean_interval(dof * runs, confidence)
+    return low * dof, high * dof
+
+
+def chi2_mean_interval(dof: float, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Two-sided interval of chi-square over its degrees of freedom, for example of summed NIS."""
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
+    tail = 0.5 * (1.0 - confidence)
+    return float(distributions.chi2.ppf(tail, dof) / dof), float(distributions.chi2.isf(tail, dof) / dof)
+
+
+def binomial_interval(count: Any, draws: Any, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
+    """Exact interval of a share, Clopper & Pearson (1934), of ``count`` in ``draws``.
+
+    Numbers or arrays that broadcast, whole or not; low and high have their shape. Without draws the interval is [0, 1].
+    """
+    count, draws = np.broadcast_arrays(np.asarray(count, float), np.asarray(draws, float))
+    tail = 0.5 * (1.0 - confidence)
+    some, not_all = count > 0.0, count < draws
+    low = special.betaincinv(np.where(some, count, 1.0), draws - count + 1.0, tail)
+    high = special.betaincinv(count + 1.0, np.where(not_all, draws - count, 1.0), 1.0 - tail)
+    return np.where(some, low, 0.0), np.where(not_all, high, 1.0)
 
 
 def nees(error: Array, covariance: Array) -> Array:
@@ -59,7 +102,10 @@ def anees(values: Array) -> Array:
     A NaN is a run that has no value in that step (rank-deficient covariance, or failed earlier); where
     no run has one the average is NaN.
     """
-    return by_steps(_mean_over_runs, np.asarray(values, float))
+    return by_steps(lambda block: mean_and_count(block, 0)[0], np.asarray(values, float))
+
+
+_half_width = lru_cache(distributions.kolmogorov.isf)
 
 
 @dataclass(frozen=True)
@@ -100,21 +146,9 @@ def kolmogorov(u: Array) -> tuple[float, float]:
     return distance, float(distributions.kolmogorov.sf(distance, N))
 
 
-def _mean_over_runs(values: Array) -> Array:
-    present = np.isfinite(values)
-    count = present.sum(axis=0)
-    total = np.where(present, values, 0.0).sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
 def _require(good: Array, what: str, last: int) -> None:
     """Raise ValueError, with the first index of the batch, unless all is true over the ``last`` axes."""
     if not good.all():
         bad = ~good.all(axis=tuple(range(-last, 0)))
         index = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0])
         raise ValueError(f"{what} at index {index if np.ndim(bad) else ()}")
-
-
-@lru_cache
-def _half_width(false_alarm: float, N: int) -> float:
-    return float(distributions.kolmogorov.isf(false_alarm, N))

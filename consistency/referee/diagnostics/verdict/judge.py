@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.sample import ATTITUDE
 from consistency.referee.diagnostics.verdict.answers import SHARES
-from consistency.referee.diagnostics.verdict.parts import Settings, Verdict
+from consistency.referee.diagnostics.verdict.parts import Guess, Scale, Settings, Verdict
 from consistency.referee.diagnostics.verdict.verdict import DEFAULT, judge_alone
-from consistency.referee.diagnostics.words.sentences import plain
+from consistency.referee.diagnostics.words.sentences import percent, plain
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning.early_stopping import Design
-
-POSES = {"heading", "yaw", "pitch", "roll"}  # components that a pose has beside its position
 
 
 def judge(record: Record, settings: Settings = DEFAULT) -> Verdict:
@@ -54,16 +55,13 @@ def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | No
 
         return of_look(*follow(design, record.first_runs, len(record.run_numbers)), record, design)
     if record.guesses:
-        from consistency.referee.diagnostics.verdict.guessed_convention import judge_guesses
-
-        return replace(judge_guesses(record, settings, judge_runs), notes=tuple(record.notes))
+        return _judge_guesses(record, settings)
     runs, truth = record.as_runs, None
     if record.truth_covariance is not None:
         from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import uncertain_truth
 
-        truth = uncertain_truth(record)
-    if truth is not None:
-        runs, record = truth.evidence, replace(record, unshown=record.unshown or truth.unjudged)
+        if (truth := uncertain_truth(record)) is not None:
+            runs, record = truth.evidence, replace(record, unshown=record.unshown or truth.unjudged)
     if record.unshown:
         runs = replace(runs, unavailable=tuple(SHARES))
     world = None if record.world is None else judge_alone(record.in_world, settings)
@@ -92,13 +90,15 @@ def with_map(verdict: Verdict, ends: Record, settings: Settings, design: Design 
     landmarks = None if ends.map is None else ends.map()
     if landmarks is None:
         return verdict
-    from consistency.referee.diagnostics.maps.map_score import map_score
+    from consistency.referee.diagnostics.maps.map_nees import map_score
 
-    runs = None if design is None else 1 + int(ends.run_numbers[: verdict.runs].max(initial=-1))
-    record = None if runs is not None else landmarks.record(None if ends.nees is None else ends.nees[:, 0])
-    some = landmarks.of_runs(runs)
-    score = map_score(some.run, some.nees, landmarks.dof)
-    return replace(verdict, map=replace(score, verdict=None if record is None else judge_alone(record, settings)))
+    of_map = None
+    if design is not None:
+        landmarks = landmarks.of_runs(1 + int(ends.run_numbers[: verdict.runs].max(initial=-1)))
+    elif (record := landmarks.record(None if ends.nees is None else ends.nees[:, 0])) is not None:
+        of_map = judge_alone(record, settings)
+    score = map_score(landmarks.run, landmarks.nees, landmarks.dof)
+    return replace(verdict, map=replace(score, verdict=of_map))
 
 
 def _beside(verdict: Verdict, r: Record, world: Verdict | None, runs: int | None = None) -> Verdict:
@@ -127,19 +127,69 @@ def _unshown(verdict: Verdict, why: str) -> Verdict:
     """Undecided, for that reason; as it was without one, or where a window failed."""
     if not why or verdict.scale is None or verdict.status == "failed":
         return verdict
-    scale = replace(verdict.scale, equivalence=replace(verdict.scale.equivalence, p_value=float("nan"), runs=None))
+    scale = _not_shown(verdict.scale)
     provided = "" if verdict.truth is not None else " if they are"
     ratio = f"the covariance ratio would be {plain(scale.inflation)}{provided}, reported and not judged"
     reasons = (f"undecided: {why}; {ratio}", *verdict.reasons[1:])
     return replace(verdict, status="undecided", scale=scale, reasons=reasons)
 
 
+def _not_shown(scale: Scale) -> Scale:
+    return replace(scale, equivalence=replace(scale.equivalence, p_value=float("nan"), runs=None))
+
+
 def _other_ways(verdict: Verdict, r: Record) -> list[str]:
     """What else would decide on a single log of poses."""
     is_log = len(r.run_numbers) == 1 and r.window is None and r.align and r.convention
-    if verdict.status != "undecided" or not is_log or not POSES & set(r.axes):
+    if verdict.status != "undecided" or not is_log or not ATTITUDE & set(r.axes):
         return []
     return [
         "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances, "
         "or poses with cross-covariances (docs/files.md)"
     ]
+
+
+# --- errors whose convention nobody declared ---------------------------------------------------------
+
+
+def _judge_guesses(record: Record, settings: Settings) -> Verdict:
+    """Undecided, with every convention that is not rejected at ``settings.false_alarm``, and its ratio.
+
+    The right convention is rejected with that probability at most, whichever it is. The intervals of the ratio hold
+    together with that of the rest: of K conventions, each at 1 - false_alarm / K (Bonferroni).
+
+    Parameters
+    ----------
+    record : with the same runs under each convention (:attr:`Record.guesses`); the first is the default of the files
+    """
+    verdicts = {kind: judge_runs(one, settings) for kind, one in record.guesses.items()}
+    confidence = 1.0 - settings.false_alarm / len(verdicts)
+    found = {kind: _guess(record.guesses[kind], v, confidence) for kind, v in verdicts.items()}
+    first = next(iter(verdicts.values()))
+    return replace(
+        first, status="undecided", scale=None if first.scale is None else _not_shown(first.scale), answers=(),
+        guesses=found, convention=None, notes=tuple(record.notes),
+        reasons=(f"undecided: {_sentence(found, settings)}", *(f"if the error is {kind}: {v.reasons[0]}"
+                                                               for kind, v in verdicts.items())),
+    )  # fmt: skip
+
+
+def _guess(record: Record, verdict: Verdict, confidence: float) -> Guess:
+    runs = record.as_runs
+    assert runs.nees is not None
+    means, counts = run_means(runs.nees)
+    ratio = ratio_interval(means[counts > 0] / runs.dof, runs.dof, confidence)
+    return Guess(verdict.status, verdict.faults, ratio, not verdict.faults and verdict.status != "failed")
+
+
+def _sentence(found: Mapping[str, Guess], settings: Settings) -> str:
+    left = [f"{kind} (covariance ratio {plain(guess.ratio)})" for kind, guess in found.items() if guess.possible]
+    rate = percent(settings.false_alarm)
+    if not left:
+        return f"no error is declared, and at a rate of {rate} each all are rejected: {', '.join(found)}"
+    gone = [kind for kind, guess in found.items() if not guess.possible]
+    rest = f"; rejected: {', '.join(gone)}" if gone else ""
+    return (
+        f"no error is declared; not rejected at a rate of {rate}: {', '.join(left)}{rest}. The filter's documentation "
+        "says which it is; declare it with --error"
+    )

@@ -9,17 +9,15 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.questions.band import Band
 from consistency.referee.diagnostics.questions.bias import hotelling
+from consistency.referee.diagnostics.questions.outliers import Outlier
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
-from consistency.referee.diagnostics.records.array_blocks import blocks, by_runs
-from consistency.referee.diagnostics.records.sample import ATTITUDE, POSITION, Errors, Sample
-from consistency.referee.diagnostics.records.symmetric import Symmetric
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, blocks, by_runs
+from consistency.referee.diagnostics.records.sample import ATTITUDE, POSITION, Sample
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.coverage import coverage, coverage_interval, rmse
-from consistency.referee.diagnostics.statistics.credibility import noncredibility
+from consistency.referee.diagnostics.statistics.accuracy import coverage, coverage_interval, noncredibility, rmse
 from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, SHAPE, STEP
-from consistency.referee.diagnostics.verdict.p_values import Tests
+from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, SHAPE, STEP, Tests
 from consistency.referee.diagnostics.verdict.parts import (  # fmt: skip
     Accuracy,
     Answer,
@@ -54,7 +52,9 @@ def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = Tr
     since, lasting = None, False
     if first is not None and faulty and ordered:
         sign = 1 if band.above[first] else -1
-        lasting = _lasting(sample, first, sign)
+        curve, steps = anees(sample.nees)[first:], pointwise_band(sample.counted.sum(axis=0), sample.dof)[first:]
+        beyond = curve > steps[:, 1] if sign > 0 else curve < steps[:, 0]
+        lasting = bool(beyond[np.isfinite(curve)].mean() > 0.5)  # in most steps from there on
         since = first + 1 if lasting and _absent_before(sample, first, sign) else None
     late = slice(0 if since is None else since - 1, None)
     return Location(
@@ -70,13 +70,6 @@ def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = Tr
         else None,
         until=until(sample, band, detect) if ordered and _any(answers, (*SCALE, *BIAS)) else None,
     )
-
-
-def _lasting(sample: Sample, first: int, sign: int) -> bool:
-    """Whether the ANEES is on that side of its pointwise band in most steps from ``first`` on."""
-    curve, band = anees(sample.nees)[first:], pointwise_band(sample.counted.sum(axis=0), sample.dof)[first:]
-    beyond = curve > band[:, 1] if sign > 0 else curve < band[:, 0]
-    return bool(beyond[np.isfinite(curve)].mean() > 0.5)
 
 
 def _absent_before(sample: Sample, first: int, sign: int) -> bool:
@@ -142,8 +135,7 @@ def chief_axes(sample: Sample, steps: slice, as_whole: bool) -> str | None:
     Bonferroni over axes. None where no axis stands out, or all do, or with fewer than 8 runs. Where the whole is at
     fault (``as_whole``), an axis that errs in the other direction does not carry it.
     """
-    assert sample.errors is not None
-    names, n = sample.errors.names, sample.dof
+    names, n = sample.known_errors.names, sample.dof
     if n == 1 or np.isfinite(sample.nees[:, steps]).any(axis=1).sum() < FEWEST:
         return None
     Y = np.stack([sample.group_means([j], steps) for j in range(n)], axis=-1)
@@ -175,7 +167,7 @@ def _stands_out(own: Array, others: Array, axes: int) -> bool:
 
 def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
     """Inflation of each component and group, since the fault began."""
-    errors = _errors(sample)
+    errors = sample.known_errors
     late, confidence = _late(location), 1.0 - (1.0 - CONFIDENCE) / len(errors.groups)
     inflation = {
         key: ratio_interval(sample.group_means(index, late), len(index), confidence)
@@ -190,8 +182,12 @@ def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
 
 def bias_of(sample: Sample, step: int | None, location: Location, answers: Answers) -> Bias:
     """Mean error of each axis, clearest in ``step``, and the scale without it."""
-    errors, late = _errors(sample), _late(location)
-    of_runs = by_runs(_standard_means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
+    errors, late = sample.known_errors, _late(location)
+
+    def means(error: Array, covariance: Symmetric, counted: Array) -> Array:
+        return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
+
+    of_runs = by_runs(means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
     by_axis = {}
     if len(of_runs) > sample.dof:
@@ -199,31 +195,20 @@ def bias_of(sample: Sample, step: int | None, location: Location, answers: Answe
         by_axis = {a: Interval(test.mean[i], *test.interval[i]) for i, a in enumerate(errors.names)}
     if not _any(answers, BIAS):
         return Bias(by_axis, step, None, None, None)
-    without = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
-    return Bias(by_axis, step, *_axis_in_step(sample, step), without)
-
-
-def _standard_means(error: Array, covariance: Symmetric, counted: Array) -> Array:
-    """Mean of the standardised errors of each run, (runs, n)."""
-    return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
-
-
-def _axis_in_step(sample: Sample, step: int | None) -> tuple[str | None, float | None]:
-    """The component whose mean stands out most in a step, and that mean in stated standard deviations."""
-    if step is None:
-        return None, None
-    errors = _errors(sample)
-    at = standardise(errors.error[:, step - 1], errors.covariance[:, step - 1])[sample.counted[:, step - 1]]
-    mean = at.mean(axis=0)
-    chief = int(np.argmax(np.abs(mean) / at.std(axis=0, ddof=1).clip(1e-300)))
-    return errors.names[chief], float(mean[chief])
+    axis = size = None
+    if step is not None:
+        at = standardise(errors.error[:, step - 1], errors.covariance[:, step - 1])[sample.counted[:, step - 1]]
+        mean = at.mean(axis=0)
+        chief = int(np.argmax(np.abs(mean) / at.std(axis=0, ddof=1).clip(1e-300)))  # what stands out most
+        axis, size = errors.names[chief], float(mean[chief])
+    return Bias(by_axis, step, axis, size, ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE))
 
 
 def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float) -> Shape | None:
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
     if tests.matrix is None or sample.dof == 1:
         return None
-    errors = _errors(sample)
+    errors = sample.known_errors
     in_step = not _any(answers, ("shape",)) and tests.shape_step is not None
     here = slice(tests.shape_step - 1, tests.shape_step) if in_step and tests.shape_step else slice(None)
     counted = sample.counted[:, here]
@@ -236,16 +221,14 @@ def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float)
 
 def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
     """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
-    odd = tests.outlier
-    if odd is None:
-        return Tails(-1, 0, float("nan"), tests.pit.values, tests.pit.half_width)
+    odd = tests.outlier or Outlier(float("nan"), -1, -1, float("nan"))
     run = int(run_numbers[odd.run]) if odd.run >= 0 else odd.run
     return Tails(run, odd.step + 1, odd.distance, tests.pit.values, tests.pit.half_width)
 
 
 def accuracy_of(sample: Sample) -> Accuracy:
     """Coverage, RMSE and the noncredibility index."""
-    errors = _errors(sample)
+    errors = sample.known_errors
     index, inclination = noncredibility(errors.error, sample.nees)
     counted = sample.counted
     inside, interval = coverage_interval(errors.error, errors.covariance, counted=counted)
@@ -264,11 +247,6 @@ def accuracy_of(sample: Sample) -> Accuracy:
         nci=float(np.nanmean(index)) if np.isfinite(index).any() else float("nan"),
         inclination=float(np.nanmean(inclination)) if np.isfinite(inclination).any() else float("nan"),
     )
-
-
-def _errors(sample: Sample) -> Errors:
-    assert sample.errors is not None
-    return sample.errors
 
 
 def _late(location: Location) -> slice:

@@ -10,13 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.questions.early_ending import EarlyEnds
 from consistency.referee.diagnostics.records.record import Record, shown_by
 from consistency.referee.diagnostics.records.skipping import Skipped
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 
 TINY = 1e-12  # ratio of an error that is rounding
+EARLY = (
+    1e-3  # chance to call runs that end early lost where they end for reasons that have nothing to do with their errors
+)
 
 # status -> what it means; the order is that of reports
 STATUSES = {
@@ -182,6 +184,20 @@ class Lost:
     upper: float  # limit of the share of lost runs
     level: float  # confidence of the limit
     needed: int | None = None  # runs that show the share asked for, if no further run is lost; None without one
+
+
+@dataclass(frozen=True)
+class EarlyEnds:
+    """Runs that end before the last step of the others, and their errors there."""
+
+    runs: int  # that end while others go on
+    above: float  # share of the runs that go on whose NEES is smaller in that step; 1/2 if ends do not depend on errors
+    p_value: float  # that they do not, or on small errors only; NaN where no run ends early
+
+    @property
+    def lost(self) -> bool:
+        """Whether runs that end early have clearly larger errors than those that go on."""
+        return self.p_value <= EARLY
 
 
 @dataclass(frozen=True)

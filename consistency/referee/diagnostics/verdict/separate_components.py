@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from consistency.referee.diagnostics.questions.equivalence import worst
 from consistency.referee.diagnostics.questions.lost_runs import lost_of
+from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.sample import names_of
-from consistency.referee.diagnostics.records.whitening import entries, squared_length, whiten
+from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.verdict.answers import SCALE, SHARES
 from consistency.referee.diagnostics.verdict.parts import Answer, Settings, Verdict
 from consistency.referee.diagnostics.verdict.verdict import judge_alone
@@ -37,27 +38,25 @@ def judge_parts(record: Record, settings: Settings) -> Verdict:
         As :func:`consistency.diagnostics.judge`.
     """
     names = names_of(record)
-    records = {", ".join(names[i] for i in index): _part(record, index, names) for index in record.parts}
+    assert record.error is not None
+    assert record.covariance is not None
+    records = {}
+    for index in record.parts:
+        axes = tuple(names[i] for i in index)
+        records[", ".join(axes)] = replace(
+            record, error=record.error[..., list(index)], covariance=Symmetric.of(record.covariance).part(index),
+            dof=len(index), axes=axes, parts=(), nis=None, nis_dof=None, innovations=None,
+            innovation_covariances=None, optimal_gain=False,
+        )  # fmt: skip
     if record.optimal_gain and record.nis is not None:
         records[INNOVATIONS] = replace(record, error=None, covariance=None, nees=None, dof=0, parts=())
     parts = _by_holm(records, settings)
     whole = judge_alone(replace(record, parts=(), unavailable=tuple(SHARES), optimal_gain=False), settings)
     verdict = _with_parts(whole, parts, record, settings)
     verdict = replace(verdict, status=_status(verdict))
-    has_wrong_size = any(question in SCALE for part in parts.values() for question in part.faults)
-    verdict = replace(verdict, axis=clear(verdict.worst_axis) if has_wrong_size else None)
+    if any(question in SCALE for part in parts.values() for question in part.faults):
+        verdict = replace(verdict, axis=clear(verdict.worst_axis))
     return replace(verdict, reasons=tuple(sentences.reasons(verdict)))
-
-
-def _part(record: Record, index: Sequence[int], names: tuple[str, ...]) -> Record:
-    """Some components of the record, and no innovations."""
-    assert record.error is not None
-    assert record.covariance is not None
-    return replace(
-        record, error=record.error[..., list(index)], covariance=entries(record.covariance).part(index),
-        dof=len(index), axes=tuple(names[i] for i in index), parts=(), nis=None, nis_dof=None, innovations=None,
-        innovation_covariances=None, optimal_gain=False,
-    )  # fmt: skip
 
 
 def _by_holm(records: Mapping[str, Record], settings: Settings) -> dict[str, Verdict]:

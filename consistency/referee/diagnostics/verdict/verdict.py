@@ -11,21 +11,30 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.planning.number_of_runs import detectable_ratio
 from consistency.referee.diagnostics.questions.band import simultaneous_band
-from consistency.referee.diagnostics.questions.early_ending import early_ends
 from consistency.referee.diagnostics.questions.equivalence import (
     equivalence,
     equivalence_by_betting,
-    equivalence_of_innovations,
+    equivalence_of_total,
+    is_tolerated,
 )
-from consistency.referee.diagnostics.questions.lost_runs import lost_of
+from consistency.referee.diagnostics.questions.lost_runs import early_ends, lost_of
 from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
+from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.sample import Sample, impossible, innovations_of, sample_of
 from consistency.referee.diagnostics.records.sample import shape_of as shape_of_arrays
-from consistency.referee.diagnostics.records.whitening import entries
-from consistency.referee.diagnostics.statistics.intervals import chi2_mean_interval
-from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, JOINT, MAIN, SHARES, STEP, answers
+from consistency.referee.diagnostics.statistics.nees import anees, chi2_mean_interval
+from consistency.referee.diagnostics.verdict.answers import (
+    AXIS,
+    DIRECTION,
+    JOINT,
+    MAIN,
+    SHARES,
+    STEP,
+    Tests,
+    answers,
+    ask,
+)
 from consistency.referee.diagnostics.verdict.location import (
     accuracy_of,
     axes_of,
@@ -34,7 +43,6 @@ from consistency.referee.diagnostics.verdict.location import (
     shape_of,
     tails_of,
 )
-from consistency.referee.diagnostics.verdict.p_values import Tests, ask
 from consistency.referee.diagnostics.verdict.parts import (
     Answer,
     Equivalence,
@@ -49,7 +57,7 @@ from consistency.referee.diagnostics.words.headline import at_share, deciding_ax
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import UncertainTruth
-    from consistency.referee.diagnostics.maps.joint_nees import JointTest
+    from consistency.referee.diagnostics.maps.map_nees import JointTest
 
 DEFAULT = Settings()
 
@@ -75,9 +83,14 @@ def judge_alone(
     settings = replace(settings, allow="conservative") if evidence.reduced else settings
     innovations, p_values = _innovations(evidence, settings)
     sample = sample_of(evidence, settings)
-    joint, excused = _joint(evidence, settings)
-    p_values |= {} if joint is None else joint.p_values
-    tests = None
+    joint: JointTest | None = None
+    excused, tests = set[str](), None
+    if evidence.joint is not None:
+        from consistency.referee.diagnostics.maps.map_nees import joint_test
+
+        joint = joint_test(evidence.joint, settings, evidence.run_numbers, evidence.landmarks)
+        p_values |= joint.p_values
+        excused = {JOINT} if is_tolerated(joint.nees, joint.score.dof, settings) else excused
     if sample is not None:
         tests = ask(sample, settings, p_values, look.scale if look else None)
         asked = tests.p_values if truth is None else truth.p_values(tests.p_values, settings)
@@ -85,7 +98,8 @@ def judge_alone(
     if look is not None:
         p_values = _at(look, p_values)
     by_question = answers(p_values, settings.false_alarm)
-    excused |= {"innovation scale"} if innovations is not None and _near(innovations, settings) else set()
+    if (i := innovations) is not None and i.judged and is_tolerated(i.ratio * i.dof, i.dof, settings):
+        excused |= {"innovation scale"}
     verdict = Verdict(
         evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), excused), evidence.failures,
         innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
@@ -102,16 +116,6 @@ def judge_alone(
     verdict = verdict if truth is None else truth.of_estimate(verdict)
     verdict = replace(verdict, axis=deciding_axis(verdict))
     return replace(verdict, reasons=tuple(sentences.reasons(verdict)))
-
-
-def _joint(evidence: Record, settings: Settings) -> tuple[JointTest | None, set[str]]:
-    """Test of pose and map together, where there is a map, and the question that the tolerance excuses."""
-    if evidence.joint is None:
-        return None, set()
-    from consistency.referee.diagnostics.maps.joint_nees import joint_test, near
-
-    test = joint_test(evidence.joint, settings, evidence.run_numbers, evidence.landmarks)
-    return test, {JOINT} if near(test, settings) else set()
 
 
 def _at(look: Look, p_values: dict[str, float]) -> dict[str, float]:
@@ -137,7 +141,8 @@ def _innovations(evidence: Record, settings: Settings) -> tuple[Innovations | No
     else:
         white = nis_whiteness(*nis_and_dof)
     judged = evidence.optimal_gain
-    shown = equivalence_of_innovations(test, settings, max(settings.factor, settings.tolerated)) if judged else None
+    factor = max(settings.factor, settings.tolerated)
+    shown = equivalence_of_total(test.ratio * test.dof, test.dof, settings, factor) if judged else None
     record = Innovations(test.ratio, low_high, test.dof, judged, white.correlation, white.bound, shown)
     if not judged:
         return record, {}
@@ -164,7 +169,7 @@ def _with_records(verdict: Verdict, evidence: Record, sample: Sample, tests: Tes
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
         return replace(verdict, scale=scale, location=location, tails=tails_of(tests, evidence.run_numbers))
     odd = impossible(evidence, sample.counted)
-    there = entries(evidence.covariance).where_all(np.isfinite)
+    there = Symmetric.of(evidence.covariance).where_all(np.isfinite)
     return replace(
         verdict,
         scale=scale,
@@ -195,13 +200,6 @@ def _equivalence(
 def _excused(all_answers: Iterable[Answer], questions: set[str]) -> tuple[Answer, ...]:
     """Answers with the faults in these questions marked as tolerated."""
     return tuple(replace(a, tolerated=True) if a.found and a.question in questions else a for a in all_answers)
-
-
-def _near(innovations: Innovations, settings: Settings) -> bool:
-    """Whether the scale of the innovations is shown to lie within the tolerance."""
-    if settings.tolerance is None or not innovations.judged:
-        return False
-    return equivalence_of_innovations(innovations, settings, settings.tolerated).shown
 
 
 def _tolerated(sample: Sample, tests: Tests, settings: Settings) -> set[str]:

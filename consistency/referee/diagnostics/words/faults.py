@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
 from consistency.referee.diagnostics.verdict.location import VISIBLE
-from consistency.referee.diagnostics.verdict.parts import TINY, Answer, Axes, Interval, JointScore, Scale, Verdict
+from consistency.referee.diagnostics.verdict.parts import TINY, Answer, Interval, JointScore, Verdict
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, off_by_factor, plain, short
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
@@ -51,19 +51,18 @@ def scale_text(v: Verdict, faults: Faults) -> str:
         text += _since(v)
     if where.subset:
         text += f", mainly {where.subset}"
-    if where.lasting and where.since is None and where.first_step is not None and where.first_step > _first(v.scale):
+    first = int(np.argmax(v.scale.alive > 0)) + 1  # judged step
+    if where.lasting and where.since is None and where.first_step is not None and where.first_step > first:
         text += f", first visible in step {where.first_step}"
-    return text + ("" if about else _but(v, faults))
+    if not about and v.status == "overconfident" and AXIS in faults and not v.settings.one_sided:
+        below = [(a, i) for a, i in _sure(v, -1).items() if v.axes is not None and a in v.axes.names]
+        text += "".join(f", but {off_by(i)} in {a}" for a, i in below[:1])  # an axis errs in the other direction
+    return text
 
 
 def _since(v: Verdict) -> str:
     since = v.location.since if v.location is not None else None
     return "" if since is None else f" since step {since}"
-
-
-def _first(scale: Scale) -> int:
-    """The first judged step."""
-    return int(np.argmax(scale.alive > 0)) + 1
 
 
 def _side(sign: float) -> str:
@@ -107,9 +106,12 @@ def _axes_text(v: Verdict) -> str:
     assert v.axes is not None
     side = 1 if v.settings.one_sided else SIDES.get(v.status, 0)
     above, below = ([*_sure(v, sign).items()] if side != -sign else [] for sign in (1, -1))
-    largest = v.axes.largest
+    largest, u = v.axes.largest, v.axes.direction
     if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for _, i in above):
-        return f"covariance {off_by(largest)} in the direction {_direction(v.axes)}"
+        assert u is not None
+        u = u * np.sign(u[np.argmax(np.abs(u))])  # of errors in stated standard deviations
+        along = (f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > 0.1)
+        return f"covariance {off_by(largest)} in the direction {' '.join(along)}"
     named = (above + below)[:MOST] if not (above and below) else [*above[: MOST - 1], below[0]]
     if not named:
         return "covariance wrong in an axis"
@@ -125,21 +127,6 @@ def _correlation_text(v: Verdict) -> str:
         return text
     worst = float(np.linalg.eigvalsh(v.shape.matrix)[-1]) * v.scale.mean_anees / v.scale.dof
     return f"{text}, but {off_by_factor(worst)} in one direction{_since(v)}"
-
-
-def _but(v: Verdict, faults: Faults) -> str:
-    """The axis that errs in the other direction than an overconfident whole."""
-    if v.status != "overconfident" or AXIS not in faults or v.settings.one_sided:
-        return ""
-    below = [(a, i) for a, i in _sure(v, -1).items() if v.axes is not None and a in v.axes.names]
-    return "".join(f", but {off_by(i)} in {a}" for a, i in below[:1])
-
-
-def _direction(axes: Axes) -> str:
-    """+0.71 x -0.70 y, of errors in stated standard deviations."""
-    assert axes.direction is not None
-    u = axes.direction * np.sign(axes.direction[np.argmax(np.abs(axes.direction))])
-    return " ".join(f"{value:+.2f} {name}" for value, name in zip(u, axes.names, strict=True) if abs(value) > 0.1)
 
 
 # --- bias, shape, tails, maps --------------------------------------------------------------------------

@@ -20,14 +20,15 @@ from consistency.referee.diagnostics.verdict.answers import (
     SCALE,
     SHARES,
     STEP,
+    Tests,
     answers,
+    ask,
 )
-from consistency.referee.diagnostics.verdict.p_values import Tests, ask
 from consistency.referee.diagnostics.verdict.parts import TINY, Interval, Settings, Verdict
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.maps.joint_nees import JointTest
+    from consistency.referee.diagnostics.maps.map_nees import JointTest
 
 CERTAIN = 0.999  # false-alarm rate, at most
 SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones
@@ -45,7 +46,10 @@ def status_of(verdict: Verdict, sample: Sample | None, tests: Tests | None, join
         shown = verdict.equivalence
         return "consistent" if shown is not None and shown.shown and few_lost(verdict) else "undecided"
     if sample is None or tests is None:
-        return _by_innovations(verdict, faults)
+        assert verdict.innovations is not None
+        if "innovation scale" not in faults:
+            return "inconsistent"
+        return "overconfident" if verdict.innovations.ratio > 1.0 else "conservative"
     if not faults & set(BIAS):
         status = _with_joint(at_share(verdict), faults, sample, tests, joint)
     else:
@@ -104,13 +108,6 @@ def _with_joint(settings: Settings, faults: set[str], sample: Sample, tests: Tes
     return "inconsistent" if {apart, together} == {"overconfident", "conservative"} else apart
 
 
-def _by_innovations(verdict: Verdict, faults: set[str]) -> str:
-    assert verdict.innovations is not None
-    if "innovation scale" not in faults:
-        return "inconsistent"
-    return "overconfident" if verdict.innovations.ratio > 1.0 else "conservative"
-
-
 def _without_bias(verdict: Verdict, sample: Sample) -> tuple[Sample, Tests, set[str]]:
     """Errors less their mean over runs, what they are asked, and the faults that remain."""
     others = {a.question: a.p_value for a in verdict.answers if a.question in INNOVATIONS}
@@ -130,21 +127,17 @@ def _by_errors(settings: Settings, faults: set[str], sample: Sample, tests: Test
         return "inconsistent" if AXIS in faults and _contradicted(settings, sample, tests) else side
     heavy = "outliers" in faults or (STEP in faults and _heavy_steps(sample, tests))
     if STEP in faults and not heavy:
-        opposite = AXIS in faults and _by_axis(settings, tests) == "inconsistent"
-        return "inconsistent" if opposite else _by_step(sample, tests)
+        if AXIS in faults and _by_axis(settings, tests) == "inconsistent":
+            return "inconsistent"
+        curve = anees(sample.nees)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            above, below = np.nanmax(curve / tests.band.high), np.nanmax(tests.band.low / curve)
+        return "overconfident" if above >= below else "conservative"  # where the ANEES is farthest from its band
     if AXIS in faults or DIRECTION in faults:
         if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
             return _by_axis(settings, tests)
         heavy = True
     return "heavy-tailed" if heavy else "inconsistent"
-
-
-def _by_step(sample: Sample, tests: Tests) -> str:
-    """The side on which the ANEES is farthest from its band."""
-    curve, band = anees(sample.nees), tests.band
-    with np.errstate(divide="ignore", invalid="ignore"):
-        above, below = np.nanmax(curve / band.high), np.nanmax(band.low / curve)
-    return "overconfident" if above >= below else "conservative"
 
 
 def _heavy_steps(sample: Sample, tests: Tests) -> bool:
@@ -164,8 +157,7 @@ def _robust(means: Array, dof: int, steps: int, settings: Settings, questions: i
 
 
 def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
-    assert sample.errors is not None
-    groups = sample.errors.groups
+    groups = sample.known_errors.groups
     return any(
         _robust(sample.group_means(groups[key]), len(groups[key]), sample.longest, settings, len(groups))
         for key, test in tests.axes.items()

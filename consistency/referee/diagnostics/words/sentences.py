@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.referee.diagnostics.statistics.coverage import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, JOINT, SCALE, SHAPE
-from consistency.referee.diagnostics.verdict.parts import Equivalence, Verdict
+from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Location, Scale, Verdict
 from consistency.referee.diagnostics.words.faults import (
     MOST,
     Faults,
@@ -31,26 +31,24 @@ def reasons(v: Verdict) -> list[str]:
     """First the sentence, then the figures."""
     faults = {a.question: a for a in v.answers if a.found and not a.tolerated}
     broken = _failures(v)
-    judged = v.scale is not None and v.scale.judged_steps > 0
     lines: list[str] = []
-    if judged:
-        assert v.scale is not None
-        level = _levels(v) if v.parts else _level(v)
-        about = [*_truth(v), *_early_ends(v), *level, *_within_one(v), *_together(v), *_coverage(v)]
-        lines = [_sentence(v, faults), *about]
-    elif v.scale is not None:
+    if (s := v.scale) is not None and s.judged_steps:
+        about = [*_truth(v), *_early_ends(v), *_levels(v, s), *_within_one(v, s), *_together(v), *_coverage(v)]
+        lines = [_sentence(v, s, faults) if faults else _no_fault(v, s), *about]
+    elif s is not None:
         lines = ["no step has a covariance of full rank to judge"]
     elif v.innovations is not None and v.innovations.dof:
-        lines = [_without_truth(v, faults)]
+        lines = [_without_truth(v, v.innovations, faults)]
     else:
         lines = ["neither truth nor innovations to judge"]
     lines = [lines[0], *broken, *lines[1:]] if faults else [*broken, *lines]
     if v.innovations is not None:
-        lines.append(_nis(v))
+        lines.append(_nis(v.innovations))
     if v.answers:
         lines.append(_questions(v, faults))
     lines += _first_steps(v)
-    return [f"{v.status}: {lines[0]}{_without_first(v)}", *lines[1:]]
+    first = "" if v.skipped is None else f"; without {v.skipped.skip.text} of each {_whole(v)}"
+    return [f"{v.status}: {lines[0]}{first}", *lines[1:]]
 
 
 # --- the sentence ------------------------------------------------------------------------------------
@@ -75,10 +73,6 @@ def _failures(v: Verdict) -> list[str]:
             f"runs, first run {v.joint.not_definite[0]}"
         )
     return lines
-
-
-def _without_first(v: Verdict) -> str:
-    return "" if v.skipped is None else f"; without {v.skipped.skip.text} of each {_whole(v)}"
 
 
 def _whole(v: Verdict) -> str:
@@ -106,17 +100,19 @@ def _first_steps(v: Verdict) -> list[str]:
     ]
 
 
-def _sentence(v: Verdict, faults: Faults) -> str:
-    if not faults:
-        return _no_fault(v)
+def _sentence(v: Verdict, s: Scale, faults: Faults) -> str:
     if v.parts:
-        return _of_parts(v)
+        named = [(name, part) for name, part in v.parts.items() if part.faults]
+        texts = [
+            f"{name}: {part.reasons[0].removeprefix(f'{part.status}: ').removesuffix('; no bias found')}"
+            for name, part in named[:MOST]
+        ]
+        return "; ".join(texts + [f"and {len(named) - MOST} more"] * (len(named) > MOST))
     parts = []
     if any(q in faults for q in BIAS):
         parts.append(bias_text(v, "bias" not in faults))
     if v.status == "heavy-tailed":
-        assert v.scale is not None
-        parts.append(f"in the mean the covariance ratio is {plain(v.scale.inflation)}")
+        parts.append(f"in the mean the covariance ratio is {plain(s.inflation)}")
     elif v.status != "biased":
         parts += [scale_text(v, faults)] if any(q in faults for q in SCALE) else []
         parts += [shape_text(v, faults)] if any(q in faults for q in SHAPE) else []
@@ -130,47 +126,26 @@ def _sentence(v: Verdict, faults: Faults) -> str:
         parts.append(f"innovations {'larger' if v.innovations.ratio > 1 else 'smaller'} than stated")
     if "innovation whiteness" in faults:
         parts.append("innovations correlated over steps")
-    if any(q in faults for q in SCALE) and v.status != "heavy-tailed" and _no_bias(v):
+    sought = any(a.question in BIAS for a in v.answers) and not set(v.faults) & set(BIAS)
+    if any(q in faults for q in SCALE) and v.status != "heavy-tailed" and sought:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
 
 
-def _of_parts(v: Verdict) -> str:
-    """The parts at fault, each with its sentence."""
-    named = {name: part for name, part in v.parts.items() if part.faults}
-    texts = [f"{name}: {_own_sentence(part)}" for name, part in [*named.items()][:MOST]]
-    more = f"; and {len(named) - MOST} more" if len(named) > MOST else ""
-    return f"{'; '.join(texts)}{more}"
-
-
-def _own_sentence(part: Verdict) -> str:
-    return part.reasons[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
-
-
-def _no_bias(v: Verdict) -> bool:
-    """A bias was looked for and not found."""
-    return any(a.question in BIAS for a in v.answers) and not set(v.faults) & set(BIAS)
-
-
-def _no_fault(v: Verdict) -> str:
+def _no_fault(v: Verdict, s: Scale) -> str:
     """Whether the ratio is shown to be right, with that of the worst axis; and what share of lost runs stays open."""
-    assert v.scale is not None
-    shown, runs = v.scale.equivalence, plural(v.runs, v.unit)
+    shown, runs = s.equivalence, plural(v.runs, v.unit)
     tolerated = [a.question for a in v.answers if a.tolerated]
     none = "no fault beyond the tolerance" if tolerated else "no fault found"
-    size = "covariance ratio of every part" if v.parts else f"covariance ratio {plain(v.scale.inflation)}"
-    axis, lost = _worst_axis(v), _lost(v)
+    size = "covariance ratio of every part" if v.parts else f"covariance ratio {plain(s.inflation)}"
+    axis = "" if (worst := v.worst_axis) is None else f" (worst axis: {worst[0]}, {plain(worst[1])})"
     if shown.shown:
-        return f"{none} in {runs}, and the {size} is shown to be {_within(v, shown)}{axis}{lost}"
+        return f"{none} in {runs}, and the {size} is shown to be {_within(shown)}{axis}{_lost(v)}"
     advice, asked = "", 0 if v.lost is None or v.settings.lost is None else v.lost.needed or 0
     if shown.runs is not None and shown.runs <= MUCH:
         advice = f"; {max(shown.runs, v.runs + 1, asked)} such {v.unit}s would probably decide"
-    return f"{none}, but {runs} {_do(v.runs)} not show the {size} to be {_within(v, shown)}{axis}{advice}"
-
-
-def _worst_axis(v: Verdict) -> str:
-    worst = v.worst_axis
-    return "" if worst is None else f" (worst axis: {worst[0]}, {plain(worst[1])})"
+    do = "does" if v.runs == 1 else "do"
+    return f"{none}, but {runs} {do} not show the {size} to be {_within(shown)}{axis}{advice}"
 
 
 def _lost(v: Verdict) -> str:
@@ -178,7 +153,7 @@ def _lost(v: Verdict) -> str:
     if (lost := v.lost) is None:
         return ""
     asked, unit, runs = v.settings.lost, v.unit, plural(v.runs, v.unit)
-    some = f"{plural(lost.count, unit)} of {lost.runs} {_is(lost.count)} lost" if lost.count else ""
+    some = f"{plural(lost.count, unit)} of {lost.runs} {'is' if lost.count == 1 else 'are'} lost" if lost.count else ""
     if asked is not None and lost.upper <= asked:
         return f"; lost {unit}s are shown to be at most {percent(asked)} of all ({some or f'none of {lost.runs} is'})"
     found = f"; {some}, and" if some else ";" if asked is None else ", but"
@@ -190,53 +165,41 @@ def _lost(v: Verdict) -> str:
     return f"{text}, and {percent(asked)} is asked for{more}"
 
 
-def _is(count: int) -> str:
-    return "is" if count == 1 else "are"
-
-
-def _within(v: Verdict, shown: Equivalence) -> str:
+def _within(shown: Equivalence) -> str:
     if shown.one_sided:
         return f"below {short(shown.factor)}"
     return f"between {short(1.0 / shown.factor)} and {short(shown.factor)}"
 
 
-def _do(runs: int) -> str:
-    return "does" if runs == 1 else "do"
-
-
 # --- the figures behind it -----------------------------------------------------------------------------
 
 
-def _level(v: Verdict) -> list[str]:
-    assert v.scale is not None
-    assert v.location is not None
-    s, (low, high) = v.scale, v.scale.accepted
+def _level(v: Verdict, s: Scale, location: Location) -> str:
+    low, high = s.accepted
     text = f"mean NEES {short(s.mean_anees)}, accepted {short(low)} to {short(high)} ({s.dof} expected)"
     if s.worst_run > SPREAD * s.median_run:
         text += f"; {short(s.median_run)} in the median and {short(s.worst_run)} in the worst {v.unit}"
     if s.judged_steps > 1:
-        counts = {"above": v.location.above, "below": v.location.below}
+        counts = {"above": location.above, "below": location.below}
         where = [f"{count} {side}" for side, count in counts.items() if count]
         text += f"; {v.places} outside the simultaneous band: {' and '.join(where) if where else 'none'}"
         text += f" of {s.judged_steps}"
-    return [text, *_worst_and_lost(v), *_tolerated(v)]
+    return text
 
 
-def _levels(v: Verdict) -> list[str]:
-    """Of parts whose cross terms are not stated: the mean NEES of each, and of all, which nothing is known of else."""
-    assert v.scale is not None
-    ratio, n = short(v.scale.mean_anees / v.scale.dof), v.scale.dof
-    whole = (
-        f"cross terms of {', '.join(v.parts)} are not stated: each is judged by itself, and the mean NEES over the {n} "
-        f"components, {ratio} (1 expected under any correlation), is not judged"
-    )
-    each = [f"{name}: {_level(part)[0]}" for name, part in v.parts.items() if part.location is not None]
-    return [whole, *_worst_and_lost(v), *_tolerated(v), *each]
-
-
-def _worst_and_lost(v: Verdict) -> list[str]:
-    assert v.scale is not None
-    s, lines = v.scale, []
+def _levels(v: Verdict, s: Scale) -> list[str]:
+    """The mean NEES, the worst axis and lost runs; of parts whose cross terms are not stated also that of each part."""
+    lines, each = [], []
+    if v.location is not None:
+        lines = [_level(v, s, v.location)]
+    if v.parts:
+        ratio = short(s.mean_anees / s.dof)
+        lines = [
+            f"cross terms of {', '.join(v.parts)} are not stated: each is judged by itself, and the mean NEES over the "
+            f"{s.dof} components, {ratio} (1 expected under any correlation), is not judged"
+        ]
+        known = [(name, p, p.scale, p.location) for name, p in v.parts.items()]
+        each = [f"{name}: {_level(part, scale, at)}" for name, part, scale, at in known if scale and at]
     if v.faults and (worst := v.worst_axis) is not None:
         lines.append(f"covariance ratio of the worst axis: {worst[0]}, {plain(worst[1])}; of all {plain(s.inflation)}")
     if v.lost is not None and (v.lost.count or v.settings.lost is not None):
@@ -244,14 +207,10 @@ def _worst_and_lost(v: Verdict) -> list[str]:
             f"lost {v.unit}s: {v.lost.count} of {v.lost.runs} failed or have a mean NEES above {short(v.lost.bound)}; "
             f"at most {percent(v.lost.upper)} of all at a confidence of {v.lost.level:g}"
         )
-    return lines
-
-
-def _tolerated(v: Verdict) -> list[str]:
-    tolerated = [a.question for a in v.answers if a.tolerated]
-    if not tolerated:
-        return []
-    return [f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"]
+    if tolerated := [a.question for a in v.answers if a.tolerated]:
+        factor = f"{v.settings.tolerated:g}"
+        lines.append(f"found, but shown to be within the tolerance of x{factor}: {', '.join(tolerated)}")
+    return lines + each
 
 
 def _truth(v: Verdict) -> list[str]:
@@ -284,12 +243,11 @@ def _early_ends(v: Verdict) -> list[str]:
     ]
 
 
-def _within_one(v: Verdict) -> list[str]:
+def _within_one(v: Verdict, s: Scale) -> list[str]:
     """Ratio of a single run, and the data that would decide."""
-    assert v.scale is not None
     if v.runs != 1 or v.landmarks is not None or v.unit != "run":
         return []
-    if (w := v.scale.within) is None:
+    if (w := s.within) is None:
         return [
             "the log is too short to show how its errors decorrelate; further runs, or a far longer log, would decide"
         ]
@@ -299,7 +257,7 @@ def _within_one(v: Verdict) -> list[str]:
     )
     if w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
         return [text]
-    if w.steps <= v.scale.judged_steps:
+    if w.steps <= s.judged_steps:
         return [f"{text}; cut into {w.pieces} runs, this log would then probably decide"]
     return [f"{text}; a log of {w.steps} steps, cut into {w.pieces} runs, would then probably decide"]
 
@@ -329,30 +287,27 @@ def _coverage(v: Verdict) -> list[str]:
     return [text]
 
 
-def _without_truth(v: Verdict, faults: Faults) -> str:
-    assert v.innovations is not None
-    if not v.innovations.judged:
+def _without_truth(v: Verdict, i: Innovations, faults: Faults) -> str:
+    if not i.judged:
         return (
             "no truth, and innovations decide nothing unless the filter declares an optimal gain: those of any other "
             "filter are neither white nor of the stated size even if it is right"
         )
     parts = ["no truth: judged by the innovations alone, which cannot see most pose errors"]
     if "innovation scale" in faults:
-        parts.append(f"they are {'larger' if v.innovations.ratio > 1 else 'smaller'} than stated")
+        parts.append(f"they are {'larger' if i.ratio > 1 else 'smaller'} than stated")
     if "innovation whiteness" in faults:
         parts.append("they are correlated over steps")
-    shown = v.innovations.equivalence
+    shown = i.equivalence
     if not faults and shown is not None:
         is_shown = "is shown to be" if shown.shown else "is not shown to be"
-        parts.append(f"their NIS {is_shown} {_within(v, shown)} times its degrees of freedom")
+        parts.append(f"their NIS {is_shown} {_within(shown)} times its degrees of freedom")
         if v.settings.lost is not None:
             parts.append("they cannot show what share of runs is lost")
     return "; ".join(parts)
 
 
-def _nis(v: Verdict) -> str:
-    assert v.innovations is not None
-    i = v.innovations
+def _nis(i: Innovations) -> str:
     if not np.isfinite(i.ratio):
         return "no NIS: the filter reports no innovations"
     text = f"NIS per degree of freedom {i.ratio:.3f}"

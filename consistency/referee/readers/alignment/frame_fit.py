@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics.records.array_blocks import by_runs
+from consistency.referee.diagnostics.records.large_arrays import by_runs
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.world_frames import (
@@ -18,8 +18,7 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     turned_frame,
 )
-from consistency.referee.readers.matching import Known
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.matching import Known, Poses
 from consistency.referee.types import Array, Indices
 
 STEP = 1e-6  # m or rad, over which the change of an error is taken

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import ENOUGH, inflation_of_mean, left_covariances
 from consistency.referee.diagnostics.verdict.answers import BIAS, INNOVATIONS, MAIN, SHARES, STEP
 from consistency.referee.errors import InputError
-from consistency.referee.readers.alignment.align import Aligned
-from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.alignment.origin import frame_of_first_pose, from_first_pose
+from consistency.referee.readers.alignment.frame_fit import Sound, frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.matching import Aligned, Poses
+from consistency.referee.types import Array
 
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
     ("posyaw", "spatial"): np.eye(6)[[0, 1, 2, 5]],
@@ -74,7 +75,7 @@ def aligned(
     frames = frames_of(name, runs, mode, judged) if frames is None else frames
     there = [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
     found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
-    return replace(found, mode=mode, notes=(_sizes(name, mode, frames), *found.notes))
+    return replace(found, align=mode, notes=(_sizes(name, mode, frames), *found.notes))
 
 
 # --- residual errors -------------------------------------------------------------------------------------------
@@ -120,7 +121,6 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
-    """Covariances of the errors relative to the first poses, or bounds of them."""
     out, factors = zip(*(from_first_pose(name, p, judged) for p in runs), strict=True)
     every = np.concatenate(factors)
     larger = float(np.median(every)) if len(every) else 1.0
@@ -138,7 +138,6 @@ def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Alig
 
 
 def _sizes(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
-    """How far the worlds are turned and shifted."""
     if len(frames) == 1 or mode.endswith("-all"):
         axis, where = (
             ", ".join(f"{value:.4g}" for value in values)
@@ -153,3 +152,71 @@ def _sizes(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
 
 def _span(values: Sequence[float]) -> str:
     return f"{min(values):.3g} to {max(values):.3g} (median {np.median(values):.3g})"
+
+
+def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
+    """The frame in which the first pose is the true one.
+
+    Raises
+    ------
+    InputError
+        No estimate is finite and has a truth and a covariance.
+    """
+    row, truth = _first(name, p)
+    estimate = p.estimate[row]
+    if p.manifold == "planar":
+        return _onto(
+            Rotation.from_euler("z", truth[2] - estimate[2]), np.append(estimate[:2], 0), np.append(truth[:2], 0)
+        )
+    turn = Rotation.from_quat(truth[3:]) * Rotation.from_quat(estimate[3:]).inv()
+    return _onto(turn, estimate[:3], truth[:3])
+
+
+def _onto(turn: Rotation, own: Array, true: Array) -> WorldTransform:
+    return WorldTransform(turn, true - turn.apply(own))
+
+
+def _first(name: str, p: Poses) -> tuple[int, Array]:
+    """Row of the first estimate that is finite and has a truth and a covariance, and its truth (m,)."""
+    known = p.known()
+    fine = p.stated[known.rows] & np.isfinite(p.estimate[known.rows]).all(axis=1)
+    fine &= np.isfinite(p.covariance[known.rows]).all(axis=(1, 2))
+    if not fine.any():
+        raise InputError(f"--align origin: a run of {name} has no estimate with a truth and a covariance to begin at")
+    k = int(np.argmax(fine))
+    return int(known.rows[k]), known.truth[k]
+
+
+def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, Array]:
+    """A run whose first pose is the true one, with bounds of the covariances of the residual errors.
+
+    The error of step k less that of the first pose, seen in step k with covariance R_k, has a covariance of at most
+    (1 + t) P_k + (1 + 1/t) R_k for any t > 0, whatever their correlation (Young's inequality); t^2 = tr(P_k^-1 R_k) / n
+    makes the sum of its variances, in units of those of P_k, least. If the first pose is exact it is P_k. The
+    covariance of the first pose itself, which has no error now, is 0.
+
+    Returns
+    -------
+    the run, and (k,) how many times as large its covariances are in the mean over components
+    """
+    row, _ = _first(name, p)
+    sound, P, index = sound_of(p, judged), p.covariance.copy(), list(judged)
+    block: Any = np.ix_(sound.rows, np.array(index), np.array(index))
+    seen = _seen(name, p, row, sound)[:, index][:, :, index]
+    size = np.trace(np.linalg.solve(P[block], seen), axis1=1, axis2=2) / len(index)
+    t = np.sqrt(np.maximum(size, 0.0))
+    wide = t[:, None, None]
+    bound = (1.0 + wide) * P[block] + seen + seen / np.where(wide > 0, wide, 1.0)
+    P[block] = 0.5 * (bound + np.swapaxes(bound, 1, 2))
+    P[row] = 0.0
+    return replace(p, covariance=P), np.square(1.0 + t[sound.rows != row])
+
+
+def _seen(name: str, p: Poses, row: int, sound: Sound) -> Array:
+    """Covariance (k, n, n) of the error that the pose in ``row`` causes in each sound row."""
+    n = p.covariance.shape[-1]
+    free = np.eye(6) if n == 6 else np.eye(6)[[0, 1, 5]]
+    plain = replace(p, covariance=np.tile(np.eye(n), (len(p.t), 1, 1)))
+    first = Sound(np.array([row]), _first(name, p)[1][None], np.zeros((1, n)))
+    J = tangent(plain, sound, free, range(n)) @ np.linalg.inv(tangent(plain, first, free, range(n))[0])
+    return np.asarray(J @ p.covariance[row] @ np.swapaxes(J, 1, 2))

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.formats.innovation_files import NisLog, choose
-from consistency.referee.readers.formats.px4_log import MICRO, Pairs, nis_of
+from consistency.referee.readers.formats.px4_log import MICRO, Pairs, nis_of, require_in_order
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array
 
@@ -42,7 +40,6 @@ LEAST = 1.0  # sigma, of a gate: ArduPilot takes a smaller one for it
 
 
 def is_dataflash(path: Path) -> bool:
-    """Whether a path is a flight log of ArduPilot, by its suffix."""
     return path.suffix.lower() == SUFFIX
 
 
@@ -142,19 +139,14 @@ def _loaded(path: Path, wanted: dict[str, list[str]]) -> tuple[dict[str, list[di
         while (message := log.recv_match(type=[*wanted, "PARM"])) is not None:
             kind = message.get_type()
             if kind in rows:
-                rows[kind].append(_row(message, wanted[kind]))
+                fields = {"TimeUS", "TimeMS", CORE, *wanted[kind]} & {*message.get_fieldnames()}
+                rows[kind].append({name: float(getattr(message, name)) for name in fields})
             elif str(message.Name).endswith("_I_GATE"):
                 gates[message.Name] = min(float(message.Value), gates.get(message.Name, np.inf))
     return rows, gates
 
 
-def _row(message: Any, fields: Sequence[str]) -> dict[str, float]:
-    there = message.get_fieldnames()
-    return {name: float(getattr(message, name)) for name in ("TimeUS", "TimeMS", CORE, *fields) if name in there}
-
-
 def _of_core(path: Path, rows: list[dict[str, float]], core: int | None) -> list[dict[str, float]]:
-    """Messages of one instance of the EKF; older logs have one and no number of it."""
     cores = sorted({int(row.get(CORE, 0)) for row in rows})
     own = choose(path, "run", cores, core, "core of the EKF")
     return [row for row in rows if int(row.get(CORE, 0)) == own]
@@ -164,6 +156,5 @@ def _times(path: Path, message: str, rows: list[dict[str, float]]) -> Array:
     t = np.array([row["TimeUS"] * MICRO if "TimeUS" in row else row.get("TimeMS", np.nan) * 1e-3 for row in rows])
     if not np.isfinite(t).all():
         raise InputError(f"{path}: {message} has no field TimeUS")
-    if len(back := np.flatnonzero(np.diff(t) < 0)):
-        raise InputError(f"{path}: message {back[0] + 2} of {message} is older than the one before; the log is damaged")
+    require_in_order(path, message, t)
     return t

@@ -50,17 +50,12 @@ class Fixes(Lines):
     geodetic: bool = True
     alone: bool = False  # deviations are stated without cross terms
 
-    @property
-    def origin(self) -> Array:
-        """The first place, (3,)."""
-        return self.values[0, 1:4]
-
     def local(self, origin: Array | None = None) -> tuple[Array, Array]:
         """Positions (N, 3) and covariances (N, 3, 3) in the plane that touches the ellipsoid in ``origin``."""
         place, P = self.values[:, 1:4], self.values[:, 4:].reshape(-1, 3, 3)
         if not self.geodetic:
             return place, P
-        start = self.origin if origin is None else origin
+        start = self.values[0, 1:4] if origin is None else origin
         turn = axes_at(start)
         between = turn @ np.swapaxes(axes_at(place), -1, -2)
         return (centred(place) - centred(start)) @ turn.T, between @ P @ np.swapaxes(between, -1, -2)
@@ -104,7 +99,7 @@ def localised(own: Lines, true: Lines) -> tuple[Lines, Lines, str]:
     geodetic = [each for each in (true, own) if isinstance(each, Fixes) and each.geodetic]
     if not geodetic:
         return _plain(own, None), _plain(true, None), ""
-    origin = geodetic[0].origin
+    origin = geodetic[0].values[0, 1:4]
     at = f"{origin[0]:.7f}, {origin[1]:.7f} degrees, {origin[2]:.2f} m"
     note = f"{geodetic[0].path}: x is east, y north, z up from its first place, {at} above the ellipsoid"
     if len(geodetic) == 1:

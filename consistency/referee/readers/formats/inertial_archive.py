@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL
-from consistency.referee.geometry.space_errors import state_error
+from consistency.referee.geometry.groups import state_error
 from consistency.referee.types import Array
 
 AXES = {
@@ -35,7 +35,7 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
         the parts as they stand in the covariance, R, p, v, bg, ba by default; one run may lack the first dimension
     convention : ``left`` is Log(est^-1 truth) of SE2(3), ``right`` Log(truth est^-1), ``additive`` a difference;
         ``so3`` and ``so3-body`` are additive but for the rotation
-        (:func:`consistency.referee.geometry.space_errors.state_error`). Biases are differences.
+        (:func:`consistency.referee.geometry.groups.state_error`). Biases are differences.
 
     Raises
     ------
@@ -72,7 +72,6 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
 
 
 def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[str]:
-    """Parts as they stand in the covariance."""
     if ("bg" in parts) != ("ba" in parts):
         raise InputError(f"{path}: key '{'ba' if 'bg' in parts else 'bg'}' is missing; there are two biases or none")
     if missing := [f"{TRUE}{part}" for part in parts if f"{TRUE}{part}" not in arrays]:
@@ -84,7 +83,6 @@ def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[st
 
 
 def _part(path: Path, arrays: Mapping[str, Array], key: str) -> Array:
-    """One part, with a first dimension for runs."""
     tail = (3, 3) if key.endswith("R") else (3,)
     array = np.asarray(arrays[key], float)
     if array.shape[-len(tail) :] != tail or array.ndim not in (len(tail) + 1, len(tail) + 2):

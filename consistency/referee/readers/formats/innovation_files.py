@@ -12,7 +12,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, one_line, require_name
 from consistency.referee.readers.formats.numpy_archive import load_arrays, run_lengths, step_times, whole_numbers
-from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet
+from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet, refuse
 from consistency.referee.readers.formats.table_columns import row_order
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array
@@ -58,7 +58,14 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     sheet = read_sheet(path)
     _require_columns(str(path), list(sheet.data))
     sheet = _of_one(_of_one(sheet, "filter", filter_name), "run", run)
-    return _of_sheet(str(sheet.data["filter"][0]) if "filter" in sheet else path.stem, sheet)
+    key = next((column for column in ("step", "t") if column in sheet), None)
+    if key is not None:
+        sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))
+    nis = sheet.numbers("nis")
+    dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
+    step = sheet.numbers("step") if "step" in sheet else np.arange(1.0, len(nis) + 1)
+    t = sheet.numbers("t") if "t" in sheet else np.full(len(nis), np.nan)
+    return NisLog(str(sheet.data["filter"][0]) if "filter" in sheet else path.stem, step, t, nis, dof)
 
 
 def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "") -> Any:
@@ -88,12 +95,8 @@ def checked_dof(nis: Array, dof: Array, place: Callable[[int], str]) -> Array:
     """
     dof = np.where(np.isnan(nis) & np.isnan(dof), 0.0, dof)
     bad = (nis < 0) | np.isinf(nis) | ~are_dof(dof)
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise InputError(
-            f"{place(row)}: nis {nis[row]:g} with nis_dof {dof[row]:g}; "
-            "nis must be 0 or more and finite, nis_dof a whole number from 0 to below 2^31"
-        )
+    needed = "nis must be 0 or more and finite, nis_dof a whole number from 0 to below 2^31"
+    refuse(bad, place, lambda row: f"nis {nis[row]:g} with nis_dof {dof[row]:g}; {needed}")
     return dof
 
 
@@ -106,7 +109,6 @@ def _require_columns(place: str, columns: list[str]) -> None:
 
 
 def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRows:
-    """The rows of one filter or run."""
     if column not in sheet:
         if choice is not None:
             raise InputError(f"--{column} {choice}: {sheet.path} has no column '{column}'")
@@ -114,17 +116,6 @@ def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRow
     values = sheet.texts(column) if column == "filter" else sheet.numbers(column, whole=True)
     there = [str(v) if column == "filter" else int(v) for v in dict.fromkeys(values.tolist())]
     return sheet.rows(values == choose(sheet.path, column, there, choice))
-
-
-def _of_sheet(name: str, sheet: TableRows) -> NisLog:
-    key = next((column for column in ("step", "t") if column in sheet), None)
-    if key is not None:
-        sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))
-    nis = sheet.numbers("nis")
-    dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
-    step = sheet.numbers("step") if "step" in sheet else np.arange(1.0, len(nis) + 1)
-    t = sheet.numbers("t") if "t" in sheet else np.full(len(nis), np.nan)
-    return NisLog(name, step, t, nis, dof)
 
 
 def _of_archive(path: Path, run: int | None) -> NisLog:

@@ -70,10 +70,6 @@ class Roles:
         """Whether they are the first columns of a TUM trajectory."""
         return self.time + self.position + self.quaternion == tuple(range(8)) and self.unit in (None, 1)
 
-    @property
-    def w_first(self) -> bool:
-        return self.quaternion[3] < self.quaternion[0]
-
 
 def head_of(path: Path) -> Head | None:
     """The names of columns above the first row of numbers; None where the file has none."""
@@ -148,7 +144,7 @@ def roles_of(names: Sequence[str], where: Path) -> Roles | None:
     plain = [_plain(name) for name in names]
     quaternion = _family(plain, QUATERNIONS, "xyzw", where)
     position = _family(plain, POSITIONS, "xyz", where)
-    clock = _clock(plain, names)
+    clock = clock_of(names)
     if position is None or clock is None:
         return None
     asl = plain[position[0]] == "p_rs_r_x" or (len(plain) == 17 and plain[-3:] == ["bax", "bay", "baz"])
@@ -186,7 +182,18 @@ def _family(plain: list[str], spellings: Sequence[str], parts: str, where: Path)
 
 def clock_of(names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
     """Places of the time, and how many of its units are a second, where its name says it; None without a time."""
-    return _clock([_plain(name) for name in names], names)
+    plain = [_plain(name) for name in names]
+    bare = [re.sub(rf"_({'|'.join(UNITS)})$", "", name) for name in plain]
+    for seconds, rest in HALVES:
+        for i, j in itertools.permutations(range(len(plain)), 2):
+            if plain[i].endswith(seconds) and plain[j] == plain[i][: -len(seconds)] + rest:
+                return (i, j), 1
+    for clock in CLOCKS:
+        for i, name in enumerate(bare):
+            if name == clock or (clock == "header_stamp" and name.endswith(clock)):
+                said = re.search(r"[\[(_ ]\s*(s|sec|ms|us|ns|nsec)\s*[\])]?$", names[i].lower())
+                return (i,), UNITS[said[1]] if said else 10**9 if plain[i] in RECORDED else None
+    return None
 
 
 def places_of(names: Sequence[str], spellings: Sequence[Sequence[str]]) -> tuple[int, ...] | None:
@@ -200,27 +207,6 @@ def places_of(names: Sequence[str], spellings: Sequence[Sequence[str]]) -> tuple
             return None
         found.append(there[0])
     return tuple(found)
-
-
-def _clock(plain: list[str], names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
-    """Places of the time, and its unit where the name says it."""
-    bare = [re.sub(rf"_({'|'.join(UNITS)})$", "", name) for name in plain]
-    for seconds, rest in HALVES:
-        for i, j in itertools.permutations(range(len(plain)), 2):
-            if plain[i].endswith(seconds) and plain[j] == plain[i][: -len(seconds)] + rest:
-                return (i, j), 1
-    for clock in CLOCKS:
-        for i, name in enumerate(bare):
-            if name == clock or (clock == "header_stamp" and name.endswith(clock)):
-                return (i,), _unit(names[i], plain[i])
-    return None
-
-
-def _unit(name: str, plain: str) -> int | None:
-    said = re.search(r"[\[(_ ]\s*(s|sec|ms|us|ns|nsec)\s*[\])]?$", name.lower())
-    if said:
-        return UNITS[said[1]]
-    return 10**9 if plain in RECORDED else None
 
 
 def _rest(plain: list[str]) -> tuple[int, ...]:

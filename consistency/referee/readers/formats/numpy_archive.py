@@ -11,18 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Evidence, Record
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone, numbered_axes
-from consistency.referee.diagnostics.records.symmetric import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
 from consistency.referee.readers.formats.sheet import Places, are_dof, bounded
-from consistency.referee.readers.matching import Manifold
+from consistency.referee.readers.matching import Manifold, NamedPoses, Poses
 from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.runs_to_record import Track, assemble, symmetric
-from consistency.referee.types import Array, Failure
+from consistency.referee.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
     from consistency.referee.readers.windows import Relative
@@ -166,7 +165,11 @@ def _of_arrays(
             raise InputError(f"--error {error_kind}: here it is 'vector', or so2, left or right for x, y, heading")
         known = _known(path, arrays, *truth.shape[:2])
         truth = np.where(known[..., None], truth, np.nan)
-        _require_truth(path, truth, estimates, known)
+        bad = known & np.isfinite(estimates).all(axis=-1) & ~np.isfinite(truth).all(axis=-1)
+        if bad.any():
+            run, step = np.argwhere(bad)[0]
+            where = f"{path}: key 'truth', run {run}, step {step + 1}"
+            raise InputError(f"{where}: not finite; 'mask' is true where there is none")
         if relative is not None:
             return _relative(path, arrays, estimates, truth, covariances, convention or "so2", relative)
         error = planar_error(truth, estimates, error_kind) if n == 3 else truth - estimates
@@ -186,7 +189,7 @@ def _of_arrays(
     tracks, poses = [], []
     for run, steps_of_run in enumerate(known):
         k = np.flatnonzero(steps_of_run)
-        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", k)  # type: ignore[misc]
+        place = steps_of(path, run, k)
         P = symmetric(covariances[run, k], place.__getitem__)
         poses.append(_poses(place, estimates[run, k], P, truth[run, k], given))
         own_nis, own_dof = (None if values is None else values[run, k] for values in (nis, dof))
@@ -199,6 +202,10 @@ def _of_arrays(
         remedy = "add --error so2, if these are x, y, heading" if error_kind and n == 3 else "wrap it to [-pi, pi]"
         notes += turns(path.stem, axes, error, covariances, remedy)
     return assemble(path.stem, tracks, step_times(path, arrays, steps), axes, str(path), error_kind, notes)
+
+
+def steps_of(of: Path | str, run: int, rows: Indices) -> Places:
+    return Places(lambda row: f"{of}, run {run}, step {row + 1}", rows)
 
 
 def _poses(place: Places, estimate: Array, covariance: Array, truth: Array, convention: str) -> Poses:
@@ -220,7 +227,7 @@ def archive_poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
     runs, steps, _ = estimates.shape
     clock, there = step_times(path, arrays, steps), _known(path, arrays, runs, steps)
     for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
-        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", np.arange(length))  # type: ignore[misc]
+        place = steps_of(path, run, np.arange(length))
         true, step = truth[run, :length], np.arange(length, dtype=float)
         known = there[run, :length] & np.isfinite(true).all(axis=-1)
         poses = Poses.bare(place, step, estimates[run, :length], step[known], true[known], "planar", 0.0)
@@ -246,7 +253,7 @@ def _relative(
             raise InputError(f"{path}: key '{key}' has shape {matrices.shape}, needs {shape}")
     t, stretches = step_times(path, arrays, steps), []
     for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
-        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", np.arange(length))  # type: ignore[misc]
+        place = steps_of(path, run, np.arange(length))
         P = symmetric(covariances[run, :length], place.__getitem__)
         known = np.flatnonzero(np.isfinite(truth[run, :length]).all(axis=-1))
         own = None if cross is None else cross[run, :length]
@@ -281,7 +288,6 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
 
 
 def _numbers(path: Path, archive: Any, key: str) -> Array:
-    """One array of an archive; what only Python could read is refused."""
     try:
         array: Array = archive[key]
     except ValueError as error:
@@ -314,15 +320,6 @@ def whole_numbers(path: Path, arrays: dict[str, Array], key: str, shape: tuple[i
         return np.broadcast_to(bounded(np.asarray(array, float)), shape)
     except ValueError:
         raise InputError(f"{path}: key '{key}' must be one number or of shape {shape}") from None
-
-
-def _require_truth(path: Path, truth: Array, estimates: Array, known: Array) -> None:
-    bad = known & np.isfinite(estimates).all(axis=-1) & ~np.isfinite(truth).all(axis=-1)
-    if bad.any():
-        run, step = np.argwhere(bad)[0]
-        raise InputError(
-            f"{path}: key 'truth', run {run}, step {step + 1}: not finite; 'mask' is true where there is none"
-        )
 
 
 def run_lengths(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> list[int]:

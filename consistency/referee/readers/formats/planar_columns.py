@@ -5,15 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from consistency.referee.column_names import COVARIANCE, POSE
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.file_kinds import PLACES, SPEEDS, TURNS, is_poses
 from consistency.referee.readers.formats.named_columns import UNIT_NAMES, clock_of, head_of, places_of
-from consistency.referee.readers.formats.pose_rows import POSE as WIDTH
-from consistency.referee.readers.formats.pose_rows import read_named, read_poses, times_of
+from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
 from consistency.referee.readers.formats.sheet import Lines, TableRows, increasing
 from consistency.referee.readers.formats.table_columns import LOWER_NAMES
 from consistency.referee.types import Array
@@ -32,7 +30,9 @@ def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
         The file holds none of these, or its timestamps do not increase.
     """
     if is_poses(path):
-        return _of_space(read_poses(path, true=True))
+        lines = read_poses(path, true=True)
+        of = lines.note or f"{path}: read as poses in space"
+        return on_plane(lines, "line"), f"{of}, of which the heading is that of the x axis"
     head = head_of(path)
     clock = None if head is None else clock_of(head.names)
     if head is None or clock is None:
@@ -79,10 +79,3 @@ def poses_of(motions: Array) -> Array:
     c, s = np.cos(before), np.sin(before)
     steps = np.column_stack([c * motions[:, 0] - s * motions[:, 1], s * motions[:, 0] + c * motions[:, 1]])
     return np.column_stack([np.cumsum(steps, axis=0), wrap(heading)])
-
-
-def _of_space(lines: Lines) -> tuple[TableRows, str]:
-    ahead = Rotation.from_quat(lines.values[:, 4:WIDTH]).apply([1.0, 0.0, 0.0])
-    columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
-    of = lines.note or f"{lines.path}: read as poses in space"
-    return TableRows(lines.path, columns, lines.line, "line"), f"{of}, of which the heading is that of the x axis"

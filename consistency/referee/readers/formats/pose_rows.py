@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.readers.file_kinds import is_solution
 from consistency.referee.readers.formats.geodetic import read_solution
@@ -25,9 +26,15 @@ from consistency.referee.readers.formats.named_columns import (  # fmt: skip
     roles_of,
     unit_of,
 )
-from consistency.referee.readers.formats.openvins import FULL as STATES
-from consistency.referee.readers.formats.openvins import as_states
-from consistency.referee.readers.formats.sheet import Lines, increasing, read_rows, read_sheet
+from consistency.referee.readers.formats.sheet import (
+    Lines,
+    TableRows,
+    increasing,
+    read_numbers,
+    read_rows,
+    read_sheet,
+    refuse,
+)
 from consistency.referee.readers.formats.text_blocks import blocks
 from consistency.referee.types import Array, Indices
 
@@ -81,6 +88,13 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     return states
 
 
+def on_plane(lines: Lines, unit: str) -> TableRows:
+    """Columns t, x, y and heading of poses in space, which is that of the x axis."""
+    ahead = Rotation.from_quat(lines.values[:, 4:POSE]).apply([1.0, 0.0, 0.0])
+    columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
+    return TableRows(lines.path, columns, lines.line, unit)
+
+
 def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     """Rows under the names of their columns."""
     pose = (*roles.time, *roles.position, *roles.quaternion, *roles.covariance)
@@ -88,7 +102,9 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     t, unit = times_of(lines, roles.time, columns[: len(roles.time)], roles.unit)
     of = roles.kind if true else roles.kind.replace(" truth", " poses")
     clock = UNIT_NAMES[unit] if len(roles.time) == 1 else "seconds and nanoseconds"
-    order = f"quaternion {'w first' if roles.w_first else 'w last'}" if roles.quaternion else "no orientation"
+    order = "no orientation"
+    if roles.quaternion:
+        order = f"quaternion {'w first' if roles.quaternion[3] < roles.quaternion[0] else 'w last'}"
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if roles.covariance:
         stated = "standard deviations" if len(roles.covariance) in DEVIATIONS else "covariance"
@@ -177,12 +193,8 @@ def _is_rigid(numbers: Array) -> Indices:
 def _matrices(lines: Lines) -> Lines:
     """Matrices that turn body into world coordinates, row by row, behind a time or a number or neither."""
     numbers, before, covariance = _matrix(lines)
-    wrong = np.flatnonzero(~_is_rigid(numbers))
-    if len(wrong):
-        raise InputError(
-            f"{lines.place(int(wrong[0]))}: the {numbers.shape[1]} numbers are no rotation and translation, row by "
-            f"row; should be these, or {LAYOUT}"
-        )
+    what = f"the {numbers.shape[1]} numbers are no rotation and translation, row by row; should be these, or {LAYOUT}"
+    refuse(~_is_rigid(numbers), lines.place, what)
     t, clock = _clock(lines, before)
     M = numbers.reshape(len(numbers), -1, 4)
     quaternion = np.full((len(M), 4), np.nan)
@@ -206,3 +218,56 @@ def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
     if len(t) != len(lines.line):
         raise InputError(f"{times}: has {len(t)} times, but {lines.path} {len(lines.line)} poses")
     return t, f"times from {times.name} beside them"
+
+
+CAMERAS, CALIBRATION = 18, 15  # column with the number of cameras, and numbers of each one's calibration
+LARGEST = 200  # columns, of more cameras than OpenVINS takes
+STATES = range(CAMERAS + 1 + CALIBRATION, LARGEST)  # columns of a state
+DEVIATION_WIDTHS = range(
+    CAMERAS + CALIBRATION - 1, LARGEST
+)  # of its deviations: three for a rotation, in place of four
+AS_TUM = [0, 5, 6, 7, 1, 2, 3, 4]  # t, position and quaternion in the order of TUM
+REST = slice(8, 17)  # velocity, biases
+SIGMA = slice(1, 16)  # rotation, position, velocity, biases
+DEVIATIONS_LAYOUT = (
+    "t, three standard deviations of the rotation, rad, three of the position, m, and those of the rest of the state"
+)
+
+
+class States(Lines):
+    """Poses (N, 8) as in a TUM trajectory, of a simulation with OpenVINS: states, and a file of their deviations."""
+
+
+def as_states(lines: Lines) -> States | None:
+    """The poses in lines of whole states; None if the lines are not states.
+
+    A state is t, the quaternion x, y, z, w, position, velocity, biases of gyroscope and accelerometer (three each), the
+    offset of the clocks, the number of cameras, and their calibration. OpenVINS states the rotation from the world into
+    the body as a JPL quaternion, whose four numbers are those of the rotation from the body into the world as a
+    Hamilton quaternion.
+    """
+    if not _has_cameras(lines.values, CAMERAS, CALIBRATION):
+        return None
+    return States(lines.path, lines.values[:, AS_TUM], lines.line, rest=lines.values[:, REST])
+
+
+def read_deviations(path: Path) -> tuple[Lines, Array]:
+    """Standard deviations of states, and covariances (N, 15, 15) whose diagonal alone is known.
+
+    They are of position, rotation, velocity and the biases of gyroscope and accelerometer.
+
+    The rotation is the error about the axes of the body, in rad.
+    """
+    lines = read_numbers(path, DEVIATION_WIDTHS, DEVIATIONS_LAYOUT)
+    if not _has_cameras(lines.values, CAMERAS - 1, CALIBRATION - 1):
+        raise InputError(f"{lines.place(0)}: has {lines.values.shape[1]} columns; should be {DEVIATIONS_LAYOUT}")
+    sigma = lines.values[:, SIGMA]
+    refuse((sigma < 0).any(axis=1), lines.place, f"a standard deviation is below 0; should be {DEVIATIONS_LAYOUT}")
+    return lines, diagonal(np.concatenate([sigma[:, 3:6], sigma[:, :3], sigma[:, 6:]], axis=1))
+
+
+def _has_cameras(values: Array, column: int, each: int) -> bool:
+    """Whether a column holds a number of cameras, of which there are so many numbers each in the columns behind it."""
+    cameras = values[:, column]
+    width = column + 1 + each * cameras
+    return bool(((cameras >= 1) & (cameras == np.round(cameras)) & (width <= values.shape[1])).all())

@@ -9,10 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
+from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.sheet import Lines, Places
+from consistency.referee.readers.matching import Poses
 from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.space_trajectories import AXES, TrajectorySource
 from consistency.referee.readers.windows import Relative
@@ -112,14 +113,9 @@ def _jacobian(convention: str, R: Array, arm: Array, point: Array) -> Array:
     J = np.empty((len(R), 3, 6))
     J[:, :, :3] = R if convention == "left" else np.eye(3)
     if convention == "right":
-        J[:, :, 3:] = -_skew(point)
+        J[:, :, 3:] = -skew(point)
     elif convention == "so3":
-        J[:, :, 3:] = -_skew(R @ arm)
+        J[:, :, 3:] = -skew(R @ arm)
     else:
-        J[:, :, 3:] = -R @ _skew(arm)
+        J[:, :, 3:] = -R @ skew(arm)
     return J
-
-
-def _skew(v: Array) -> Array:
-    """Matrices (..., 3, 3) of the cross product with v (..., 3)."""
-    return np.cross(np.eye(3), v[..., None, :])

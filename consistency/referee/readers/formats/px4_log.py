@@ -17,7 +17,7 @@ from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.formats.innovation_files import NisLog, choose
 from consistency.referee.readers.matching import associate
-from consistency.referee.types import Array, Indices
+from consistency.referee.types import Array
 
 TOPICS = ("estimator_innovations", "estimator_innovation_variances")
 OLD = "ekf2_innovations"  # of older firmware: innovations and variances in one message
@@ -121,13 +121,15 @@ def _divided(data: dict[str, Array]) -> tuple[dict[str, Array], dict[str, Array]
 
 
 def _paired(path: Path, innovations: dict[str, Array], variances: dict[str, Array]) -> Pairs:
-    """The messages of both topics that belong together."""
     fields = [name for name in innovations if name in variances and not name.startswith("timestamp")]
     clock = next((name for name in CLOCKS if name in innovations and name in variances), None)
     if clock is None:
         raise InputError(f"{path}: {TOPICS[0]} lacks a field 'timestamp'")
     times, others = _times(path, TOPICS[0], innovations[clock]), _times(path, TOPICS[1], variances[clock])
-    rows, match = _together(times, others, exact=clock == CLOCKS[0])
+    if clock == CLOCKS[0]:  # of several with one stamp the first
+        _, rows, match = np.intersect1d(times, others, return_indices=True)
+    else:
+        rows, match = associate(times, others, TOGETHER)
     if not len(rows):
         raise InputError(f"{path}: no message of {TOPICS[0]} has its partner in {TOPICS[1]}; both must be logged")
     return Pairs(
@@ -139,22 +141,17 @@ def _paired(path: Path, innovations: dict[str, Array], variances: dict[str, Arra
 
 
 def _times(path: Path, topic: str, stamps: Array) -> Array:
-    back = np.flatnonzero(np.diff(stamps.astype(np.int64)) < 0)
-    if len(back):
-        raise InputError(f"{path}: message {back[0] + 2} of {topic} is older than the one before; the log is damaged")
+    require_in_order(path, topic, stamps.astype(np.int64))
     return stamps.astype(float) * MICRO
 
 
-def _together(times: Array, others: Array, exact: bool) -> tuple[Indices, Indices]:
-    """Messages of either topic that belong together; of several with one stamp the first."""
-    if exact:
-        _, rows, match = np.intersect1d(times, others, return_indices=True)
-        return rows, match
-    return associate(times, others, TOGETHER)
+def require_in_order(path: Path, topic: str, t: Array) -> None:
+    """Refuse messages whose times go back."""
+    if len(back := np.flatnonzero(np.diff(t) < 0)):
+        raise InputError(f"{path}: message {back[0] + 2} of {topic} is older than the one before; the log is damaged")
 
 
 def _groups(pairs: Pairs) -> dict[str, list[str]]:
-    """Components of each sensor."""
     groups: dict[str, list[str]] = {}
     for field in pairs.innovation:
         groups.setdefault(COMPONENT.sub("", field), []).append(field)
@@ -193,7 +190,6 @@ def nis_of(pairs: Pairs, parts: list[str]) -> tuple[Array, Array, int]:
 
 
 def _notes(path: Path, name: str, pairs: Pairs, dof: Array, held: int, log: Any) -> list[str]:
-    """Notes on left-out messages, and on data missing in the log."""
     notes = [f"{path}: {name}: {int((dof > 0).sum())} innovations in {len(dof)} messages"]
     if held:
         notes[0] += f"; {plural(held, 'message')} repeat the innovation before, as no measurement came between"

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,21 +17,15 @@ from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.parsing import reading
 from consistency.referee.readers.file_kinds import is_one_bag
-from consistency.referee.readers.formats.geodetic import Fixes, localised
+from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.pose_rows import POSE
-from consistency.referee.readers.formats.position_truth import fixed, position_source, positions
-from consistency.referee.readers.formats.sheet import Lines, Places
-from consistency.referee.readers.formats.tum import UNIT, unused
+from consistency.referee.readers.formats.sheet import Lines
+from consistency.referee.readers.formats.tum import UNIT, bare_poses, poses_of
+from consistency.referee.readers.matching import NamedPoses, Poses
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.relative_motions import MARGINAL
-from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.space_trajectories import (
-    ALONE,
     AXES,
-    POINTS,
-    WHOLE,
-    TrajectorySource,
     recordings_of,
     require_axes,
 )
@@ -65,37 +59,31 @@ def read_bags(path: Path, r: Reading, relative: Relative | None = None) -> list[
     if r.error not in (None, *SPATIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
     require_axes(r.axes)
-    bags = [path] if is_one_bag(path) else sorted(part for part in path.iterdir() if is_one_bag(part))
+    bags = _bags(path)
     if twice := _parts_of_one(bags):
         raise InputError(
             f"{path}: {twice} and others are parts of one recording; make its metadata by 'ros2 bag reindex'"
         )
-    found = [_bagged(bag, r) for bag in bags]
-    poses, parts = [one.poses for one in found], found[0].parts
-    if any(one.parts is not parts for one in found):
-        raise InputError(f"{path}: the covariances of some bags have cross terms, of others none; judge them apart")
-    why = "" if r.error else "; as the ROS messages define it; declare yours with --error"
-    files = [(bag, f"{r.truth_topic} of {bag}") for bag in bags]
-    notes = tuple(dict.fromkeys(note for one in found for note in one.notes))
-    source = TrajectorySource(path, files, path, why, notes)
-    if any(one.manifold == "vector" for one in poses):
-        source = position_source(source, poses, found[0].convention, r, None)
+    source, poses, parts = poses_of(
+        path,
+        [(bag, f"{r.truth_topic} of {bag}") for bag in bags],
+        (_run_of(bag, r) for bag in bags),
+        r,
+        why="; as the ROS messages define it; declare yours with --error",
+        mixed=f"{path}: the covariances of some bags have cross terms, of others none; judge them apart",
+    )
     stated, said = _stated(path, poses)
     if r.axes is None and said:
         r, source = replace(r, axes=stated), replace(source, notes=(*source.notes, said))
     return recordings_of(source, poses, parts, r)
 
 
-class Bagged(NamedTuple):
-    """A bag before errors are taken."""
-
-    poses: Poses
-    parts: Mapping[str, range]
-    convention: str  # of the error whose covariance is stated; "" of positions
-    notes: list[str]
+def _bags(path: Path) -> list[Path]:
+    return [path] if is_one_bag(path) else sorted(part for part in path.iterdir() if is_one_bag(part))
 
 
-def _bagged(bag: Path, r: Reading) -> Bagged:
+def _run_of(bag: Path, r: Reading) -> tuple[Lines, Lines, None, list[str]]:
+    """Estimates and truth of a bag, whose covariances stand in the lines, and notes on their frames."""
     with _opened(bag) as reader:
         topic, truth = _chosen(bag, reader, r.topic), r.truth_topic
         if truth is None:
@@ -106,37 +94,14 @@ def _bagged(bag: Path, r: Reading) -> Bagged:
         own = _lines(bag, reader, topic)
         true = _lines(bag, reader, truth)
         notes = _other_frames(bag, (topic, _frames(reader, topic)), (truth, _frames(reader, truth)))
-    own, true, world = localised(own, true)
-    notes = [note for note in (own.note, true.note, world, unused(true, r), *notes) if note]
-    P_true = _of_truth(bag, true, r)
-    if not np.isfinite(true.values[:, 1 : 4 if isinstance(true, Fixes) else POSE]).all():
-        raise InputError(f"{bag}: the truth on {truth} is not finite")
-    if isinstance(own, Fixes):
-        return Bagged(fixed(own, true, r, P_true), ALONE if own.alone else POINTS, "", notes)
-    place = Places(own.place, np.arange(len(own.t)))
-    P = symmetric(own.values[:, POSE:].reshape(-1, 6, 6), place.__getitem__)
-    kind, pose = r.error or "so3", slice(1, POSE)
-    stated = np.ones(len(own.t), bool)
-    poses = Poses(
-        place, own.t, own.values[:, pose], P, stated, true.t, true.values[:, pose], "spatial", kind, r.tolerance,
-        true_covariance=P_true,
-    )  # fmt: skip
-    if isinstance(true, Fixes):
-        poses = positions(poses, r.lever_arm or (0.0, 0.0, 0.0), blocks=False)
-    return Bagged(poses, WHOLE, kind, notes)
-
-
-def _of_truth(bag: Path, true: Lines, r: Reading) -> Array | None:
-    """Covariance of the truth, (M, 6, 6) or of fixes (M, 3, 3), where it is asked for."""
-    if r.truth_covariance is None:
-        return None
-    if r.truth_covariance != COLUMNS:
+    covariance = 4 if isinstance(true, Fixes) else POSE
+    if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: with a bag it is '{COLUMNS}', of the messages")
-    P = true.values[:, 4 if isinstance(true, Fixes) else POSE :]
-    if not np.isfinite(P).any():
+    if r.truth_covariance is not None and not np.isfinite(true.values[:, covariance:]).any():
         raise InputError(f"{bag}: --truth-covariance {COLUMNS}: the messages of {r.truth_topic} state none")
-    n = 3 if isinstance(true, Fixes) else 6
-    return symmetric(P.reshape(-1, n, n), true.place)
+    if not np.isfinite(true.values[:, 1:covariance]).all():
+        raise InputError(f"{bag}: the truth on {truth} is not finite")
+    return own, true, None, notes
 
 
 def _parts_of_one(bags: Sequence[Path]) -> str:
@@ -211,7 +176,6 @@ def _listed(topics: Sequence[str], reader: Any) -> str:
 
 
 def _chosen(bag: Path, reader: Any, topic: str | None) -> str:
-    """The topic of the estimates."""
     there = _topics(reader, STATED) or _topics(reader, (FIX,))
     if topic is None and len(there) == 1:
         return there[0]
@@ -222,16 +186,9 @@ def _chosen(bag: Path, reader: Any, topic: str | None) -> str:
 
 
 def _raw(reader: Any, topic: str) -> Iterator[Any]:
-    """Messages of a topic."""
     connections = [connection for connection in reader.connections if connection.topic == topic]
     for connection, _, raw in reader.messages(connections=connections):
         yield reader.deserialize(raw, connection.msgtype)
-
-
-def _messages(reader: Any, topic: str) -> Iterator[tuple[Any, Any]]:
-    """Header and content of the messages of a topic."""
-    for message in _raw(reader, topic):
-        yield message.header, getattr(message, "pose", None) or message.transform
 
 
 def _frames(reader: Any, topic: str) -> tuple[str, str]:
@@ -247,7 +204,6 @@ def _frames(reader: Any, topic: str) -> tuple[str, str]:
 
 
 def _transforms(bag: Path, reader: Any, frames: str) -> Iterator[tuple[Any, Any]]:
-    """Header and transform of CHILD in PARENT from /tf."""
     parent, child = (frame.strip().lstrip("/") for frame in frames.split(":", 1))
     connections = [connection for connection in reader.connections if connection.msgtype in TREE]
     seen = set()
@@ -270,7 +226,8 @@ def _lines(bag: Path, reader: Any, topic: str) -> Lines:
         raise InputError(f"{bag}: --truth-topic {topic}: is not there with poses; there are: {_listed(there, reader)}")
     if topic in _topics(reader, (FIX,)):
         return _fixes(bag, topic, list(_raw(reader, topic)))
-    return _track(bag, topic, _messages(reader, topic))
+    messages = ((each.header, getattr(each, "pose", None) or each.transform) for each in _raw(reader, topic))
+    return _track(bag, topic, messages)
 
 
 def _fixes(bag: Path, topic: str, messages: Sequence[Any]) -> Fixes:
@@ -319,7 +276,6 @@ def _row(header: Any, content: Any) -> tuple[float, list[float], Array]:
 
 
 def _stamp(header: Any) -> float:
-    """Time of a message, s."""
     return float(header.stamp.sec + SECOND * header.stamp.nanosec)
 
 
@@ -328,7 +284,7 @@ def _stamp(header: Any) -> float:
 
 def bag_poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
     """Poses of each bag, of a topic with or without covariances, which are not looked at."""
-    for bag in [path] if is_one_bag(path) else sorted(part for part in path.iterdir() if is_one_bag(part)):
+    for bag in _bags(path):
         with _opened(bag) as reader:
             topic = r.topic if r.topic in _topics(reader, POSES) else _chosen(bag, reader, r.topic)
             if r.truth_topic is None:
@@ -337,6 +293,4 @@ def bag_poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
             own, true = (_lines(bag, reader, each) for each in (topic, r.truth_topic))
         if isinstance(own, Fixes) or isinstance(true, Fixes):
             raise InputError(f"{bag}: positions by satellite have no orientations, which motions need")
-        place, pose = Places(own.place, np.arange(len(own.t))), slice(1, POSE)
-        poses = Poses.bare(place, own.t, own.values[:, pose], true.t, true.values[:, pose], "spatial", r.tolerance)
-        yield NamedPoses(bag.stem, poses, own.t)
+        yield bare_poses(bag.stem, own, true, r)

@@ -9,13 +9,12 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.extras import require
-from consistency.referee.outside import outside
+from consistency.referee.extras import outside, require
 from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.referee.readers.formats.text_blocks import Block, blocks
 from consistency.referee.types import Array, Indices
@@ -64,7 +63,6 @@ class TableRows:
 
     @property
     def columns(self) -> str:
-        """The names of the first columns, for messages."""
         names = list(self.data)
         return ", ".join(names[:12]) + ", …" * (len(names) > 12)
 
@@ -94,17 +92,14 @@ class TableRows:
         return values
 
     def rows(self, keep: Array) -> TableRows:
-        """The rows of a mask or of indices."""
         return TableRows(
             self.path, {name: cells[keep] for name, cells in self.data.items()}, self.line[keep], self.unit
         )
 
     def texts(self, column: str) -> Array:
-        """A column as text, (N,)."""
         return np.array([str(cell) for cell in self.data[column]], object)
 
     def empty(self, column: str) -> Array:
-        """Which cells of a column are empty, (N,)."""
         cells = self.data[column]
         return np.isnan(cells) if cells.dtype.kind == "f" else np.array([cell is None for cell in cells], bool)
 
@@ -133,27 +128,24 @@ class Lines:
         return replace(self, values=self.values[:, columns].copy())
 
 
-class Places(Sequence[str]):
+class Places:
     """Places of some rows of a file, put into words when asked for."""
 
     def __init__(self, of: Callable[[int], str], rows: Indices) -> None:
         self._of, self._rows = of, rows
 
-    @overload
-    def __getitem__(self, which: int) -> str: ...
-    @overload
-    def __getitem__(self, which: slice) -> Places: ...
-    def __getitem__(self, which: int | slice) -> str | Places:
-        if isinstance(which, slice):
-            return Places(self._of, self._rows[which])
+    def __getitem__(self, which: int) -> str:
         return self._of(int(self._rows[which]))
 
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def at(self, rows: Indices) -> Places:
-        """Places of some of the rows."""
+    def at(self, rows: Indices | slice) -> Places:
         return Places(self._of, self._rows[rows])
+
+
+def refuse(bad: Any, place: Callable[[int], str], what: str | Callable[[int], str]) -> None:
+    """Refuse rows, (N,) of bool, that are ``bad``, by what is wrong with the first of them."""
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(f"{place(row)}: {what if isinstance(what, str) else what(row)}")
 
 
 def bounded(values: Array) -> Array:
@@ -168,13 +160,18 @@ def are_dof(values: Array) -> Array:
 
 def read_sheet(path: Path) -> TableRows:
     """A CSV file (comma, semicolon or tab; # comments) or a Parquet file."""
-    sheet = _read_parquet(path) if path.suffix.lower() in (".parquet", ".pq") else _read_csv(path)
+    if path.suffix.lower() in (".parquet", ".pq"):
+        if not is_file(path):
+            raise InputError(f"{path}: no such file")
+        require(f"{path}: Parquet", "parquet")
+        columns, rows = outside("columns")(path, "cannot be read as Parquet")
+        sheet = TableRows(path, columns, np.arange(rows), "row")
+    else:
+        sheet = _read_csv(path)
     if not len(sheet):
         raise InputError(f"{path}: holds no row")
     if "filter" in sheet:
-        empty = np.flatnonzero(sheet.empty("filter"))
-        if len(empty):
-            raise InputError(f"{sheet.place(int(empty[0]))}: column 'filter' is empty")
+        refuse(sheet.empty("filter"), sheet.place, "column 'filter' is empty")
         for name in dict.fromkeys(sheet.texts("filter")):
             require_name(name, f"{path}: column 'filter'")
     return sheet
@@ -205,14 +202,6 @@ def _cells(values: Array) -> Column:
     return np.array([None if str(cell) in EMPTY else cell for cell in values.tolist()], object)
 
 
-def _read_parquet(path: Path) -> TableRows:
-    if not is_file(path):
-        raise InputError(f"{path}: no such file")
-    require(f"{path}: Parquet", "parquet")
-    columns, rows = outside("columns")(path, "cannot be read as Parquet")
-    return TableRows(path, columns, np.arange(rows), "row")
-
-
 def _read_csv(path: Path) -> TableRows:
     names: list[str] = []
     separator, tables, line = ",", list[dict[str, Column]](), list[Indices]()
@@ -238,7 +227,6 @@ def _read_csv(path: Path) -> TableRows:
 
 
 def _header(path: Path, line: str) -> tuple[list[str], str]:
-    """Names of the columns, and the character between them."""
     separator = max(",;\t", key=line.count)
     names = [name.strip().strip('"') for name in line.split(separator)]
     twice = {name for name in names if names.count(name) > 1}
@@ -250,15 +238,21 @@ def _header(path: Path, line: str) -> tuple[list[str], str]:
 def _rows(
     path: Path, lines: list[tuple[int, str]], names: list[str], separator: str
 ) -> tuple[dict[str, Column], Indices] | None:
-    """Rows of a table from its lines, and their numbers; None without any."""
+    """Rows of a table from its lines, out of quotes where they are in some, and their numbers; None without any."""
+    rows = []
     for number, line in lines:
-        fields = line.count(separator) + 1
-        if fields != len(names) and '"' not in line:
-            raise InputError(f"{path}, line {number}: has {fields} columns, the header has {len(names)}")
-    if not lines:
-        return None
-    numbers = [number for number, _ in lines]
-    return _columns(_fields(path, lines, separator, len(names)), names), np.array(numbers)
+        fields = line.split(separator)
+        if '"' in line:
+            if line.count('"') % 2:
+                raise InputError(
+                    f"{path}: cannot be read as CSV (line {number}: a quoted field goes over several lines)"
+                )
+            with reading(path, f"line {number} cannot be read as CSV"):
+                (fields,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+        if len(fields) != len(names):
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the header has {len(names)}")
+        rows.append(fields)
+    return (_columns(rows, names), np.array([number for number, _ in lines])) if rows else None
 
 
 def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[str, Column], Indices] | None:
@@ -272,24 +266,6 @@ def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[st
     if found is not None and found[0].shape == (block.count, len(names)):
         return dict(zip(names, found[0].T, strict=True)), numbers
     return _columns([line.split(separator) for line in block.text.splitlines()], names), numbers
-
-
-def _fields(path: Path, lines: list[tuple[int, str]], separator: str, width: int) -> list[list[str]]:
-    """The fields of lines, out of their quotes where they are in some."""
-    rows = []
-    for number, line in lines:
-        fields = line.split(separator)
-        if '"' in line:
-            if line.count('"') % 2:
-                raise InputError(
-                    f"{path}: cannot be read as CSV (line {number}: a quoted field goes over several lines)"
-                )
-            with reading(path, f"line {number} cannot be read as CSV"):
-                (fields,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
-        if len(fields) != width:
-            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the header has {width}")
-        rows.append(fields)
-    return rows
 
 
 def _columns(rows: list[list[str]], names: list[str]) -> dict[str, Column]:
@@ -324,14 +300,8 @@ def _number(cell: object) -> float:
 def _joined(parts: list[Column]) -> Column:
     """Parts of a column below each other, as objects where one of them is."""
     if any(part.dtype.kind == "O" for part in parts):
-        parts = [part if part.dtype.kind == "O" else _objects(part) for part in parts]
+        parts = [part if part.dtype.kind == "O" else np.where(np.isnan(part), np.array(None), part) for part in parts]
     return np.concatenate(parts)
-
-
-def _objects(values: Array) -> Column:
-    cells = values.astype(object)
-    cells[np.isnan(values)] = None
-    return cells
 
 
 def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
@@ -358,16 +328,14 @@ def read_rows(path: Path, widths: Sequence[int], layout: str, header: int = 0) -
 
 def increasing(lines: Lines) -> Lines:
     """Lines whose first column is finite and increases; others are refused."""
-    wrong = np.flatnonzero(~np.isfinite(lines.t))
-    if len(wrong):
-        raise InputError(f"{lines.place(int(wrong[0]))}: the timestamp is not finite")
-    wrong = np.flatnonzero(np.diff(lines.t) <= 0)
-    if len(wrong):
-        row = int(wrong[0]) + 1
-        what = "is there twice" if lines.t[row] == lines.t[row - 1] else "is less than the one before"
-        raise InputError(
-            f"{lines.place(row)}: timestamp {lines.t[row]:.10g} {what}; they must increase, so leave the row out"
-        )
+    t = lines.t
+    refuse(~np.isfinite(t), lines.place, "the timestamp is not finite")
+
+    def what(row: int) -> str:
+        of = "is there twice" if t[row] == t[row - 1] else "is less than the one before"
+        return f"timestamp {t[row]:.10g} {of}; they must increase, so leave the row out"
+
+    refuse(np.append(False, np.diff(t) <= 0), lines.place, what)
     return lines
 
 

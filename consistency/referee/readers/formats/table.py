@@ -10,36 +10,34 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone
-from consistency.referee.diagnostics.records.symmetric import diagonal
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import ADDITIVE, PLANAR, planar_error
-from consistency.referee.readers.alignment.align import Aligned
+from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.readers.file_kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.formats.named_columns import begins_with_numbers, head_of
 from consistency.referee.readers.formats.sheet import Places, TableRows, read_sheet
 from consistency.referee.readers.formats.table_columns import (
     POSE,
+    by_run,
     cross_covariances,
     has_own,
+    manifold_of,
+    matched,
     nis_columns,
-    present_columns,
     require_columns,
-    row_order,
+    samples_of,
     stated_covariance,
     stated_deviations,
 )
-from consistency.referee.readers.formats.table_truth import Samples, manifold_of, matched, samples_of
-from consistency.referee.readers.matching import common_steps, common_times
+from consistency.referee.readers.matching import Aligned, Known, NamedPoses, Poses, common_steps, common_times
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.runs_to_record import Track, assemble
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.readers.relative_motions import Stretch
     from consistency.referee.readers.windows import Relative
 
 
@@ -57,8 +55,10 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
     sheet, note = _sheet(estimates, axes, bool(r.motions))
     estimates = sheet.path
     convention = _convention(r.error, axes, truth)
-    if relative is not None:
-        require_poses(estimates, axes, convention, truth)
+    if relative is not None and truth is None:
+        raise InputError(f"{estimates}: --relative needs --truth FILE, poses in any world")
+    if relative is not None and (axes != POSE or convention == "vector"):
+        raise InputError(f"{estimates}: --relative needs poses x, y, heading, with --error so2, left or right")
     if r.align is not None and manifold_of(convention) != "planar":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
     other, notes = None, [note]
@@ -86,7 +86,7 @@ def _sheet(
     if isinstance(table, TableRows):
         return table, ""
     if is_drive(table):
-        from consistency.referee.readers.formats.kitti_oxts import drive_sheet
+        from consistency.referee.readers.formats.kitti_files import drive_sheet
 
         return drive_sheet(table, body), ""
     return planar_sheet(table, motions) if axes == POSE else (read_sheet(table), "")
@@ -113,14 +113,6 @@ def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | Non
     if convention not in (None, "vector"):
         raise InputError(f"--error {convention}: needs the states x,y,heading; for {','.join(axes)} it is 'vector'")
     return "vector"
-
-
-def require_poses(path: Path, axes: tuple[str, ...], convention: str, truth: Path | None) -> None:
-    """Refuse windows unless the table has planar poses beside a truth."""
-    if truth is None:
-        raise InputError(f"{path}: --relative needs --truth FILE, poses in any world")
-    if axes != POSE or convention == "vector":
-        raise InputError(f"{path}: --relative needs poses x, y, heading, with --error so2, left or right")
 
 
 def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
@@ -152,17 +144,19 @@ def _recording(
     r: Reading,
     relative: Relative | None,
 ) -> Evidence:
-    runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
-    order = row_order(sheet, runs, key)
-    sheet, runs = sheet.rows(order), runs[order]
+    sheet, runs = by_run(sheet, key)
     keys = sheet.numbers(key, finite=True)
-    error = covariance = deviations = of_truth = path = None
-    keep = np.ones(len(runs), bool)
+    numbers = [int(run) for run in np.unique(runs)]
+    members = [np.flatnonzero(runs == run) for run in numbers]
     notes: list[str] = []
-    moved = Aligned(())
+    moved, deviations = Aligned(()), None
+    of_runs: list[dict[str, Array | None]]
     if truth is None:
-        broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *present_columns(sheet, axes)])).all(axis=1)
-        error = None if not broken.any() else np.where(broken, np.nan, 0.0)[:, None]
+        there = [sheet.numbers(axis) for axis in axes if axis in sheet]
+        broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *there])).all(axis=1)
+        of_runs = [
+            {"error": np.where(broken[rows], np.nan, 0.0)[:, None] if broken.any() else None} for rows in members
+        ]
     else:
         own = convention != ADDITIVE and axes == POSE and has_own(sheet)
         deviations = None if own else stated_deviations(sheet, axes)
@@ -170,138 +164,94 @@ def _recording(
         estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
         estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
         samples = samples_of(truth, axes, key, r.truth_covariance)
-        shift, clocks = 0.0, list[str]()
         if relative is not None and deviations is not None:
             raise InputError(
                 f"{sheet.path}: --relative needs covariances; here deviations of each component are stated"
             )
-        if relative is not None:
-            shift = r.shift
-        elif key == "step" and r.align is None:
-            clocks = hints(name, axes, _poses(sheet, samples, runs, keys, estimate, covariance, convention, 0.0))
-        else:
-            reach = r.tolerance if key == "t" else 0.0
-            poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, reach)
-            from consistency.referee.readers.clock_offset import clocks_and_frames
+        true_of = [samples.of(run) for run in numbers]
+        if missing := [run for run, true in zip(numbers, true_of, strict=True) if not len(true.keys)]:
+            has = ", ".join(map(str, [] if samples.runs is None else np.unique(samples.runs)[:5]))
+            raise InputError(
+                f"{truth.path}: holds no run {missing[0]} (it has {has}); without a column 'run' it serves all"
+            )
+        moved = Aligned([
+            Poses(
+                Places(sheet.place, rows), keys[rows], estimate[rows], covariance[rows], np.ones(len(rows), bool),
+                true.keys, true.values, manifold_of(convention), convention, r.tolerance if key == "t" else 0.0,
+                true_covariance=true.covariance,
+            )
+            for rows, true in zip(members, true_of, strict=True)
+        ])  # fmt: skip
+        shift, clocks = r.shift, list[str]()
+        if relative is None:
+            if key == "t" or r.align is not None:
+                from consistency.referee.readers.clock_offset import clocks_and_frames
 
-            shift, clocks, moved = clocks_and_frames(name, poses, r.time_offset, r.align, range(len(axes)))
+                shift, clocks, moved = clocks_and_frames(name, moved.runs, r.time_offset, r.align, range(len(axes)))
             clocks += [*moved.notes, *hints(name, axes, moved.runs, shift)]
-            if r.align is not None:
-                there = np.isin(runs, np.unique(samples.runs)) if samples.runs is not None else np.ones(len(runs), bool)
-                estimate[there] = np.concatenate([p.estimate for p in moved.runs])
-                covariance[there] = np.concatenate([p.covariance for p in moved.runs])
-        keep, true, of_truth, notes = matched(
-            name, sheet, truth, samples, runs, keys + shift, key, axes, convention, r.tolerance
-        )
+        known, notes = matched(name, sheet, truth, samples, key, numbers, members, moved.runs, shift, r.tolerance)
         if relative is not None:
-            from consistency.referee.readers.relative_motions import relative_recording
+            from consistency.referee.readers.relative_motions import Stretch, relative_recording
 
-            stretches = _stretches(sheet, runs, keep, true, estimate, covariance, convention, relative)
+            t = sheet.numbers("t", finite=True) if "t" in sheet else np.full(len(runs), np.nan)
+            cross = None if relative.motions else cross_covariances(sheet)
+            stretches = [
+                Stretch(
+                    run, str(sheet.path), p.place, t[rows], p.estimate, p.covariance,
+                    None if cross is None else cross[rows], found.rows, found.truth, convention,
+                )
+                for run, rows, p, found in zip(numbers, members, moved.runs, known, strict=True)
+            ]  # fmt: skip
             record = relative_recording(name, str(sheet.path), stretches, axes, range(len(axes)), relative)
             return replace(record, notes=(*notes, *record.notes))
         if deviations is not None:
             notes.append(
                 f"{name}: standard deviations without cross terms are stated, so each component is judged by itself"
             )
-        notes += clocks
-        error = planar_error(true, estimate, convention) if axes == POSE else true - estimate
-        plane = 3 if axes[:3] == ("x", "y", "z") else 2
-        path = np.stack([true[:, :plane], estimate[:, :plane]], axis=1) if axes[:2] == ("x", "y") else None
-        notes.append(f"error convention {convention}: {PLANAR[convention]}")
+        notes += [*clocks, f"error convention {convention}: {PLANAR[convention]}"]
         if own:
             notes.append(f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error")
-        if key == "step":
-            keep &= ~_exact_start(keys, covariance)
+        if key == "step" and not (keys < 0).any():
+            kinds = classify(np.concatenate([p.covariance[p.t == 0] for p in moved.runs]), ROUNDED)
+            # rows of step 0 where no run is uncertain yet: the start, not an estimate
+            if np.isin(kinds, (Validity.DEFICIENT, Validity.INDEFINITE)).all():
+                known = [
+                    Known(*(values[p.t[found.rows] != 0] for values in found))
+                    for p, found in zip(moved.runs, known, strict=True)
+                ]
+        plane = 3 if axes[:3] == ("x", "y", "z") else 2
+        of_runs = [
+            {
+                "error": p.error_of(found.rows, found.truth), "covariance": p.covariance[found.rows],
+                "truth_covariance": p.truth_covariances(found, shift),
+                "path": np.stack([found.truth[:, :plane], p.estimate[found.rows, :plane]], axis=1)
+                if axes[:2] == ("x", "y") else None,
+            }
+            for p, found in zip(moved.runs, known, strict=True)
+        ]  # fmt: skip
+        members = [rows[found.rows] for rows, found in zip(members, known, strict=True)]
     nis, dof = nis_columns(sheet)
-    numbers = [int(run) for run in np.unique(runs[keep])]
-    members = [np.flatnonzero(keep & (runs == run)) for run in numbers]
+    clock = sheet.numbers("t") if "t" in sheet else None
+    some = [each for each in zip(numbers, members, of_runs, strict=True) if len(each[1])]
+    members = [rows for _, rows, _ in some]
     if key == "step":
         columns, steps = common_steps([keys[rows] for rows in members])
         t = np.full(len(steps), np.nan)
-        if "t" in sheet:
-            times = sheet.numbers("t")
+        if clock is not None:
             for rows, column in zip(reversed(members), reversed(columns), strict=True):
-                t[column] = times[rows]
+                t[column] = clock[rows]
         if not np.array_equal(steps, np.arange(1, len(steps) + 1)):
             notes.append(f"{name}: step k below is the k-th step of the file, which has {steps[0]:g} to {steps[-1]:g}")
     else:
         columns, t = common_times([keys[rows] for rows in members])
-    clock = sheet.numbers("t") if "t" in sheet else None
-    tracks = [
-        Track(
-            run,
-            column,
-            Places(sheet.place, rows),
-            *(
-                None if values is None else values[rows]
-                for values in (error, covariance, nis, dof, None, clock, of_truth, path)
-            ),
-        )
-        for run, rows, column in zip(numbers, members, columns, strict=True)
-    ]
+    tracks = []
+    for (run, rows, arrays), column in zip(some, columns, strict=True):
+        own_nis, own_dof, own_t = (None if values is None else values[rows] for values in (nis, dof, clock))
+        tracks.append(Track(run, column, Places(sheet.place, rows), nis=own_nis, nis_dof=own_dof, t=own_t, **arrays))
     record = assemble(name, tracks, t, axes, str(sheet.path), convention if truth is not None else "", notes)
     if truth is None:
         return replace(record, error=None, dof=0)
     return moved.on(each_alone(record) if deviations is not None else record)
-
-
-def _stretches(
-    sheet: TableRows, runs: Array, keep: Array, true: Array, estimate: Array, covariance: Array, convention: str,
-    relative: Relative,
-) -> list[Stretch]:  # fmt: skip
-    """Each run before its windows are taken."""
-    from consistency.referee.readers.relative_motions import Stretch
-
-    t = sheet.numbers("t", finite=True) if "t" in sheet else np.full(len(runs), np.nan)
-    cross = None if relative.motions else cross_covariances(sheet)
-    found = []
-    for run in np.unique(runs[keep]):
-        rows = np.flatnonzero(runs == run)
-        known = np.flatnonzero(keep[rows])
-        found.append(
-            Stretch(
-                int(run), str(sheet.path), Places(sheet.place, rows), t[rows], estimate[rows], covariance[rows],
-                None if cross is None else cross[rows], known, true[rows[known]], convention,
-            )
-        )  # fmt: skip
-    return found
-
-
-def _poses(
-    sheet: TableRows,
-    samples: Samples,
-    runs: Array,
-    t: Array,
-    estimate: Array,
-    covariance: Array,
-    convention: str,
-    max_dt: float,
-) -> list[Poses]:
-    """Each run that has a truth, with it."""
-    found = []
-    for run in np.unique(runs):
-        rows, true = np.flatnonzero(runs == run), samples.of(run)
-        if len(true.keys):
-            place = Places(sheet.place, rows)
-            found.append(
-                Poses(
-                    place, t[rows], estimate[rows], covariance[rows], np.ones(len(rows), bool), true.keys, true.values,
-                    manifold_of(convention), convention, max_dt,
-                )
-            )  # fmt: skip
-    return found
-
-
-def _exact_start(steps: Array, covariance: Array) -> Array:
-    """Rows of step 0 where no run is uncertain yet: the start, not an estimate."""
-    start: Array = steps == 0
-    if not start.any() or (steps < 0).any() or not _is_exact(covariance[start]):
-        return np.zeros(len(steps), bool)
-    return start
-
-
-def _is_exact(covariance: Array) -> bool:
-    return bool(np.isin(classify(covariance, ROUNDED), (Validity.DEFICIENT, Validity.INDEFINITE)).all())
 
 
 # --- poses alone -------------------------------------------------------------------------------------
@@ -317,9 +267,7 @@ def table_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
     require_columns(sheet, POSE)
     key = _key(sheet, truth, r)
     samples = samples_of(truth, POSE, key, None)
-    runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
-    order = row_order(sheet, runs, key)
-    sheet, runs = sheet.rows(order), runs[order]
+    sheet, runs = by_run(sheet, key)
     keys, clock = sheet.numbers(key, finite=True), sheet.numbers("t") if "t" in sheet else np.full(len(runs), np.nan)
     estimate = np.column_stack([sheet.numbers(axis) for axis in POSE])
     for run in np.unique(runs):

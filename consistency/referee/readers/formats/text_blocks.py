@@ -51,7 +51,6 @@ class Block:
 
     @cached_property
     def count(self) -> int:
-        """Number of lines."""
         return len(self._starts) if self.plain else len(self.text.splitlines())
 
     def lines(self) -> list[tuple[int, str]]:
@@ -60,7 +59,6 @@ class Block:
         return [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
 
     def count_of(self, character: bytes) -> Indices:
-        """How often a character is in each line of a plain block."""
         return self._per_line(np.frombuffer(self.data, np.uint8) == ord(character))
 
     def numbers(self, separator: bytes = b",") -> tuple[Array, Indices] | None:
@@ -86,12 +84,10 @@ class Block:
 
     @cached_property
     def _starts(self) -> Indices:
-        """Where the lines of a plain block begin."""
         after = np.flatnonzero(np.frombuffer(self.data, np.uint8) == NEWLINE) + 1
         return np.concatenate([[0], after[after < len(self.data)]])
 
     def _per_line(self, marks: Array) -> Indices:
-        """How many of the bytes in each line are marked."""
         return np.asarray(np.add.reduceat(marks, self._starts, dtype=np.int64))
 
 

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.records.symmetric import diagonal
+from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.readers.file_kinds import TABLES, is_drive, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
-from consistency.referee.readers.formats.kitti_oxts import read_drive
-from consistency.referee.readers.formats.openvins import LAYOUT, States, read_deviations
-from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, POINT, POSE, SPLIT, TRIANGLE, read_poses
+from consistency.referee.readers.formats.kitti_files import read_drive
+from consistency.referee.readers.formats.pose_rows import (
+    DEVIATIONS,
+    DEVIATIONS_LAYOUT,
+    FULL,
+    POINT,
+    POSE,
+    SPLIT,
+    TRIANGLE,
+    States,
+    read_deviations,
+    read_poses,
+)
 from consistency.referee.readers.formats.position_truth import fixed, position_source, positions
-from consistency.referee.readers.formats.sheet import Lines, Places, read_numbers
-from consistency.referee.readers.matching import associate
+from consistency.referee.readers.formats.sheet import Lines, Places, read_numbers, refuse
+from consistency.referee.readers.matching import NamedPoses, Poses, associate
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.space_trajectories import (
     ALONE,
@@ -52,52 +61,71 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
     cross-covariance is not in the file, so a joint NEES would be wrong. With the states and standard deviations of a
     simulation each component is one. The truth may be a drive of KITTI.
     """
-    order = r.covariance_order
     if r.error not in (None, *INERTIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    if order not in (None, *ORDERS):
-        raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}")
+    if r.covariance_order not in (None, *ORDERS):
+        raise InputError(f"--covariance-order {r.covariance_order}: must be {' or '.join(ORDERS)}")
     require_axes(r.axes, STATE)
     if r.truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
-    runs = _runs(estimates, r.truth, r.covariance)
+    files = _runs(estimates, r.truth, r.covariance)
     truth_of = _truths(r)
-    parts: Mapping[str, range] = WHOLE
-    poses: list[Poses] = []
-    notes: list[str] = []
-    for path, true_path, P_path in runs:
-        own, true = read_trajectory(path), truth_of(true_path)
-        own, true, world = localised(own, true)
-        notes += [note for note in (own.note, true.note, world, unused(true, r)) if note]
-        if not poses:
-            parts = _parts(own)
-            error_kind = r.error or ("so3" if parts in (WHOLE, ALONE) else "so3-body")
-            require_error(own, r.error)
-        if parts not in (WHOLE, ALONE) and order == ORDERS[0]:
-            raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
-        if _parts(own) is not parts:
-            raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
-        if isinstance(own, Fixes):
-            poses.append(fixed(own, true, r, of_truth(true, own, ORDERS[0], r)))
-            continue
-        k, why = judged_rest(own, true, r, relative)
-        notes += [why] * bool(why)
-        poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r, k))
-        if _is_point(true):
-            poses[-1] = positions(poses[-1], r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE)
-    why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
-    files = [(path, true) for path, true, _ in runs]
-    source = TrajectorySource(estimates, files, r.covariance or estimates, why, tuple(dict.fromkeys(notes)))
-    if any(one.manifold == "vector" for one in poses):
-        source = position_source(source, poses, "" if parts is POINTS else error_kind, r, relative)
-    elif r.lever_arm is not None:
-        raise InputError("--lever-arm: goes with a truth of positions alone; this one has the orientation of its body")
+    runs = ((read_trajectory(path), truth_of(true), P, list[str]()) for path, true, P in files)
+    source, poses, parts = poses_of(estimates, [(path, true) for path, true, _ in files], runs, r, relative)
     return recordings_of(source, poses, parts, r, relative)
 
 
-def _truths(r: Reading) -> Callable[[Path], Lines]:
-    """Reads a truth, once where runs that follow each other have the same."""
+def poses_of(
+    estimates: Path,
+    files: Sequence[tuple[Path | str, Path | str]],
+    runs: Iterable[tuple[Lines, Lines, Path | None, list[str]]],
+    r: Reading,
+    relative: Relative | None = None,
+    why: str = "",
+    mixed: str = "",
+) -> tuple[TrajectorySource, list[Poses], Mapping[str, range]]:
+    """Runs before any error is taken, with their origin, and the components whose covariance is known.
 
+    Parameters
+    ----------
+    files : of each run: its estimates, its truth
+    runs : estimates and truth, a file of covariances where they are not in the lines, and notes
+    why : reason for the default error, as the end of a note; that of the layout where empty
+    mixed : message where runs are of different layouts
+    """
+    order = r.covariance_order or ORDERS[0]
+    parts: Mapping[str, range] = WHOLE
+    poses: list[Poses] = []
+    notes: list[str] = []
+    for (path, _), (own, true, P_path, said) in zip(files, runs, strict=True):
+        own, true, world = localised(own, true)
+        notes += [note for note in (own.note, true.note, world, unused(true, r), *said) if note]
+        if not poses:
+            parts, is_fixed = _parts(own), isinstance(own, Fixes)
+            error_kind = r.error or ("so3" if parts in (WHOLE, ALONE) else "so3-body")
+            require_error(own, r.error)
+        if parts not in (WHOLE, ALONE) and r.covariance_order == ORDERS[0]:
+            raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
+        if _parts(own) is not parts:
+            raise InputError(mixed or f"{path}: has {own.values.shape[1]} columns, {files[0][0]} another layout")
+        if isinstance(own, Fixes):
+            poses.append(fixed(own, true, r, of_truth(true, own, ORDERS[0], r)))
+            continue
+        k, unjudged = judged_rest(own, true, r, relative)
+        notes += [unjudged] * bool(unjudged)
+        poses.append(_poses(own, true, P_path, error_kind, order, r, k))
+        if _is_point(true):
+            poses[-1] = positions(poses[-1], r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE)
+    why = "" if r.error else why or f"; the default of this layout, {_origin(parts)}"
+    source = TrajectorySource(estimates, files, r.covariance or estimates, why, tuple(dict.fromkeys(notes)))
+    if any(one.manifold == "vector" for one in poses):
+        source = position_source(source, poses, "" if is_fixed else error_kind, r, relative)
+    elif r.lever_arm is not None:
+        raise InputError("--lever-arm: goes with a truth of positions alone; this one has the orientation of its body")
+    return source, poses, parts
+
+
+def _truths(r: Reading) -> Callable[[Path], Lines]:
     @lru_cache(maxsize=1)
     def read(path: Path) -> Lines:
         return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, true=True)
@@ -106,14 +134,13 @@ def _truths(r: Reading) -> Callable[[Path], Lines]:
 
 
 def _is_point(lines: Lines) -> bool:
-    """Whether they hold positions without orientations."""
     return lines.values.shape[1] == POINT or isinstance(lines, Fixes)
 
 
 def _parts(own: Lines) -> Mapping[str, range]:
     """Components whose covariance is known, by the layout of a file."""
     if isinstance(own, Fixes):
-        return POINTS
+        return ALONE if own.alone else POINTS
     if isinstance(own, States):
         return SINGLE
     stated = own.values.shape[1] - POSE
@@ -187,7 +214,11 @@ def _poses(
         if source.values.shape[1] == 1 + BOTH:
             cross = _cross(own, source, rows, picked, order)
     if covariance is None:
-        of = f"the standard deviations of {LAYOUT}" if isinstance(own, States) else f"lines of t and {FULL} numbers"
+        of = (
+            f"the standard deviations of {DEVIATIONS_LAYOUT}"
+            if isinstance(own, States)
+            else f"lines of t and {FULL} numbers"
+        )
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
     covariance = covariance[:, : 6 + k, : 6 + k]
     P = np.full((len(own.t), 6 + k, 6 + k), np.nan)
@@ -195,17 +226,17 @@ def _poses(
     with_P = np.zeros(len(own.t), bool)
     with_P[rows] = True
     own = own.of(slice(0, POSE))
-    place, (estimate, true) = Places(own.place, np.arange(len(own.t))), (_states(lines, k) for lines in (own, truth))
+    estimate, true = (
+        np.column_stack([each.values[:, 1:POSE], each.rest[:, :k]])
+        if k and each.rest is not None
+        else each.values[:, 1:POSE]
+        for each in (own, truth)
+    )
+    place = Places(own.place, np.arange(len(own.t)))
     return Poses(
         place, own.t, estimate, P, with_P, truth.t, true, "spatial", convention, tolerance, cross,
         of_truth(truth, own, order, r),
     )  # fmt: skip
-
-
-def _states(lines: Lines, k: int) -> Array:
-    """Poses (N, 7 + k) with ``k`` numbers of the velocity and the biases."""
-    pose = lines.values[:, 1:POSE]
-    return pose if lines.rest is None or not k else np.column_stack([pose, lines.rest[:, :k]])
 
 
 def _width(lines: Lines) -> int:
@@ -267,11 +298,9 @@ def of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
 
 def _cross(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str) -> Array:
     """Cross-covariances with the line before, on the rows of ``own``, (N, 6, 6)."""
-    if len(gap := np.flatnonzero(np.diff(picked) != 1)):
-        raise InputError(
-            f"{source.place(int(picked[gap[0]]) + 1)}: no pose of {own.path} has this time, but the "
-            "cross-covariance of the next line is with this one; give each line its pose"
-        )
+    what = "but the cross-covariance of the next line is with this one; give each line its pose"
+    gap = np.diff(picked) != 1
+    refuse(gap, lambda row: source.place(int(picked[row]) + 1), f"no pose of {own.path} has this time, {what}")
     out = np.full((len(own.t), 6, 6), np.nan)
     out[rows] = _matrices(source.values[picked, 1 + FULL :], order)
     return out
@@ -291,26 +320,17 @@ def read_trajectory(path: Path, true: bool = False) -> Lines:
     """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
     lines = read_poses(path, true)
     pose = lines.values[:, 1:POSE]
-    if true and not np.isfinite(pose).all():
-        row = int(np.flatnonzero(~np.isfinite(pose).all(axis=1))[0])
-        raise InputError(f"{lines.place(row)}: the truth is not finite; leave such lines out")
+    finite = np.isfinite(pose).all(axis=1)
+    if true:
+        refuse(~finite, lines.place, "the truth is not finite; leave such lines out")
     if _is_point(lines):
         return lines
     length = np.linalg.norm(pose[:, 3:], axis=1)
-    bad = np.flatnonzero(np.isfinite(pose).all(axis=1) & (np.abs(length - 1.0) > UNIT))
-    if len(bad):
-        row = int(bad[0])
-        raise InputError(
-            f"{lines.place(row)}: the quaternion has length {length[row]:.4g}, not 1; {_columns_of(lines)}"
-        )
+    columns = f"columns {'2 to 5' if isinstance(lines, States) else '5 to 8'} must be qx qy qz qw"
+    where = lines.note.partition(": ")[2] or columns
+    bad = finite & (np.abs(length - 1.0) > UNIT)
+    refuse(bad, lines.place, lambda row: f"the quaternion has length {length[row]:.4g}, not 1; {where}")
     return lines
-
-
-def _columns_of(lines: Lines) -> str:
-    """Where a quaternion should be."""
-    if lines.note:
-        return lines.note.partition(": ")[2]
-    return f"columns {'2 to 5' if isinstance(lines, States) else '5 to 8'} must be qx qy qz qw"
 
 
 def read_covariances(path: Path) -> Lines:
@@ -370,6 +390,11 @@ def trajectory_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
         for lines, name in ((own, path), (truth, true_path)):
             if _is_point(lines):
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")
-        place, pose = Places(own.place, np.arange(len(own.t))), slice(1, POSE)
-        poses = Poses.bare(place, own.t, own.values[:, pose], truth.t, truth.values[:, pose], "spatial", r.tolerance)
-        yield NamedPoses(path.stem, poses, own.t)
+        yield bare_poses(path.stem, own, truth, r)
+
+
+def bare_poses(name: str, own: Lines, truth: Lines, r: Reading) -> NamedPoses:
+    """A run of poses in space without covariances."""
+    place, pose = Places(own.place, np.arange(len(own.t))), slice(1, POSE)
+    poses = Poses.bare(place, own.t, own.values[:, pose], truth.t, truth.values[:, pose], "spatial", r.tolerance)
+    return NamedPoses(name, poses, own.t)

@@ -5,15 +5,23 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
-from consistency.referee.readers.alignment.bodies import fitted_body, on_body
-from consistency.referee.readers.alignment.world_frames import WorldTransform, fitted_frame, moved, spread
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.alignment.world_frames import (
+    WorldTransform,
+    fitted_body,
+    fitted_frame,
+    moved,
+    on_body,
+    spread,
+)
+from consistency.referee.readers.matching import Poses
 from consistency.referee.types import Array
 
 ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
@@ -21,6 +29,8 @@ DEGREE = np.pi / 180.0
 MILLI = 1e-3
 ARM = 1e-3  # of the size of the path: shorter lever arms are not named
 TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
+
+OF = {"both files": ("estimate", "truth"), "the estimates": ("estimate",), "the truth": ("truth",)}  # fields of poses
 
 Change = Callable[[Poses], Poses]
 
@@ -38,7 +48,10 @@ class Guess:
 def guesses_of(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
     """Possible mix-ups, the likelier first."""
     kind, convention = runs[0].manifold, runs[0].convention
-    guesses = [*_covariances()]
+    guesses = [
+        Guess("its diagonal holds standard deviations; square them", _squared),
+        Guess("it is an information matrix; invert it", _inverted),
+    ]
     if kind == "spatial":
         own = [*_orders(convention), *_quaternions(), *guesses, *_permuted(axes, 3)]
         return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_positions(3), *_frames(runs), *_bodies(runs)]
@@ -51,55 +64,47 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
 def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator[Guess]:
     """Components of the covariance, or of estimates and covariance, in another order; of six in both blocks alike."""
     n = width if len(axes) != 2 * width else 2 * width
-    if width > SWAPS:
-        return
-    orders: Iterable[tuple[int, ...]] = itertools.permutations(range(width))
-    if width > ALL_ORDERS:
-        orders = (_swap(width, *pair) for pair in itertools.combinations(range(width), 2))
-    for order in orders:
-        if order == tuple(range(width)):
-            continue
-        there = [axes[order.index(slot)] for slot in range(width)]
-        words = f"in the order {', '.join(there)}{' (rotations alike)' * (n > width)}"
+    what = "the components of the covariance are {}"
+    if states:
+        what = "the components of the estimates and of their covariance are {}, beside those of the truth"
+    for order, there in _other_orders(axes, width):
+        words = what.format(f"in the order {there}{' (rotations alike)' * (n > width)}")
         whole = [*order, *(width + i for i in order)][:n]
-        if states:
-            what = f"the components of the estimates and of their covariance are {words}, beside those of the truth"
-        else:
-            what = f"the components of the covariance are {words}"
-        change = _reordered_states(whole, whole) if states else _reordered(whole)
-        yield Guess(f"{what}; write them as {', '.join(axes[:width])}", change)
+        yield Guess(f"{words}; write them as {', '.join(axes[:width])}", _reordered(whole if states else None, whole))
 
 
 def _positions(width: int) -> Iterator[Guess]:
     """Coordinates of the estimates of poses in another order, with the blocks of their covariance or without."""
     axes = "xyz"[:width]
-    for order in itertools.permutations(range(width)):
-        if order == tuple(range(width)):
-            continue
-        there = ", ".join(axes[order.index(slot)] for slot in range(width))
+    turned, rest = ([3, 4, 5, 6], [3, 4, 5]) if width == 3 else ([2], [2])
+    for order, there in _other_orders(axes, width):
         words = f"of the estimates are in the order {there}; write them as {', '.join(axes)}"
-        turned, rest = ([3, 4, 5, 6], [3, 4, 5]) if width == 3 else ([2], [2])
-        place, both = [*order, *turned], [*order, *rest]
-        yield Guess(f"the positions {words}", _reordered_estimates(place), fine=False)
-        yield Guess(f"positions and covariance {words}", _reordered_states(place, both), fine=False)
+        yield Guess(f"the positions {words}", _reordered([*order, *turned]), fine=False)
+        yield Guess(f"positions and covariance {words}", _reordered([*order, *turned], [*order, *rest]), fine=False)
 
 
-def _swap(width: int, i: int, j: int) -> tuple[int, ...]:
-    order = list(range(width))
-    order[i], order[j] = j, i
-    return tuple(order)
+def _other_orders(axes: Sequence[str], width: int) -> Iterator[tuple[list[int], str]]:
+    """Other orders of the first ``width`` axes, with the axes in this order; swaps of two of many, none of too many."""
+    same = list(range(width))
+    orders: Iterable[Iterable[int]] = itertools.permutations(same)
+    if width > ALL_ORDERS:
+        orders = ([{i: j, j: i}.get(k, k) for k in same] for i, j in itertools.combinations(same, 2))
+    for order in map(list, orders if width <= SWAPS else ()):
+        if order != same:
+            yield order, ", ".join(axes[order.index(slot)] for slot in same)
 
 
-def _reordered(order: list[int]) -> Change:
-    return lambda p: replace(p, covariance=p.covariance[:, order][:, :, order])
+def _reordered(
+    estimate: list[int] | None = None, covariance: list[int] | None = None, convention: str | None = None
+) -> Change:
+    """Columns of the estimates, components of their covariance, and its error, in place of others where given."""
 
+    def change(p: Poses) -> Poses:
+        p = p if estimate is None else replace(p, estimate=p.estimate[:, estimate])
+        p = p if covariance is None else replace(p, covariance=p.covariance[:, covariance][:, :, covariance])
+        return p if convention is None else replace(p, convention=convention)
 
-def _reordered_estimates(order: list[int]) -> Change:
-    return lambda p: replace(p, estimate=p.estimate[:, order])
-
-
-def _reordered_states(estimate: list[int], covariance: list[int]) -> Change:
-    return lambda p: _reordered(covariance)(_reordered_estimates(estimate)(p))
+    return change
 
 
 def _ned(convention: str) -> Iterator[Guess]:
@@ -124,7 +129,6 @@ def _ned(convention: str) -> Iterator[Guess]:
 
 
 def _mirrored(convention: str) -> Guess:
-    """A plane of x north and y east."""
     A = np.diag([1.0, -1.0, -1.0])
     if convention != "left":
         A[:2, :2] = [[0.0, 1.0], [1.0, 0.0]]
@@ -145,53 +149,43 @@ def _orders(convention: str) -> Iterator[Guess]:
             if (other, turned) != (convention, False):
                 words = [] if other == convention else [f"the error is '{other}' (--error {other})"]
                 words += ["the covariance has its two blocks in the other order (--covariance-order)"] if turned else []
-                yield Guess(" and ".join(words), _read_as(other, swap if turned else [0, 1, 2, 3, 4, 5]))
-
-
-def _read_as(convention: str, order: list[int]) -> Change:
-    return lambda p: replace(p, convention=convention, covariance=p.covariance[:, order][:, :, order])
+                yield Guess(" and ".join(words), _reordered(None, swap if turned else [0, 1, 2, 3, 4, 5], other))
 
 
 def _sides(convention: str) -> Iterator[Guess]:
     for other in PLANAR:
         if other not in (convention, "vector"):
-            yield Guess(f"the error is '{other}' (--error {other})", _read_as(other, [0, 1, 2]))
+            yield Guess(f"the error is '{other}' (--error {other})", _reordered(None, [0, 1, 2], other))
 
 
 def _quaternions() -> Iterator[Guess]:
     first = [0, 1, 2, 4, 5, 6, 3]
-    yield Guess(
-        "the quaternions of both files are w x y z; write them x y z w",
-        lambda p: replace(p, estimate=p.estimate[:, first], truth=p.truth[:, first]),
-    )
-    yield Guess(
-        "the quaternions of the estimates are w x y z; write them x y z w",
-        lambda p: replace(p, estimate=p.estimate[:, first]),
-    )
-    yield Guess(
-        "the quaternions of the truth are w x y z; write them x y z w", lambda p: replace(p, truth=p.truth[:, first])
-    )
+    for of, names in OF.items():
+        words = f"the quaternions of {of} are w x y z; write them x y z w"
+        yield Guess(words, _changed(names, lambda values: values[:, first]))
     back = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
     yield Guess(
         "the quaternions of the estimates turn world into body; invert them",
-        lambda p: replace(p, estimate=p.estimate * back),
+        _changed(["estimate"], lambda values: values * back),
     )
+
+
+def _changed(names: Sequence[str], function: Callable[[Array], Any]) -> Change:
+    return lambda p: replace(p, **{name: function(getattr(p, name)) for name in names})
 
 
 def _headings() -> Iterator[Guess]:
     degrees = np.array([1.0, 1.0, DEGREE])
     remedy = "; multiply them by pi / 180"
-    yield Guess(f"the headings of both files are in degrees{remedy}", lambda p: _scaled(p, degrees, degrees))
-    yield Guess(f"the headings of the estimates are in degrees{remedy}", lambda p: _scaled(p, degrees, None))
-    yield Guess(f"the headings of the truth are in degrees{remedy}", lambda p: _scaled(p, None, degrees))
+    for of, names in OF.items():
+        yield Guess(f"the headings of {of} are in degrees{remedy}", partial(_scaled, names, degrees))
     both = "the headings of both files and their variances are in degrees"
-    yield Guess(f"{both}{remedy}", lambda p: _weighed(_scaled(p, degrees, degrees), slice(2, 3), DEGREE))
+    yield Guess(f"{both}{remedy}", lambda p: _weighed(_scaled(OF["both files"], degrees, p), slice(2, 3), DEGREE))
 
 
-def _scaled(p: Poses, estimate: Array | None, truth: Array | None) -> Poses:
-    ones = np.ones(p.estimate.shape[1])
-    p = replace(p, estimate=p.estimate * (ones if estimate is None else estimate))
-    p = replace(p, truth=p.truth * (ones if truth is None else truth))
+def _scaled(names: Sequence[str], factors: Array, p: Poses) -> Poses:
+    """Estimates and truth with the columns of ``names`` times factors, and headings within half a turn."""
+    p = replace(p, **{name: getattr(p, name) * (factors if name in names else 1.0) for name in ("estimate", "truth")})
     for values in (p.estimate, p.truth):
         values[:, 2] = wrap(values[:, 2])
     return p
@@ -216,22 +210,14 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
         "the positions of the estimates and their covariance are in millimetres; divide them by 1000",
         lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),
     )
-    for of, change in (
-        ("truth", lambda p: replace(p, truth=shrunk(p.truth))),
-        ("estimates", lambda p: replace(p, estimate=shrunk(p.estimate))),
-    ):
-        yield Guess(f"the positions of the {of} are in millimetres; divide them by 1000", change)
+    for of in ("the truth", "the estimates"):
+        yield Guess(f"the positions of {of} are in millimetres; divide them by 1000", _changed(OF[of], shrunk))
 
 
 def _weighed(p: Poses, part: slice, factor: float) -> Poses:
     scale = np.ones(p.covariance.shape[-1])
     scale[part] = factor
     return replace(p, covariance=p.covariance * scale[:, None] * scale)
-
-
-def _covariances() -> Iterator[Guess]:
-    yield Guess("its diagonal holds standard deviations; square them", _squared)
-    yield Guess("it is an information matrix; invert it", _inverted)
 
 
 def _squared(p: Poses) -> Poses:

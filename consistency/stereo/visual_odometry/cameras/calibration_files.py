@@ -8,11 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import read_text, reading
+from consistency.referee.parsing import one_line, read_text, reading
+from consistency.referee.readers.formats.kitti_files import numbers, read_keys, turn
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.boofcv import read_boofcv
-from consistency.stereo.visual_odometry.cameras.camera_pair import EUROC_BODY, Calibration, checked, distortion, sized
-from consistency.stereo.visual_odometry.cameras.kitti_calibration import read_kitti, read_kitti_raw
+from consistency.stereo.visual_odometry.cameras.camera_pair import (
+    CAMERA_0,
+    EUROC_BODY,
+    Calibration,
+    checked,
+    distortion,
+    sized,
+)
 from consistency.stereo.visual_odometry.cameras.yaml_file import matrix, read_yaml
 
 # names that tools give to the same thing; the first one is used in messages
@@ -145,3 +151,119 @@ def _require_known(path: Path, data: dict[str, Any], missing: list[str]) -> None
 
 def _number(path: Path, data: dict[str, Any], key: str) -> float:
     return float(sized(path, key, data[key], 1)[0])
+
+
+def read_boofcv(path: Path) -> Calibration:
+    """``stereo.yaml`` of BoofCV: left and right pin-hole cameras, rightToLeft with x_left = R x_right + (x, y, z)."""
+    data = read_yaml(path)
+    cameras = [_boofcv_camera(path, data, side) for side in ("left", "right")]
+    pose = _part(path, data, "rightToLeft")
+    R = sized(path, "rightToLeft.rotation", pose.get("rotation"), 9).reshape(3, 3)
+    t = np.array([float(sized(path, f"rightToLeft.{key}", pose.get(key), 1)[0]) for key in "xyz"])
+    (K_left, D_left, size), (K_right, D_right, other) = cameras
+    if size != other:
+        raise InputError(f"{path}: left has {size[0]} x {size[1]} px, right {other[0]} x {other[1]}; must be equal")
+    return checked(Calibration(str(path), K_left, K_right, D_left, D_right, R.T, -R.T @ t, size))
+
+
+def _boofcv_camera(path: Path, data: dict[str, Any], side: str) -> tuple[Array, Array, tuple[int, int]]:
+    camera = _part(path, data, side)
+    model = camera.get("model")
+    if model not in ("pinhole", "pinhole_radial_tangential"):
+        raise InputError(
+            f"{path}: key '{side}.model': {one_line(str(model))} is not pinhole or pinhole_radial_tangential"
+        )
+    lens = _part(path, camera, "pinhole", f"{side}.")
+    keys = ("fx", "fy", "cx", "cy", "skew", "width", "height")
+    fx, fy, cx, cy, skew, width, height = (
+        float(sized(path, f"{side}.pinhole.{key}", lens.get(key), 1)[0]) for key in keys
+    )
+    if skew != 0.0:
+        raise InputError(f"{path}: key '{side}.pinhole.skew': {skew:g}, only 0 is taken; calibrate with zero skew")
+    D = np.zeros(5)
+    if model != "pinhole":
+        bend = _part(path, camera, "radial_tangential", f"{side}.")
+        radial = matrix(path, f"{side}.radial_tangential.radial", bend.get("radial") or [0.0]).ravel()
+        if radial.size > 3:
+            raise InputError(f"{path}: key '{side}.radial_tangential.radial': has {radial.size} numbers, 3 at most")
+        D[[0, 1, 4][: radial.size]] = radial
+        D[2:4] = [
+            float(sized(path, f"{side}.radial_tangential.{key}", bend.get(key, 0.0), 1)[0]) for key in ("t1", "t2")
+        ]
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), D, (int(width), int(height))
+
+
+def _part(path: Path, data: dict[str, Any], key: str, before: str = "") -> dict[str, Any]:
+    part = data.get(key)
+    if not isinstance(part, dict):
+        raise InputError(f"{path}: key '{before}{key}' is missing, or holds no keys of its own")
+    return part
+
+
+def read_kitti(path: Path, left: str = "", right: str = "") -> Calibration:
+    """``calib.txt`` of KITTI odometry: lines ``P0:`` to ``P3:`` of 12 numbers, or two lines without names.
+
+    P = K [I | t] of each camera in the common rectified axes; colour images (image_2, image_3) go with P2 and P3.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    names = ("P2", "P3") if left.endswith("2") and right.endswith("3") else ("P0", "P1")
+    return _projections(path, read_keys(path, unnamed="P"), names, None)
+
+
+def _projections(
+    path: Path,
+    rows: dict[str, Array],
+    names: tuple[str, str],
+    size: tuple[int, int] | None,
+    rectified: Array | None = None,
+) -> Calibration:
+    """Rectified cameras by their matrices P = K [I | t]; ``rectified`` (3, 3) turns camera 0 into their axes."""
+    P_left, P_right = (numbers(path, rows, name, (3, 4)) for name in names)
+    for name, P in zip(names, (P_left, P_right), strict=True):
+        if np.linalg.matrix_rank(P[:, :3]) < 3:
+            raise InputError(f"{path}: key '{name}': the matrix of its camera is singular; must be P = K [I | t]")
+    t_left, t_right = (np.linalg.solve(P[:, :3], P[:, 3]) for P in (P_left, P_right))
+    none = np.zeros(4)
+    body = (None, "") if rectified is None else (_pose(rectified, t_left), CAMERA_0)
+    return checked(
+        Calibration(str(path), P_left[:, :3], P_right[:, :3], none, none, np.eye(3), t_right - t_left, size, *body)
+    )
+
+
+def _pose(R: Array, t: Array) -> Array:
+    """Pose (4, 4) in camera 0 of a camera with x = R x_0 + t."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
+    return pose
+
+
+def read_kitti_raw(
+    path: Path, left: str = "", right: str = "", image_size: tuple[int, int] | None = None
+) -> Calibration:
+    """``calib_cam_to_cam.txt`` of KITTI raw (Geiger et al. 2013), of image_00 and image_01 or image_02 and image_03.
+
+    Images of ``image_size`` S_rect are rectified (``sync``) and have P_rect; those of size S (``extract``) have K, D, R
+    and T, with x_i = R_i x_0 + T_i. Without a size they are taken as rectified. The body of the calibration is camera
+    0, before rectification.
+    """
+    rows = read_keys(path)
+    two = ("02", "03") if left.endswith("2") and right.endswith("3") else ("00", "01")
+    sizes = {
+        name: tuple(numbers(path, rows, f"{name}_{two[0]}", (2,)).astype(int).tolist()) for name in ("S", "S_rect")
+    }
+    if image_size in (None, sizes["S_rect"]):
+        axes = turn(path, rows, "R_rect_00")
+        return _projections(path, rows, (f"P_rect_{two[0]}", f"P_rect_{two[1]}"), sizes["S_rect"], axes)
+    if image_size != sizes["S"]:
+        found, raw, rectified = (f"{w} x {h} px" for w, h in (image_size or (0, 0), sizes["S"], sizes["S_rect"]))
+        raise InputError(f"{path}: the images have {found}, but it is for {raw}, and for {rectified} rectified")
+    K, D, T = ([numbers(path, rows, f"{name}_{camera}", shape) for camera in two]
+               for name, shape in (("K", (3, 3)), ("D", (5,)), ("T", (3,))))  # fmt: skip
+    R = [turn(path, rows, f"R_{camera}") for camera in two]
+    between = R[1] @ R[0].T
+    return checked(
+        Calibration(
+            str(path), K[0], K[1], D[0], D[1], between, T[1] - between @ T[0], sizes["S"], _pose(R[0], T[0]), CAMERA_0
+        )
+    )  # fmt: skip

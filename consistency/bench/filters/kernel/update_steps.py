@@ -1,0 +1,298 @@
+"""Steps of all updates: to the observation and back, and the correction, eq. 11 and 12 with W = S^-1/2 Cov(z, x)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters.compiler.jit import inner
+from consistency.bench.filters.kernel.arrays import sum_of
+from consistency.bench.filters.kernel.blas import (
+    add_gram,
+    add_product_of_transposed,
+    add_transposed_times,
+    solve_transposed,
+)
+from consistency.bench.filters.kernel.covariance import add_gram_to_state, definite_root, gather_all_rows, state_index
+from consistency.bench.filters.kernel.part_functions import (
+    Data,
+    Factors,
+    Slam,
+    State,
+    Triple,
+    combine,
+    expands,
+    innovate_again,
+    insert,
+    landmark_point,
+    landmark_width,
+    locate,
+    locate_jacobian,
+    measure,
+    measure_jacobian,
+    observation_point,
+    observed_width,
+    predict_innovation,
+    retract,
+    stands_apart,
+    to_body,
+    to_body_jacobian,
+    to_error,
+    wrap_residual,
+)
+from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.motion.unicycle import Frame, robot_frame
+from consistency.bench.models import point
+from consistency.referee.types import Array
+
+NOT_FINITE, INNOVATION, POSE, HALTED = 1, 2, 3, 4
+REASONS = {
+    NOT_FINITE: "the estimate is not finite",
+    INNOVATION: "the innovation covariance is not positive definite",
+    POSE: "the pose covariance is not positive definite",
+}
+
+
+@inner
+def observe(slam: Slam, frame: Frame, values: Array, z: Array) -> None:
+    """z (s,) <- h: the landmark ``values`` (w,) as the sensor of a robot at ``frame`` sees it."""
+    bx, by, bz = to_body(slam.landmark, frame, values)
+    cx, cy, cz = point.to_sensor(bx, by, bz, slam.sensor.mount)
+    expected = measure(slam.sensor, cx, cy, cz)
+    for i in range(observed_width(slam.sensor)):
+        z[i] = expected[i]
+
+
+@inner
+def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, Hl: Array) -> None:
+    """z (s,), Hp (s, 3), Hl (s, w) <- h at ``frame`` and ``values`` (w,), and its Jacobians by variables of both."""
+    body = to_body(slam.landmark, frame, values)
+    mount = slam.sensor.mount
+    cx, cy, cz = point.to_sensor(body[0], body[1], body[2], mount)
+    expected = measure(slam.sensor, cx, cy, cz)
+    for i in range(observed_width(slam.sensor)):
+        z[i] = expected[i]
+    J = measure_jacobian(slam.sensor, cx, cy, cz)
+    for i in range(observed_width(slam.sensor)):
+        j0, j1, j2 = J[3 * i], J[3 * i + 1], J[3 * i + 2]
+        row: Triple = (
+            j0 * mount.xx + j1 * mount.xy + j2 * mount.xz,
+            j0 * mount.yx + j1 * mount.yy + j2 * mount.yz,
+            j0 * mount.zx + j1 * mount.zy + j2 * mount.zz,
+        )
+        to_body_jacobian(slam.landmark, frame, values, body, row, Hp[i], Hl[i])
+
+
+@inner
+def linearise(
+    slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array, work: Work[NamedTuple]
+) -> None:
+    """z (s,) <- h expected of pose (3,), values (w,) in step k + 1; Hp (s, 3), Hl (s, w) <- Jacobians at the point."""
+    at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label, work)
+    linearise_at(slam, robot_frame(at), landmark, z, Hp, Hl)
+    if expands(slam.point):
+        for i in range(observed_width(slam.sensor)):
+            for j in range(len(pose)):
+                z[i] += Hp[i, j] * (pose[j] - at[j]) + Hl[i, j] * (values[j] - landmark[j])
+    if stands_apart(slam.point):
+        observe(slam, robot_frame(pose), values, z)
+
+
+@inner
+def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work[NamedTuple]) -> None:
+    """values (w,), ``work.Jp`` (w, 3), ``work.Jz`` (w, s) <- inverse of h at ``pose`` (3,) for z (s,); Jacobians."""
+    mount, Jb, s = slam.sensor.mount, work.Jb, observed_width(slam.sensor)
+    cx, cy, cz = locate(slam.sensor, z)
+    body = point.from_sensor(cx, cy, cz, mount)
+    J = locate_jacobian(slam.sensor, z)
+    for j in range(s):
+        Jb[0, j] = mount.xx * J[j] + mount.xy * J[s + j] + mount.xz * J[2 * s + j]
+        Jb[1, j] = mount.yx * J[j] + mount.yy * J[s + j] + mount.yz * J[2 * s + j]
+        Jb[2, j] = mount.zx * J[j] + mount.zy * J[s + j] + mount.zz * J[2 * s + j]
+    insert(slam.landmark, robot_frame(pose), body, Jb, mount, values, work.Jp, work.Jz)
+
+
+@inner
+def gather(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
+    """``work.rows`` (3 + w m, n + base) <- rows of P and of Phi of the robot and of the ``m`` seen landmarks."""
+    gather_all_rows(state, local.Phi, landmark_width(slam.landmark), work.at, m, work.rows)
+
+
+@inner
+def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTuple]) -> None:
+    """``work``: zhat (s m,), Hp (m, s, 3), Hl (m, s, w) <- h of the seen landmarks; Jacobians by the filter's error."""
+    pose, w, s = state.x[:3], landmark_width(slam.landmark), observed_width(slam.sensor)
+    for i in range(m):
+        o, expected = work.at[i], work.zhat[s * i : s * i + s]
+        values = state.x[o : o + w]
+        linearise(slam, pose, values, k, work.label[i], expected, work.Hp[i], work.Hl[i], work)
+        to_error(slam.error, pose, values, work.Hp[i], work.Hl[i])
+
+
+@inner
+def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> None:
+    """``work.A`` (s m, n + base) <- H P from the gathered rows; upper half of ``work.S`` (s m, s m) <- H P H'."""
+    w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
+    A, S, Hp, Hl, width = work.A, work.S, work.Hp, work.Hl, state.n + state.base
+    for i in range(m):
+        combine(slam.landmark, Hp[i], Hl[i], work.rows[:, :width], i, A[s * i : s * i + s, :width])
+    for i in range(m):
+        o = work.at[i]
+        for row in range(s * i + s):
+            for a in range(s):
+                total = 0.0
+                for c in range(max(3, w)):
+                    term = 0.0
+                    if c < 3:
+                        term += A[row, c] * Hp[i, a, c]
+                    if c < w:
+                        term += A[row, o + c] * Hl[i, a, c]
+                    total += term
+                S[row, s * i + a] = total
+
+
+@inner
+def innovate(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> Array:
+    """Innovation (s m,) of the ``m`` landmarks, which is the last column of ``work.A``."""
+    s = observed_width(slam.sensor)
+    y = work.A[: s * m, state.n + state.base]
+    for i in range(m):
+        measured, expected = data.z[work.known[i]], work.zhat[s * i : s * i + s]
+        wrap_residual(slam.sensor, expected, measured)
+        for a in range(s):
+            y[s * i + a] = measured[a] - expected[a]
+    return y
+
+
+@inner
+def correct_at_once(
+    update: NamedTuple,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    has_innovation: bool,
+    local: Factors,
+    work: Work[NamedTuple],
+) -> tuple[int, float, float]:
+    """The update of a filter that does not iterate: it is led by what :func:`predict_innovation` leaves in ``work``."""
+    code, total = 0, 0.0
+    if not has_innovation:
+        code, total = predict_innovation(update, slam, state, data, k, m, local, work)
+    if code > 0:
+        return code, np.nan, np.nan
+    code, nis, log_det = divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+    if code == 0:
+        apply(slam, state, m, local, work)
+    return code, nis, log_det
+
+
+@inner
+def correct_iterated(
+    update: Any,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    has_innovation: bool,
+    local: Factors,
+    work: Work[Any],
+) -> tuple[int, float, float]:
+    """The update in ``update.passes``, each linearised where the one before led to, from the same prior."""
+    w = landmark_width(slam.landmark)
+    involved, first_nis, first_log_det = 3 + w * m, np.nan, np.nan
+    gather(slam, state, m, local, work)
+    for a in range(involved):
+        work.prior[a] = state.x[state_index(w, a, work.at)]
+    for i in range(update.passes):
+        if not innovate_again(update, slam, state, data, k, m, work):
+            return POSE, np.nan, np.nan
+        code, nis, log_det = whiten(slam, state, data, m, work)
+        if code > 0:
+            return code, nis, log_det
+        if i == 0:
+            first_nis, first_log_det = nis, log_det
+        is_last = i == update.passes - 1
+        for a in range(involved):
+            j = state_index(w, a, work.at)
+            state.x[j] = work.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
+    apply(slam, state, m, local, work)
+    return 0, first_nis, first_log_det
+
+
+@inner
+def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float, float]:
+    """S (s m, s m) <- root of S + R; A and the innovation <- divided by it. As :func:`divide_by_root`."""
+    total = add_noise(slam, state, data, m, work)
+    return divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+
+
+@inner
+def add_noise(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> float:
+    """S (s m, s m) <- S + R; returns a sum that is finite if innovation and S are."""
+    s = observed_width(slam.sensor)
+    rows, width = s * m, state.n + state.base
+    S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
+    y, total = joined[:, width], 0.0
+    for i in range(m):
+        for a in range(s):
+            row = s * i + a
+            for c in range(s):
+                S[row, s * i + c] += data.R[work.known[i], a, c]
+            total += y[row] + sum_of(S[row, row:])
+    return total
+
+
+@inner
+def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float) -> tuple[int, float, float]:
+    """S <- its root, and A and the innovation <- divided by it; ``total`` is finite if all that is given is.
+
+    Returns a code of REASONS, 0 where all is well, the NIS, and log det S.
+    """
+    width = state.n + state.base
+    S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
+    y = joined[:, width]
+    if not definite_root(S, work.scale):
+        return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan, np.nan
+    solve_transposed(S, joined)
+    nis, log_det = 0.0, 0.0
+    for row in range(rows):
+        nis += y[row] * y[row]
+        log_det += 2.0 * np.log(S[row, row])
+    if np.isfinite(nis):
+        return 0, nis, log_det
+    return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan, np.nan
+
+
+@inner
+def shift(slam: Slam, state: State, m: int, j: int, work: Work[NamedTuple]) -> float:
+    """By how much the whitened gain moves variable j of an additive error."""
+    total, y = 0.0, state.n + state.base
+    for row in range(observed_width(slam.sensor) * m):
+        total += work.A[row, j] * work.A[row, y]
+    return total
+
+
+@inner
+def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
+    """x (n,) <- moved by W' S^-1/2 innovation, P (n, n) <- P - W' W; with the columns of Phi as ``local`` says."""
+    rows, n = observed_width(slam.sensor) * m, state.n
+    A, y = work.A[:rows, :n], work.A[:rows, n + state.base]
+    retract(slam.error, slam, state, A, y, work)
+    add_gram_to_state(-1.0, A, state.P, n)
+    apply_beyond(state, rows, local, work)
+
+
+@inner
+def apply_beyond(state: State, rows: int, local: Factors, work: Work[NamedTuple]) -> None:
+    """Phi, Psi and theta <- what a correction of the active part says of the rest."""
+    n, base = state.n, state.base
+    A, y = work.A[:rows, :n], work.A[:rows, n + base]
+    if base > 0:
+        beyond = work.A[:rows, n : n + base]
+        add_product_of_transposed(-1.0, A, beyond, local.Phi[:n, :base])
+        add_gram(1.0, beyond, local.Psi[:base, :base])
+        add_transposed_times(beyond, y, local.theta[:base])

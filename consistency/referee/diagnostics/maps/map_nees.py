@@ -1,0 +1,115 @@
+"""NEES of a map, whose landmarks share the errors of one run: by itself, and together with the pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics.questions.scale import ratio_interval
+from consistency.referee.diagnostics.records.record import JointNees
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.statistics.nees import kolmogorov
+from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
+from consistency.referee.diagnostics.verdict.parts import JointScore, MapScore, Settings
+from consistency.referee.types import Array, Indices
+
+POSE, POINT = 3, 3  # degrees of freedom of a pose in the plane, and of a landmark in space
+
+
+def map_score(run: Indices, nees: Array, dof: int = POINT) -> MapScore:
+    """Mean NEES over ``dof`` of landmarks (M,), with an interval from the spread between their runs (M,).
+
+    Landmarks of one run share the error of its pose, so each run counts once, by the mean of its landmarks.
+    """
+    judged = np.isfinite(nees)
+    _, place = np.unique(run[judged], return_inverse=True)
+    counts = np.bincount(place)
+    means = np.bincount(place, nees[judged]) / np.maximum(counts, 1) / dof
+    return MapScore(ratio_interval(means, dof), len(counts), int(judged.sum()), int((~judged).sum()))
+
+
+def joint_nees(error: Array, covariance: Array, dof: int = POINT) -> Array:
+    """Parts (1 + K,) of the NEES of a joint error (3 + ``dof`` K,) of a pose and K landmarks, with its covariance.
+
+    L^-1 error with L L' = covariance has independent standard normal components if the covariance is right. So each
+    part is chi-square with as many degrees of freedom as it has components, independent of the others: that of its
+    components given those before. Their sum is the joint NEES. All are infinite if the covariance is not positive
+    definite.
+    """
+    count = 1 + (len(error) - POSE) // dof
+    try:
+        L = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return np.full(count, np.inf)
+    squares = np.square(solve_triangular(L, error, lower=True, check_finite=False))
+    parts = np.append(squares[:POSE].sum(), squares[POSE:].reshape(-1, dof).sum(axis=1))
+    return parts if np.isfinite(parts).all() else np.full(count, np.inf)
+
+
+SURE = 0.04  # false-alarm rate of naming a landmark that does not stand out
+
+
+@dataclass(frozen=True)
+class JointTest:
+    """Result of the test of the joint NEES of N runs."""
+
+    p_values: dict[str, float]
+    score: JointScore
+    nees: float  # of all runs
+    means: Array  # (N,), over the degrees of freedom
+    dof: int  # of the smallest run
+
+
+def joint_test(
+    joint: JointNees, settings: Settings, run_numbers: Indices | None = None, landmarks: Indices | None = None
+) -> JointTest:
+    """Test that the joint NEES of N runs are chi-square with their degrees of freedom d_i, each run one observation.
+
+    If the joint covariance is right, their sum is exactly chi-square with sum d_i degrees of freedom, and the
+    distribution functions of the d_i at the N values are uniform (Kolmogorov's test). Nothing is estimated. Runs
+    whose joint covariance is not positive definite have an infinite value: they are named and left out.
+
+    Parameters
+    ----------
+    run_numbers, landmarks : (N,) and (L,), labels of the runs and of the columns of ``joint.landmarks``
+    """
+    total = joint.pose + joint.map
+    given = ~np.isnan(total) & (joint.dof > 0)
+    kept = given & np.isfinite(total)
+    numbers = np.arange(len(total)) if run_numbers is None else run_numbers
+    q, d = total[kept], joint.dof[kept] + POSE
+    Q, D = float(q.sum()), int(d.sum())
+    p_values = dict.fromkeys((JOINT, JOINT_DISTRIBUTION), float("nan"))
+    if len(q):
+        above, below = float(distributions.chi2.sf(Q, D)), float(distributions.chi2.cdf(Q, D))
+        p_values[JOINT] = above if settings.one_sided else min(1.0, 2.0 * min(above, below))
+        if not settings.one_sided:
+            p_values[JOINT_DISTRIBUTION] = kolmogorov(distributions.chi2.cdf(q, d))[1]
+    least = int(d.min()) if len(d) else 2 * POSE
+    score = JointScore(
+        both=ratio_interval(q / d, least, CONFIDENCE),
+        pose=ratio_interval(joint.pose[kept] / POSE, POSE, CONFIDENCE),
+        map=ratio_interval(joint.map[kept] / joint.dof[kept], least - POSE, CONFIDENCE),
+        runs=len(q),
+        dof=D,
+        chief=_chief(joint, landmarks),
+        not_definite=tuple(int(run) for run in numbers[given & ~kept]),
+    )
+    return JointTest(p_values, score, Q, q / d, least)
+
+
+def _chief(joint: JointNees, labels: Indices | None) -> tuple[int, ...]:
+    """Landmarks (L,) whose parts (N, L), each chi-square, are beyond chance, worst first.
+
+    Two-sided, Bonferroni over landmarks.
+    """
+    parts = joint.landmarks
+    if parts is None or labels is None or not len(labels):
+        return ()
+    here = np.isfinite(parts)
+    total, dof = np.where(here, parts, 0.0).sum(axis=0), np.maximum(joint.width * here.sum(axis=0), 1)
+    p = 2.0 * np.minimum(distributions.chi2.sf(total, dof), distributions.chi2.cdf(total, dof)) * len(labels)
+    return tuple(int(labels[j]) for j in np.argsort(p, kind="stable") if p[j] <= SURE and here[:, j].any())

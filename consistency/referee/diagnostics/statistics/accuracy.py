@@ -1,0 +1,141 @@
+"""Coverage of the stated bounds, root mean square errors, and the noncredibility index."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Sequence
+
+import numpy as np
+
+from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, blocks, by_runs, of_runs
+from consistency.referee.diagnostics.records.whitening import all_finite, spread_steps, squared_length, whiten
+from consistency.referee.diagnostics.statistics.nees import binomial_interval
+from consistency.referee.types import Array
+
+TWO_SIGMA = 0.9544997361036416  # P(|N(0, 1)| <= 2)
+
+
+def coverage(error: Array, covariance: Array | Symmetric, bound: float = 2.0, counted: Array | None = None) -> Array:
+    """Share of errors within ``bound`` standard deviations, for each axis.
+
+    Shapes (..., n) and (..., n, n) -> (n,); rows with NaN, or not ``counted`` (...), do not count.
+    """
+    error, P = np.asarray(error, float), Symmetric.of(covariance)
+    n = error.shape[-1]
+    inside, count = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    if error.ndim == 1:
+        error, P = error[None], P[None]
+    for here in of_runs(error):
+        for i in range(n):
+            e, sigma = error[here][..., i], _sigma(P.entry(i, i)[here])
+            valid = np.isfinite(e) & np.isfinite(sigma)
+            if counted is not None:
+                valid &= counted[here]
+            within = np.abs(np.where(valid, e, 0.0)) <= bound * np.where(valid, sigma, 0.0)
+            inside[i] += (valid & within).sum()
+            count[i] += valid.sum()
+    return np.where(count > 0, inside / np.maximum(count, 1), np.nan)
+
+
+def _sigma(variance: Array) -> Array:
+    return np.sqrt(np.where(variance >= 0, variance, np.nan))
+
+
+def rmse(error: Array, axes: Sequence[int] | None = None, counted: Array | None = None) -> float:
+    """Root of the mean squared length of errors (..., n) over all runs and steps.
+
+    NaN rows do not count.
+
+    Parameters
+    ----------
+    axes : components of the length; all of them where None
+    counted : (...) of bool, rows that count
+    """
+    e = np.asarray(error, float)
+    some = list(range(e.shape[-1])) if axes is None else list(axes)
+    squared, count = np.empty(e[..., 0].size), 0
+    for here in of_runs(e):
+        part = squared_length(e[here][..., some])
+        part = part[np.isfinite(part) if counted is None else np.isfinite(part) & counted[here]]
+        squared[count : count + len(part)] = part
+        count += len(part)
+    return float(np.sqrt(squared[:count].mean())) if count else float("nan")
+
+
+def coverage_interval(
+    error: Array,
+    covariance: Array | Symmetric,
+    bound: float = 2.0,
+    confidence: float = CONFIDENCE,
+    counted: Array | None = None,
+) -> tuple[Array, Array]:
+    """Coverage of one step of each run and its exact binomial interval (Clopper & Pearson 1934), for each axis.
+
+    One step of each run, spread over the trajectory (:func:`spread_steps`), gives independent draws; pooled steps would
+    not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2); rows with NaN, or not ``counted`` (runs, steps),
+    are not drawn.
+    """
+    error, P = np.asarray(error, float), Symmetric.of(covariance)
+    there = by_runs(_usable, error, P)
+    steps = spread_steps(there if counted is None else there & counted)
+    rows = np.flatnonzero(steps >= 0)
+    variance = P[rows, steps[rows]].variances
+    inside = (np.abs(error[rows, steps[rows]]) <= bound * _sigma(variance)).sum(axis=0)
+    if not len(rows):
+        n = error.shape[-1]
+        return np.full(n, np.nan), np.tile([0.0, 1.0], (n, 1))
+    return inside / len(rows), np.stack(binomial_interval(inside, len(rows), confidence), axis=-1)
+
+
+def _usable(error: Array, P: Symmetric) -> Array:
+    variances = (P.entry(i, i) for i in range(P.n))
+    known = (np.isfinite(error[..., i]) & np.isfinite(v) & (v >= 0) for i, v in enumerate(variances))
+    return functools.reduce(operator.and_, known)
+
+
+def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
+    """Noncredibility index and inclination index of every step, Li & Zhao (2006).
+
+    10 / N times the sum over runs of log10(NEES / NEES*), with absolute value for the first and with sign for
+    the second; NEES* is that with the actual mean squared error matrix of the step in place of the stated
+    covariance. 0 is credible; 10 is a covariance wrong by a factor of 10. Inclination above 0 is
+    overconfident. Both are relative to errors of the same runs, so they need many more runs than dimensions.
+
+    Parameters
+    ----------
+    error : (runs, steps, n)
+    nees : (runs, steps); NaN where a run has no value
+
+    Returns
+    -------
+    (steps,) and (steps,) in dB; NaN where fewer than 2 n runs have a value
+    """
+    runs, steps = nees.shape
+    index, inclination = zip(*(_of_steps(error[:, s], nees[:, s]) for s in blocks(steps, runs)), strict=True)
+    return np.concatenate(index), np.concatenate(inclination)
+
+
+def _of_steps(error: Array, nees: Array) -> tuple[Array, Array]:
+    n = error.shape[-1]
+    present = np.isfinite(nees) & all_finite(error) & (nees > 0)
+    index, inclination = np.full(nees.shape[1], np.nan), np.full(nees.shape[1], np.nan)
+    count = present.sum(axis=0)
+    e = np.where(present[..., None], error, 0.0)
+    by_step = np.ascontiguousarray(np.moveaxis(e, 1, 0))
+    mse = np.swapaxes(by_step, -1, -2) @ by_step / np.maximum(count, 1)[:, None, None]
+    scale = np.sqrt(np.diagonal(mse, axis1=-2, axis2=-1))
+    good = (count >= 2 * n) & (scale > 0).all(axis=-1)
+    unit = np.where(good[:, None], scale, 1.0)
+    correlation = mse / (unit[:, :, None] * unit[:, None, :])
+    good &= np.linalg.cond(np.where(good[:, None, None], correlation, np.eye(n))) < 1e12
+    if not good.any():
+        return index, inclination
+    actual = squared_length(whiten(e[:, good] / unit[good], correlation[good]))
+    here = present[:, good]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(here, 10.0 * np.log10(np.where(here, nees[:, good], 1.0) / np.where(here, actual, 1.0)), 0.0)
+    index[good] = np.abs(ratio).sum(axis=0) / count[good]
+    inclination[good] = ratio.sum(axis=0) / count[good]
+    return index, inclination

@@ -1,0 +1,25 @@
+"""Commands run in the process of the tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from consistency.referee.cli import main
+
+
+def consistency(capsys: pytest.CaptureFixture[str], *words: str | Path, status: int = 0) -> tuple[str, str]:
+    """Standard output and error of a command that has to end with ``status``."""
+    with pytest.raises(SystemExit) as end:
+        main([*map(str, words)])
+    out, err = capsys.readouterr()
+    assert (end.value.code or 0) == status, err
+    return out, err
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
+    """The one line that a command ends with whose input cannot be used."""
+    out, err = consistency(capsys, *words, status=2)
+    assert (out, err.count("\n")) == ("", 1), err
+    return err

@@ -1,0 +1,18 @@
+"""How far the estimates of two filters are apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from consistency.bench.types import Estimates
+
+
+def apart(a: Estimates, b: Estimates) -> float:
+    """Largest difference of poses (m, rad), of covariances and of NIS relative to their size, and of log det S."""
+    assert a.failure is None
+    assert b.failure is None
+    assert np.array_equal(a.nis_dof, b.nis_dof)
+    size = np.maximum(np.abs(b.covariance).max(axis=(1, 2), keepdims=True), 1e-30)
+    covariance = (np.abs(a.covariance - b.covariance) / size).max()
+    nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
+    return float(max(np.abs(a.pose - b.pose).max(), covariance, nis, np.nanmax(np.abs(a.log_det - b.log_det))))

@@ -21,8 +21,7 @@ from script_options import options_of
 import consistency as cs
 from consistency.bench.models import point, stereo
 from consistency.bench.scenario import PicturedSensor, Scenario, UvdSensor
-from consistency.bench.scenario.effects.bias_map import BiasMap
-from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
+from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth
 from consistency.bench.simulation import World
 from consistency.bench.types import Trial
 from consistency.referee.types import Array

@@ -25,7 +25,7 @@ from script_options import options_of
 import consistency as cs
 from consistency.bench.tuning.fit import FactorFit
 from consistency.bench.tuning.noise_groups import groups_of, scaled
-from consistency.bench.tuning.setting_scores import BeliefScorer
+from consistency.bench.tuning.scores import BeliefScorer
 from consistency.bench.tuning.split import parts_of
 from consistency.bench.tuning.tune import _Tuner
 from consistency.bench.types import Trial

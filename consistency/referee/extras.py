@@ -178,8 +178,8 @@ OUTSIDE = {  # may need an extra
     "results": "bench.runs.results_to_records:source_of",  # of the bench, in memory or in a folder
     "innovations": "bench.runs.results_to_records:innovations_of",  # of one run in a folder of results
     "report": "bench.pages:write_reports",  # of a folder of results
-    "pilot": "bench.runs.pilot_runs:pilots_in",  # runs in a folder of results, to plan by
-    "pilot runs": "bench.runs.pilot_runs:pilots_in_world",  # runs of a scenario, to plan by
+    "pilot": "bench.runs.sequential:pilots_in",  # runs in a folder of results, to plan by
+    "pilot runs": "bench.runs.sequential:pilots_in_world",  # runs of a scenario, to plan by
     "columns": "bench.store.parquet:read_columns",  # of a Parquet file
 }
 

@@ -21,9 +21,8 @@ from edited import accept_changes
 from flight import Flight
 
 import consistency as cs
-from consistency.bench.store.data_frames import failures_table, rejections_table
 from consistency.bench.store.log import read_log
-from consistency.bench.store.trial_rows import Rejected
+from consistency.bench.store.trial_rows import Rejected, noted_table
 from consistency.referee.cli import main
 from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.system.provenance import manifest_of
@@ -121,8 +120,8 @@ def write_results(folder: Path, rng: np.random.Generator) -> None:
     path = np.column_stack([np.repeat(range(RUNS), STEPS + 1), np.tile(range(STEPS + 1), RUNS)])
     true = pd.DataFrame(np.column_stack([path, 0.1 * path[:, 1], truth.reshape(-1, 3)]))
     true.columns = ["run", "step", "t", "x", "y", "heading"]
-    failures = failures_table([Failure("two", 3, 8, "the pose covariance is not positive definite")])
-    rejections = rejections_table([Rejected("two", r, 40, 4, 3, 2) for r in range(RUNS)])
+    failures = noted_table("failures", [Failure("two", 3, 8, "the pose covariance is not positive definite")])
+    rejections = noted_table("rejections", [Rejected("two", r, 40, 4, 3, 2) for r in range(RUNS)])
     scenario = _world()
     manifest = manifest_of(
         filters=list(FILTERS), wall=0.1, complete=True, seed=0, runs=RUNS, optimal_gain=["one"], failures=1,

@@ -10,8 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search, standard_error
-from consistency.bench.challenging.shrink import shrink
+from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search, shrink, standard_error
 from consistency.bench.challenging.world_scores import ChallengeScorer, Part, has_map
 from consistency.bench.challenging.worlds import Point, Space, require_right_belief, space_of
 from consistency.bench.filters import get_filter
@@ -205,7 +204,6 @@ def corners(space: Space) -> list[Scenario]:
 
 
 def scenario_of(space: Space, point: Point) -> Scenario | None:
-    """The scenario of a point; None where there is no such world."""
     try:
         return space.world(point)
     except ValueError:

@@ -20,7 +20,8 @@ def lines(outcome: Challenge, out: Path) -> list[str]:
     """What to print; ``out`` is the file that was written, if the filter was found overconfident."""
     plan, verdict = outcome.plan, outcome.verdict
     name = _subject(outcome)
-    searched = f"{outcome.worlds} worlds and {outcome.trials} trials in {_duration(outcome.seconds)}"
+    duration = f"{outcome.seconds / 60:.1f} minutes" if outcome.seconds >= 90 else f"{outcome.seconds:.0f} s"
+    searched = f"{outcome.worlds} worlds and {outcome.trials} trials in {duration}"
     tested = f"ANEES {verdict.statistic:.3g} (3 is right), {verdict.status}, on {verdict.runs} fresh runs"
     if verdict.failures:
         tested += f", of which {len(verdict.failures)} broke down"
@@ -56,7 +57,6 @@ def command(outcome: Challenge, out: Path) -> str:
 
 
 def as_data(outcome: Challenge, out: Path) -> dict[str, Any]:
-    """The outcome for programs."""
     plan, verdict, space = outcome.plan, outcome.verdict, outcome.space
     search_seed, shrink_seed, confirm_seed = plan.seeds
     return {
@@ -104,13 +104,7 @@ def require_writable(out: Path, overwrite: bool) -> None:
 
 
 def write_scenario(outcome: Challenge, out: Path) -> None:
-    """Write the world of a filter that was found overconfident, whole or not at all.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written.
-    """
+    """Write the world of a filter that was found overconfident, whole or not at all."""
     verdict = outcome.verdict
     summary = (
         f"{_subject(outcome)} is {verdict.status} here, ANEES {verdict.statistic:.3g} in {verdict.runs} runs: "
@@ -121,7 +115,3 @@ def write_scenario(outcome: Challenge, out: Path) -> None:
     )
     with writing(out):
         write_whole(out, text.encode("utf-8"))
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} s"

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import joblib
 import numpy as np
@@ -50,13 +50,12 @@ class ChallengeScorer:
     def __init__(self, filter_: Filter, jobs: int = -1, part: Part = "pose") -> None:
         self.filter, self.workers, self.part = filter_, worker_count(jobs), part
         self._stack = ExitStack()
-        self._parallel: Any = None
 
     def __enter__(self) -> ChallengeScorer:
         self._stack.enter_context(one_blas_thread())
-        if self.workers > 1:  # kernels release the GIL; other filters run in processes, for which threads wait
-            self._stack.enter_context(joblib.parallel_config("threading", n_jobs=self.workers))
-            self._parallel = self._stack.enter_context(joblib.Parallel())
+        # kernels release the GIL; other filters run in processes, for which threads wait
+        self._stack.enter_context(joblib.parallel_config("threading", n_jobs=self.workers))
+        self._parallel = self._stack.enter_context(joblib.Parallel())
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -71,13 +70,10 @@ class ChallengeScorer:
 
         No trial begins after ``until``, a time of ``time.monotonic``.
         """
-        if self._parallel is None:
-            return [_score(self.filter, self.part, *job, seed, until) for job in jobs]
         tasks = (joblib.delayed(_score)(self.filter, self.part, *job, seed, until) for job in jobs)
         return list(self._parallel(tasks))
 
     def split(self, world: Scenario, runs: Sequence[int]) -> list[Job]:
-        """The trials of one world as a job for each worker."""
         return [(world, part) for part in (runs[i :: self.workers] for i in range(self.workers)) if part]
 
 

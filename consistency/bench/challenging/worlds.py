@@ -98,11 +98,9 @@ class Choice:
         return self.base if self.base in self.values else self.values[0]
 
     def at(self, u: float) -> Value:
-        """Value at ``u`` in [0, 1]."""
         return self.values[min(int(u * len(self.values)), len(self.values) - 1)]
 
     def where(self, value: Value) -> float:
-        """Place of a value in [0, 1]."""
         return (self.values.index(value) + 0.5) / len(self.values)
 
     def between(self, value: Value) -> Value:
@@ -121,7 +119,6 @@ class Choice:
         return replace(self, values=tuple(known[part] for part in dict.fromkeys(parts)))
 
     def text(self, value: Value) -> str:
-        """A value with its unit."""
         return f"{_text(value)}{self.unit}"
 
 
@@ -173,7 +170,6 @@ class Space:
         return f"{self.base.name} with {', '.join(parts)}" if parts else f"{self.base.name} as it is"
 
     def values(self, point: Point) -> dict[str, Value]:
-        """Values of a point by the names of the dimensions."""
         return {d.name: value for d, value in zip(self.dimensions, point, strict=True)}
 
 
@@ -229,24 +225,21 @@ def _dimensions(base: Scenario) -> list[Dimension]:
     truth = base.truth
     found: list[Dimension] = []
     if isinstance(truth.landmarks, UniformLandmarks):
-        seed = truth.landmarks.seed
-        found += [Choice("seed", seed, (seed, *(s for s in range(SEEDS) if s != seed)))]
+        found += [_choice("seed", truth.landmarks.seed, range(SEEDS))]
     found += [_scale("sensor", 1.0, "x")]
     if truth.motion.sigma_v > 0 or truth.motion.sigma_omega > 0:
         found += [_scale("odometry", 1.0, "x")]
     found += [_scale("steps", truth.steps, whole=True)]
     if isinstance(truth.landmarks, UniformLandmarks):
         own = truth.path.shape
-        found += [Choice("path", own, (own, *(shape for shape in SHAPES if shape != own)))]
+        found += [_choice("path", own, SHAPES)]
         found += [_scale("lap", 1.0, "x")] if own in SHAPES else []
         found += [_scale("density", 1.0, "x")]
     found += [_scale("dt", truth.dt, " s")]
     if isinstance(truth.sensor, UvdSensor):
         (_, _, z), (_, pitch, _) = truth.sensor.mount.position, truth.sensor.mount.rotation
-        found += [
-            _choice("tilt", round(float(np.rad2deg(pitch)), 6), TILTS, " deg"),
-            _choice("height", z, HEIGHTS, " m"),
-        ]
+        pitch = round(float(np.rad2deg(pitch)), 6)
+        found += [_choice("tilt", pitch, TILTS, " deg"), _choice("height", z, HEIGHTS, " m")]
         found += [_scale("baseline", truth.sensor.B, " m")]
     return [*found, _scale("range", truth.sensor.range[1], " m")]
 
@@ -256,7 +249,7 @@ def _scale(name: str, base: float, unit: str = "", whole: bool = False) -> LogSc
     return LogScale(name, base, max(1, round(low)) if whole else low, round(high) if whole else high, unit, whole)
 
 
-def _choice(name: str, base: float, values: Sequence[float], unit: str) -> Choice:
+def _choice(name: str, base: Value, values: Sequence[Value], unit: str = "") -> Choice:
     return Choice(name, base, (base, *(value for value in values if value != base)), unit)
 
 
@@ -266,10 +259,9 @@ def _choice(name: str, base: float, values: Sequence[float], unit: str) -> Choic
 def _changes(base: Scenario, values: Mapping[str, Value]) -> dict[str, Any]:
     """Keys of the scenario that change, in truth and belief alike."""
     truth, changes = base.truth, _landmarks(base.truth, values)
-    for name, keys in {"odometry": ("sigma_v", "sigma_omega")}.items():
-        for key in keys if name in values else ():
-            sigma = float(values[name]) * getattr(truth.motion, key)
-            changes |= {f"{half}__motion__{key}": sigma for half in ("truth", "belief")}
+    for key in ("sigma_v", "sigma_omega") if "odometry" in values else ():
+        sigma = float(values["odometry"]) * getattr(truth.motion, key)
+        changes |= {f"{half}__motion__{key}": sigma for half in ("truth", "belief")}
     if "sensor" in values:
         sigmas = tuple(float(values["sensor"]) * sigma for sigma in truth.sensor.sigma)
         changes |= {f"{half}__sensor__sigma": sigmas for half in ("truth", "belief")}

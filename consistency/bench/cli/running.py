@@ -166,7 +166,7 @@ def reproduce(
 ) -> None:
     """Set each published finding beside what is measured here; exit 1 if a published one is not reproduced."""
     from consistency.bench.pages import write_reports
-    from consistency.bench.runs.claims_table import findings_table
+    from consistency.bench.runs.findings import findings_table
     from consistency.bench.runs.findings import reproduce as reproduce_findings
     from consistency.bench.types import OURS
     from consistency.referee.show import terminal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -9,21 +10,26 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.pages.answer import answer
 from consistency.bench.pages.contents import SECTIONS
 from consistency.bench.pages.report_input import Report, Study, Track
 from consistency.bench.runs.findings import read_findings
 from consistency.bench.runs.results_to_records import design_of, record_of, steps_of
 from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
+from consistency.bench.types import outcome
 from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
+from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.words.sentences import plural
 from consistency.referee.document.blocks import Block, Chapter, Document
+from consistency.referee.document.wording import listed
 from consistency.referee.errors import InputError
 from consistency.referee.pages.judged import clock_of
 from consistency.referee.pages.section import OPENING, STUDY, Section
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.system.progress import Advance
+
+LISTED = 6  # filters that the first paragraph names one by one
 
 
 def folders_of(folder: Path, manifest: dict[str, Any]) -> list[Path]:
@@ -94,19 +100,16 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
 
 
 def compose(report: Report, sections: tuple[Section[Any, Any], ...] | None = None) -> Document:
-    """The document that HTML and PDF show: every section that applies, in the order of ``sections``.
-
-    Raises
-    ------
-    InputError
-        A file that a section reads is damaged.
-    """
+    """The document that HTML and PDF show: every section that applies, in the order of ``sections``."""
     chapters: list[Chapter] = []
     opening: tuple[Block, ...] = ()
     for part, group in groupby(SECTIONS if sections is None else sections, key=lambda section: section.part):
         members = tuple(group)
         if part is STUDY:
-            chapters += [_chapter(study, index, members) for index, study in enumerate(report.studies)]
+            for index, study in enumerate(report.studies):
+                shown = tuple(block for section in members for block in section.blocks(study))
+                anchor = f"{STUDY.anchor}-{index}"
+                chapters.append(Chapter(anchor, study.name, study.name, shown, study.summary, study.keys()))
         elif blocks := tuple(block for section in members for block in section.blocks(report)):
             if part is OPENING:
                 opening = blocks
@@ -115,6 +118,72 @@ def compose(report: Report, sections: tuple[Section[Any, Any], ...] | None = Non
     return Document(report.title, answer(report.studies, report.findings), tuple(chapters), opening)
 
 
-def _chapter(study: Study, index: int, sections: tuple[Section[Any, Any], ...]) -> Chapter:
-    blocks = tuple(block for section in sections for block in section.blocks(study))
-    return Chapter(f"{STUDY.anchor}-{index}", study.name, study.name, blocks, study.summary, study.keys())
+def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:
+    """Who is honest and who is not, in one paragraph."""
+    pairs = [(track, study) for study in studies for track in study.tracks]
+    text = []
+    if findings:
+        text.append(_finding_sentence(findings))
+    if pairs:
+        text.append(_count_sentence(studies, [track for track, _ in pairs]))
+        text += [sentence for status in STATUSES if (sentence := _status_sentence(status, pairs, len(studies)))]
+        text.append(_failure_sentence(studies))
+    if any(track.innovations_judged and not study.has_truth for track, study in pairs):
+        text.append(
+            "Where the truth is not known the innovations alone decide, if the filter declares an optimal gain; they "
+            "cannot see most pose errors."
+        )
+    return " ".join(text) or "This folder holds neither results nor findings."
+
+
+def _count_sentence(studies: Sequence[Study], tracks: Sequence[Track]) -> str:
+    """How many pairs of filter and scenario passed, and what."""
+    honest = sum(track.verdict.consistent for track in tracks)
+    one = honest == 1 or len(tracks) == 1
+    passed = f"{'is' if one else 'are'} shown to be honest about the uncertainty of the pose"
+    nothing = False
+    if not any(study.has_truth for study in studies):
+        passed = f"{'passes' if one else 'pass'} the test of the innovations, the only one without truth"
+        nothing = not any(track.innovations_judged for track in tracks)
+    unknown = "no filter can be judged: the truth is not known, and none declares an optimal gain"
+    if len(studies) == 1:
+        size = f"{plural(studies[0].runs, 'run')} of {plural(len(studies[0].steps), 'step')}"
+        count = unknown if nothing else f"{honest} of {plural(len(tracks), 'filter')} {passed}"
+        return f"In {studies[0].name} ({size}), {count}."
+    count = unknown if nothing else f"{honest} {passed}"
+    return f"{len(studies)} studies put {len(tracks)} pairs of filter and scenario to the test; {count}."
+
+
+def _status_sentence(status: str, pairs: list[tuple[Track, Study]], studies: int) -> str:
+    names = [track.name for track, _ in pairs if track.verdict.status == status]
+    if not names:
+        return ""
+    if studies > 1 or len(names) > LISTED:
+        return f"{len(names)} {'is' if len(names) == 1 else 'are'} {status} ({STATUSES[status]})."
+    return f"{status.capitalize()} ({STATUSES[status]}): {listed(names)}."
+
+
+def _failure_sentence(studies: Sequence[Study]) -> str:
+    failed = sum(len(study.failures) for study in studies)
+    total = sum(study.runs * len(study.tracks) for study in studies)
+    if not failed:
+        return "No run broke down."
+    where = " that looked at them" if any(study.until_decided for study in studies) else ""
+    return (
+        f"{failed} of {total} runs through a filter broke down; they are listed below and counted in the "
+        f"verdicts{where}."
+    )
+
+
+def _finding_sentence(findings: Sequence[dict[str, Any]]) -> str:
+    said = [outcome(str(finding["source"] or ""), str(finding["verdict"])) for finding in findings]
+    own = [verdict for verdict in said if verdict in ("holds", "does not hold")]
+    published = [verdict for verdict in said if verdict not in ("holds", "does not hold")]
+    parts = []
+    if published:
+        counts = [f"{published.count(verdict)} {verdict}" for verdict in dict.fromkeys(published)]
+        parts.append(f"Of {plural(len(published), 'published finding')}, {listed(counts)}.")
+    if own:
+        holding = own.count("holds")
+        parts.append(f"Of {plural(len(own), 'finding')} of this project, {holding} hold{'s' * (holding == 1)}.")
+    return " ".join(parts)

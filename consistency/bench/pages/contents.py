@@ -7,17 +7,20 @@ from typing import Any
 
 from consistency.referee.pages.section import Section
 
-# modules with a SECTION, by name below the package: some are of the stereo laboratory, which the bench does not know
+# sections by module below the package, and by name where it is not SECTION: some are of the stereo laboratory, which
+# the bench does not know
 NAMES = (
-    *(
-        f"bench.pages.sections.{name}"
-        for name in (
-            "overview", "findings", "filters", "verdicts", "anees", "no_truth", "world", "pose_errors", "innovations",
-        )
-    ),
+    "bench.pages.sections.overview",
+    "bench.pages.exhibits:FINDINGS",
+    "bench.pages.sections.filters",
+    "bench.pages.sections.overview:VERDICTS",
+    "bench.pages.sections.anees",
+    "bench.pages.sections.study_tables:NO_TRUTH",
+    *(f"bench.pages.sections.{name}" for name in ("world", "pose_errors", "innovations")),
     "referee.pages.questions",
     "referee.pages.axes",
-    *(f"bench.pages.sections.{name}" for name in ("nees", "further", "own_errors", "maps", "rejections")),
+    "bench.pages.sections.nees",
+    *(f"bench.pages.sections.study_tables:{name}" for name in ("FURTHER", "OWN_ERRORS", "MAPS", "REJECTIONS")),
     "stereo.pages.stereo_noise",
     "bench.pages.sections.shares",
     "stereo.pages.scenes",
@@ -25,5 +28,8 @@ NAMES = (
     *(f"stereo.pages.{name}" for name in ("sensor_issues", "images")),
     "bench.pages.sections.referee",
     "bench.pages.sections.provenance",
-)  # fmt: skip
-SECTIONS: tuple[Section[Any, Any], ...] = tuple(import_module(f"consistency.{name}").SECTION for name in NAMES)
+)
+SECTIONS: tuple[Section[Any, Any], ...] = tuple(
+    getattr(import_module(f"consistency.{module}"), name or "SECTION")
+    for module, _, name in (entry.partition(":") for entry in NAMES)
+)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.experiment_tables import extra_table
-from consistency.bench.pages.report_input import Report
+from consistency.bench.pages.report_input import Report, as_given
+from consistency.bench.store.parquet import read_frame
 from consistency.bench.types import outcome
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Small, Stack, Status, Table, table
 from consistency.referee.document.drawing import Figure, Key, Panel, Sheet
 from consistency.referee.document.wording import number, p_cell
+from consistency.referee.errors import InputError
 from consistency.referee.pages.section import Part, Section
+from consistency.referee.parsing import one_line, reading
 
 OF_FINDINGS = (
     Column("Finding", width="2.5cm"),
@@ -46,58 +50,41 @@ class Exhibit:
     sources: tuple[Source, ...]
 
 
-@dataclass(frozen=True)
-class Shown:
-    """An exhibit as a folder has it."""
-
-    exhibit: Exhibit
-    findings: tuple[dict[str, Any], ...]
-    tables: tuple[tuple[Source, pd.DataFrame], ...]
-
-
-def section(part: Part, exhibits: Sequence[Exhibit]) -> Section[Report, tuple[Shown, ...]]:
+def section(part: Part, exhibits: Sequence[Exhibit]) -> Section[Report, Report]:
     """The section of these exhibits; an exhibit without any of its tables is left out."""
 
-    def read(report: Report) -> tuple[Shown, ...] | None:
-        """The exhibits of the folder; None where there is none.
+    def show(report: Report) -> tuple[Block, ...]:
+        """Each exhibit: its heading, its findings with published value, measured value and rule, and its tables."""
+        blocks: list[Block] = []
+        for exhibit in exhibits:
+            tables = []
+            for source in exhibit.sources:
+                path = report.folder / f"{source.name}.parquet"
+                tables.append((source, extra_table(path, source.numbers, source.texts, source.missing)))
+            shown = [source.show(data) for source, data in tables if data is not None]
+            own = [finding for finding in report.findings if finding["id"] in exhibit.findings]
+            if shown:
+                blocks.append(Heading(exhibit.title, paper=exhibit.title))
+                blocks += [findings_table(own, f"Findings on: {exhibit.title}")] if own else []
+                blocks += shown
+        return tuple(blocks)
 
-        Raises
-        ------
-        InputError
-            A file is damaged or lacks a column.
-        """
-        shown = (_read(report, exhibit) for exhibit in exhibits)
-        return tuple(each for each in shown if each.tables) or None
-
-    return Section(part, read, show)
-
-
-def _read(report: Report, exhibit: Exhibit) -> Shown:
-    own = tuple(finding for finding in report.findings if finding["id"] in exhibit.findings)
-    tables = []
-    for source in exhibit.sources:
-        path = report.folder / f"{source.name}.parquet"
-        data = extra_table(path, source.numbers, source.texts, source.missing)
-        if data is not None:
-            tables.append((source, data))
-    return Shown(exhibit, own, tuple(tables))
-
-
-def show(shown: tuple[Shown, ...]) -> tuple[Block, ...]:
-    """Each exhibit: its heading, its findings with published value, measured value and rule, and its tables."""
-    blocks: list[Block] = []
-    for each in shown:
-        blocks.append(Heading(each.exhibit.title, paper=each.exhibit.title))
-        if each.findings:
-            blocks.append(findings_table(each.findings, f"Findings on: {each.exhibit.title}"))
-        blocks += [source.show(data) for source, data in each.tables]
-    return tuple(blocks)
+    return Section(part, as_given, show)
 
 
 def findings_table(findings: Sequence[dict[str, Any]], label: str, caption: str = "") -> Table:
     """Claim, rule, published and measured value and verdict of each finding."""
     rows = [_row(finding) for finding in findings]
     return table(OF_FINDINGS, rows, label, caption=caption, paper=f"{caption}." if caption else "", style="prose")
+
+
+def _all_findings(report: Report) -> tuple[Block, ...]:
+    """Published claims of the folder beside what was measured."""
+    caption = "Rules of acceptance are constants of the scripts, fixed before this run"
+    return (findings_table(report.findings, "Findings", caption),) if report.findings else ()
+
+
+FINDINGS = Section(Part("findings", "Findings: published beside measured", "Findings"), as_given, _all_findings)
 
 
 def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:
@@ -160,3 +147,41 @@ def several(title: str, caption: str, panels: Sequence[Panel], keys: tuple[Key, 
 def groups(data: pd.DataFrame, column: str) -> list[tuple[str, pd.DataFrame]]:
     """Rows by the text in a column, in the order in which the texts come."""
     return [(str(name), part) for name, part in data.groupby(column, sort=False)]
+
+
+def extra_table(
+    path: Path, numbers: Sequence[str], texts: Sequence[str] = (), missing: Sequence[str] = ()
+) -> pd.DataFrame | None:
+    """Columns of a Parquet file; None where the file does not exist.
+
+    Parameters
+    ----------
+    numbers : columns of finite numbers, read as float
+    texts : columns of names
+    missing : columns of ``numbers`` that may hold NaN
+
+    Raises
+    ------
+    InputError
+        The file is damaged, has no rows, lacks a column or holds what the column may not.
+    """
+    if not path.exists():
+        return None
+    table = read_frame(path)
+    wanted = [*numbers, *texts]
+    if absent := [column for column in wanted if column not in table.columns]:
+        raise InputError(f"{path}: column '{absent[0]}' is missing; needed: {', '.join(wanted)}")
+    if not table.columns.is_unique:
+        raise InputError(f"{path}: a column is there twice; write the folder again")
+    if table.empty:
+        raise InputError(f"{path}: has no rows; write the folder again")
+    for column in numbers:
+        with reading(path, f"column '{column}' cannot be read as numbers"):
+            values = pd.to_numeric(table[column], errors="coerce").to_numpy(float, na_value=np.nan)
+        bad = ~np.isfinite(values) & (table[column].notna().to_numpy() | (column not in missing))
+        if bad.any():
+            row = int(np.flatnonzero(bad)[0])
+            value = one_line(table[column].iloc[row], 60)
+            raise InputError(f"{path}: column '{column}', row {row}: not a finite number ({value})")
+        table[column] = values
+    return table[wanted]

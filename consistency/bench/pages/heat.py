@@ -68,7 +68,6 @@ def title_of(fixed: Sequence[tuple[GridAxis, int]]) -> str:
 
 
 def heat_figure(regime: Regime, name: str) -> Figure:
-    """All heat maps of one filter."""
     found = views(regime)
     panels = tuple(_panel(regime, name, sides, fixed) for sides, fixed in found)
     rows = max(len(sides[1].values) if len(sides) > 1 else 1 for sides, _ in found)

@@ -11,7 +11,7 @@ from consistency.bench.pages.heat import PAPER_TITLE, cells_of, heat_figure, on_
 from consistency.bench.sweeps import axes as grid
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell as GridCell
-from consistency.bench.sweeps.plan import text_alone
+from consistency.bench.sweeps.plan import values_of
 from consistency.bench.sweeps.printing import by_verdict
 from consistency.bench.sweeps.regime import Regime
 from consistency.referee.diagnostics.verdict.parts import STATUSES
@@ -59,7 +59,6 @@ TIPS: Tips = (
 
 
 def compose_regime(regime: Regime) -> Document:
-    """The document that HTML and PDF show."""
     sweep = regime.sweep
     regions = tuple(figure for name in sweep.filters for figure in _figures(regime, name))
     about = Text(method(regime), style="note")
@@ -91,7 +90,6 @@ def answer(regime: Regime) -> str:
 
 
 def method(regime: Regime) -> str:
-    """How a cell is judged."""
     rule, wrong = regime.sweep.rule, "a ratio of true to stated covariance of"
     return (
         f"Each filter runs in each cell until it is decided, with at most {rule.max_runs} runs. A filter that is right "
@@ -128,7 +126,7 @@ def _rigs(regime: Regime) -> Table:
         fixed = list(zip(facets, at, strict=True))
         title = ", ".join(f"{_short(axis.key)} {axis.say(i)}" for axis, i in fixed)
         rows = tuple(
-            (*_values(regime, shown, cell), _trusted(regime, cell), _others(regime, cell))
+            (*values_of(regime.sweep, shown, cell), _trusted(regime, cell), _others(regime, cell))
             for cell in cells_of(regime, fixed)
         )
         groups.append((title, rows))
@@ -138,12 +136,6 @@ def _rigs(regime: Regime) -> Table:
 
 def _sides(regime: Regime) -> list[grid.Axis]:
     return next((sides for sides, _ in views(regime, numbers=True)), [])
-
-
-def _values(regime: Regime, shown: list[grid.Axis], cell: GridCell) -> list[str]:
-    sweep = regime.sweep
-    values = [axis.say(cell.indices[sweep.axes.index(axis)]) for axis in shown]
-    return [*values, text_alone(sweep, cell)] if sweep.alone else values
 
 
 def _trusted(regime: Regime, cell: GridCell) -> Cell:
@@ -231,7 +223,6 @@ def _pair(regime: Regime, name: str, shown: list[grid.Axis], fixed: list[tuple[g
 
 
 def _axis(axis: grid.Axis) -> Axis:
-    """An axis of the grid as one of a panel."""
     values = tuple(map(float, axis.values))
     if not axis.log:
         room = 0.08 * (values[-1] - values[0])

@@ -9,8 +9,8 @@ import signal
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
+from typing import NamedTuple
 
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler import disk_cache
@@ -29,22 +29,13 @@ NAMED = 3  # filters that are named where several are compiled
 Wanted = tuple[Filter, Trial, Belief]  # a filter, and a trial that it is to run on
 
 
-@dataclass(frozen=True)
-class Need:
+class Need(NamedTuple):
     """A kernel, and a filter that compiles it for a trial."""
 
     filter: Compiled
     trial: Trial
     belief: Belief
     outlook: Outlook
-
-    def compile(self) -> None:
-        self.filter.compile(self.trial, self.belief)
-
-
-def compile_for(filters: Sequence[Filter], trial: Trial, belief: Belief, jobs: int = 1) -> None:
-    """Compile what the filters need for ``trial`` and is not yet compiled, and say how long it will take."""
-    compile_all(((filter_, trial, belief) for filter_ in filters), jobs)
 
 
 def compile_all(wanted: Iterable[Wanted], jobs: int = 1) -> list[Need]:
@@ -88,12 +79,14 @@ def _compile(missing: Sequence[Need], jobs: int) -> None:
     shared = sorted(
         (need for need in missing if need.outlook.is_shared), key=lambda need: need.outlook.seconds, reverse=True
     )
-    workers = min(jobs, len(shared)) if len(shared) > 1 and _may_fork() and not disk_cache.refusal() else 1
+    # processes start as copies of this one: in a thread beside others a lock may be held for ever
+    may_fork = sys.platform == "linux" and threading.active_count() == 1
+    workers = min(jobs, len(shared)) if len(shared) > 1 and may_fork and not disk_cache.refusal() else 1
     seconds = _wall([need.outlook.seconds for need in missing], workers)
     with _processes(shared, workers if workers > 1 else 0) as links, progress.foreseen(_label(missing), seconds):
         _side_by_side(len(shared), links)
         for need in missing:
-            need.compile()
+            need.filter.compile(need.trial, need.belief)
 
 
 def _label(missing: Sequence[Need]) -> str:
@@ -112,11 +105,6 @@ def _wall(seconds: Sequence[float], workers: int) -> float:
 
 
 # --- side by side ---------------------------------------------------------------------------------
-
-
-def _may_fork() -> bool:
-    """Whether processes can start as copies of this one: in a thread beside others a lock may be held for ever."""
-    return sys.platform == "linux" and threading.active_count() == 1
 
 
 @contextlib.contextmanager
@@ -173,6 +161,6 @@ def _compiler(needs: Sequence[Need], link: Connection, parent: int) -> None:
     for stream in (1, 2):
         os.dup2(nowhere, stream)
     while os.getppid() == parent:
-        number = link.recv()
-        needs[number].compile()
+        need = needs[number := link.recv()]
+        need.filter.compile(need.trial, need.belief)
         link.send(number)

@@ -23,8 +23,6 @@ FIRST_STEPS = "herath2007-stereo"  # the world of the README's first commands
 
 @dataclass(frozen=True)
 class Ahead:
-    """What :func:`compile_ahead` has made."""
-
     kernels: int
     compiled: int  # of them; the others were there
     filters: int

@@ -17,7 +17,6 @@ from joblib.externals.loky import Future, ProcessPoolExecutor
 
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.backends.local import worker_count
-from consistency.bench.runs.claims_table import findings_table
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import record_of
@@ -25,8 +24,9 @@ from consistency.bench.scenario import Scenario, data_folder, load_scenario
 from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import OURS as OURS
-from consistency.bench.types import Finding
+from consistency.bench.types import Finding, outcome
 from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.document.blocks import Cell, Column, Status, Table, table
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_json, reading
 from consistency.referee.show.terminal import show
@@ -101,8 +101,8 @@ class Study:
         def contents(folder: Path) -> None:
             for name, results in self.kept.items():
                 results.write(folder / name)
-            for name, table in self.tables.items():
-                table.to_parquet(folder / f"{name}.parquet", compression="zstd", index=False)
+            for name, frame in self.tables.items():
+                frame.to_parquet(folder / f"{name}.parquet", compression="zstd", index=False)
             text = json.dumps([asdict(finding) for finding in findings], indent=2, ensure_ascii=False)
             (folder / "findings.json").write_text(text + "\n", encoding="utf-8")
 
@@ -155,7 +155,6 @@ def _executed(path: Path, name: str) -> ModuleType:
 
 
 def _summary(module: ModuleType) -> str:
-    """First line of a script's docstring."""
     return (module.__doc__ or "").strip().splitlines()[0]
 
 
@@ -186,7 +185,7 @@ def reproduce(
         An unknown id, a number out of range, or an output folder that cannot be written.
     """
     scripts = experiments()
-    only = _without_scripts(scripts, only or ())
+    only = [finding for name in only or () for finding in (scripts[name].FINDINGS if name in scripts else (name,))]
     selection = _selection(scripts, only, long)
     require_free(out, overwrite, "findings")
     study, started = Study(runs, seed, jobs, only=only), time.monotonic()
@@ -201,11 +200,6 @@ def _compile(selection: Sequence[tuple[ModuleType, Sequence[str]]], jobs: int) -
     needs = [need for module, _ in selection for need in getattr(module, "KERNELS", {}).items()]
     pairs = [(get_filter(name), load_scenario(world)) for world, names in needs for name in names]
     compile_all(first_trials(pairs), jobs)
-
-
-def _without_scripts(scripts: Mapping[str, ModuleType], only: Sequence[str]) -> list[str]:
-    """The ids in ``only``, those of a script's findings in place of its name."""
-    return [finding for name in only for finding in (scripts[name].FINDINGS if name in scripts else (name,))]
 
 
 def _selection(
@@ -316,3 +310,11 @@ def read_findings(folder: Path) -> list[dict[str, Any]]:
         return []
     with reading(path, "not a list of findings"):
         return [asdict(Finding(**entry)) for entry in read_json(path)]
+
+
+def findings_table(findings: Sequence[Finding]) -> Table:
+    columns = tuple(map(Column, ("finding", "published", "measured", "verdict")))
+    rows: list[tuple[Cell, ...]] = [
+        (f.id, f.published, f.measured, Status(outcome(f.source, f.verdict))) for f in findings
+    ]
+    return table(columns, rows, "Findings", style="prose")

@@ -14,10 +14,9 @@ from consistency.bench.filters import filter_names, get_filter, usable_names
 from consistency.bench.filters.stepping import error_of, name_of
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.campaign import Campaign, own_errors
+from consistency.bench.runs.campaign import PLAN, Campaign, ResultsPlace, own_errors, place_for
 from consistency.bench.runs.campaign import Interrupted as Interrupted
 from consistency.bench.runs.isolation.isolating import Isolation
-from consistency.bench.runs.resuming import PLAN, place_for, place_with
 from consistency.bench.runs.trial_work import Backend, Recorded, Simulated, TrialWork
 from consistency.bench.scenario import Belief, Scenario
 from consistency.bench.scenario.toml_tables import UNITS
@@ -29,7 +28,7 @@ from consistency.bench.store.results import Results, StoredResults, Tables
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
 from consistency.referee.system.folders import require_free
-from consistency.referee.system.provenance import manifest_of
+from consistency.referee.system.provenance import manifest_of, this_machine
 
 
 # fmt: off
@@ -89,7 +88,7 @@ def run_trials(
     Interrupted
         Ctrl-C, or a signal that is taken as such; carries the finished runs, and the folder, if any, is written.
     """
-    _require_counts(runs, seed)
+    require_counts(runs, seed)
     with studied(
         scenario, filters, seed, backend or LocalThreads(jobs), timeout, memory, out=out, previous=previous,
         resume=resume, overwrite=overwrite,
@@ -171,7 +170,7 @@ def studied(
     with (
         place_for(known, None if out is None else Path(out), previous, resume, overwrite)
         if journal is None
-        else nullcontext(place_with(journal))
+        else nullcontext(ResultsPlace(None, journal, None, frozenset(), [this_machine()]))  # results stay in memory
     ) as place:
         yield Campaign(backend, work, place, fields, _landmarks_table(scenario))
 
@@ -218,7 +217,7 @@ def simulate_log(
     scenario: Scenario, runs: int, seed: int, out: Path, overwrite: bool = False, form: str = "parquet"
 ) -> None:
     """Write ``runs`` simulated trials as a log folder, in Parquet or as CSV; raises as :func:`run_trials`."""
-    _require_counts(runs, seed)
+    require_counts(runs, seed)
     require_format(form)
     world = require_landmarks_in_view(scenario)
     require_free(out, overwrite, "log")
@@ -231,7 +230,8 @@ def simulate_log(
     write_log(out, trials, scenario.belief, _landmarks_table(scenario), manifest, overwrite, view, form=form)
 
 
-def _require_counts(runs: int, seed: int) -> None:
+def require_counts(runs: int, seed: int) -> None:
+    """Refuse a number of runs, or a seed, out of its range."""
     if runs < 1:
         raise InputError(f"runs must be at least 1, got {runs}")
     if seed < 0:

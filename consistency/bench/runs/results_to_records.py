@@ -32,13 +32,7 @@ POINT = ("x", "y", "z")
 
 
 def records_of(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
-    """A record for every filter of the results, or for those named, each read when it is asked for.
-
-    Raises
-    ------
-    InputError
-        As :func:`record_of`.
-    """
+    """A record for every filter of the results, or for those named, each read when it is asked for."""
     steps = steps_of(results)
     return (record_of(results, name, steps) for name in filters or results.filters)
 
@@ -168,16 +162,12 @@ def _first_number(values: Array) -> Array:
 
 def _require_nis(filter_name: str, runs: Indices, nis: Array, nis_dof: Indices) -> None:
     """Refuse a missing NIS in a step with degrees of freedom."""
-    missing = by_runs(_lacks_nis, nis, nis_dof)
+    missing = by_runs(lambda nis, dof: np.asarray((np.isnan(nis) & (dof > 0)).any(axis=1)), nis, nis_dof)
     if missing.any():
         raise InputError(
             f"estimates of '{filter_name}', run {runs[int(np.argmax(missing))]}: column 'nis' is null or NaN in a step "
             "whose nis_dof is not 0; the tables were changed or damaged; write them again"
         )
-
-
-def _lacks_nis(nis: Array, nis_dof: Indices) -> Array:
-    return np.asarray((np.isnan(nis) & (nis_dof > 0)).any(axis=1))
 
 
 def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: str = ADDITIVE) -> Array:

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.campaign import Campaign
-from consistency.bench.runs.montecarlo import studied
-from consistency.bench.runs.results_to_records import record_of
+from consistency.bench.runs.montecarlo import run_trials, studied
+from consistency.bench.runs.results_to_records import record_of, records_of
+from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.trial_work import Backend
-from consistency.bench.scenario import Scenario
+from consistency.bench.scenario import Scenario, load_scenario
 from consistency.bench.store.journal import Journal
-from consistency.bench.store.results import Results, StoredResults, Tables
+from consistency.bench.store.results import Results, StoredResults, Tables, open_results
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import Design, Record, Verdict, look, sequential_design, speaks
+from consistency.referee.diagnostics.questions.scale import FEW
 from consistency.referee.diagnostics.verdict.judge import of_look, with_map
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
+from consistency.referee.types import Array
 from consistency.referee.verdicts.options import refused
 
 
@@ -80,7 +84,10 @@ def run_until_decided(
     ) as campaign:  # fmt: skip
         _require_less(campaign, max_runs)
         names = campaign.gathered.filters
-        read = partial(_record, campaign, scenario.truth.steps)
+
+        def read(runs: int, name: str) -> Record:
+            return record_of(campaign.so_far(runs), name, scenario.truth.steps)
+
         results = campaign.finish(_rounds(campaign, looks(design, names, read, decided), decided, names))
     return results, {name: decided[name] for name in names}
 
@@ -99,7 +106,7 @@ def looks(
         yield runs
         for name in [name for name in filters if name not in decided]:
             verdict = _look(design, read(runs, name), runs, spent)
-            if verdict is not None and (settled(verdict) or runs == design.max_runs):
+            if verdict is not None and (verdict.status != "undecided" or runs == design.max_runs):
                 decided[name] = verdict
         if len(decided) == len(filters):
             return
@@ -112,10 +119,6 @@ def _look(design: Design, record: Record, runs: int, spent: float | None) -> Ver
         return None
     verdict = of_look(look(design, some, spent), runs, record, design)
     return with_map(verdict, record.ends, design.settings, design)
-
-
-def _record(campaign: Campaign, steps: int, runs: int, name: str) -> Record:
-    return record_of(campaign.so_far(runs), name, steps)
 
 
 def _rounds(
@@ -151,12 +154,35 @@ def plan_of(plan: dict[str, Any]) -> Design:
         raise refused(error) from None
 
 
-def settled(verdict: Verdict) -> bool:
-    """No further run changes what this look says."""
-    return verdict.status != "undecided"
-
-
 def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:
-    """One line of progress."""
     parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
     return ", ".join(parts + [f"{name} open" for name in filters if name not in decided])
+
+
+# --- pilots: runs that tell how steps depend on each other, from which a number of runs is planned ----------------
+
+
+def pilots_in(folder: Path, filters: Sequence[str] | None = None) -> dict[str, tuple[Array, int]]:
+    """Pilots in a folder of results; see :func:`pilots_of`."""
+    return pilots_of(open_results(folder), filters)
+
+
+def pilots_in_world(scenario: str, filters: Sequence[str], runs: int, seed: int) -> dict[str, tuple[Array, int]]:
+    """Pilots that are run for it, in a world by its name or path; see :func:`pilots_of`."""
+    return pilots_of(run_trials(load_scenario(scenario), filters, runs, seed), filters)
+
+
+def pilots_of(results: Tables, filters: Sequence[str] | None = None) -> dict[str, tuple[Array, int]]:
+    """Pilots of :func:`consistency.referee.verdicts.options.plan`, of every filter or of those named."""
+    return {of.name: (_pilot_means(of), of.t.size) for of in records_of(results, filters)}
+
+
+def _pilot_means(of: Record) -> Array:
+    """Mean NEES over dof of the runs that did not fail, (runs,)."""
+    if of.nees is None:
+        raise InputError(f"{of.name}: has no truth; only runs with a NEES tell how their steps depend on each other")
+    means = run_means(of)
+    means = means[np.isfinite(means)] / len(POSE)
+    if len(means) < FEW:
+        raise InputError(f"{of.name}: a pilot needs at least {FEW} runs that did not fail, got {len(means)}")
+    return np.asarray(means)

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.compiling import compile_for
+from consistency.bench.runs.compiling import compile_all
 from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.runs.memory_needed import workers_that_fit
 from consistency.bench.scenario import Scenario
@@ -99,7 +99,8 @@ class TrialWork:
     def compile(self, run: int, jobs: int = 1) -> None:
         """Compile what a run needs and is not yet compiled, in ``jobs`` processes at most, and say so."""
         if self.isolation.compiled:
-            compile_for(self.isolation.compiled, self._ahead(run), self.isolation.belief, jobs)
+            trial, belief = self._ahead(run), self.isolation.belief
+            compile_all(((filter_, trial, belief) for filter_ in self.isolation.compiled), jobs)
 
 
 class Backend(Protocol):

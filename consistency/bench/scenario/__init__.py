@@ -1,38 +1,31 @@
 """Scenarios: a TOML file becomes a frozen record of what is true and what the filter believes.
 
-``tables`` reads files, ``view`` and ``sensor`` have the one definition of a sensor, ``truth`` and ``belief`` the two
-halves of a scenario, ``record`` puts them together, ``writing`` makes a file of one. ``effects`` holds what a sensor
-does to an ideal observation, one effect a file: its keys and its ``apply``. Nothing here draws a trial; that is the
-simulation's.
+``toml_tables`` reads files, ``sensor_view`` and ``sensor`` have the one definition of a sensor, ``truth`` what is the
+case. ``scenario`` sets a belief beside it, and makes a file of both. ``effects`` holds what a sensor does to an ideal
+observation: the keys of each effect and its ``apply``. Nothing here draws a trial; that is the simulation's.
 """
 
-from consistency.bench.scenario.agreement import misbelief
-from consistency.bench.scenario.belief import Belief, BelievedMotion, GuardSettings, SigmaPoints
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
-from consistency.bench.scenario.scenario import Scenario, load_scenario, scenario_names
+from consistency.bench.scenario.scenario import (
+    Belief,
+    BelievedMotion,
+    GuardSettings,
+    Scenario,
+    SigmaPoints,
+    load_scenario,
+    misbelief,
+    scenario_names,
+    scenario_text,
+    toml_text,
+)
 from consistency.bench.scenario.sensor import (
     BelievedSensor,
-    LinearSensor,
     PicturedSensor,
-    RangeBearingSensor,
-    RelativeXySensor,
     TrueSensor,
     UvdSensor,
-    XyzSensor,
 )
 from consistency.bench.scenario.sensor_view import PLANAR_SENSORS, Mount
-from consistency.bench.scenario.toml_tables import (
-    Count,
-    Finite,
-    Interval,
-    NonNegative,
-    Positive,
-    Sigmas,
-    Table,
-    Triple,
-    explain,
-    read_table,
-)
+from consistency.bench.scenario.toml_tables import Count, Finite, Positive, Table, explain, read_table
 from consistency.bench.scenario.truth import (
     AnnularLandmarks,
     Circle,
@@ -42,12 +35,10 @@ from consistency.bench.scenario.truth import (
     ListedLandmarks,
     Path_,
     RoundedRectangle,
-    TrueMotion,
     Truth,
     UniformLandmarks,
     Waypoints,
 )
-from consistency.bench.scenario.writing import scenario_text, toml_text
 from consistency.referee.shipped import data_folder
 
 __all__ = [
@@ -65,31 +56,22 @@ __all__ = [
     "FigureOfEight",
     "Finite",
     "GuardSettings",
-    "Interval",
-    "LinearSensor",
     "ListedEffect",
     "ListedLandmarks",
     "LocalBias",
     "Mount",
-    "NonNegative",
     "Path_",
     "PicturedSensor",
     "Positive",
-    "RangeBearingSensor",
-    "RelativeXySensor",
     "RoundedRectangle",
     "Scenario",
     "SigmaPoints",
-    "Sigmas",
     "Table",
-    "Triple",
-    "TrueMotion",
     "TrueSensor",
     "Truth",
     "UniformLandmarks",
     "UvdSensor",
     "Waypoints",
-    "XyzSensor",
     "data_folder",
     "explain",
     "load_scenario",

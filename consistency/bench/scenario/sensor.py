@@ -55,7 +55,6 @@ class PicturedSensor(BelievedSensor, ImageSensor):
     """A believed sensor with the image that its observations come from, as a log says it."""
 
     def belief(self) -> BelievedSensor:
-        """What a filter believes of this sensor."""
         return BelievedSensor.model_validate(self.model_dump(include=set(BelievedSensor.model_fields)))
 
 

@@ -89,21 +89,16 @@ def explain(error: ValueError, model: type[Table]) -> str:
     complaints = sorted(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
     first, more = complaints[0], len(complaints) - 1
     keys = [one_line(key, 60) for key in _keys(first["loc"])]
+    if first["type"].startswith("union_tag"):
+        keys.append(first["ctx"]["discriminator"].strip("'"))
     where = f"key '{'.'.join(keys)}': " if keys else ""
     if first["type"] == "extra_forbidden":
         allowed = _allowed(model, [str(part) for part in first["loc"][:-1]])
         text = f"unknown key; allowed here: {', '.join(allowed)}"
-    elif first["type"] == "missing":
-        text = "missing; it must be given"
-    elif first["type"] == "union_tag_not_found":
-        tag = first["ctx"]["discriminator"].strip("'")
-        where = f"key '{'.'.join([*keys, tag])}': "
+    elif first["type"] in ("missing", "union_tag_not_found"):
         text = "missing; it must be given"
     elif first["type"] == "union_tag_invalid":
-        tag = first["ctx"]["discriminator"].strip("'")
-        expected = first["ctx"]["expected_tags"]
-        where = f"key '{'.'.join([*keys, tag])}': "
-        text = f"'{first['ctx'].get('tag', '')}' is not one of {expected}"
+        text = f"'{first['ctx'].get('tag', '')}' is not one of {first['ctx']['expected_tags']}"
     else:
         text = first["msg"].removeprefix("Value error, ")
         if first["type"] != "value_error":

@@ -65,7 +65,6 @@ class Journal:
 
     @property
     def runs(self) -> set[int]:
-        """Numbers of the runs that are there."""
         return set(self._offsets)
 
     def begin(self, study: Mapping[str, Any]) -> None:
@@ -74,7 +73,6 @@ class Journal:
         self.study = dict(study)
 
     def clear(self) -> None:
-        """Drop all that is there."""
         self._file.truncate(0)
         self._end, self.study, self._unsynced = 0, {}, True
         self.notes.clear()
@@ -109,7 +107,6 @@ class Journal:
                 at += size
 
     def close(self) -> None:
-        """Synchronise and close the file."""
         self._closed.set()
         if self._syncing is not None:
             self._syncing.join()
@@ -232,7 +229,9 @@ class Unfinished:
                 require_free(out, overwrite or resume, kind)
             self._lock = self._locked()
             try:
-                self._recover()
+                replaced = self.path / "replaced"
+                if replaced.exists() and not out.exists():  # the process ended while the results were being replaced
+                    os.replace(replaced, out)
                 if overwrite and not resume:
                     (self.path / "journal").unlink(missing_ok=True)
                 self.journal = Journal(self.path / "journal")
@@ -282,13 +281,6 @@ class Unfinished:
                 return lock
             lock.release()
 
-    def _recover(self) -> None:
-        """Put back the results of before if the process ended while they were being replaced."""
-        replaced = self.path / "replaced"
-        if replaced.exists() and not self.out.exists():
-            os.replace(replaced, self.out)
-
 
 def unfinished_of(out: Path) -> Path:
-    """Folder of the unfinished work on an output folder."""
     return out.absolute().parent / f".{out.absolute().name}.unfinished"

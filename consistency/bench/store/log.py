@@ -25,9 +25,9 @@ from consistency.bench.scenario import (
     toml_text,
 )
 from consistency.bench.scenario.toml_tables import SIGMA_UNITS
-from consistency.bench.store.data_frames import controls_table, observations_table, truth_of
 from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.log_tables import read_table_file, require_format, table_file
+from consistency.bench.store.trial_rows import controls_table, observations_table, stacked_table, truth_columns
 from consistency.bench.types import Trial
 from consistency.referee.column_names import COLUMNS, POSE
 from consistency.referee.errors import InputError
@@ -99,8 +99,7 @@ def read_log(folder: str | Path) -> Log:
     _check_pixels(folder, observations, sensor)
     start = np.array([sensor.start.x, sensor.start.y, sensor.start.heading]) if sensor.start else None
     names = _names(folder, observations, tables["landmarks"])
-    _require_landmarks_only(folder, names, belief)
-    positions = _positions(folder, tables["landmarks"], names.landmarks, belief)
+    positions = _positions(folder, tables["landmarks"], names, belief)
     of_controls, of_observations, truth = _by_run(controls), _by_run(observations), tables["truth"]
     of_truth = None if truth is None else _by_run(truth)
     trials = [
@@ -137,14 +136,15 @@ def write_log(
     require_format(form)
     tables = {"controls": controls_table(trials), "observations": observations_table(trials)}
     if trials[0].truth is not None:
-        tables["truth"] = truth_of(trials)
+        parts = [("", truth_columns(t, t.truth)) for t in trials if t.truth is not None]
+        tables["truth"] = stacked_table("truth", parts)
     if landmarks is not None:
         tables["landmarks"] = landmarks
     texts = {"sensor.toml": tomli_w.dumps(_sensor_file(belief, trials[0].start, view)), **files}
 
     def contents(at: Path) -> None:
         for name, text in texts.items():
-            _write_text(at / name, text)
+            (at / name).write_text(text, encoding="utf-8")
         if form == "csv":
             for name, table in tables.items():
                 table.to_csv(at / f"{name}.csv", index=False)
@@ -163,10 +163,6 @@ def sensor_text(folder: Path, belief: Belief) -> str:
     sensor = read_table(folder / "sensor.toml", SensorFile)
     changed = sensor.model_copy(update={"motion": belief.motion, "sigma": belief.sensor.sigma})
     return toml_text(changed.model_dump(mode="json", exclude_none=True))
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
 
 
 def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, object]:
@@ -201,23 +197,23 @@ def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, bel
     for run, part in controls.groupby("run"):
         if not np.array_equal(np.sort(part["step"]), np.arange(1, len(part) + 1)):
             raise InputError(f"{path}: column 'step' of run {run} must count 1, 2, … without gap or repetition")
-    if (controls["dt"] <= 0).any():
-        row = int(np.flatnonzero(controls["dt"] <= 0)[0])
-        raise InputError(f"{path}: column 'dt', row {row}: must be positive")
+    _refuse(path, controls["dt"] <= 0, "column 'dt', row {}: must be positive")
     path = table_file(folder, "observations")
     if observations.empty:
         raise InputError(f"{path}: holds no observation; no landmark was ever in view")
     twice = observations.duplicated(["run", "step", "landmark"])
-    if twice.any():
-        raise InputError(f"{path}: row {int(np.flatnonzero(twice)[0])}: this landmark is there twice in one step")
+    _refuse(path, twice, "row {}: this landmark is there twice in one step")
     known = pd.MultiIndex.from_frame(controls[["run", "step"]])
     stray = ~pd.MultiIndex.from_frame(observations[["run", "step"]]).isin(known)
-    if stray.any():
-        controls_file = table_file(folder, "controls").name
-        raise InputError(f"{path}: row {int(np.flatnonzero(stray)[0])}: {controls_file} has no such run and step")
-    if belief.sensor.model == "uvd" and (observations["z2"] <= 0).any():
-        row = int(np.flatnonzero(observations["z2"] <= 0)[0])
-        raise InputError(f"{path}: column 'z2', row {row}: a disparity must be positive")
+    _refuse(path, stray, f"row {{}}: {table_file(folder, 'controls').name} has no such run and step")
+    if belief.sensor.model == "uvd":
+        _refuse(path, observations["z2"] <= 0, "column 'z2', row {}: a disparity must be positive")
+
+
+def _refuse(path: Path, bad: pd.Series[bool] | Array, text: str) -> None:
+    """Refuse rows that are ``bad``; ``text`` takes the number of the first."""
+    if bad.any():
+        raise InputError(f"{path}: {text.format(int(np.flatnonzero(bad)[0]))}")
 
 
 def _check_pixels(folder: Path, observations: pd.DataFrame, sensor: SensorFile) -> None:
@@ -253,28 +249,23 @@ def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | N
     if "source" not in observations:
         return _Names(labels, labels[:0])
     wrong = (observations["source"] < -1) | (observations["landmark"] < 0)
-    if wrong.any():
-        row = int(np.flatnonzero(wrong)[0])
-        raise InputError(
-            f"{table_file(folder, 'observations')}: row {row}: beside a column 'source' landmarks are numbered from 0, "
-            "and a source is one of them or -1"
-        )
+    _refuse(
+        table_file(folder, "observations"), wrong,
+        "row {}: beside a column 'source' landmarks are numbered from 0, and a source is one of them or -1",
+    )  # fmt: skip
     source = np.unique(observations["source"])
     known = source[source >= 0] if landmarks is None else np.concatenate([source[source >= 0], landmarks["landmark"]])
     real = np.union1d(source[source >= 0], np.intersect1d(labels, known))
     return _Names(real, np.setdiff1d(labels, real))
 
 
-def _require_landmarks_only(folder: Path, names: _Names, belief: Belief) -> None:
+def _positions(folder: Path, landmarks: pd.DataFrame | None, names: _Names, belief: Belief) -> Array | None:
     if belief.sensor.model == "linear" and len(names.things):
         raise InputError(
             f"{table_file(folder, 'observations')}: column 'landmark': {names.things[0]} is no landmark, and a linear "
             "world needs one that it is linearised about"
         )
-
-
-def _positions(folder: Path, landmarks: pd.DataFrame | None, labels: Array, belief: Belief) -> Array | None:
-    path = table_file(folder, "landmarks")
+    path, labels = table_file(folder, "landmarks"), names.landmarks
     if landmarks is None:
         if belief.sensor.model == "linear":
             raise InputError(f"{path}: missing; a linear world needs the landmarks it is linearised about")

@@ -199,13 +199,12 @@ def joined(parts: Sequence[Results]) -> Results:
     }
     errors = {name: error for part in parts for name, error in part.manifest.get("error", {}).items()}
     manifest |= {"error": errors} if errors else {}
-    estimates = pd.concat([part.estimates for part in parts], ignore_index=True)
-    maps = [part.map for part in parts if part.map is not None]
-    map_ = pd.concat(maps, ignore_index=True) if maps else None
-    failures = pd.concat([p.failures for p in parts if len(p.failures)] or [parts[0].failures], ignore_index=True)
-    guarded = [part.rejections for part in parts if part.rejections is not None]
-    rejections = pd.concat(guarded, ignore_index=True) if guarded else None
-    return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest, map=map_, rejections=rejections)
+    tables: dict[str, Any] = {}
+    for name in ("estimates", "failures", "map", "rejections"):
+        all_ = (getattr(part, name) for part in parts)
+        those = [table for table in all_ if table is not None and (name != "failures" or len(table))]
+        tables[name] = pd.concat(those, ignore_index=True) if those else getattr(parts[0], name)
+    return replace(parts[0], manifest=manifest, **tables)
 
 
 def open_results(folder: str | Path) -> StoredResults:

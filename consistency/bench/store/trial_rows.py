@@ -1,19 +1,20 @@
-"""Rows of the tables for one trial, from the arrays that filters give."""
+"""Rows of the tables for one trial, from the arrays that filters give, and tables of the rows of many."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.filters.kernel.linalg import definiteness
-from consistency.bench.store.parquet import Columns
+from consistency.bench.store.parquet import BY_FILTER, Columns
 from consistency.bench.store.results import JOINT
 from consistency.bench.types import Estimates, Map, Trial
-from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
+from consistency.referee.column_names import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
 from consistency.referee.diagnostics.maps.map_nees import joint_nees
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.geometry import pose_error
@@ -77,7 +78,8 @@ def _rows(trial: Trial, estimates: Estimates) -> tuple[Estimates, Columns]:
     first = _full_rank((estimates.covariance if own is None else own)[:last])
     columns = _columns(trial, estimates, last, first)
     step, reason = _first_failure(columns, first, trial.truth is not None)
-    if not step and estimates.map is not None and not _is_bounded(estimates.map):
+    numbers = () if estimates.map is None else (estimates.map.mean, estimates.map.covariance)
+    if not step and not all((np.abs(values) <= LARGEST_NUMBER).all() for values in numbers):
         step, reason = last, f"a number in the map is beyond {LARGEST_NUMBER:g}"
     if not step:
         return estimates, columns
@@ -102,10 +104,6 @@ def _first_failure(columns: Columns, first: int, has_truth: bool) -> tuple[int, 
             beyond = f"is beyond {LARGEST_NUMBER:g}" if np.isfinite(size[at]) else "is not finite"
             faults.append((at + 1, f"the {kind} {beyond}"))
     return min(faults, key=lambda fault: fault[0], default=(0, ""))
-
-
-def _is_bounded(map_: Map) -> bool:
-    return all(bool((np.abs(values) <= LARGEST_NUMBER).all()) for values in (map_.mean, map_.covariance))
 
 
 def _last(trial: Trial, estimates: Estimates) -> int:
@@ -214,3 +212,64 @@ def truth_columns(trial: Trial, path: Array) -> Columns:
         "t": trial.t,
         **dict(zip(POSE, path.T, strict=True)),
     }
+
+
+def stacked_table(name: str, parts: Sequence[tuple[str, Columns]], also: Sequence[str] = ()) -> pd.DataFrame:
+    """Table ``name`` of (filter, columns), one below the other; NaN where a column is lacking, one of ``also`` too.
+
+    The columns are nobody else's: pandas would copy them, at millions of rows half the memory.
+    """
+    table = pd.DataFrame(columns=list(COLUMNS[name])).astype(COLUMNS[name])
+    if parts:
+        rows, stacked = [len(columns["run"]) for _, columns in parts], dict[str, Any]()
+        if name in BY_FILTER:
+            names = pd.Series([each for each, _ in parts], dtype="str")
+            stacked["filter"] = names.repeat(rows).reset_index(drop=True)
+        for column in dict.fromkeys(column for _, part in parts for column in part):
+            pairs = zip(parts, rows, strict=True)
+            pieces = [part[column] if column in part else np.full(n, np.nan) for (_, part), n in pairs]
+            stacked[column] = np.concatenate(pieces)
+        table = pd.DataFrame(stacked, copy=False)
+    missing = [column for column in also if column not in table]
+    return table.assign(**dict.fromkeys(missing, np.nan)) if missing else table
+
+
+def noted_table(name: str, rows: Sequence[Failure | Rejected]) -> pd.DataFrame:
+    """``failures.parquet`` or ``rejections.parquet``."""
+    return pd.DataFrame(rows, columns=list(COLUMNS[name])).astype(COLUMNS[name])
+
+
+def controls_table(trials: Sequence[Trial]) -> pd.DataFrame:
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "run": np.full(t.steps, t.run),
+                    "step": np.arange(1, t.steps + 1),
+                    **dict(zip(["dt", "v", "omega"], t.controls.T, strict=True)),
+                }
+            )
+            for t in trials
+        ],
+        ignore_index=True,
+    )
+
+
+def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
+    """``observations.parquet``; with a column ``source`` if a row is not of the landmark that it says."""
+    labelled = any(t.source is not None for t in trials)
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "run": np.full(len(t.landmark), t.run),
+                    "step": t.step,
+                    "landmark": t.landmark,
+                    **dict(zip(["z0", "z1", "z2"], t.z.T, strict=False)),
+                    **({"source": t.landmark if t.source is None else t.source} if labelled else {}),
+                }
+            )
+            for t in trials
+        ],
+        ignore_index=True,
+    )

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor
-from consistency.bench.scenario.toml_tables import UNITS
 from consistency.bench.simulation import draw_landmarks
 from consistency.bench.simulation.path import lap_length
 from consistency.bench.simulation.variation import course_of, mount_of
@@ -63,10 +62,6 @@ def _disparity_noise(scenario: Scenario) -> float:
         return sensor.sigma[2]
     middle = sensor.f * sensor.B / np.mean(sensor.range)
     return float(sensor.sigma[2] * sensor.disparity_growth.ratio_at(np.array(middle)))
-
-
-def _range(base: Scenario, value: float) -> Changes:
-    return {"truth.sensor.range": (base.truth.sensor.range[0], value)}
 
 
 def _count(base: Scenario, value: float) -> Changes:
@@ -153,7 +148,12 @@ def _loops_of(scenario: Scenario, base: Scenario) -> float:
 
 QUANTITIES: dict[str, Quantity] = {
     "baseline": Quantity("baseline", "m", _baseline, equivalent_baseline),
-    "range": Quantity("range of landmarks", "m", _range, lambda scenario, _: float(scenario.truth.sensor.range[1])),
+    "range": Quantity(
+        "range of landmarks",
+        "m",
+        lambda base, value: {"truth.sensor.range": (base.truth.sensor.range[0], value)},
+        lambda scenario, _: float(scenario.truth.sensor.range[1]),
+    ),
     "density": Quantity(
         "density of landmarks", "×", _count, lambda scenario, base: density_of(scenario) / density_of(base)
     ),
@@ -247,19 +247,12 @@ class Axis:
 
 
 def say_value(unit: str, value: Any) -> str:
-    """A value with its unit."""
     text = f"{value:.3g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value)
     return f"×{text}" if unit == "×" else f"{text} {unit}".rstrip()
 
 
 def require_key(axis: Axis, base: Scenario) -> None:
-    """Refuse a key that no scenario has.
-
-    Raises
-    ------
-    InputError
-        Says what is allowed in its place.
-    """
+    """Refuse a key that no scenario has, and say what is allowed in its place."""
     if axis.key in QUANTITIES:
         return
     for key in axis.changes(base, None):
@@ -281,18 +274,3 @@ def leaves(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]
             yield from leaves(value, f"{path}{key}.")
         else:
             yield path + key, value
-
-
-def with_changes(base: Scenario, name: str, summary: str, changes: Changes) -> Scenario:
-    """A copy of the scenario with keys set; raises pydantic's ValidationError."""
-    data = base.model_dump() | {"name": name, "summary": summary}
-    for path, value in changes.items():
-        *parents, key = path.split(".")
-        table = data
-        for parent in parents:
-            table = table[parent]
-        stem, _, unit = key.rpartition("_")
-        if key not in table and f"_{unit}" in UNITS.values():
-            table.pop(stem, None)  # the value comes with its unit
-        table[key] = value
-    return Scenario.model_validate(data)

@@ -59,8 +59,6 @@ NUMBERS = tuple(f.name for f in fields(CellResult) if f.type == "float")
 
 
 class CellOutcome(NamedTuple):
-    """A result with its table of runs."""
-
     result: CellResult
     runs: pd.DataFrame  # RUN_COLUMNS
 
@@ -87,7 +85,6 @@ def run_cell(
     OSError, InputError with an OSError as its cause
         No space left, no process can be started, a connection is lost.
     """
-    nothing = CellResult("failed", "", 0, 0, *[np.nan] * len(NUMBERS))
     try:
         with quiet():
             results, verdicts = run_until_decided(
@@ -98,8 +95,8 @@ def run_cell(
     except Exception as error:  # what breaks one cell must not end a night of others
         if isinstance(error, OSError) or isinstance(error.__cause__, OSError):  # it would break all of them
             raise
-        text = f"failed: {type(error).__name__}: {error}"
-        return CellOutcome(CellResult(**asdict(nothing) | {"diagnosis": text}), pd.DataFrame(columns=list(RUN_COLUMNS)))
+        failed = CellResult("failed", f"failed: {type(error).__name__}: {error}", 0, 0, *[np.nan] * len(NUMBERS))
+        return CellOutcome(failed, pd.DataFrame(columns=list(RUN_COLUMNS)))
     try:
         cost, step_us = cost_of(filter_name, sweep.reference, cell.scenario, sweep.seed_of(cell))
     except Exception:  # the verdict stands without it
@@ -107,7 +104,7 @@ def run_cell(
     return CellOutcome(result_of(verdict, cost, step_us), runs_table(found))
 
 
-def result_of(verdict: Verdict, cost: float = np.nan, step_us: float = np.nan) -> CellResult:
+def result_of(verdict: Verdict, cost: float, step_us: float) -> CellResult:
     """The numbers of a verdict that a map keeps."""
     accuracy = verdict.in_world.accuracy
     low, high = verdict.threshold

@@ -14,7 +14,7 @@ from typing import Any
 
 from consistency.bench.scenario import Scenario
 from consistency.bench.store.folder_tables import write_folder
-from consistency.bench.store.journal import Journal, Unfinished, unfinished_of
+from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellOutcome, CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.plan import MOST_CELLS, Cell, StoppingRule, Sweep, alone, number_of_points
@@ -104,25 +104,15 @@ class SweepFolder:
         with reading(path / "manifest.json", "key 'result' is damaged; remove that folder"):
             return result_from(manifest["result"])
 
-    def is_missing(self, work: CellWork) -> bool:
-        """Whether there is no result, or one with other inputs."""
+    def fresh(self, work: CellWork) -> CellResult | None:
+        """The result with these inputs; None where there is none, or one with others."""
         try:
-            return self.done(work) is None
+            return self.done(work)
         except StaleCell:
-            return True
-
-    def is_cluttered(self, work: CellWork) -> bool:
-        """Whether unfinished work is there, of a process at work or of one that was killed as it ended."""
-        return unfinished_of(self.place(work)).exists()
+            return None
 
     def require_usable(self, overwrite: bool) -> None:
-        """Refuse, before any work, a folder of something else, and cells that were made with other inputs.
-
-        Raises
-        ------
-        InputError
-            See above; with ``overwrite`` such cells are run again.
-        """
+        """Refuse before any work a folder of something else, and unless ``overwrite`` cells made with other inputs."""
         if not (self.path.exists() or self.path.is_symlink()):
             return
         try:
@@ -131,19 +121,17 @@ class SweepFolder:
             raise InputError(f"--out {self.path}: is not a folder of 'consistency sweep' ({error})") from None
         if kind != KIND:
             raise InputError(f"--out {self.path}: holds {kind}, not a sweep; choose another folder")
-        stale = list(self._stale()) if not overwrite else []
+        stale = []
+        for work in () if overwrite else self.all_work():
+            try:
+                self.done(work)
+            except StaleCell as error:
+                stale.append(error)
         if stale:
             more = f" (and {len(stale) - 1} more)" if len(stale) > 1 else ""
             raise InputError(
                 f"{stale[0]}{more}; add --overwrite to run such cells again, or give another --out to keep them"
             )
-
-    def _stale(self) -> Iterator[StaleCell]:
-        for work in self.all_work():
-            try:
-                self.done(work)
-            except StaleCell as stale:
-                yield stale
 
     def all_work(self, part: int = 1, parts: int = 1) -> list[CellWork]:
         """Every filter in every cell of a share."""
@@ -201,15 +189,9 @@ class SweepFolder:
 
     def results(self) -> dict[tuple[int, str], CellResult]:
         """What is there, by number of the cell and filter; results with other inputs are left out."""
-        found = {}
-        for cell, name in itertools.product(self.sweep.cells, self.sweep.filters):
-            try:
-                result = self.done(CellWork(cell, name))
-            except StaleCell:
-                continue
-            if result is not None:
-                found[cell.number, name] = result
-        return found
+        places = itertools.product(self.sweep.cells, self.sweep.filters)
+        found = ((cell.number, name, self.fresh(CellWork(cell, name))) for cell, name in places)
+        return {(number, name): result for number, name, result in found if result is not None}
 
 
 class StaleCell(InputError):

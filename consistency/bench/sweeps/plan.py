@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import itertools
 import math
@@ -20,10 +19,10 @@ from consistency.bench.filters import get_filter
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.runs.sequential import plan_of
 from consistency.bench.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
-from consistency.bench.sweeps.axes import QUANTITIES, Axis, leaves, require_key, with_changes
+from consistency.bench.scenario.scenario import unknown, with_changes
+from consistency.bench.sweeps.axes import QUANTITIES, Axis, leaves, require_key
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, POWER
-from consistency.referee.diagnostics import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE
 
@@ -40,19 +39,8 @@ class StoppingRule(Table):
     power: Positive = POWER
     max_runs: Count = 192
 
-    @property
-    def plan(self) -> dict[str, Any]:
-        return self.model_dump() | {"dof": len(POSE)}
-
-    @property
-    def settings(self) -> Settings:
-        """Settings of the verdict for a fixed number of runs."""
-        return Settings(self.false_alarm, self.detect, self.power)
-
 
 class SweepFile(Table):
-    """Keys of a sweep's file."""
-
     summary: str
     base: str  # name or path of a scenario
     filters: Annotated[list[str], Field(min_length=1)]
@@ -70,8 +58,6 @@ class SweepFile(Table):
 
 @dataclass(frozen=True)
 class Cell:
-    """One point of the sweep."""
-
     number: int  # 0, 1, ... in the order of :func:`points`
     indices: tuple[int, ...]  # place on each axis
     name: str  # of its folder
@@ -156,14 +142,15 @@ def points(axes: Sequence[Axis]) -> Iterator[tuple[int, ...]]:
 
 
 def number_of_points(axes: Sequence[Axis]) -> int:
-    """How many :func:`points` gives."""
     grid = math.prod(len(axis.values) for axis in axes if axis.home is None)
     return grid * (1 + sum(len(axis.values) - 1 for axis in axes if axis.home is not None))
 
 
-def text_alone(sweep: Sweep, cell: Cell) -> str:
-    """What of a cell varies alone, in words."""
-    return text_of(sweep.alone, [i for axis, i in zip(sweep.axes, cell.indices, strict=True) if axis.home is not None])
+def values_of(sweep: Sweep, axes: Sequence[Axis], cell: Cell) -> list[str]:
+    """A cell's values on some axes, and in a sweep with axes that vary alone what of the cell does."""
+    places = [cell.indices[sweep.axes.index(axis)] for axis in (*axes, *sweep.alone)]
+    alone = [text_of(sweep.alone, places[len(axes) :])] if sweep.alone else []
+    return [*map(Axis.say, axes, places), *alone]
 
 
 def _changed(axes: Sequence[Axis], at: Sequence[int]) -> list[tuple[Axis, int]]:
@@ -194,7 +181,6 @@ def _shipped() -> Path:
 
 
 def sweep_names() -> list[str]:
-    """Names of the built-in sweeps."""
     return sorted(path.stem for path in _shipped().glob("*.toml"))
 
 
@@ -214,14 +200,11 @@ def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
     if str(name) in sweep_names():
         path = _shipped() / f"{name}.toml"
     elif path.suffix != ".toml":
-        near = difflib.get_close_matches(str(name), sweep_names(), n=1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        known = ", ".join(sweep_names())
-        raise InputError(f"unknown sweep '{name}'{hint}; known: {known}; or give a .toml file or a folder of 'sweep'")
+        raise InputError(f"{unknown('sweep', str(name), sweep_names())}; or give a .toml file or a folder of 'sweep'")
     file = read_table(path, SweepFile)
     try:
         sweep = _sweep(path, file, tuple(filters or file.filters))
-        plan_of(sweep.rule.plan)
+        plan_of(sweep.rule.model_dump() | {"dof": len(POSE)})
         for filter_ in sweep.filters:
             get_filter(filter_)
         resolve_filters(sweep.filters, sweep.base.belief)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.sweeps.cell import CellResult, plain_numbers
-from consistency.bench.sweeps.plan import text_alone
+from consistency.bench.sweeps.plan import values_of
 from consistency.bench.sweeps.recommend import Advice, MapPlace, NearFilter
 from consistency.bench.sweeps.regime import Regime
 from consistency.bench.sweeps.rig import AxisPlace
@@ -68,10 +68,8 @@ def _cells_table(regime: Regime) -> Table:
     )
     rows: list[tuple[Cell, ...]] = []
     for cell in sweep.cells:
-        values = [axis.say(cell.indices[sweep.axes.index(axis)]) for axis in axes]
-        values += [text_alone(sweep, cell)] if sweep.alone else []
         found = regime.at(cell)
-        rows.append((*values, *(_verdict(found.get(name)) for name in sweep.filters)))
+        rows.append((*values_of(sweep, axes, cell), *(_verdict(found.get(name)) for name in sweep.filters)))
     return table(columns, rows, "Cells")
 
 
@@ -87,9 +85,9 @@ def _verdict(result: CellResult | None) -> Cell:
 
 def advice_blocks(advice: Advice) -> tuple[Block, ...]:
     """Where the rig lies, a row a filter, and the answer in sentences."""
-    first = [f"{advice.rig.name}: {'; '.join(place.text for place in advice.places)}"]
+    first = [f"{advice.rig.name}: {'; '.join(place.text for place in advice.here.places)}"]
     first += [f"  {note}" for note in notes_of(advice)]
-    first.append(f"nearest cell of the map: {advice.nearest.text}")
+    first.append(f"nearest cell of the map: {advice.here.nearest.text}")
     if advice.beyond is not None:
         first.append(f"and of the map of single axes: {advice.beyond.nearest.text}")
     rows = [_row(candidate) for candidate in advice.candidates]
@@ -98,18 +96,13 @@ def advice_blocks(advice: Advice) -> tuple[Block, ...]:
 
 def _row(c: NearFilter) -> tuple[Cell, ...]:
     near = c.nearest
+    there = near if c.beyond is None or near.status != "consistent" else c.beyond  # of the map that does not agree
     said = "not run" if c.verdict is None else Status(c.verdict.status)
     return (
-        c.filter, _there(c), f"{c.agreeing} of {c.around}", Quantity(near.rmse_position, digits=".3f"),
+        c.filter, Status(there.status), f"{c.agreeing} of {c.around}", Quantity(near.rmse_position, digits=".3f"),
         Quantity(np.rad2deg(near.rmse_heading), digits=".2f"), f"×{near.cost:.2g}" if np.isfinite(near.cost) else "-",
         said,
     )  # fmt: skip
-
-
-def _there(c: NearFilter) -> Cell:
-    """The verdict in the nearest cell, of the second map where that is looked at and does not agree."""
-    found = c.nearest if c.beyond is None or c.nearest.status != "consistent" else c.beyond
-    return Status(found.status)
 
 
 def notes_of(advice: Advice) -> list[str]:
@@ -139,8 +132,12 @@ def sentences_of(advice: Advice) -> list[str]:
             found = f"the map has one, but {plural(advice.runs, 'run')} of this rig find: {names}"
             return [f"No filter to trust: {found}.{more}"]
         if advice.lacking:
+            there, sweep = ", ".join(c.filter for c in advice.candidates), advice.here.regime.sweep
             return [
-                f"No answer yet: of {advice.nearest.text} the map lacks {', '.join(advice.lacking)}. {_none_of(advice)}"
+                f"No answer yet: of {advice.here.nearest.text} the map lacks {', '.join(advice.lacking)}. Of those "
+                f"there ({there}) none is consistent. {advice.here.regime.missing} of its "
+                f"{len(sweep.cells) * len(sweep.filters)} results are missing; finish the sweep: the same "
+                "'consistency sweep' goes on."
             ]
         where = f" Nearest cell where one is consistent: {advice.elsewhere}." if advice.elsewhere else ""
         return [f"No filter of the map is consistent near this rig.{where}"]
@@ -149,16 +146,6 @@ def sentences_of(advice: Advice) -> list[str]:
         *([_confirmed(advice, best)] if best.verdict is not None else []),
         *(_contradiction(advice, c) for c in advice.candidates if c.sure == "no"),
     ]
-
-
-def _none_of(advice: Advice) -> str:
-    """What the map has, and how to have the rest."""
-    there, sweep = ", ".join(c.filter for c in advice.candidates), advice.regime.sweep
-    total = len(sweep.cells) * len(sweep.filters)
-    return (
-        f"Of those there ({there}) none is consistent. {advice.regime.missing} of its {total} results are missing; "
-        "finish the sweep: the same 'consistency sweep' goes on."
-    )
 
 
 def _why(advice: Advice, best: NearFilter) -> str:
@@ -174,7 +161,7 @@ def _why(advice: Advice, best: NearFilter) -> str:
 def _confirmed(advice: Advice, best: NearFilter) -> str:
     """What the confirming runs said, and what they could have missed."""
     assert best.verdict is not None
-    rule = advice.regime.sweep.rule
+    rule = advice.here.regime.sweep.rule
     rate = 100.0 * rule.false_alarm
     ratio, (low, high) = best.verdict.inflation, best.verdict.inflation_interval
     runs = plural(advice.runs, "run")
@@ -195,10 +182,10 @@ def advice_json(advice: Advice) -> dict[str, Any]:
     """The advice for programs; NaN becomes null."""
     best = advice.best
     return {
-        "rig": advice.rig.name, "map": advice.regime.sweep.name, "inside": advice.inside,
+        "rig": advice.rig.name, "map": advice.here.regime.sweep.name, "inside": advice.inside,
         "take": None if best is None else best.filter, "sure": None if best is None else best.sure,
-        "answer": sentences_of(advice), "notes": notes_of(advice), "nearest_cell": advice.nearest.text,
-        "axes": _axes_json(advice.places), "beyond": _beyond_json(advice.beyond),
+        "answer": sentences_of(advice), "notes": notes_of(advice), "nearest_cell": advice.here.nearest.text,
+        "axes": _axes_json(advice.here.places), "beyond": _beyond_json(advice.beyond),
         "runs": advice.runs,
         "filters": [
             {"filter": c.filter, "sure": c.sure or None, "cells_around": c.around, "agreeing": c.agreeing}

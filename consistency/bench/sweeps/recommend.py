@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.sweeps.cell import CellResult
-from consistency.bench.sweeps.plan import Cell, Sweep, text_of
+from consistency.bench.sweeps.plan import Cell, text_of
 from consistency.bench.sweeps.regime import Regime, ranked
 from consistency.bench.sweeps.rig import (
     ALIKE,
@@ -23,7 +23,7 @@ from consistency.bench.sweeps.rig import (
     read_rig,
 )
 from consistency.referee.column_names import POSE
-from consistency.referee.diagnostics import Verdict, gate_runs
+from consistency.referee.diagnostics import Settings, Verdict, gate_runs
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.sources import analyse
 
@@ -83,35 +83,16 @@ class Advice:
     here: MapPlace  # in the map
     beyond: MapPlace | None  # in the map of axes that vary alone, if the rig differs in one of these
     candidates: tuple[NearFilter, ...]  # the best first
+    unlike: tuple[str, ...]  # keys in which no cell of a map is as the rig is
+    inside: bool
     runs: int  # confirming runs of each filter; 0: the map alone was asked
     elsewhere: str  # the nearest cell with a filter to trust, where there is none here
-
-    @property
-    def regime(self) -> Regime:
-        return self.here.regime
-
-    @property
-    def places(self) -> tuple[AxisPlace, ...]:
-        return self.here.places
-
-    @property
-    def nearest(self) -> Cell:
-        return self.here.nearest
-
-    @property
-    def unlike(self) -> tuple[str, ...]:
-        """Keys in which no cell of a map is as the rig is."""
-        return _left(self.here, self.beyond)[0]
-
-    @property
-    def inside(self) -> bool:
-        return not _left(self.here, self.beyond)[1]
 
     @property
     def lacking(self) -> tuple[str, ...]:
         """Filters that the map, of a sweep that is not finished, does not have in the nearest cell."""
         there = {candidate.filter for candidate in self.candidates}
-        return tuple(name for name in self.regime.sweep.filters if name not in there)
+        return tuple(name for name in self.here.regime.sweep.filters if name not in there)
 
     @property
     def untried(self) -> tuple[str, ...]:
@@ -128,7 +109,7 @@ class Advice:
     def equivalent(self) -> tuple[float, float] | None:
         """Baseline of the rig and the one that it counts as (m), where they differ."""
         sensor_rig = self.rig.scenario.truth.sensor.rig
-        counted = next((float(place.value) for place in self.places if place.axis.key == "baseline"), None)
+        counted = next((float(place.value) for place in self.here.places if place.axis.key == "baseline"), None)
         if sensor_rig is None or counted is None or abs(counted / sensor_rig[1] - 1.0) < ALIKE:
             return None
         return sensor_rig[1], counted
@@ -159,8 +140,9 @@ def recommend_for(
     """
     if confirm < 1:
         raise InputError(f"--confirm {confirm}: must be at least 1; for the map alone, without a run, give --runs 0")
-    sweep = regime.sweep
-    runs = runs_of(sweep) if runs is None else runs
+    sweep, rule = regime.sweep, regime.sweep.rule
+    if runs is None:  # its fault is found, or its absence shown
+        runs = gate_runs(len(POSE), rule.detect, rule.false_alarm, rule.power)
     if runs < 0 or runs == 1:
         raise InputError(f"--runs {runs}: must be 0, or 2 or more")
     rig = read_rig(request, sweep.base)
@@ -172,17 +154,17 @@ def recommend_for(
     if not candidates:
         raise InputError(f"the map has nothing of {here.nearest.text}; finish its sweep first")
     unlike, outside = _left(here, beyond)
-    left, known = confirm if runs else 0, []
+    left, known, settings = confirm if runs else 0, [], Settings(rule.false_alarm, rule.detect, rule.power)
     for candidate in candidates:
         if left and candidate.is_near:
             results = run_trials(rig.scenario, [candidate.filter], runs, seed, jobs)
-            (verdict,) = analyse(results, [candidate.filter], settings=sweep.rule.settings).values()
+            (verdict,) = analyse(results, [candidate.filter], settings=settings).values()
             candidate = replace(candidate, verdict=verdict)
             left = 0 if verdict.status in OPEN else left - 1
         alike = not unlike and (beyond is None or candidate.beyond is not None)
         known.append(replace(candidate, sure=sureness(candidate, not outside, alike, alone=runs == 0)))
     elsewhere = "" if any(c.is_near for c in known) else _elsewhere(regime, here.places)
-    return Advice(rig, here, beyond, _sorted(known), runs, elsewhere)
+    return Advice(rig, here, beyond, _sorted(known), unlike, not outside, runs, elsewhere)
 
 
 def place_in(regime: Regime, rig: Rig, known: Collection[str] = ()) -> MapPlace | None:
@@ -227,12 +209,6 @@ def _left(here: MapPlace, beyond: MapPlace | None) -> tuple[tuple[str, ...], set
     varied = {place.axis.key for place in beyond.places if place.axis.home is not None}
     unlike = tuple(key for key in here.unlike if key in beyond.unlike)
     return unlike, (here.outside - varied) | beyond.outside
-
-
-def runs_of(sweep: Sweep) -> int:
-    """Runs that suffice for a verdict by the rule of the map: its fault is found, or its absence shown."""
-    rule = sweep.rule
-    return gate_runs(len(POSE), rule.detect, rule.false_alarm, rule.power)
 
 
 def around(places: Sequence[AxisPlace]) -> list[tuple[int, ...]]:

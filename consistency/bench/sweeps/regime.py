@@ -79,7 +79,6 @@ def ranked(results: Mapping[str, CellResult]) -> list[tuple[str, CellResult]]:
 
 
 def regime_of(folder: SweepFolder) -> Regime:
-    """The map of what a folder holds."""
     return Regime(folder.sweep, folder.results(), manifest_of(kind=MAP_KIND))
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from consistency.bench.scenario import ListedEffect, LocalBias, Scenario, UvdSensor, explain, load_scenario, read_table
+from consistency.bench.scenario.scenario import with_changes
 from consistency.bench.store.log import SensorFile
-from consistency.bench.sweeps.axes import QUANTITIES, Axis, Changes, density_of, leaves, say_value, with_changes
+from consistency.bench.sweeps.axes import QUANTITIES, Axis, Changes, density_of, leaves, say_value
 from consistency.bench.sweeps.plan import Cell, Sweep
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_toml
@@ -33,8 +34,6 @@ class Request:
 
 @dataclass(frozen=True)
 class Rig:
-    """A rig as a scenario."""
-
     name: str
     scenario: Scenario
     assumed: tuple[str, ...]  # what was taken from the map's world
@@ -88,14 +87,11 @@ def _from_sensor(path: Path, base: Scenario, request: Request) -> Rig:
         low, high = camera.disparity
         disparity = (low, high * file.f * file.B / (f * B))
         assumed.append(f"disparities {low:g} to {disparity[1]:.0f} px")
-    if request.range is None:
-        assumed.append(f"landmarks up to {camera.range[1]:g} m (--range)")
-    if request.speed is None:
-        assumed.append(f"speed {base.truth.path.speed:g} m/s (--speed)")
-    if request.density is None:
-        assumed.append(f"{density_of(base):.2g} landmarks a square metre (--density)")
-    if request.dt is None:
-        assumed.append(f"time of a step {base.truth.dt:g} s (--dt)")
+    texts = {
+        "range": f"landmarks up to {camera.range[1]:g} m", "speed": f"speed {base.truth.path.speed:g} m/s",
+        "density": f"{density_of(base):.2g} landmarks a square metre", "dt": f"time of a step {base.truth.dt:g} s",
+    }  # fmt: skip
+    assumed += [f"{text} (--{option})" for option, text in texts.items() if getattr(request, option) is None]
     changes: Changes = {
         f"truth.sensor.{key}": value
         for key, value in {"sigma": file.sigma, "f": file.f, "B": file.B, "image": image, "disparity": disparity,
@@ -122,7 +118,6 @@ def _with_bias(camera: UvdSensor, file: SensorFile) -> list[ListedEffect]:
 
 
 def _with_options(scenario: Scenario, request: Request) -> Scenario:
-    """The scenario with what the options say."""
     for option in ("range", "speed", "density", "dt"):
         value = getattr(request, option)
         if value is None:
@@ -167,7 +162,6 @@ class AxisPlace:
 
 
 def is_known(value: Any) -> bool:
-    """Whether a rig has a value on an axis."""
     return value is not None and bool(value == value)
 
 

@@ -13,7 +13,7 @@ from consistency.bench.filters import get_filter
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.trial_work import Backend
-from consistency.bench.store.journal import Busy, Journal
+from consistency.bench.store.journal import Busy, Journal, unfinished_of
 from consistency.bench.sweeps.cell import CellResult, run_cell
 from consistency.bench.sweeps.folder import CellWork, SweepFolder
 from consistency.bench.sweeps.plan import Sweep
@@ -63,7 +63,8 @@ def run_sweep(
     folder.require_usable(overwrite)
     share = folder.all_work(part, parts)
     folder.begin()
-    todo = [work for work in share if folder.is_missing(work) or folder.is_cluttered(work)]
+    # unfinished work is of a process at work, or of one that was killed as it ended
+    todo = [work for work in share if folder.fresh(work) is None or unfinished_of(folder.place(work)).exists()]
     if len(todo) < len(share):
         say(f"{len(share) - len(todo)} of {len(share)} are there already")
     with stoppable() as stop:
@@ -75,7 +76,7 @@ def run_sweep(
         for count, (work, seconds) in enumerate(_in_turn(folder, todo, partial(_do, stop, jobs, backend)), 1):
             left = _left(seconds * (len(todo) - count))
             say(f"{count} of {len(todo)}: {work.text}: {_said(folder.done(work))}{left}")
-    missing = sum(folder.is_missing(work) for work in folder.all_work())
+    missing = sum(folder.fresh(work) is None for work in folder.all_work())
     return folder, missing
 
 
@@ -99,7 +100,7 @@ def _in_turn(
         for work in waiting:
             try:
                 with _refusals(folder), folder.at_work(work) as journal:
-                    if folder.is_missing(work):  # nobody has done it meanwhile
+                    if folder.fresh(work) is None:  # nobody has done it meanwhile
                         do(folder, work, journal)
                         count += 1
             except Busy:

@@ -63,7 +63,7 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> FactorFit | None:
         moved[free] += np.clip(np.linalg.solve(bend, slope[free]), -STEP, STEP)
         best = moved if search.total(moved) > search.total(best) else best
     interval = Profile(search, search.tried, best, np.nan_to_num(curvature), LIMIT).intervals()
-    return FactorFit(best, interval, edge, search.total(best) - first, search.settings)
+    return FactorFit(best, interval, edge, search.total(best) - first, len(search.tried))
 
 
 class _Search:
@@ -90,10 +90,6 @@ class _Search:
     @property
     def tried(self) -> list[Array]:
         return [np.frombuffer(key) for key in self._known]
-
-    @property
-    def settings(self) -> int:
-        return len(self._known)
 
 
 def _derivatives(search: _Search, x: Array, free: Sequence[int]) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.montecarlo import run_log, run_trials
+from consistency.bench.runs.montecarlo import require_counts, run_log, run_trials
 from consistency.bench.runs.trial_work import Simulated
 from consistency.bench.scenario import Belief, Scenario
 from consistency.bench.store.log import Log
@@ -38,11 +38,6 @@ class Parts:
         """Belief before the fit."""
         return self.world.belief
 
-    @property
-    def scenario(self) -> Scenario | None:
-        """The world, where it is simulated."""
-        return self.world if isinstance(self.world, Scenario) else None
-
 
 def parts_of(world: Scenario | Log, runs: int, seed: int) -> Parts:
     """So many runs of a scenario and as many fresh ones; or the first half of a log and its second.
@@ -56,10 +51,7 @@ def parts_of(world: Scenario | Log, runs: int, seed: int) -> Parts:
     """
     if isinstance(world, Log):
         return _of_log(world)
-    if runs < 1:
-        raise InputError(f"runs must be at least 1, got {runs}")
-    if seed < 0:
-        raise InputError(f"seed must not be negative, got {seed}")
+    require_counts(runs, seed)
     for_fit, for_verdict, spare = (int(state) for state in np.random.SeedSequence(seed).generate_state(3))
     simulated = Simulated(world, for_fit)
     count = f"{runs} run{'s' * (runs != 1)}"
@@ -115,5 +107,4 @@ def part_of(trial: Trial, start: int, end: int) -> Trial:
 
 
 def with_belief(scenario: Scenario, belief: Belief, name: str | None = None) -> Scenario:
-    """The scenario with another belief."""
     return scenario.variant(name or scenario.name, belief=belief.model_dump(), summary=scenario.summary)

@@ -15,14 +15,12 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import Belief, Scenario, load_scenario
 from consistency.bench.store.log import Log
-from consistency.bench.tuning.balance import balanced, nearest
+from consistency.bench.tuning.faults import Probe, balanced, is_at_fault, nearest, reasons_of
 from consistency.bench.tuning.fit import FactorFit, maximise
 from consistency.bench.tuning.noise_groups import NoiseGroup, groups_of, rounded, scaled
 from consistency.bench.tuning.result import Factor, Setting, Tuning
-from consistency.bench.tuning.scores import require_scorable
-from consistency.bench.tuning.setting_scores import BeliefScorer
+from consistency.bench.tuning.scores import BeliefScorer, require_scorable
 from consistency.bench.tuning.split import Judging, Parts, parts_of
-from consistency.bench.tuning.why import Probe, is_at_fault, reasons_of
 from consistency.referee.diagnostics import Settings, Verdict
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
@@ -81,16 +79,13 @@ def tune(
     require_scorable(instance, by, parts.has_truth)
     tuner = _Tuner(instance, parts, parsed, jobs, timeout, settings or Settings())
     chosen = tuner.fitted(by)
-    before = tuner.before()
-    nothing: Explanation = (None, 0, False, ())
-    other, tried, no_setting, why = tuner.explained(chosen) if is_at_fault(chosen.verdict) else nothing
+    before = tuner.verdict(parts.on_fresh, parts.belief, tuner.settings)
+    other, tried, no_setting, why = tuner.explained(chosen) if is_at_fault(chosen.verdict) else (None, 0, False, ())
     seconds = time.monotonic() - began
     return Tuning(name_of(instance), parts, before, chosen, other, tried, no_setting, why, seconds)
 
 
 class _Tuner:
-    """One filter in one world: fits and verdicts."""
-
     def __init__(
         self,
         filter_: Filter,
@@ -112,8 +107,8 @@ class _Tuner:
 
     def explained(self, chosen: Setting) -> Explanation:
         """For a setting with a fault: another one, how many were tried, whether none is consistent, and why."""
-        probe, scenario = None, self.parts.scenario
-        if scenario is not None:
+        probe, scenario = None, self.parts.world
+        if isinstance(scenario, Scenario):
             say("a fault is found; asking whether it is there with the true noises, too")
             count, seed = len(self.parts.trials), self.parts.spare_seed
             probe = Probe(self.filter, scenario, count, seed, self.jobs, self.timeout, self.settings)
@@ -138,7 +133,7 @@ class _Tuner:
 
         def judge(log_factors: Array) -> Verdict:
             belief = scaled(self.parts.belief, self.groups, log_factors)
-            return self._verdict(self.parts.on_fitted, belief, self.settings)
+            return self.verdict(self.parts.on_fitted, belief, self.settings)
 
         centre = np.array([0.0 if factor.edge else np.log(factor.value) for factor in fitted.factors])
         with BeliefScorer(self.filter, self.parts.trials, self.parts.belief, "nees", self.jobs, self.timeout) as bench:
@@ -152,14 +147,10 @@ class _Tuner:
     def _setting(self, by: str, x: Array, interval: Array, edge: Sequence[int], settings: int) -> Setting:
         factors = tuple(map(_factor, self.groups, x, interval, edge))
         belief = rounded(scaled(self.parts.belief, self.groups, x))
-        verdict = self._verdict(self.parts.on_fresh, belief, tolerant(self.settings, interval))
+        verdict = self.verdict(self.parts.on_fresh, belief, tolerant(self.settings, interval))
         return Setting(by, factors, belief, verdict, settings)
 
-    def before(self) -> Verdict:
-        """The verdict on the other part with the belief as it is."""
-        return self._verdict(self.parts.on_fresh, self.parts.belief, self.settings)
-
-    def _verdict(self, judging: Judging, belief: Belief, settings: Settings) -> Verdict:
+    def verdict(self, judging: Judging, belief: Belief, settings: Settings) -> Verdict:
         with quiet():
             results = judging(self.filter, belief, self.jobs, self.timeout)
         return analyse(results, settings=settings)[name_of(self.filter)]
@@ -167,7 +158,8 @@ class _Tuner:
     def _fit(self, bench: BeliefScorer) -> FactorFit:
         at_first = bench(self.parts.belief)
         if not at_first.failures and not np.isfinite(at_first.ratio):
-            raise InputError(f"{self.parts.world.name}: no step has {_wanted(bench.by)} to fit; give longer runs")
+            wanted = "an innovation" if bench.by == "innovations" else "a NEES"
+            raise InputError(f"{self.parts.world.name}: no step has {wanted} to fit; give longer runs")
         common = at_first.ratio if np.isfinite(at_first.ratio) and at_first.ratio > 0.0 else 1.0
         factors = (common, 1.0, *OTHER_STARTS)  # as all covariances scale together, so do the squares: a good guess
 
@@ -195,10 +187,6 @@ def tolerant(settings: Settings, interval: Array) -> Settings:
     known = unsure if np.isfinite(half_widths).all() else MOST_TOLERATED
     tolerance = max(settings.tolerated, min(known, MOST_TOLERATED))
     return replace(settings, tolerance=tolerance) if tolerance > 1.0 else settings
-
-
-def _wanted(by: str) -> str:
-    return "an innovation" if by == "innovations" else "a NEES"
 
 
 def _factor(group: NoiseGroup, log_factor: float, interval: Array, edge: int) -> Factor:

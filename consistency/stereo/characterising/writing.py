@@ -13,8 +13,7 @@ import numpy as np
 import tomli_w
 
 from consistency.bench.scenario import PicturedSensor
-from consistency.bench.scenario.effects.bias_map import BiasMap
-from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
+from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.sentences import p_text

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.experiment_tables import extra_table
+from consistency.bench.pages.exhibits import extra_table
 from consistency.bench.pages.report_input import Report
 from consistency.referee.document.colours import EXPECTED, SHADE, style
 from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span

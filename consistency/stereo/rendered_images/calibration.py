@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from consistency.bench.scenario.effects.bias_map import BiasMap
-from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
-from consistency.bench.scenario.effects.node_tables import bilinear, hats
+from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth, bilinear, hats
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.chain import Tracks

@@ -14,7 +14,7 @@ from misbehaving import Still
 
 import consistency as cs
 from consistency.bench.runs.backends import remote
-from consistency.bench.runs.backends.batches import Batch, Batches, Event, WorkerLost, failed, in_batches
+from consistency.bench.runs.backends.batches import Batch, Batches, Event, failed, in_batches
 from consistency.bench.runs.backends.choosing import backend_for
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
@@ -64,7 +64,7 @@ class Fake:
         if self.killers & set(batch.left):
             dead = [batch, *(self.waiting if self.shares else [])]
             self.waiting = [] if self.shares else self.waiting
-            return [(each, WorkerLost("killed")) for each in dead]
+            return [(each, "killed") for each in dead]
         done = batch.left[: self.most]
         return [(batch, Counted().part(done, seconds=self.per_run * len(done))), (batch, None)]
 

@@ -20,8 +20,17 @@ import consistency as cs
 from consistency.bench.challenging import challenge as challenging
 from consistency.bench.challenging import world_scores as scoring
 from consistency.bench.challenging.challenge import BASES, ChallengePhases, Plan, base_of, challenge, is_overconfident
-from consistency.bench.challenging.search import BATCH, RUNGS, Budget, Candidate, ranked, search, standard_error
-from consistency.bench.challenging.shrink import changed, shrink
+from consistency.bench.challenging.search import (
+    BATCH,
+    RUNGS,
+    SIZE,
+    Budget,
+    Candidate,
+    ranked,
+    search,
+    shrink,
+    standard_error,
+)
 from consistency.bench.challenging.wording import as_data, lines, write_scenario
 from consistency.bench.challenging.world_scores import WORST, ChallengeScorer, Done, map_nees, score_of_run
 from consistency.bench.challenging.worlds import Choice, LogScale, Point, Space, space_of
@@ -34,6 +43,12 @@ from consistency.referee.errors import InputError
 
 STEREO = cs.load_scenario("herath2007-stereo")
 SMALL = ("steps=50:100", "seed=2007", "path=circle", "sensor=1", "odometry=1")
+
+
+def changed(space: Space, point: Point) -> int:
+    """Number of values that are not the plain ones, the size of the world aside."""
+    pairs = zip(space.dimensions, point, strict=True)
+    return sum(value != d.plain for d, value in pairs if d.name != SIZE)
 
 
 def point_with(space: Space, **values: object) -> Point:

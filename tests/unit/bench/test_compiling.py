@@ -69,7 +69,7 @@ def case():
         os.setgid(65534)
         os.setuid(65534)
     try:
-        compiling.compile_for(filters, None, None, int(jobs))
+        compiling.compile_all(((f, None, None) for f in filters), int(jobs))
     except KeyboardInterrupt:
         print("stopped")
     else:
@@ -183,7 +183,8 @@ def test_kernels_of_root_serve_other_users(done: Done, folder: Path, monkeypatch
 def test_what_others_cannot_read_is_compiled_here(capsys: pytest.CaptureFixture[str]) -> None:
     made: list[int] = []
     outlook = Outlook("", is_ready=False, is_shared=False, seconds=4.0)
-    need: Any = SimpleNamespace(filter=SimpleNamespace(name="mine"), outlook=outlook, compile=lambda: made.append(1))
+    mine: Any = SimpleNamespace(name="mine", compile=lambda *_: made.append(1))
+    need = compiling.Need(mine, None, None, outlook)  # type: ignore[arg-type]
     compiling._compile([need, need], 2)
     assert made == [1, 1]
     assert capsys.readouterr().err == "compiling 2 kernels of mine: about 6 s, once\n"

@@ -19,8 +19,8 @@ from consistency.bench.scenario.effects import EFFECTS, Context, FieldOfView, Li
 from consistency.bench.scenario.toml_tables import Count, Positive, Triple
 from consistency.bench.simulation import World, draw_landmarks, planned_controls
 from consistency.bench.simulation.sensing import purpose_of
-from consistency.bench.store.data_frames import observations_table
 from consistency.bench.store.log import read_log
+from consistency.bench.store.trial_rows import observations_table
 from consistency.referee.types import Array
 
 Small = Callable[..., cs.Scenario]

@@ -14,7 +14,6 @@ from consistency.bench.filters.covariance_update.local import Local as Locally
 from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.kernel.part_functions import Data, Slam, make_factors, make_local
 from consistency.bench.runs import memory_needed as module
-from consistency.bench.runs import memory_touched as touched
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.isolation.isolating import Isolation
 from consistency.bench.runs.memory_needed import footprint, memory_here, trial_bytes, workers_that_fit
@@ -158,47 +157,47 @@ def parts(linear: cs.Scenario) -> Slam:
 
 def test_rows_are_touched_for_what_is_known(parts: Slam) -> None:
     data = seen([[0, 1, 2], [1], [0, 2, 3, 4], [0, 1, 2]])
-    reach = touched._reach(parts, data, 3, 18, touched._tally(parts, 3, 18))
+    reach = module._reach(parts, data, 3, 18, module._tally(parts, 3, 18))
     assert reach == (3, 3, 18, 12 * 18, 0, 0), "in the last step, with three of the five that are known"
-    S, rows = touched.half(9), 12 * 18
-    assert touched.touched(parts, data, 18, 0) == 8 * (S + 2 * rows)
-    assert touched.touched(parts, seen([[0, 1, 2], [3, 4]]), 18, 0) == 0, "nothing known is seen"
+    S, rows = module.half(9), 12 * 18
+    assert module.touched(parts, data, 18, 0) == 8 * (S + 2 * rows)
+    assert module.touched(parts, seen([[0, 1, 2], [3, 4]]), 18, 0) == 0, "nothing known is seen"
 
 
 def test_half_a_matrix_is_whole_pages() -> None:
-    assert touched.half(9) == 81
-    assert touched.half(512) == 512**2
-    assert touched.half(5120) == 5120 * (5120 + 512) // 2
+    assert module.half(9) == 81
+    assert module.half(512) == 512**2
+    assert module.half(5120) == 5120 * (5120 + 512) // 2
 
 
 def test_a_local_base_grows_until_it_is_due(parts: Slam) -> None:
     slam = parts._replace(covariance=Locally(60))
     every = list(range(40))
     data = seen([every, [0, 1], [2, 1], [2, 3], [3, 40]])
-    local = touched._tally(slam, 3, 126)
+    local = module._tally(slam, 3, 126)
     assert len(local.x) == len(make_local(slam.covariance, 3, 126, 5, 41).x)
-    reach = touched._reach(slam, data, 3, 126, local)
+    reach = module._reach(slam, data, 3, 126, local)
     assert (reach.base, reach.active) == (15, 15), "the robot and four landmarks; what is new is active after the step"
     assert reach.width == 30
     a, b = reach.active, reach.base
-    numbers = touched.half(6) + 2 * 9 * 30 + a * a + a * b + touched.half(b) + (a + b) * 126
-    assert touched.touched(slam, data, 126, 0) == 8 * numbers
+    numbers = module.half(6) + 2 * 9 * 30 + a * a + a * b + module.half(b) + (a + b) * 126
+    assert module.touched(slam, data, 126, 0) == 8 * numbers
     dense = seen([every, every, every])
-    assert touched._reach(slam, dense, 3, 123, touched._tally(slam, 3, 123)).base == 0
+    assert module._reach(slam, dense, 3, 123, module._tally(slam, 3, 123)).base == 0
 
 
 def test_parked_landmarks_are_left_alone() -> None:
     parking = Parking(every=5, unseen=3, doubt=0.1, adrift=1.0, whole=False, patience=True, start=60)
     data = seen([list(range(40)), *[[0, 1, 2]] * 12, [5, 0]])
     factors = make_factors(63, 126, 42)
-    reach = touched._parked(parking, data, 126, factors)
+    reach = module._parked(parking, data, 126, factors)
     assert (reach.seen, reach.back, reach.base) == (3, 1, 12)
     assert reach.width == 3 + 3 * 40 + 3, "all of it, with a clone, before the others are parked"
-    again = touched._parked(parking, seen([list(range(40)), *[[0, 1, 2]] * 12, [5, 6, 7, 8, 0]]), 126, factors)
+    again = module._parked(parking, seen([list(range(40)), *[[0, 1, 2]] * 12, [5, 6, 7, 8, 0]]), 126, factors)
     assert (again.seen, again.back, again.cells) == (5, 4, 12 * 126), "the active part and its base are narrow"
     often = seen([list(range(40)), *[[0, 1]] * 3, [0, 2]])
-    assert [touched._parked(parking._replace(unseen=n), often, 126, factors).back for n in (1, 2, 3)] == [1, 1, 0]
-    still = touched._parked(parking._replace(every=0), data, 126, factors)
+    assert [module._parked(parking._replace(unseen=n), often, 126, factors).back for n in (1, 2, 3)] == [1, 1, 0]
+    still = module._parked(parking._replace(every=0), data, 126, factors)
     assert (still.back, still.base, still.width) == (0, 0, 123)
 
 
@@ -208,6 +207,6 @@ def test_arrays_that_cannot_be_made_count_by_the_square(parts: Slam, monkeypatch
             raise MemoryError
         return [np.zeros((m, m))]
 
-    monkeypatch.setattr(touched, "make_watch", watch)
+    monkeypatch.setattr(module, "make_watch", watch)
     data = seen([list(range(40))])
-    assert touched.touched(parts, data, 123, 0) == 16 * 8 * 100
+    assert module.touched(parts, data, 123, 0) == 16 * 8 * 100

@@ -228,10 +228,10 @@ def test_bad_sensor_file(folder: Path, case: str) -> None:
 def test_an_error_while_writing_leaves_nothing(
     uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*args: object) -> None:
+    def full(*args: object, **options: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("consistency.bench.store.log._write_text", full)
+    monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises((OSError, cs.InputError), match="No space left"):
         simulate_log(uvd, runs=1, seed=0, out=tmp_path / "log")
     assert list(tmp_path.iterdir()) == []

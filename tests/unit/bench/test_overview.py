@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.pages.answer import answer
-from consistency.bench.pages.build import build_report, compose
+from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.report_input import Report
 from consistency.bench.pages.sections import overview
 from consistency.referee.document.blocks import Name, Status, Table

@@ -12,11 +12,12 @@ import pytest
 
 import consistency as cs
 from consistency.bench.scenario import data_folder, misbelief
+from consistency.bench.scenario.scenario import with_changes
 from consistency.bench.store.log import write_log
 from consistency.bench.sweeps import recommend as advising
 from consistency.bench.sweeps import regime as maps
 from consistency.bench.sweeps import rig as rigs
-from consistency.bench.sweeps.axes import QUANTITIES, Axis, equivalent_baseline, with_changes
+from consistency.bench.sweeps.axes import QUANTITIES, Axis, equivalent_baseline
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.bench.sweeps.printing import advice_blocks, advice_json, notes_of, sentences_of
@@ -88,8 +89,8 @@ def test_places_that_are_no_numbers() -> None:
 
 def test_the_published_rig_lies_at_its_cells(regime: Regime) -> None:
     advice = advise(regime)
-    assert advice.nearest.indices == (1, 2, 2, 1)
-    assert [place.around for place in advice.places] == [(1,), (1, 2), (2,), (1,)]
+    assert advice.here.nearest.indices == (1, 2, 2, 1)
+    assert [place.around for place in advice.here.places] == [(1,), (1, 2), (2,), (1,)]
     assert advice.inside
     assert advice.unlike == ()
 
@@ -117,7 +118,7 @@ def test_the_cheaper_of_two_equally_good_filters_comes_first(regime: Regime, tmp
 
 def test_cells_around_are_corners_and_neighbours_on_each_axis(regime: Regime) -> None:
     """Between two ranges, at a value of each other axis: the odometry of the map has a value on one side alone."""
-    near = set(advising.around(advise(regime).places))
+    near = set(advising.around(advise(regime).here.places))
     assert near == {(1, 2, 2, 1), (1, 1, 2, 1), (0, 2, 2, 1), (2, 2, 2, 1), (1, 3, 2, 1), (1, 2, 1, 1), (1, 2, 2, 0)}
 
 
@@ -144,7 +145,7 @@ def test_outside_the_map_nothing_is_sure(regime: Regime) -> None:
     advice = advise(regime, range=30.0)
     assert not advice.inside
     assert advice.best.sure == "unsure"
-    assert "range of landmarks 30 m, beyond the map's 2 m to 12 m" in [place.text for place in advice.places]
+    assert "range of landmarks 30 m, beyond the map's 2 m to 12 m" in [place.text for place in advice.here.places]
     assert "outside the map" in sentences_of(advice)[0]
 
 
@@ -165,7 +166,7 @@ def test_a_map_that_is_not_finished_says_what_is_missing(regime: Regime) -> None
     """The sweep was interrupted before the second filter was in the nearest cell: none is not known yet."""
     bad = made(lambda *_: result("biased"))
     *_, second = bad.sweep.filters
-    here = advise(bad).nearest
+    here = advise(bad).here.nearest
     part = replace(bad, results={k: v for k, v in bad.results.items() if k != (here.number, second)})
     [answer] = sentences_of(advise(part))
     assert answer == (
@@ -434,7 +435,7 @@ def test_the_sensor_of_a_simulated_log_is_read(tmp_path: Path, regime: Regime) -
     log = tmp_path / "log"
     write_log(log, [cs.simulate(scenario)], scenario.belief, None, {"kind": "log"}, view=((320, 240), (160.0, 120.0)))
     advice = advise(regime, str(log / "sensor.toml"))
-    assert advice.nearest.indices == (1, 2, 2, 1)
+    assert advice.here.nearest.indices == (1, 2, 2, 1)
     assert advice.unlike == ("truth.sensor.principal_point",)
 
 
@@ -501,7 +502,7 @@ def test_bad_sensors_and_options(regime: Regime, tmp_path: Path) -> None:
 
 
 def test_a_map_with_a_hole_is_refused_there(regime: Regime) -> None:
-    here = advise(regime).nearest.number
+    here = advise(regime).here.nearest.number
     hole = replace(regime, results={key: found for key, found in regime.results.items() if key[0] != here})
     with pytest.raises(InputError, match=r"the map has nothing of baseline 0\.09 m"):
         advise(hole)

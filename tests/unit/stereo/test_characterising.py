@@ -12,8 +12,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.scenario import PicturedSensor
-from consistency.bench.scenario.effects.bias_map import BiasMap
-from consistency.bench.scenario.effects.node_tables import bilinear, hats
+from consistency.bench.scenario.effects.node_tables import BiasMap, bilinear, hats
 from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array

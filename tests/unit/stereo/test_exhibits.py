@@ -66,7 +66,7 @@ def test_an_exhibit_has_its_own_findings_and_none_without_a_table(tmp_path: Path
     assert rows_of(findings)[0][-1] == Status("reproduced")
     assert rows_of(table) == (("1.2",),)
     (folder / "first.parquet").unlink()
-    assert of.read(build_report(folder)) is None
+    assert of.blocks(build_report(folder)) == ()
 
 
 def test_a_listing_writes_text_numbers_and_verdicts() -> None:
@@ -143,4 +143,4 @@ def test_a_bias_map_is_drawn_row_by_row(tmp_path: Path) -> None:
 def test_a_table_that_lacks_a_column_is_refused(tmp_path: Path, name: str, module: Any) -> None:
     folder = written(tmp_path / "out", {name: pd.DataFrame({"filter": ["x"]})})
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: column '\w+' is missing"):
-        module.SECTION.read(build_report(folder))
+        module.SECTION.blocks(build_report(folder))

@@ -88,8 +88,9 @@ class Kernel:
             self._contents[signature] = self._content(signature)
         content = self._contents[signature]
         is_shared = content.unknown is None
-        is_kept = is_shared and disk_cache.read(disk_cache.place(content.key)) is not None
-        is_ready = signature in self._entries or is_kept
+        is_ready = signature in self._entries or (
+            is_shared and disk_cache.read(disk_cache.place(content.key)) is not None
+        )
         return Outlook(content.key, is_ready, is_shared, disk_cache.seconds_for(self._size(content)))
 
     def _content(self, signature: tuple[Any, ...]) -> Content:

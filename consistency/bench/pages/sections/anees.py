@@ -49,7 +49,6 @@ class Anees:
 
     @property
     def common(self) -> Curve | None:
-        """The filter whose bands are those of the study."""
         return next((curve for curve in self.curves if not curve.own_band), None)
 
 
@@ -83,7 +82,6 @@ def _fewer(verdict: Verdict, shared: Verdict | None) -> bool:
 
 
 def figures(anees: Anees) -> tuple[Figure, ...]:
-    """One panel with all filters."""
     study = anees.study
     name = f"{study.statistic} of the pose"
     marks = [*_bands(anees), *(_line(curve, study) for curve in anees.curves)]
@@ -135,7 +133,6 @@ def _line(curve: Curve, study: Study) -> Line:
 
 
 def caption(anees: Anees) -> str:
-    """What the chart shows."""
     study, shared = anees.study, anees.common
     runs = shared.track.verdict.runs if shared else study.runs
     what = f"NEES of the single run {study.shown_run}" if study.single else f"Average NEES over {runs} runs"

@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from consistency.bench.pages.experiment_tables import extra_table
+from consistency.bench.pages.exhibits import extra_table
 from consistency.bench.pages.report_input import Report
 from consistency.referee.document.blocks import Block, Cell, Column, Small, Stack, Status, table
 from consistency.referee.document.wording import brief
@@ -32,18 +32,11 @@ COLUMNS = (
 
 
 def read(report: Report) -> pd.DataFrame | None:
-    """The table of the folder; None where the file does not exist.
-
-    Raises
-    ------
-    InputError
-        The file is damaged or lacks a column.
-    """
+    """The table of the folder; None where the file does not exist."""
     return extra_table(report.folder / FILE, NUMBERS, NAMES, MISSING)
 
 
 def show(filters: pd.DataFrame) -> tuple[Block, ...]:
-    """One row for each filter."""
     first = filters.iloc[0]
     rows = [_row(values) for values in filters.to_dict("records")]
     caption = (
@@ -69,7 +62,6 @@ def _row(values: dict[Any, Any]) -> tuple[Cell, ...]:
 
 
 def _brief(diagnosis: str) -> str:
-    """The first two things that a diagnosis says."""
     return "; ".join(diagnosis.split("; ")[:CLAUSES])
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,46 +32,19 @@ LEAST = 0.1  # correlation drawn on either side of zero, so that noise does not 
 ONE = Look("#333333", width=0.8)
 
 
-@dataclass(frozen=True)
-class Lags:
+class Lags(NamedTuple):
     """Autocorrelation of the innovations."""
 
     values: Array  # (lags,), of lag 1, 2, ...
     bound: float | None  # that 95 % of the lags stay within, if white; None where they are not judged
 
 
-@dataclass(frozen=True)
-class Innovation:
-    """One filter; T steps."""
-
-    track: Track
-    ratio: Array  # (T,), NIS of all runs over their degrees of freedom
-    lags: Lags | None  # None with too few innovations
-    slot: int  # place of the filter among the others
-
-
-@dataclass(frozen=True)
-class Innovations:
-    """All filters of a study."""
-
-    study: Study
-    filters: tuple[Innovation, ...]
-
-    @property
-    def correlated(self) -> bool:
-        return any(of.lags for of in self.filters)
-
-
-def read(study: Study) -> Innovations:
-    """NIS and autocorrelation of the runs of each verdict."""
-    return Innovations(
-        study,
-        tuple(Innovation(track, track.nis_ratio, lags(track), slot) for slot, track in enumerate(study.tracks)),
-    )
+def read(study: Study) -> Study:
+    """The study: every verdict knows the innovations of its runs."""
+    return study
 
 
 def lags(track: Track) -> Lags | None:
-    """Autocorrelation of lag 1, 2, ...; None with too few innovations."""
     innovations = track.verdict.innovations
     if (
         innovations is None
@@ -82,62 +55,55 @@ def lags(track: Track) -> Lags | None:
     return Lags(innovations.autocorrelation, innovations.bound if innovations.judged else None)
 
 
-def figures(innovations: Innovations) -> tuple[Figure, ...]:
+def figures(study: Study) -> tuple[Figure, ...]:
     """On a screen one panel each with all filters, on paper a row for each filter."""
-    study, filters = innovations.study, innovations.filters
-    panels = [_sizes(study, filters)]
-    if innovations.correlated:
-        panels.append(_correlation(study, filters))
-    sheets = tuple(_sheet(innovations, of) for of in filters)
+    sheets = tuple(
+        Sheet(panels, 1.3, widths=(2.4, 1.0)[: len(panels)], title=track.name)
+        for track in study.tracks
+        for panels in [_panels(study, (track,))]
+    )
     keys = (Key("expected of an optimal gain", EXPECTED), *study.keys())
     return (
         Figure(
-            "Innovations", caption(innovations), tuple(panels), sheets, keys, stacked=True,
-            paper=caption(innovations, panels=True),
+            "Innovations", caption(study), _panels(study, study.tracks), sheets, keys, stacked=True,
+            paper=caption(study, panels=True),
         ),
     )  # fmt: skip
 
 
-def _sheet(innovations: Innovations, of: Innovation) -> Sheet:
-    panels = [_sizes(innovations.study, (of,))]
-    if innovations.correlated:
-        panels.append(replace(_correlation(innovations.study, (of,)), empty="too few innovations"))
-    return Sheet(tuple(panels), 1.3, widths=(2.4, 1.0)[: len(panels)], title=of.track.name)
+def _panels(study: Study, tracks: tuple[Track, ...]) -> tuple[Panel, ...]:
+    """Sizes of some filters, and their autocorrelation where one of the study has any."""
+    sizes = _sizes(study, tracks)
+    return (sizes, _correlation(study, tracks)) if any(map(lags, study.tracks)) else (sizes,)
 
 
-def _sizes(study: Study, filters: Sequence[Innovation]) -> Panel:
-    y = Axis("NIS / dof", log=wide([of.ratio for of in filters]), follows=True)
-    tips = (*study.clock.tips, ("NIS / dof", "@y{0.000}"))
+def _sizes(study: Study, tracks: tuple[Track, ...]) -> Panel:
+    y = Axis("NIS / dof", log=wide([track.nis_ratio for track in tracks]), follows=True)
+    tips, columns = (*study.clock.tips, ("NIS / dof", "@y{0.000}")), {"step": study.steps}
     points = (
-        Points(
-            study.clock.values,
-            of.ratio,
-            replace(of.track.look, size=2.0, alpha=0.7),
-            of.track.owner,
-            tips,
-            {"step": study.steps},
-        )
-        for of in filters
+        Points(study.clock.values, of.nis_ratio, replace(of.look, size=2.0, alpha=0.7), of.owner, tips, columns)
+        for of in tracks
     )
     alt = f"NIS over degrees of freedom of {study.name} over time"
     return Panel(study.clock.whole, y, (*points, Rule("y", 1.0, ONE)), alt)
 
 
-def _correlation(study: Study, filters: Sequence[Innovation]) -> Panel:
-    lags_of = [(of, of.lags) for of in filters if of.lags is not None]
+def _correlation(study: Study, tracks: tuple[Track, ...]) -> Panel:
+    lags_of = [(track, of) for track in tracks if (of := lags(track)) is not None]
     alt = f"Autocorrelation of the innovations of {study.name} over lags"
     longest = max((len(of.values) for _, of in lags_of), default=1)
     x = Axis("lag (steps)", window=(0.4, longest + 0.6), whole=True)
     if not lags_of:
-        return Panel(x, Axis("autocorrelation", "correlation"), (), alt, height=240)
+        return Panel(x, Axis("autocorrelation", "correlation"), (), alt, height=240, empty="too few innovations")
     bounds = {of.bound for _, of in lags_of if of.bound is not None}
     reach = 1.15 * max(LEAST, *bounds, *(float(np.abs(of.values).max()) for _, of in lags_of))
     y = Axis("autocorrelation", "correlation", window=(-reach, reach), follows=True, least=2 * LEAST)
     marks: list[Mark] = [Span("y", -bound, bound, SHADE) for bound in bounds if len(bounds) == 1]
     marks.append(Rule("y", 0.0, EXPECTED))
-    for of, values in lags_of:
-        beside = 0.6 * dodge(of.slot, len(study.tracks)) if len(filters) > 1 else 0.0
-        marks += _lags(of.track, values, beside, len(bounds) > 1)
+    for track, of in lags_of:
+        slot = [each.name for each in study.tracks].index(track.name)
+        beside = 0.6 * dodge(slot, len(study.tracks)) if len(tracks) > 1 else 0.0
+        marks += _lags(track, of, beside, len(bounds) > 1)
     return Panel(x, y, tuple(marks), alt, height=240)
 
 
@@ -153,9 +119,8 @@ def _lags(track: Track, of: Lags, beside: float, own_bound: bool) -> list[Mark]:
     return marks
 
 
-def caption(innovations: Innovations, panels: bool = False) -> str:
+def caption(study: Study, panels: bool = False) -> str:
     """What the figure shows; ``panels``: each filter has axes of its own."""
-    study = innovations.study
     over = "" if study.single else ", summed over the runs of its verdict"
     judged, every = study.judged, len(study.tracks)
     text = (
@@ -169,7 +134,7 @@ def caption(innovations: Innovations, panels: bool = False) -> str:
         text += f" Only {listed(judged)} {declare} one; the innovations of the others are reported and not judged."
     if panels and every > 1:
         text += " Axes differ between filters."
-    if innovations.correlated:
+    if any(map(lags, study.tracks)):
         text += (" Right: " if panels else " Below: ") + "autocorrelation over steps"
         text += "; 95 % of the lags stay within the shaded bound if the innovations are white." if judged else "."
     return text

@@ -51,7 +51,6 @@ def steps(track: Estimator) -> Steps | None:
 
 
 def figures(distribution: Distribution) -> tuple[Figure, ...]:
-    """One panel with all filters on a screen, a small one for each on paper."""
     study, filters = distribution.study, distribution.filters
     small = tuple(_small(study, of, number) for number, of in enumerate(filters))
     sheet = Sheet(small, 1.85 * -(-len(small) // PANELS), columns=PANELS)  # panels that are nearly square
@@ -89,7 +88,6 @@ def _small(study: Judged, of: Steps, number: int) -> Panel:
 
 
 def caption() -> str:
-    """What the curves are."""
     return (
         "Distribution of the NEES: chi-square probability of the NEES in one step of each run, with nothing fitted. "
         "On the diagonal the covariance is right; a curve below it has too many large values (overconfident), above it "

@@ -6,14 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.report_input import Report, Track
+from consistency.bench.pages.report_input import Report, Track, as_given
 from consistency.referee.diagnostics import Interval
-from consistency.referee.document.blocks import Block, Column, Name, Table, table
+from consistency.referee.document.blocks import Block, Column, Name, Table, Text, table
 from consistency.referee.document.colours import EXPECTED, SHADE, solid
 from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span, dodge
 from consistency.referee.document.verdict import BRIEF, cells, columns, factor
 from consistency.referee.document.wording import written
-from consistency.referee.pages.section import OPENING, Section
+from consistency.referee.pages.section import OPENING, Part, Section
+from consistency.referee.pages.verdicts import judgement, method
 
 TITLE = "Which filter tells the truth about its uncertainty, and where?"
 LABEL = "covariance ratio (truth / stated)"
@@ -111,4 +112,13 @@ def _intervals(places: list[Place]) -> list[Intervals]:
     return marks
 
 
+def verdicts(report: Report) -> tuple[Block, ...]:
+    """Verdicts of all filters in all studies, and how a verdict comes about."""
+    if not report.studies:
+        return (Text("No study was run for these findings."),)
+    blocks = [block for study in report.studies for block in judgement(study)]
+    return (*blocks, Text(method(report.studies), "How a verdict comes about.", "note"))
+
+
 SECTION = Section(OPENING, read, show)
+VERDICTS = Section(Part("verdicts", "Verdicts", "Verdicts"), as_given, verdicts)

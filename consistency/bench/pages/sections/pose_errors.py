@@ -87,7 +87,6 @@ def _sheet(study: Study, of: PoseError) -> Sheet:
 
 
 def caption(errors: PoseErrors) -> str:
-    """What the charts show."""
     return (
         f"Pose error (truth minus estimate) of run {errors.study.shown_run}, the lowest run number, with the filter's "
         "own 2-sigma bounds (dashed). An honest filter's error stays inside about 95 % of the time."

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from consistency.bench.pages.report_input import Report, Study
+from consistency.bench.pages.report_input import Report, Study, as_given
 from consistency.referee.document.blocks import Block, Details, Facts, Settings
 from consistency.referee.pages.provenance import facts
 from consistency.referee.pages.section import Part, Section
@@ -14,13 +14,7 @@ PROVENANCE = Part("provenance", "Provenance", "Provenance")
 SHORT = 4000  # characters of settings that surely fit on one page
 
 
-def read(report: Report) -> Report:
-    """The whole report: every folder has a manifest."""
-    return report
-
-
 def show(report: Report) -> tuple[Block, ...]:
-    """Facts of the folder, then of each study with its settings."""
     rows = facts(report.manifest)
     return Facts(rows), *(_study(study, rows, len(report.studies) > 1) for study in report.studies)
 
@@ -52,4 +46,4 @@ def _rounded(value: Any) -> Any:
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
-SECTION = Section(PROVENANCE, read, show)
+SECTION = Section(PROVENANCE, as_given, show)

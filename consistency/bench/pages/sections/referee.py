@@ -47,12 +47,6 @@ class Rate:
     measured: float
     interval: tuple[float, float]  # exact binomial, Clopper & Pearson (1934)
 
-    @property
-    def broken(self) -> bool:
-        """The whole interval lies on the wrong side of the promise."""
-        low, high = self.interval
-        return low > self.promised if self.at_most else high < self.promised
-
 
 @dataclass(frozen=True)
 class Promise:
@@ -84,7 +78,6 @@ class Calibration:
 
     @property
     def gates(self) -> int:
-        """Verdicts in all rows together."""
         return sum(rate.gates for rate in self.rates)
 
     @property
@@ -98,7 +91,6 @@ class Calibration:
 
 
 def read(_: Report) -> Calibration | None:
-    """The shipped table; None where there is none."""
     return calibration()
 
 
@@ -131,7 +123,6 @@ def _rates(rows: Iterable[dict[str, Any]]) -> Iterable[Rate]:
 
 
 def show(c: Calibration) -> tuple[Block, ...]:
-    """Promises in groups, and the worlds in which they were measured."""
     promises = Table(COLUMNS, groups(c), "Promises of the referee, and how often they were kept", style="grouped")
     worlds = Facts(tuple((name, about.replace("`", "")) for name, about in c.worlds.items()), HEADS, "4cm")
     return Text(text(c)), promises, Details("Worlds", (worlds,))
@@ -164,7 +155,6 @@ def _row(promise: Promise) -> tuple[Cell, ...]:
 
 
 def text(c: Calibration) -> str:
-    """What the appendix on the referee measures."""
     return (
         "A gate is one verdict on one group of runs. Each line is a promise of the referee: which share of gates is "
         "counted at most, or at least, and the shares measured, from the world where the promise is kept best to the "

@@ -32,7 +32,6 @@ class World:
 
 
 def read(study: Study) -> World:
-    """Paths of the shown run."""
     landmarks = study.results.landmarks
     return World(
         study,
@@ -74,10 +73,10 @@ def _odometry(study: Study) -> Array | None:
 
 
 def figures(world: World) -> tuple[Figure, ...]:
-    """One map."""
     study = world.study
+    start = [] if world.truth is None else [Points(*xy(world.truth[:1]), START)]
     panel = Panel(
-        Axis("x (m)"), Axis("y (m)"), (*_surroundings(world), *_estimates(world), *_start(world)),
+        Axis("x (m)"), Axis("y (m)"), (*_surroundings(world), *_estimates(world), *start),
         f"Map of {study.name}", height=520, shape="map", equal=True,
     )  # fmt: skip
     keys = (*_keys(world), *study.keys())
@@ -94,10 +93,6 @@ def _surroundings(world: World) -> list[Mark]:
     if world.truth is not None:
         marks.append(Line(*xy(world.truth), TRUE, path=True))
     return marks
-
-
-def _start(world: World) -> list[Mark]:
-    return [] if world.truth is None else [Points(*xy(world.truth[:1]), START)]
 
 
 def _estimates(world: World) -> list[Mark]:
@@ -120,7 +115,6 @@ def _keys(world: World) -> list[Key]:
 
 
 def caption(world: World) -> str:
-    """What the map shows."""
     parts = []
     if world.truth is not None:
         parts.append("true path solid with its start as a circle")

@@ -34,14 +34,7 @@ class Batch:
         self.left = list(self.runs)
 
 
-@dataclass(frozen=True)
-class WorkerLost:
-    """Who did a batch is dead, and why."""
-
-    reason: str
-
-
-Event = tuple[Batch, Part | WorkerLost | None]  # some runs of a batch; its loss; its end
+Event = tuple[Batch, Part | str | None]  # some runs of a batch; why who did it is dead; its end
 
 
 class Engine(Protocol):
@@ -152,7 +145,7 @@ def in_batches(engine: Engine, batches: Batches, work: TrialWork) -> Outcomes:
             match what:
                 case None:
                     batches.ended(batch)
-                case WorkerLost(reason):
+                case str(reason):
                     for run in batches.lost(batch):
                         yield failed(work, run, reason)
                 case Part():

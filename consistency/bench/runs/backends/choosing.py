@@ -27,8 +27,8 @@ def backend_for(
     Parameters
     ----------
     jobs : workers of this machine, or jobs of Slurm at a time; -1 for as many as the backend thinks right
-    scheduler : of ``dask``, see :class:`consistency.runs.backends.dask.Dask`
-    slurm : options of ``slurm``, each ``key=value``, see :class:`consistency.runs.backends.slurm.Slurm`
+    scheduler : of ``dask``, see :class:`consistency.bench.runs.backends.dask.Dask`
+    slurm : options of ``slurm``, each ``key=value``, see :class:`consistency.bench.runs.backends.slurm.Slurm`
     wait : seconds to wait for the scheduler of ``dask``, 60 if not given
     out : folder of the results; ``slurm`` keeps the files of its jobs beside it, on a disk that they see
 

@@ -24,7 +24,7 @@ from dask.config import set as set_config
 from distributed import Client, Future, KilledWorker, LocalCluster, Security, WorkerPlugin
 
 from consistency.bench.filters.stepping import reason_of
-from consistency.bench.runs.backends.batches import Batch, Batches, Event, WorkerLost, in_batches
+from consistency.bench.runs.backends.batches import Batch, Batches, Event, in_batches
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
 from consistency.bench.runs.isolation.isolating import ONE_THREAD
@@ -91,7 +91,7 @@ class Dask:
         ------
         InputError
             No scheduler, or no worker of it, for as long as is waited; bad input, see
-            :func:`consistency.runs.backends.batches.in_batches`.
+            :func:`consistency.bench.runs.backends.batches.in_batches`.
         """
         with _silence(), self._address(len(runs)) as address, closing(_Engine(address, work, self.wait)) as engine:
             yield from in_batches(engine, Batches(runs, TARGET), work)
@@ -118,7 +118,7 @@ class Dask:
 
 
 class _Engine:
-    """See :class:`consistency.runs.backends.batches.Engine`."""
+    """See :class:`consistency.bench.runs.backends.batches.Engine`."""
 
     def __init__(self, address: dict[str, Any], work: TrialWork, wait: float) -> None:
         self._address, self._pickled, self._wait = address, pickled_work(work), wait
@@ -186,7 +186,7 @@ class _Engine:
             return []
         del self._sent[key]
         if part is None:
-            return [(batch, WorkerLost("its worker died, and so did those that tried it again"))]
+            return [(batch, "its worker died, and so did those that tried it again")]
         return [(batch, part), (batch, None)]
 
     def _count(self) -> None:

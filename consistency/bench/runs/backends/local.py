@@ -26,11 +26,6 @@ class LocalThreads:
     Parameters
     ----------
     jobs : number of workers, -1 for one a core
-
-    Raises
-    ------
-    InputError
-        Another number.
     """
 
     jobs: int = -1
@@ -41,13 +36,7 @@ class LocalThreads:
         worker_count(self.jobs)
 
     def prepare(self, work: TrialWork, run: int, /) -> None:
-        """See :class:`consistency.bench.runs.trial_work.Backend`.
-
-        Raises
-        ------
-        InputError
-            A run takes more memory than there is.
-        """
+        """See :class:`consistency.bench.runs.trial_work.Backend`."""
         workers = worker_count(self.jobs)
         fitting = work.room_for(run, workers)
         self._room = fitting if self.jobs == -1 else workers
@@ -81,25 +70,16 @@ def _in_threads(work: TrialWork, runs: Sequence[int], workers: int) -> Outcomes:
                     while True:
                         ready.append(finished.get_nowait())
                 under_way -= len(ready)
-                ready.sort(key=_failed, reverse=True)  # what is finished counts, whatever ends the rest
+                # what is finished counts, whatever ends the rest
+                ready.sort(key=lambda future: future.exception() is not None, reverse=True)
                 while ready:
                     yield ready.pop().result()
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _failed(future: Future[RunOutcome]) -> bool:
-    return future.exception() is not None
-
-
 def worker_count(jobs: int) -> int:
-    """Number of workers that ``jobs`` stands for: itself, or one a core for -1.
-
-    Raises
-    ------
-    InputError
-        Any other number.
-    """
+    """Number of workers that ``jobs`` stands for: itself, or one a core for -1; raises InputError for another."""
     if jobs == 0 or jobs < -1:
         raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
     if jobs > 0:

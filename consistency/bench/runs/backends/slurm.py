@@ -21,7 +21,7 @@ from typing import Any
 import submitit
 
 from consistency.bench.filters.stepping import reason_of
-from consistency.bench.runs.backends.batches import Batch, Batches, Event, WorkerLost, in_batches
+from consistency.bench.runs.backends.batches import Batch, Batches, Event, in_batches
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
 from consistency.bench.runs.trial_work import Outcomes, TrialWork
@@ -32,6 +32,7 @@ EVERY = 5.0  # s of work between parts
 GLANCE = 1.0  # s between looks at the folder
 LATE = 15.0  # s that a shared disk may take to show the last file of a job
 JOBS = 16  # at a time
+WORK = "work.pickle"  # in the folder of the jobs
 MINUTES = 60  # of a job, which Slurm ends then; the rest of its runs is done by another
 
 
@@ -69,7 +70,7 @@ class Slurm:
         ------
         InputError
             There is no Slurm here, or it does not know an option; bad input, see
-            :func:`consistency.runs.backends.batches.in_batches`.
+            :func:`consistency.bench.runs.backends.batches.in_batches`.
         """
         jobs = min(JOBS if self.jobs < 0 else self.jobs, len(runs))
         with closing(_Engine(self.folder, self.options, jobs, work)) as engine:
@@ -103,7 +104,7 @@ class _Job:
 
 
 class _Engine:
-    """See :class:`consistency.runs.backends.batches.Engine`."""
+    """See :class:`consistency.bench.runs.backends.batches.Engine`."""
 
     def __init__(self, folder: Path, options: Mapping[str, Any], room: int, work: TrialWork) -> None:
         self.room, self.folder = room, folder.absolute()
@@ -112,8 +113,7 @@ class _Engine:
         shutil.rmtree(self.folder, ignore_errors=True)  # jobs of a client that was killed end where they cannot write
         try:
             self._executor = self._made(dict(options))
-            self._sent = Sent(str(self.folder / "work.pickle"), tuple(sys.path))
-            Path(self._sent.work).write_bytes(pickled_work(work))
+            (self.folder / WORK).write_bytes(pickled_work(work))
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
@@ -142,8 +142,9 @@ class _Engine:
         for outbox in outboxes:
             outbox.mkdir()
         runs = [batch.runs for batch in batches]
+        path = itertools.repeat(sys.path)
         try:
-            submitted = self._executor.map_array(do_job, itertools.repeat(self._sent), runs, map(str, outboxes))
+            submitted = self._executor.map_array(do_job, path, runs, map(str, outboxes))
         except (submitit.core.utils.FailedJobError, RuntimeError) as error:
             raise InputError(f"Slurm does not take the jobs: {reason_of(error)}") from None
         self._jobs += map(_Job, batches, submitted, outboxes)
@@ -178,7 +179,7 @@ class _Engine:
             return []
         self._jobs.remove(job)
         self._lost += 1
-        return [(job.batch, WorkerLost("its job died, and so did those that tried it again"))]
+        return [(job.batch, "its job died, and so did those that tried it again")]
 
     def close(self) -> None:
         """Cancel what is not done; logs stay where a job has died."""
@@ -194,18 +195,10 @@ class _Engine:
             shutil.rmtree(self.folder, ignore_errors=True)
 
 
-@dataclass(frozen=True)
-class Sent:
-    """What all jobs are told: the file of the work, and where modules are looked for."""
-
-    work: str
-    path: tuple[str, ...]
-
-
-def do_job(sent: Sent, runs: Sequence[int], outbox: str) -> None:
-    """In a job: leave parts in ``outbox``, each of which appears as a whole."""
-    sys.path[:] = sent.path
-    worker = Worker(Path(sent.work).read_bytes())
+def do_job(path: Sequence[str], runs: Sequence[int], outbox: str) -> None:
+    """In a job: leave parts in ``outbox``, each of which appears as a whole; modules are looked for in ``path``."""
+    sys.path[:] = path
+    worker = Worker(Path(outbox).with_name(WORK).read_bytes())
     try:
         for number, part in enumerate(worker.parts(runs, EVERY)):
             unfinished = Path(outbox) / "unfinished"

@@ -224,7 +224,6 @@ def _folder() -> str:
 
 @atexit.register  # before multiprocessing waits for its children
 def dismiss() -> None:
-    """End the supervisors that are idle."""
     while _idle:
         _idle.pop().link.close()
 

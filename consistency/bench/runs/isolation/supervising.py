@@ -70,8 +70,6 @@ class SupervisorSetup:
 
 @dataclass(frozen=True)
 class Task:
-    """A trial for a filter, and what the filter believes."""
-
     guest: str
     trial: Trial
     belief: Belief

@@ -1,28 +1,25 @@
-"""Effects of a sensor on an ideal observation, each in a file with its keys in a scenario and its ``apply``.
+"""Effects of a sensor on an ideal observation, each with its keys in a scenario and its ``apply``.
 
-``field_of_view``, ``noise`` and ``search_range`` are in every sensor. The effects that a scenario may list are made
-known by the imports below, one line each; docs/extending.md shows how to add one.
+Those of ``built_in`` are in every sensor. The effects that a scenario may list are made known by the imports below;
+docs/extending.md shows how to add one.
 """
 
-from consistency.bench.scenario.effects.bias_map import BiasMap
-from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
+from consistency.bench.scenario.effects.built_in import FieldOfView, Noise, SearchRange
 from consistency.bench.scenario.effects.distortion import Distortion
-from consistency.bench.scenario.effects.drift import Drift as Drift
-from consistency.bench.scenario.effects.effect import EFFECTS, Effect, ListedEffect, register
-from consistency.bench.scenario.effects.field_of_view import FieldOfView
-from consistency.bench.scenario.effects.frame_rate import Frames as Frames
-from consistency.bench.scenario.effects.heavy_tails import HeavyTails as HeavyTails
+from consistency.bench.scenario.effects.effect import EFFECTS, ListedEffect, register
+from consistency.bench.scenario.effects.gross_errors import HeavyTails as HeavyTails
+from consistency.bench.scenario.effects.gross_errors import Mismatch as Mismatch
+from consistency.bench.scenario.effects.gross_errors import Swap as Swap
 from consistency.bench.scenario.effects.junction import Junction as Junction
-from consistency.bench.scenario.effects.local_bias import LocalBias
-from consistency.bench.scenario.effects.mismatch import Mismatch as Mismatch
-from consistency.bench.scenario.effects.noise import Noise
+from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth, LocalBias
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.effects.occlusion import Occlusion as Occlusion
-from consistency.bench.scenario.effects.search_range import SearchRange
 from consistency.bench.scenario.effects.selection import Selection as Selection
-from consistency.bench.scenario.effects.swap import Swap as Swap
-from consistency.bench.scenario.effects.track_error import TrackError as TrackError
+from consistency.bench.scenario.effects.track_errors import Drift as Drift
+from consistency.bench.scenario.effects.track_errors import TrackError as TrackError
+from consistency.bench.scenario.effects.visibility import Frames as Frames
+from consistency.bench.scenario.effects.visibility import Occlusion as Occlusion
 
+Effect = FieldOfView | Noise | SearchRange | ListedEffect
 BUILT_IN = (FieldOfView.label, Noise.label, SearchRange.label)
 
 __all__ = [

@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from consistency.bench.scenario.effects.bias_map import BiasMap
-from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register
+from consistency.bench.scenario.effects.node_tables import BiasMap
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.bench.scenario.toml_tables import Finite
 from consistency.referee.types import Array
@@ -17,7 +17,7 @@ Coefficients = tuple[Finite, Finite]
 
 
 @register
-class Distortion(ListedEffect):
+class Distortion(UvdEffect):
     """What is left of the radial distortion of both cameras, k1 and k2 of each.
 
     A point of a rectified image at (x, y) = (u, v) / f from the principal point is seen at
@@ -25,7 +25,6 @@ class Distortion(ListedEffect):
     (u - d, v); d is the difference of the distorted columns. That the rows then differ too is left to the matcher.
     """
 
-    models: ClassVar[tuple[str, ...]] = ("uvd",)
     draws: ClassVar[bool] = False
     before_noise: ClassVar[bool] = True
 
@@ -34,7 +33,6 @@ class Distortion(ListedEffect):
     right: Coefficients
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """All observations, distorted."""
         assert context.sensor.f is not None
         return observations.with_z(self.distorted(observations.z, context.sensor.f))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Annotated, Any, ClassVar, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, TypeAdapter, model_validator
@@ -13,21 +13,6 @@ from consistency.bench.scenario.effects.observations import Context, Observation
 from consistency.bench.scenario.toml_tables import Table
 
 E = TypeVar("E", bound="ListedEffect")
-
-
-class Effect(Protocol):
-    """One thing that a sensor does to the observations of a whole trial."""
-
-    @property
-    def label(self) -> str:
-        """Name in messages, and of the random stream."""
-
-    @property
-    def draws(self) -> bool:
-        """Whether it draws random numbers. One that does not is a function of observations and path alone."""
-
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """What becomes of ``observations``; ``rng`` is this effect's own in this run."""
 
 
 class ListedEffect(Table):
@@ -47,7 +32,6 @@ class ListedEffect(Table):
 
     @property
     def label(self) -> str:
-        """``name``, or ``kind`` where no name is given."""
         return self.name or self.kind
 
     @abstractmethod
@@ -77,6 +61,12 @@ class ListedEffect(Table):
         # as a tagged union would, with the kind in the location of an error
         effects = TypeAdapter[dict[str, ListedEffect]](dict[str, effect])  # type: ignore[valid-type]
         return effects.validate_python({str(data["kind"]): data})[str(data["kind"])]
+
+
+class UvdEffect(ListedEffect):
+    """An effect on the pixels of a stereo sensor."""
+
+    models: ClassVar[tuple[str, ...]] = ("uvd",)
 
 
 EFFECTS: dict[str, type[ListedEffect]] = {}  # by kind

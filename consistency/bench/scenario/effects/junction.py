@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from consistency.bench.models import point, stereo
-from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.bench.scenario.toml_tables import Count, Positive, Rate
 from consistency.referee.types import Array
@@ -26,7 +26,7 @@ class Crossings:
 
 
 @register
-class Junction(ListedEffect):
+class Junction(UvdEffect):
     """``count`` apparent crossings of a near vertical and a far horizontal edge, each of which is tracked as a corner.
 
     The crossing is on the ray that meets both edges. While the robot moves, it slides up and down the near edge and to
@@ -39,7 +39,6 @@ class Junction(ListedEffect):
     while it is in the image, on both edges, and the near edge is in range.
     """
 
-    models: ClassVar[tuple[str, ...]] = ("uvd",)
     units: ClassVar[dict[str, str]] = {"edge": "_m", "behind": "_m"}
     draws: ClassVar[bool] = False
     before_noise: ClassVar[bool] = True
@@ -58,7 +57,6 @@ class Junction(ListedEffect):
         return self
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The observations with those of crossings."""
         z, seen = self._seen(self.drawn(context), context)
         step, thing = np.nonzero(seen)
         return observations.add(step + 1, thing, z[seen])

@@ -7,14 +7,14 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.bench.scenario.toml_tables import Count, NonNegative, Positive
 from consistency.referee.types import Array, Indices
 
 
 @register
-class Selection(ListedEffect):
+class Selection(UvdEffect):
     """At most ``count`` tracks at a time. One that is chosen is kept until it is not seen for ``forget_steps``.
 
     Free places go, one after the other, to what is seen and has the highest rank, the sum of four numbers in [0, 1]
@@ -30,7 +30,6 @@ class Selection(ListedEffect):
     those that are too large. It is then also the same in every run, and done once.
     """
 
-    models: ClassVar[tuple[str, ...]] = ("uvd",)
     units: ClassVar[dict[str, str]] = {"near": "_px"}
     draws: ClassVar[bool] = False
     before_noise: ClassVar[bool] = True
@@ -48,7 +47,6 @@ class Selection(ListedEffect):
     depth: NonNegative
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The rows of chosen tracks."""
         base, cell, is_near = self._ranked(observations, context)
         ends = np.searchsorted(observations.step, np.arange(1, context.steps + 2))
         last, is_kept = np.zeros(observations.ids, np.int64), np.zeros(observations.ids, bool)

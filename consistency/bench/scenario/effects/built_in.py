@@ -1,4 +1,4 @@
-"""The field of view: what is in range and in the image."""
+"""The effects of every sensor: field of view, independent Gaussian noise, and the disparities that stereo searches."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from consistency.bench.models import point, stereo
+from consistency.bench.scenario.effects.node_tables import DisparityGrowth
 from consistency.bench.scenario.effects.observations import Context, Observations
 from consistency.referee.types import Array
 
@@ -26,7 +27,6 @@ class FieldOfView:
     draws: ClassVar[bool] = False
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The rows of the ideal ``observations`` (T, N) that are seen."""
         path = context.planned if context.linear else context.path
         x, y, heading = path[1:].T[..., None]
         c, s = np.cos(heading), np.sin(heading)
@@ -52,3 +52,37 @@ def _visible(context: Context, x: Array, y: Array, z: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v, _ = stereo.project(x, y, z, sensor.f, 0.0)
     return np.asarray(seen & (x > 0) & context.in_image(u, v))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Adds ``sigma`` times a standard normal number to each value; that of a disparity may grow with it."""
+
+    label: ClassVar[str] = "noise"
+    draws: ClassVar[bool] = True
+
+    sigma: tuple[float, ...]  # px for uvd, m and rad for range-bearing, m otherwise
+    growth: DisparityGrowth | None = None
+
+    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+        z = rng.standard_normal((len(observations), len(self.sigma)))
+        z *= self.sigma
+        if self.growth is not None:
+            z[:, 2] *= self.growth.ratio_at(observations.z[:, 2])
+        z += observations.z
+        return observations.with_z(z)
+
+
+@dataclass(frozen=True)
+class SearchRange:
+    """Keeps a row if its measured disparity is in the search range. The last effect of a ``uvd`` sensor."""
+
+    label: ClassVar[str] = "search-range"
+    draws: ClassVar[bool] = False
+
+    low: float  # px
+    high: float  # px
+
+    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+        d = observations.z[:, 2]
+        return observations.keep((d >= self.low) & (d <= self.high))

@@ -1,4 +1,4 @@
-"""Landmarks behind walls are not seen."""
+"""What is not seen: landmarks behind walls, and all of them in steps without an image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import Field
 
 from consistency.bench.scenario.effects.effect import ListedEffect, register
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Finite
+from consistency.bench.scenario.toml_tables import Count, Finite
 from consistency.referee.types import Array
 
 
@@ -29,7 +29,6 @@ class Occlusion(ListedEffect):
     walls: Annotated[list[tuple[Finite, Finite, Finite, Finite]], Field(min_length=1)]
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
-        """The rows of what no wall hides."""
         x, y, heading = context.path[observations.step].T
         dx, dy, _ = context.sensor.mount.position
         c, s = np.cos(heading), np.sin(heading)
@@ -48,3 +47,22 @@ def _side(a: Array, b: Array, p: Array) -> Array:
     """Whether points (2, M) are to the left of the line from ``a`` to ``b``, (2, M) or (2, 1)."""
     left: Array = (b[0] - a[0]) * (p[1] - a[1]) > (b[1] - a[1]) * (p[0] - a[0])
     return left
+
+
+@register
+class Frames(ListedEffect):
+    """Images come after ``every`` steps, whose numbers are taken in turn; in the steps between nothing is seen.
+
+    A camera that is slower than the odometry, or whose images are lost.
+    """
+
+    draws: ClassVar[bool] = False
+    before_noise: ClassVar[bool] = True
+    errs: ClassVar[bool] = False
+
+    kind: Literal["frames"] = "frames"
+    every: Annotated[list[Count], Field(min_length=1)]
+
+    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+        images = np.cumsum(np.resize(self.every, context.steps))
+        return observations.keep(np.isin(observations.step, images))

@@ -1,6 +1,16 @@
-"""Why no setting of the noises makes a filter consistent: what the referee finds, and what other noise tells."""
+"""What is left to try and to say where a fitted filter has a fault.
+
+Settings at which errors have the size that is stated: any setting that is consistent lies among them. And why no
+setting of the noises makes a filter consistent: what the referee finds, and what other noise tells.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import qmc
 
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
@@ -10,11 +20,16 @@ from consistency.referee.diagnostics import Settings, Verdict
 from consistency.referee.diagnostics.verdict.answers import BIAS, SCALE
 from consistency.referee.diagnostics.words.sentences import short
 from consistency.referee.system.progress import quiet
+from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import analyse
 
 LESS = 0.1  # of all standard deviations: what is of second order in the errors is then a hundredth
 FIT = 1.1  # NIS per degree of freedom within this factor of 1: innovations look right
 PROBE = 50  # runs of a probe, at least
+SPAN = float(np.log(100.0))  # of one factor to another, up and down from a fit; beyond it a filter hardly uses one
+ALONG = 9  # settings for two factors: ratios a factor of 3.2 apart
+AROUND = 16  # settings for more
+CORRECTIONS = 2  # of the common scale; the first is nearly right, for gains hardly change with it
 
 
 def is_at_fault(verdict: Verdict) -> bool:
@@ -84,3 +99,55 @@ def with_noise(scenario: Scenario, factor: float) -> Scenario:
         for key, value in (("motion__sigma_v", v), ("motion__sigma_omega", omega), ("sensor__sigma", sigma))
     }
     return scenario.variant(scenario.name, summary=scenario.summary, **noises)
+
+
+class Balanced(NamedTuple):
+    """Log factors (p,), and the verdict on the runs of the fit."""
+
+    log_factors: Array
+    verdict: Verdict
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Greater is nearer to consistent: by the p-value of all questions, then by the size of the errors."""
+        p = self.verdict.p_value
+        ratio = self.verdict.inflation
+        return (p if np.isfinite(p) else 0.0, -abs(np.log(ratio)) if ratio > 0.0 else -np.inf)
+
+
+def directions(p: int) -> Array:
+    """Log factors (settings, p) of mean zero: how factors may differ from each other."""
+    if p == 1:
+        return np.zeros((1, 1))
+    if p == 2:
+        apart = np.linspace(-SPAN, SPAN, ALONG)
+        return np.column_stack([-apart / 2.0, apart / 2.0])
+    points: Array = SPAN * (qmc.Sobol(p, scramble=False).random(AROUND) - 0.5)
+    return np.asarray(points - points.mean(axis=1, keepdims=True))
+
+
+def balanced(centre: Array, ratio: Callable[[Array], float], judge: Callable[[Array], Verdict]) -> list[Balanced]:
+    """Settings at which the mean NEES is as stated, one for each direction from a fit, with the verdict on each.
+
+    Scaling all covariances together leaves the gains of a linear filter as they are and divides its NEES, so that each
+    direction has one such setting, and finding it takes one step or two. Directions in which a run fails are left out.
+
+    Parameters
+    ----------
+    centre : log factors (p,) of the fit
+    ratio : mean NEES over its degrees of freedom at log factors (p,); not finite where a run fails
+    judge : the verdict there, on the same runs
+    """
+    settings = []
+    for direction in directions(len(centre)):
+        x = centre + direction
+        for _ in range(CORRECTIONS):
+            x = x + np.log(ratio(x))
+        if np.isfinite(x).all():
+            settings.append(Balanced(x, judge(x)))
+    return settings
+
+
+def nearest(settings: Sequence[Balanced]) -> Balanced | None:
+    """The one that comes nearest to consistent; None of none."""
+    return max(settings, key=lambda setting: setting.rank, default=None)

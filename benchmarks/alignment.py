@@ -28,7 +28,7 @@ from consistency.referee.geometry import wrap
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.clock_offset import clocks_and_frames
 from consistency.referee.readers.formats.sheet import Places
-from consistency.referee.readers.matching import Aligned, Poses
+from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 
 SEED, RUNS, STEPS, DRAWS, OFTEN, FEWER, QUICK = 20261123, 60, 400, 500, 400, 100, 20

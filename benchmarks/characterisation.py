@@ -27,7 +27,7 @@ from consistency.bench.types import Trial
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
 from consistency.stereo.characterising.residuals import residuals_of
-from consistency.stereo.characterising.writing import believed
+from consistency.stereo.characterising.sensor_text import believed
 
 SCENARIO = "herath2007-stereo"
 EVERYTHING = (1e-6, 1e6)  # px: a search range that leaves nothing out

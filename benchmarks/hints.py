@@ -23,8 +23,8 @@ from script_options import options_of
 
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.formats.sheet import Places
-from consistency.referee.readers.matching import Poses
 from consistency.referee.readers.mix_ups.hints import hints
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 AXES = {

@@ -22,8 +22,8 @@ from consistency.stereo.visual_odometry import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.visual_odometry.pose import euler_angles
 from consistency.stereo.visual_odometry.registration import rigid_motions
+from consistency.stereo.visual_odometry.relative_pose import euler_angles
 
 rigs = sibling(__file__, "published_rig")
 

@@ -16,7 +16,7 @@ from consistency.stereo.visual_odometry import RelativePose, StereoRig, relative
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_opencv
 from consistency.stereo.visual_odometry.motion import RelativeMotion
 from consistency.stereo.visual_odometry.odometry import visual_odometry
-from consistency.stereo.visual_odometry.pose import angular
+from consistency.stereo.visual_odometry.relative_pose import angular
 from consistency.stereo.visual_odometry.sequence import read_image, read_sequence
 
 KITTI, EUROC, MINNIE = "kitti06_f0-50", "euroc_static", "minnie_quad"

@@ -12,8 +12,11 @@ from hyperdual import HyperDual, derivatives
 from consistency.referee.geometry import rotation
 from consistency.stereo.visual_odometry import RelativePose, StereoRig, register_svd, triangulate
 from consistency.stereo.visual_odometry.cameras.rig import solved
-from consistency.stereo.visual_odometry.propagation import registration_derivatives, triangulation_derivatives
-from consistency.stereo.visual_odometry.refinement import _profile, loss
+from consistency.stereo.visual_odometry.covariance_propagation import (
+    registration_derivatives,
+    triangulation_derivatives,
+)
+from consistency.stereo.visual_odometry.maximum_likelihood import _profile, loss
 from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches, PointMatches, TwoFrames
 from consistency.stereo.visual_odometry.two_frame_cost import derivatives as two_frame_derivatives
 

@@ -18,7 +18,7 @@ from consistency.bench.store.log import SensorFile, read_log
 from consistency.referee.cli.app import main
 from consistency.stereo.characterising.characterise import characterise
 from consistency.stereo.characterising.residuals import Residuals
-from consistency.stereo.characterising.writing import believed, sensor_text
+from consistency.stereo.characterising.sensor_text import believed, sensor_text
 
 
 def run(*arguments: object) -> int:

@@ -15,7 +15,7 @@ from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World

@@ -54,10 +54,10 @@ def sweep(
 ) -> None:
     """A grid of scenarios, each filter in each until decided; then a map of where which filter is consistent."""
     from consistency.bench.runs.backends.choosing import backend_for, require_scheduler
-    from consistency.bench.sweeps.folder import open_sweep
     from consistency.bench.sweeps.plan import load_sweep
     from consistency.bench.sweeps.regime import regime_of, write_regime
     from consistency.bench.sweeps.running import run_sweep
+    from consistency.bench.sweeps.sweep_folder import open_sweep
     from consistency.referee.system.progress import say
     from consistency.referee.system.stopping import stoppable
 

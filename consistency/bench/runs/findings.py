@@ -185,6 +185,8 @@ def reproduce(
         An unknown id, a number out of range, or an output folder that cannot be written.
     """
     scripts = experiments()
+    if alone := [name for name in only or () if name in scripts and not scripts[name].FINDINGS]:
+        raise InputError(f"--only {alone[0]}: its data are not shipped; python {scripts[alone[0]].__file__} --help")
     only = [finding for name in only or () for finding in (scripts[name].FINDINGS if name in scripts else (name,))]
     selection = _selection(scripts, only, long)
     require_free(out, overwrite, "findings")

@@ -16,7 +16,7 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.campaign import PLAN, Campaign, ResultsPlace, own_errors, place_for
 from consistency.bench.runs.campaign import Interrupted as Interrupted
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.trial_work import Backend, Recorded, Simulated, TrialWork
 from consistency.bench.scenario import Belief, Scenario
 from consistency.bench.scenario.toml_tables import UNITS

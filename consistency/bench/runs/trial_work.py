@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.compiling import compile_all
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.memory_needed import workers_that_fit
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view

@@ -16,7 +16,7 @@ from consistency.bench.filters import get_filter
 from consistency.bench.filters.compiled import Compiled, one_blas_thread
 from consistency.bench.filters.stepping import run_filter
 from consistency.bench.protocols import Filter, WholeTrial
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.sequential import run_until_decided

@@ -14,8 +14,8 @@ import pandas as pd
 
 from consistency.bench.scenario import data_folder
 from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
-from consistency.bench.sweeps.folder import SweepFolder, describe, open_sweep, sweep_from
 from consistency.bench.sweeps.plan import Cell, Sweep
+from consistency.bench.sweeps.sweep_folder import SweepFolder, describe, open_sweep, sweep_from
 from consistency.referee.errors import InputError
 from consistency.referee.pages.write_pages import write_file
 from consistency.referee.parsing import read_json, reading

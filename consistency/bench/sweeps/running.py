@@ -15,8 +15,8 @@ from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.trial_work import Backend
 from consistency.bench.store.journal import Busy, Journal, unfinished_of
 from consistency.bench.sweeps.cell import CellResult, run_cell
-from consistency.bench.sweeps.folder import CellWork, SweepFolder
 from consistency.bench.sweeps.plan import Sweep
+from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
 from consistency.referee.system.stopping import Stop, stoppable

@@ -15,7 +15,7 @@ from consistency.bench.filters.stepping import name_of, rejects
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.scenario import Belief
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Estimates, Trial

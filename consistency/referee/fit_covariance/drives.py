@@ -23,8 +23,8 @@ from consistency.referee.readers.file_kinds import (
 )
 from consistency.referee.readers.formats.sheet import refuse
 from consistency.referee.readers.formats.table import table_poses
-from consistency.referee.readers.matching import NamedPoses, truth_at
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.truth_matching import NamedPoses, truth_at
 from consistency.referee.types import Array, Indices
 
 

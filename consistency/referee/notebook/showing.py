@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.diagnostics.words.sentences import plural
 from consistency.referee.document.blocks import Bullets, Facts
 from consistency.referee.document.verdict import summary
@@ -45,4 +47,6 @@ def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> An
     from consistency.referee.pages.files_report import record_sheet
     from consistency.referee.pages.write_pages import plotted
 
+    if record.error is not None and not record.axes:
+        record = replace(record, axes=numbered_axes(record.error.shape[-1]))
     return plotted(record_sheet(record, verdict), path)

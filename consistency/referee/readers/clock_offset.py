@@ -11,7 +11,7 @@ from scipy import optimize
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.errors import InputError
-from consistency.referee.readers.matching import Aligned, Poses
+from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 
 REACH = 1.0  # s, the largest offset that is looked for

@@ -19,8 +19,8 @@ from consistency.referee.diagnostics.words.sentences import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
 from consistency.referee.readers.formats.sheet import Places
-from consistency.referee.readers.matching import common_times
 from consistency.referee.readers.runs_to_record import Track, assemble
+from consistency.referee.readers.truth_matching import common_times
 from consistency.referee.readers.windows import Relative, windows
 from consistency.referee.types import Array, Indices
 

@@ -29,7 +29,7 @@ from consistency.referee.document.drawing import (
 from consistency.referee.pages.provenance import facts
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
-from consistency.stereo.characterising.writing import counted, interval, sentences
+from consistency.stereo.characterising.sensor_text import counted, interval, sentences
 
 MEASURED, NORMAL, STUDENT = Look(COLOURS[0]), Look("#333333"), Look(COLOURS[1], (5.0, 2.0))
 LOCAL = Look("#7f7f7f", marker="s", size=3.4)

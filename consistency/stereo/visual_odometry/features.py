@@ -15,7 +15,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
-from consistency.stereo.visual_odometry.pose import cross_matrix
+from consistency.stereo.visual_odometry.relative_pose import cross_matrix
 
 COUNT = 3000  # strongest features of an image; at 1226 x 370 px that is nearly all of them
 GREY = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601 weights of red, green and blue

@@ -11,6 +11,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulable, triangulate
+from consistency.stereo.visual_odometry.covariance_propagation import registration_covariance, triangulation_covariance
 from consistency.stereo.visual_odometry.features import (
     COUNT,
     EPIPOLAR_PX,
@@ -23,10 +24,9 @@ from consistency.stereo.visual_odometry.features import (
     stereo_matches,
 )
 from consistency.stereo.visual_odometry.input_errors import ConsensusError, MatchError
-from consistency.stereo.visual_odometry.pose import RelativePose
-from consistency.stereo.visual_odometry.propagation import registration_covariance, triangulation_covariance
-from consistency.stereo.visual_odometry.refinement import Refined, refine_reprojection
+from consistency.stereo.visual_odometry.maximum_likelihood import Refined, refine_reprojection
 from consistency.stereo.visual_odometry.registration import register_horn, register_svd, squared_distances
+from consistency.stereo.visual_odometry.relative_pose import RelativePose
 from consistency.stereo.visual_odometry.resection import inliers_within, resect_ransac, squared_reprojections
 
 ESTIMATORS = ("reprojection", "svd", "horn")

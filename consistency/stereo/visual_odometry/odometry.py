@@ -14,7 +14,7 @@ from consistency.referee.geometry.groups import carried
 from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion, motion_between, stereo_features
-from consistency.stereo.visual_odometry.pose import RelativePose, angular, cross_matrix
+from consistency.stereo.visual_odometry.relative_pose import RelativePose, angular, cross_matrix
 from consistency.stereo.visual_odometry.sequence import Sequence
 
 FULL, FEWEST = 12, 3  # motions beside which a bridge was tried, for a covariance (6, 6), and for variances alone

@@ -14,7 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import input_checks
 from consistency.stereo.visual_odometry.input_errors import ConsensusError, DegenerateError
-from consistency.stereo.visual_odometry.pose import RelativePose
+from consistency.stereo.visual_odometry.relative_pose import RelativePose
 
 ON_A_LINE = 1e-8  # second singular value of a cloud, over its largest coordinate, up to which it is a line
 AMBIGUOUS = 1e-14  # gap to the second-best rotation, relative, that is rounding

@@ -13,7 +13,7 @@ import numpy as np
 
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
-from consistency.stereo.visual_odometry.pose import RelativePose, rotation_derivatives
+from consistency.stereo.visual_odometry.relative_pose import RelativePose, rotation_derivatives
 
 
 @dataclass(frozen=True, eq=False)

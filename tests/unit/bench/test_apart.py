@@ -17,7 +17,7 @@ import pytest
 import consistency as cs
 from consistency.bench.filters.compiled import Compiled, Halted
 from consistency.bench.filters.compiler.uninterrupted import apart
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 
 
 @pytest.fixture

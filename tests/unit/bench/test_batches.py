@@ -18,7 +18,7 @@ from consistency.bench.runs.backends.batches import Batch, Batches, Event, faile
 from consistency.bench.runs.backends.choosing import backend_for
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
 from consistency.bench.store.results import open_results

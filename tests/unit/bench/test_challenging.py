@@ -34,7 +34,7 @@ from consistency.bench.challenging.search import (
 from consistency.bench.challenging.wording import as_data, lines, write_scenario
 from consistency.bench.challenging.world_scores import WORST, ChallengeScorer, Done, map_nees, score_of_run
 from consistency.bench.challenging.worlds import Choice, LogScale, Point, Space, space_of
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.simulation import World, require_landmarks_in_view
 from consistency.bench.simulation.path import lap_length, planned_path
 from consistency.bench.store.trial_rows import outcome_of

@@ -24,8 +24,8 @@ from consistency.bench.runs.findings import experiments
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import load_scenario
 from consistency.bench.sweeps import running
-from consistency.bench.sweeps.folder import SweepFolder
 from consistency.bench.sweeps.plan import load_sweep
+from consistency.bench.sweeps.sweep_folder import SweepFolder
 
 Done = Callable[..., tuple[str, str]]
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="kernels are compiled side by side on Linux")

@@ -16,7 +16,7 @@ import consistency as cs
 from consistency.bench.runs.backends import dask
 from consistency.bench.runs.backends.dask import Dask
 from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
 from consistency.bench.store.results import StoredResults

@@ -145,6 +145,15 @@ def test_a_script_apart_runs_no_filter(scripts: Path, tmp_path: Path) -> None:
     assert found["two"] == "ValueError: OWN_PROCESS is for scripts that run no filter"
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("e09_kitti07", r"its data are not shipped; python .*e09_kitti07\.py --help"), ("e99", "no such finding")],
+)
+def test_what_cannot_be_reproduced_is_refused(tmp_path: Path, name: str, told: str) -> None:
+    with pytest.raises(InputError, match=f"--only {name}: {told}"):
+        reproduce([name], 5, 0, 1, tmp_path / "out")
+
+
 def test_jobs_out_of_range() -> None:
     with pytest.raises(InputError, match="jobs must be at least 1, or -1"):
         Study(jobs=0)

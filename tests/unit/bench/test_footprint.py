@@ -15,7 +15,7 @@ from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.kernel.part_functions import Data, Slam, make_factors, make_local
 from consistency.bench.runs import memory_needed as module
 from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.memory_needed import footprint, memory_here, trial_bytes, workers_that_fit
 from consistency.bench.runs.trial_work import Recorded, TrialWork
 from consistency.referee.errors import InputError

@@ -25,8 +25,8 @@ from threadpoolctl import threadpool_info
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter
 from consistency.bench.runs.gather import Gathered
-from consistency.bench.runs.isolation import isolating, supervising
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation import filter_process, supervisor
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Control, Observation
@@ -339,16 +339,16 @@ class Threads(Still):
 @pytest.fixture
 def no_supervisors() -> Iterator[None]:
     """New ones, and those of before set aside: starting one takes a second or more."""
-    before = isolating._idle[:]
-    isolating._idle.clear()
+    before = filter_process._idle[:]
+    filter_process._idle.clear()
     yield
-    isolating.dismiss()
-    isolating._idle.extend(before)
+    filter_process.dismiss()
+    filter_process._idle.extend(before)
 
 
 @pytest.mark.usefixtures("no_supervisors")
 def test_blas_has_one_thread(world: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in isolating.ONE_THREAD:
+    for name in filter_process.ONE_THREAD:
         monkeypatch.setenv(name, "2")
     results = cs.run_trials(world, [Threads("threads")], runs=1, jobs=1)
     assert (results.estimates["x"] == 1.0).all()
@@ -458,15 +458,15 @@ def test_a_filter_within_its_limits_has_the_same_bits(world: cs.Scenario, doomed
 
 def test_a_process_that_is_spawned(world: cs.Scenario, doomed: Control, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on macOS and Windows: the same bits, and a crash is a failed run with its step."""
-    monkeypatch.setattr(supervising, "_context", multiprocessing.get_context("spawn"))
+    monkeypatch.setattr(supervisor, "_context", multiprocessing.get_context("spawn"))
     bad = Still("bad", ends, doomed)
     study = Isolation([bad], world.belief, LONG)._study
     trials = [cs.simulate(world, run) for run in (DOOMED + 1, DOOMED)]
     near, far = multiprocessing.Pipe()
     longest = max(trials, key=lambda trial: len(trial.landmark))
-    host = supervising._Host(study, study.guests["bad"], longest, supervising.Printed("bad"))
+    host = supervisor._Host(study, study.guests["bad"], longest, supervisor.Printed("bad"))
     for trial in trials:
-        reply = host.run(trial, pickle.dumps(supervising.Task("bad", trial, world.belief)), far)
+        reply = host.run(trial, pickle.dumps(supervisor.Task("bad", trial, world.belief)), far)
         expected = run_filter(Still("bad"), trial, world.belief)
         if trial.run == DOOMED:
             assert reply.estimates.failure.step == STEP

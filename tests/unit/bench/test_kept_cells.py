@@ -19,9 +19,9 @@ from consistency.bench.store.trial_rows import RunOutcome
 from consistency.bench.sweeps import cell as cells
 from consistency.bench.sweeps import running
 from consistency.bench.sweeps.cell import cost_of
-from consistency.bench.sweeps.folder import CellWork, SweepFolder
 from consistency.bench.sweeps.plan import Sweep, load_sweep
 from consistency.bench.sweeps.running import run_sweep
+from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
 
 GRID = """
 summary = "Three densities in a linear world"
@@ -138,7 +138,7 @@ def test_runs_of_other_inputs_are_dropped(
     monkeypatch.undo()
     monkeypatch.setattr(cells, "cost_of", lambda *_: (1.0, 5.0))
     if new == "code":
-        monkeypatch.setattr("consistency.bench.sweeps.folder.code_digest", lambda: "another")
+        monkeypatch.setattr("consistency.bench.sweeps.sweep_folder.code_digest", lambda: "another")
         new = ""
     sweep = grid(at, old, new) if old else grid(at)
     done = stop_after(-1, Killed())

@@ -13,7 +13,7 @@ import consistency as cs
 from consistency.bench.runs.backends import slurm
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.backends.slurm import Slurm, options_of
-from consistency.bench.runs.isolation.isolating import Isolation
+from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
 

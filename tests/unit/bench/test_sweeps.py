@@ -21,14 +21,14 @@ from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.scenario import data_folder
 from consistency.bench.scenario.scenario import with_changes
 from consistency.bench.sweeps import cell as cells
-from consistency.bench.sweeps import folder as folders
 from consistency.bench.sweeps import running
+from consistency.bench.sweeps import sweep_folder as folders
 from consistency.bench.sweeps.axes import QUANTITIES, density_of
 from consistency.bench.sweeps.cell import CellResult, cost_of, run_cell
-from consistency.bench.sweeps.folder import CellWork, SweepFolder, describe, open_sweep, sweep_from
 from consistency.bench.sweeps.plan import Sweep, load_sweep, number_of_points, sweep_names
 from consistency.bench.sweeps.regime import Regime, ranked, read_regime, regime_of, write_regime
 from consistency.bench.sweeps.running import run_sweep
+from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder, describe, open_sweep, sweep_from
 from consistency.referee.errors import InputError
 
 LINEAR = """

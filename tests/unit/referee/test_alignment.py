@@ -42,7 +42,7 @@ from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE,
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.clock_offset import clocks_and_frames
 from consistency.referee.readers.formats.sheet import Places
-from consistency.referee.readers.matching import Aligned, Poses
+from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 
 STEPS = 30

@@ -16,7 +16,7 @@ from recorded import read_recordings
 import consistency as cs
 from consistency.referee.readers.formats.named_columns import fields_of, require_units
 from consistency.referee.readers.formats.sheet import TableRows
-from consistency.referee.readers.matching import unit_apart
+from consistency.referee.readers.truth_matching import unit_apart
 from consistency.referee.types import Array
 
 DATA = Path(os.environ.get("CONSISTENCY_DATA", Path(__file__).parents[4] / "shared" / "data"))

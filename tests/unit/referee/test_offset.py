@@ -16,7 +16,7 @@ from consistency.referee.geometry import wrap
 from consistency.referee.readers import clock_offset
 from consistency.referee.readers.clock_offset import Offset, clock_shift, offset_of, steps_of
 from consistency.referee.readers.formats.sheet import Places
-from consistency.referee.readers.matching import Poses
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 SIGMA = np.array([0.3, 0.3, 0.02])

@@ -26,7 +26,7 @@ from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import planar_error, se2_log
 from consistency.referee.geometry.groups import se3_log, spatial_error
-from consistency.referee.readers.matching import associate, common_times
+from consistency.referee.readers.truth_matching import associate, common_times
 from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import analyse
 

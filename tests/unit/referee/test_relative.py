@@ -300,7 +300,7 @@ def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[objec
     """Motions of a front-end, and true poses (number + 1, 4, 4); errors are of roll, pitch, yaw."""
     from consistency.referee.geometry import rotation
     from consistency.stereo.visual_odometry.motion import RelativeMotion
-    from consistency.stereo.visual_odometry.pose import RelativePose
+    from consistency.stereo.visual_odometry.relative_pose import RelativePose
 
     root = np.diag([0.02, 0.01, 0.03, 0.002, 0.004, 0.003]) @ (np.eye(6) + 0.3 * rng.normal(size=(6, 6)))
     found, steps = list[object](), [np.eye(4)]

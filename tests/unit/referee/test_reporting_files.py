@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +151,8 @@ def test_every_panel_of_a_plot_has_a_legend(steps: int, tmp_path: Path, rng: np.
     """One for all errors, and one each above NEES and coverage."""
     np.savez(tmp_path / "e.npz", **{key: value[:, :steps] for key, value in errors_of(rng).items()})
     record = cs.read(tmp_path / "e.npz")
-    for figure, others in ((record.plot(), 1), (cs.judge(record).plot(), 2)):
+    unnamed = replace(record, axes=())
+    for figure, others in ((record.plot(), 1), (unnamed.plot(), 1), (cs.judge(record).plot(), 2)):
         assert figure.legends
         of_panels = [axes.get_legend() for axes in figure.axes if axes.axison]
         assert [legend is not None for legend in of_panels] == [False, False, *(others * [True])]

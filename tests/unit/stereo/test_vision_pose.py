@@ -19,7 +19,7 @@ from consistency.stereo.visual_odometry import (
     register_svd,
     registration_covariance,
 )
-from consistency.stereo.visual_odometry.pose import rotation_derivatives
+from consistency.stereo.visual_odometry.relative_pose import rotation_derivatives
 
 Array = np.ndarray[Any, Any]
 A = np.array([0.3, -0.2, 0.9, 0.5, -0.7, 2.0])

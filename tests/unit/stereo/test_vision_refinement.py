@@ -22,7 +22,7 @@ from consistency.stereo.visual_odometry import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.visual_odometry import refinement as module
+from consistency.stereo.visual_odometry import maximum_likelihood as module
 
 Array = np.ndarray[Any, Any]
 S = 0.25 * np.eye(4)

@@ -27,7 +27,7 @@ from consistency.bench.filters.stepping import reason_of
 from consistency.bench.runs.backends.batches import Batch, Batches, Event, in_batches
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
-from consistency.bench.runs.isolation.isolating import ONE_THREAD
+from consistency.bench.runs.isolation.filter_process import ONE_THREAD
 from consistency.bench.runs.trial_work import Outcomes, TrialWork
 from consistency.referee.errors import InputError
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.runs.isolation.isolating import dismiss
+from consistency.bench.runs.isolation.filter_process import dismiss
 from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.errors import InputError

@@ -19,7 +19,7 @@ from consistency.referee.diagnostics.records.sample import Sample, sample_of
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES, least
-from consistency.referee.diagnostics.verdict.location import accuracy_of, bias_of
+from consistency.referee.diagnostics.verdict.fault_location import accuracy_of, bias_of
 from consistency.referee.diagnostics.verdict.parts import Equivalence, Interval, Settings, TruthShare, Verdict
 from consistency.referee.diagnostics.words.headline import at_share
 from consistency.referee.types import Array

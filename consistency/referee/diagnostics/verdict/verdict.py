@@ -35,7 +35,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     answers,
     ask,
 )
-from consistency.referee.diagnostics.verdict.location import (
+from consistency.referee.diagnostics.verdict.fault_location import (
     accuracy_of,
     axes_of,
     bias_of,

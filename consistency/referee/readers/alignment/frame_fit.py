@@ -18,7 +18,7 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     turned_frame,
 )
-from consistency.referee.readers.matching import Known, Poses
+from consistency.referee.readers.truth_matching import Known, Poses
 from consistency.referee.types import Array, Indices
 
 STEP = 1e-6  # m or rad, over which the change of an error is taken

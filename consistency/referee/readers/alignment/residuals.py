@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.verdict.answers import BIAS, INNOVATIONS, M
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.frame_fit import Sound, frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
-from consistency.referee.readers.matching import Aligned, Poses
+from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.matching import Manifold, Poses
+from consistency.referee.readers.truth_matching import Manifold, Poses
 from consistency.referee.types import Array
 
 

@@ -16,7 +16,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.formats.innovation_files import NisLog, choose
-from consistency.referee.readers.matching import associate
+from consistency.referee.readers.truth_matching import associate
 from consistency.referee.types import Array
 
 TOPICS = ("estimator_innovations", "estimator_innovation_variances")

@@ -21,7 +21,6 @@ from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.pose_rows import POSE
 from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.formats.tum import UNIT, bare_poses, poses_of
-from consistency.referee.readers.matching import NamedPoses, Poses
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.relative_motions import MARGINAL
 from consistency.referee.readers.space_trajectories import (
@@ -29,6 +28,7 @@ from consistency.referee.readers.space_trajectories import (
     recordings_of,
     require_axes,
 )
+from consistency.referee.readers.truth_matching import NamedPoses, Poses
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 

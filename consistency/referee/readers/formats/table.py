@@ -31,10 +31,10 @@ from consistency.referee.readers.formats.table_columns import (
     stated_covariance,
     stated_deviations,
 )
-from consistency.referee.readers.matching import Aligned, Known, NamedPoses, Poses, common_steps, common_times
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.runs_to_record import Track, assemble
+from consistency.referee.readers.truth_matching import Aligned, Known, NamedPoses, Poses, common_steps, common_times
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.named_columns import DEVIATIONS
 from consistency.referee.readers.formats.sheet import TableRows, are_dof, refuse
-from consistency.referee.readers.matching import Known, Manifold, Poses, unit_apart
 from consistency.referee.readers.options import COLUMNS
 from consistency.referee.readers.runs_to_record import listed, symmetric
+from consistency.referee.readers.truth_matching import Known, Manifold, Poses, unit_apart
 from consistency.referee.types import Array, Indices
 
 POSE = ("x", "y", "heading")

@@ -29,7 +29,6 @@ from consistency.referee.readers.formats.pose_rows import (
 )
 from consistency.referee.readers.formats.position_truth import fixed, position_source, positions
 from consistency.referee.readers.formats.sheet import Lines, Places, read_numbers, refuse
-from consistency.referee.readers.matching import NamedPoses, Poses, associate
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.space_trajectories import (
@@ -44,6 +43,7 @@ from consistency.referee.readers.space_trajectories import (
     recordings_of,
     require_axes,
 )
+from consistency.referee.readers.truth_matching import NamedPoses, Poses, associate
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 

@@ -13,7 +13,7 @@ from consistency.referee.diagnostics.records.validity import Validity, classify
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.matching import Poses
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from consistency.referee.readers.alignment.world_frames import (
     on_body,
     spread,
 )
-from consistency.referee.readers.matching import Poses
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at

@@ -19,7 +19,7 @@ from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.recorder import RunRecord
 from consistency.bench.filters.stepping import error_of, name_of, reason_of, rejects
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.isolation.supervising import Guest, Reply, SupervisorSetup, Task, supervise
+from consistency.bench.runs.isolation.supervisor import Guest, Reply, SupervisorSetup, Task, supervise
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
@@ -147,7 +147,7 @@ class Isolation:
 
 
 class _Supervisor:
-    """The near end of :func:`.supervising.supervise`, which runs in a process without ``__main__``."""
+    """The near end of :func:`.supervisor.supervise`, which runs in a process without ``__main__``."""
 
     def __init__(self) -> None:
         if current_process().daemon:

@@ -18,10 +18,10 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import batch_inverses, input_checks
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
+from consistency.stereo.visual_odometry.covariance_propagation import implicit_covariance
 from consistency.stereo.visual_odometry.input_errors import ConvergenceError, DegenerateError
-from consistency.stereo.visual_odometry.pose import RelativePose
-from consistency.stereo.visual_odometry.propagation import implicit_covariance
 from consistency.stereo.visual_odometry.registration import matched, register_svd
+from consistency.stereo.visual_odometry.relative_pose import RelativePose
 from consistency.stereo.visual_odometry.two_frame_cost import (
     Derivatives,
     PixelMatches,

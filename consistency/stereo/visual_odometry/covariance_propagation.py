@@ -12,8 +12,8 @@ from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import batch_inverses, input_checks
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, solved
 from consistency.stereo.visual_odometry.input_errors import ConvergenceError, DegenerateError
-from consistency.stereo.visual_odometry.pose import RelativePose, rotation_derivatives
 from consistency.stereo.visual_odometry.registration import matched
+from consistency.stereo.visual_odometry.relative_pose import RelativePose, rotation_derivatives
 
 AT_MINIMUM = 1e-3  # standard deviations that a pose may be away from the minimum that the theorem speaks of
 

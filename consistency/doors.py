@@ -25,6 +25,11 @@ DOORS = {
     "vision": "stereo.visual_odometry",
     "diagnostics.shared_errors": "referee.diagnostics.imperfect_truth.shared_errors",
     "diagnostics.skipping": "referee.diagnostics.records.skipping",
+    "scenario.tables": "bench.scenario.toml_tables",
+    "reporting": "bench.pages",  # this and what is below it: of sections of reports written before there were roots
+    "reporting.drawing": "referee.document.drawing",
+    "reporting.model": "bench.pages.report_input",
+    "reporting.section": "referee.pages.section",
 }  # fmt: skip
 
 

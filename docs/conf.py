@@ -35,7 +35,7 @@ nitpick_ignore_regex = [
     (r"py:class", r"consistency\..*\.(Backend|DisparityGrowth|Lens|Moments|NoiseGroup|Observations|Parts)"),
     (r"py:class", r"consistency\..*\.(Reading|Results|Source|Space|Sweep|Tables)"),
     # stages of the chain
-    (r"py:class", r"consistency\.stereo\.rendered_images\.\w+\.(Correspondence|FeatureSelection|ObservationFilter|Tracking)"),
+    (r"py:class", r"consistency\..*\.stages\.(Correspondence|FeatureSelection|ObservationFilter|Tracking)"),
 ]
 
 # pages

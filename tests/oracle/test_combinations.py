@@ -23,7 +23,6 @@ from consistency.bench.filters.kernel.part_functions import (
     State,
     insert_error,
     landmark_width,
-    move,
     observed_width,
     place,
     propagate,
@@ -32,7 +31,7 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.kernel.update_steps import linearise_seen
 from consistency.bench.filters.kernel.work_arrays import make_work
-from consistency.bench.filters.motion.unicycle import Unicycle
+from consistency.bench.filters.motion.unicycle import Unicycle, move
 from consistency.bench.filters.point.at_known import AtTruth
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook import basics
@@ -131,7 +130,7 @@ class Bench:
 
     def predicted(self, x: Array, u: Array, P: Array | None = None) -> Array:
         x, after = x.copy(), x.copy()
-        move(self.slam.motion, x[:3], u, after[:3])
+        move(x[:3], u, after[:3])
         self.stand(x, after)
         propagate(self.slam.error, self.slam, self.state(x, self.n, P), 0, u, np.zeros((3, 3)), self.work)
         return x
@@ -222,15 +221,14 @@ class TrueKalman:
         assert trial.truth is not None
         assert trial.landmarks is not None
         self.path, self.landmarks, self.uvd = trial.truth, trial.landmarks, uvd
-        self.robot = basics.Unicycle()
 
     def init(self, problem: Problem) -> TrueState:
         return TrueState(basics.start(problem), 0)
 
     def predict(self, state: TrueState, control: Control) -> TrueState:
         before, x, P = self.path[state.step], state.slam.x.copy(), state.slam.P.copy()
-        F, G = self.robot.jacobians(before, control)
-        x[:3] = self.robot.move(before, control) + F @ (x[:3] - before)
+        F, G = basics.motion_jacobians(before, control)
+        x[:3] = basics.move(before, control) + F @ (x[:3] - before)
         P[:3] = F @ P[:3]
         P[:, :3] = P[:, :3] @ F.T
         P[:3, :3] += basics.process_noise(G, state.slam.problem.belief)
@@ -244,8 +242,7 @@ class TrueKalman:
             known = np.concatenate([pose, *(landmarks[label] for label in slam.landmarks)])
             zhat, H = basics.expect(replace(slam, x=known), seen, self.uvd)
             innovation = basics.innovation_of(slam, z, zhat, self.uvd) - H @ (slam.x - known)
-            S, W = basics.gain(slam.P, H, basics.block_diagonal(R))
-            return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
+            return basics.corrected(slam, H, innovation, R)
 
         def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
             Hp, Hl = sensor.jacobians(pose, landmarks[label])

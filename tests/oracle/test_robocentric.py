@@ -288,11 +288,11 @@ def test_the_chain_of_the_kernel_is_that_of_its_twin(rng: np.random.Generator, o
     moved, C = inverse_range.chained(poses, xi, on=on)
     pixels = Pixels(1.0, 1.0, 1.0, Growth(np.ones(1), np.ones(1)), 0.0, 0.0, False, False, False)
     update = Converting(pixels, 0.03, 20, 12, clones, True, True, True, 0.0, 1.0)
-    room = converting_room(update, 3, 3, 3, m, 30)
+    room = converting_room(update, 3, 3, m, 30)
     room.number[:], room.on[0], size = number, on, 3 + 3 * (m + clones)
     places = np.array([3 + 3 * (m + c) for c in range(clones)] + [0])[:, None] + np.arange(3)
     room.delta[places] = xi
-    local = make_clones(Parking(50, 20, 4e-4, np.inf, True, True), 3, 3, 30, 200, 9)
+    local = make_clones(Parking(50, 20, 4e-4, np.inf, True, True), 3, 30, 200, 9)
     local.origin[number] = poses[:3]
     state = State(np.append(poses[3], np.zeros(27)), np.zeros((30, 30)), 30, 0, np.zeros(9, int))
     before = room.delta.copy()
@@ -511,7 +511,7 @@ def test_landmarks_are_parked_and_come_back(small: Small) -> None:
 
 
 def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
-    clones = make_clones(Parking(50, 20, 4e-4, np.inf, True, True, start=10), 3, 3, 36, 100, 2)
+    clones = make_clones(Parking(50, 20, 4e-4, np.inf, True, True, start=10), 3, 36, 100, 2)
     clones.factors.Phi[:] = 1.0
     clones.of[:], clones.uses[0], clones.here[0] = 0, 2, 9
     state = State(np.ones(12), np.ones((12, 12)), 12, 9, np.array([3, 6]))
@@ -531,7 +531,7 @@ def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
 
 def test_the_state_is_split_only_where_the_step_has_room() -> None:
     """Room for 18 variables: those of the robot, of four landmarks in use, and of one more."""
-    clones = make_clones(Parking(50, 20, 4e-4, np.inf, True, True, start=10), 3, 3, 36, 100, 9)
+    clones = make_clones(Parking(50, 20, 4e-4, np.inf, True, True, start=10), 3, 36, 100, 9)
     clones.of[4:] = 0
     whole = State(np.ones(36), np.eye(36), 36, 0, np.array([3, 6, 9, 12, 15, 18, -1, -1, -1]))
     assert len(clones.factors.x) == 18

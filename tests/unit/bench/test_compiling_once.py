@@ -53,7 +53,7 @@ def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> Counts:
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Counts:
     """Calls whose type Numba has looked for."""
-    monkeypatch.setattr("consistency.bench.filters.compiler.type_inference._known", {})
+    monkeypatch.setattr("consistency.bench.filters.compiler.whole_program._known", {})
     return counted(monkeypatch, functions.BaseFunction, "get_call_type")
 
 

@@ -16,9 +16,9 @@ from single_log import errors
 
 import consistency as cs
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.referee.diagnostics.imperfect_truth.shared_errors import LEAST
 from consistency.referee.diagnostics.planning.single_log import (
     APART,
+    FEWEST,
     MOST,
     correlation_time,
     in_pieces,
@@ -218,7 +218,7 @@ def test_a_constant_part_is_undecided(share: float) -> None:
 def test_too_short_pieces_are_undecided() -> None:
     one = log(np.random.default_rng(5), 400, 0.9)
     v = judge(in_pieces(one))
-    assert (v.status, v.runs) == ("undecided", LEAST)
+    assert (v.status, v.runs) == ("undecided", FEWEST)
     assert "20 pieces of 20 steps are not shown to be independent: errors go on over" in v.reasons[0]
     few = judge(in_pieces(log(np.random.default_rng(5), 4000), 10))
     assert "10 pieces of one log are too few, at least 20 are needed" in few.reasons[0]

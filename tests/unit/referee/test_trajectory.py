@@ -80,9 +80,9 @@ def test_no_ellipse_of_errors_about_other_axes() -> None:
 def test_only_what_is_judged_is_drawn() -> None:
     figure = trajectory(record(axes=("x", "y")))
     assert figure.panels[0].y.label == "y (m)"
-    assert trajectory(record(axes=("z",)), 0) is None
+    assert trajectory(record(axes=("z",))) is None
     bare = record()
-    assert trajectory(Evidence("est", bare.error, bare.covariance, axes=bare.axes), 0) is None
+    assert trajectory(Evidence("est", bare.error, bare.covariance, axes=bare.axes)) is None
 
 
 def test_units() -> None:
@@ -123,4 +123,4 @@ def test_tables_keep_it_too(tmp_path: Path) -> None:
     (tmp_path / "truth.csv").write_text("t,x,y,heading\n" + "".join(f"{k},{k + 1},{2 * k},0.1\n" for k in range(1, 9)))
     (one,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
     np.testing.assert_array_equal(one.path[0, 3], [[5.0, 8.0], [4.0, 8.0]])
-    assert trajectory(one, 0) is not None
+    assert trajectory(one) is not None

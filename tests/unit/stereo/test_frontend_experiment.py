@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import scripts
 
-import consistency as cs
 from consistency.stereo.visual_odometry import RelativePose
 
 figures = scripts.experiment("front_end_figures")
@@ -53,14 +52,6 @@ def test_bias_and_floor_of_errors_with_too_small_covariances(experiment: ModuleT
     np.testing.assert_allclose(floor, 3.0, atol=6 * 4 * np.sqrt(2 / n))
     _, none = experiment.floored(rng.normal(size=(n, 6)), np.tile(9 * np.eye(6), (n, 1, 1)))
     assert not none.any()
-
-
-def test_without_data_it_says_what_to_set(
-    experiment: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.delenv("CONSISTENCY_DATA", raising=False)
-    assert experiment.main(cs.Study(runs=1)) == []
-    assert "CONSISTENCY_DATA" in capsys.readouterr().err
 
 
 def test_figures_are_png(rng: np.random.Generator) -> None:

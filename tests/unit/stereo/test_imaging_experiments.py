@@ -129,9 +129,9 @@ def test_a_report_without_images_has_no_section(tmp_path: Path) -> None:
     study.tables["images_exp1"] = pd.DataFrame({"frame": [0.0], "tracks": [3.0], "rms_u": [0.1]})
     study.write(tmp_path / "out", [], 0.0)
     with pytest.raises(cs.InputError, match=r"images_exp1\.parquet: column 'rms_v' is missing"):
-        images.SECTION.read(build_report(tmp_path / "out"))
+        images.SECTION.blocks(build_report(tmp_path / "out"))
     (tmp_path / "out" / "images_exp1.parquet").unlink()
-    assert images.SECTION.read(build_report(tmp_path / "out")) is None
+    assert not images.SECTION.blocks(build_report(tmp_path / "out"))
 
 
 def test_a_junction_ranks_above_a_point(moving: ModuleType) -> None:

@@ -32,8 +32,8 @@ RANKS = {
     },
     "bench": {
         "types": 0, "models": 1, "scenario": 2, "protocols": 3, "simulation": 4, "filters": 4,
-        "store.parquet": 3, "store.folder_tables": 4, "store.results_check": 4, "store.log_tables": 4, "store.journal": 5,
-        "store.results": 5, "store.trial_rows": 6, "store.log": 8,
+        "store.parquet": 3, "store.folder_tables": 4, "store.results_check": 4, "store.log_tables": 4,
+        "store.journal": 5, "store.results": 5, "store.trial_rows": 6, "store.log": 8,
         "runs.memory_needed": 8, "runs.gather": 8,
         "runs.isolation": 8, "runs.compiling": 8, "runs.trial_work": 9, "runs.backends": 10,
         "runs.campaign": 10, "runs.montecarlo": 11, "runs.results_to_records": 8, "runs.run_scores": 9,

@@ -371,9 +371,9 @@ def test_a_second_ctrl_c_soon_is_the_same_wish(monkeypatch: pytest.MonkeyPatch) 
     with stoppable() as stop:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-        now[0] += 0.9 * stopping.GRACE
+        now[0] += 0.9 * stopping.AGAIN
         signal.raise_signal(signal.SIGINT)
-        now[0] += 0.2 * stopping.GRACE
+        now[0] += 0.2 * stopping.AGAIN
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert (stop.number, stop.status) == (signal.SIGINT, 130)

@@ -18,7 +18,6 @@ import consistency as cs
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.diagnostics.planning.single_log import (
     APART,
-    FEWEST,
     MOST,
     correlation_time,
     in_pieces,

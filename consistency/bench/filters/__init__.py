@@ -7,7 +7,6 @@ share. Nothing here knows the simulation.
 
 from __future__ import annotations
 
-import difflib
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -120,9 +119,9 @@ def get_filter(name: str) -> Any:
     if name not in MODULES:
         if "," in name:
             raise InputError(f"unknown filter '{name}'; give --filter once for each filter")
-        near = difflib.get_close_matches(name, MODULES, n=1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        raise InputError(f"unknown filter '{name}'{hint}; known: {', '.join(MODULES)}")
+        from consistency.bench.scenario.scenario import unknown
+
+        raise InputError(unknown("filter", name, list(MODULES)))
     module, attribute, _ = MODULES[name]
     if (missing := _missing(module)) is not None:
         package, extra = missing

@@ -132,7 +132,7 @@ def with_changes(base: Scenario, name: str, summary: str, changes: Mapping[str, 
 
 
 def unknown(what: str, name: str, known: Sequence[str]) -> str:
-    """That there is no such scenario or sweep, and what there is."""
+    """That there is no such scenario, sweep or filter, and what there is."""
     near = difflib.get_close_matches(name, known, n=1)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
     return f"unknown {what} '{name}'{hint}; known: {', '.join(known)}"

@@ -12,6 +12,7 @@ from consistency.referee.diagnostics.imperfect_truth.shared_errors import (
     halves,
     without_shared,
 )
+from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of
 
@@ -68,7 +69,7 @@ def _less(record: Evidence, other: Evidence, kind: str, data: str) -> Evidence:
     """The record without what another shows, with what was fitted among its notes, and a caption of its verdict."""
     fit = fit_record(other, kind)
     record = without_shared(record, fit, kind)
-    axes = record.axes or [f"axis {i}" for i in range(len(fit.floor))]
+    axes = record.axes or numbered_axes(len(fit.floor))
     each = {"by-vector": "", "by-time": " a second", "by-distance": " a metre"}[kind]
     means = ", ".join(f"{axis} {value:.3g}" for axis, value in zip(axes, fit.mean, strict=True))
     floors = ", ".join(f"{value:.2g}" for value in fit.floor)

@@ -11,7 +11,7 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.planning.number_of_runs import MARGIN
 from consistency.referee.diagnostics.questions.equivalence import deciding_runs
 from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest, run_means
-from consistency.referee.diagnostics.records.record import Record, arrays_of
+from consistency.referee.diagnostics.records.record import Record, arrays_of, numbered_axes
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.answers import BIAS
@@ -183,7 +183,7 @@ def _require_steady(record: Record, P: Array) -> None:
     if min(map(len, blocks)) == 0:
         return
     medians = np.array([np.nanmedian(block, axis=0) for block in blocks])
-    names = record.axes or [f"axis {i}" for i in range(medians.shape[1])]
+    names = record.axes or numbered_axes(medians.shape[1])
     for axis, values in zip(names, medians.T, strict=True):
         ratio = float(values[-1] / max(values[1], np.finfo(float).tiny))
         signs = np.sign(values[None, :] - values[:, None])[np.triu_indices(len(values), 1)]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pkgutil
+import re
 import subprocess
 import sys
 from importlib import import_module
 from operator import attrgetter
+from pathlib import Path
 
 import pytest
 
@@ -44,3 +47,20 @@ def test_other_names_are_not_found() -> None:
     for name in ("recording", "diagnostics.nonsense", "referee.nonsense"):
         with pytest.raises(ModuleNotFoundError, match=r"nonsense|recording"):
             import_module(f"consistency.{name}")
+
+
+def test_names_of_the_documents_are_found() -> None:
+    """Every name that docs/api lists, by the path that stands there."""
+    names = []
+    for page in sorted((Path(__file__).parents[2] / "docs/api").glob("*.md")):
+        module = "consistency"
+        for line in page.read_text(encoding="utf-8").splitlines():
+            if found := re.match(r"\.\. (currentmodule|autofunction|autoclass):: (\S+)", line):
+                kind, name = found.groups()
+                if kind == "currentmodule":
+                    module = name
+                else:
+                    names.append(name if name.startswith("consistency") else f"{module}.{name}")
+    assert len(names) > 100
+    for name in names:
+        assert callable(pkgutil.resolve_name(name)), name

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from consistency.referee.diagnostics import Record, nis_of
 from consistency.referee.diagnostics.records.skipping import Skip, skip_of
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.numpy_archive import in_memory, record_of_arrays, steps_of
+from consistency.referee.readers.formats.numpy_archive import in_memory, masked_steps, record_of_arrays, steps_of
 from consistency.referee.readers.runs_to_record import Track, judged_rows, longest_start, symmetric
 from consistency.referee.types import Array, Failure, Indices
 from consistency.referee.verdicts.sources import Results, source_of
@@ -187,7 +187,7 @@ def _vectors(
 ) -> tuple[Array, Array, list[Failure]]:
     """Innovations (runs, steps, m), their covariances, and failed runs, as of errors.
 
-    A step without a measurement is masked, or, in an array that is not, all NaN.
+    A step without a measurement is masked in either, or, where the innovations are not masked, all NaN.
     """
     v, S = in_memory("innovations", vectors), in_memory("innovation_covariances", covariances)
     _require_runs("innovations", v.shape, gone)
@@ -196,8 +196,10 @@ def _vectors(
             "innovations and innovation_covariances must have shapes (runs, steps, m) and (runs, steps, m, m), "
             f"got {v.shape} and {S.shape}"
         )
-    masked = np.ma.getmaskarray(vectors) if isinstance(vectors, np.ma.MaskedArray) else None
-    absent = np.isnan(v).all(axis=-1) if masked is None else masked.any(axis=-1)
+    absent = masked_steps("innovations", vectors, v.shape[:2])
+    absent |= masked_steps("innovation_covariances", covariances, v.shape[:2])
+    if not isinstance(vectors, np.ma.MaskedArray):
+        absent |= np.isnan(v).all(axis=-1)
     there: Array = np.asarray(~(absent if gone is None else absent | gone))
     _require_some("innovations", there, np.asarray(np.isfinite(v).all(axis=-1)))
     _require_some("innovation_covariances", there, np.asarray(np.isfinite(S).all(axis=(-2, -1))))
@@ -225,7 +227,10 @@ def _nis(name: str, nis: ArrayLike, nis_dof: ArrayLike, gone: Array | None) -> t
         raise ValueError(f"nis must have shape (runs, steps), got {values.shape}")
     if dof.ndim not in (0, 2) or (dof.ndim == 2 and dof.shape != values.shape):
         raise ValueError(f"nis_dof must be a number or have the shape of nis, {values.shape}, got {dof.shape}")
-    dof = np.where(False if gone is None else gone, 0.0, np.broadcast_to(dof, values.shape))
+    absent = masked_steps("nis", nis, values.shape) | (False if gone is None else gone)
+    if dof.ndim:
+        absent |= masked_steps("nis_dof", nis_dof, values.shape)
+    dof = np.where(absent, 0.0, np.broadcast_to(dof, values.shape))
     if not (np.isfinite(dof).all() and (dof >= 0).all() and (dof == np.round(dof)).all()):
         raise ValueError("nis_dof must hold whole numbers, 0 where there was no innovation")
     there, finite = np.asarray(dof > 0), np.asarray(np.isfinite(values))

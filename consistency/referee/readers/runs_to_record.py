@@ -18,6 +18,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.sheet import Places, refuse
 from consistency.referee.types import Array, Failure, Indices
 
+NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
 ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path")  # of a track, as in a record
 
 
@@ -194,13 +195,41 @@ def _cut(track: Track, start: int, end: int) -> Track:
     return replace(track, covariance=P, nees=values)
 
 
+def not_estimated(errors: Sequence[Array], variances: Sequence[Array]) -> Indices:
+    """Components whose errors are 0 in every row while their variance is one constant, (n,) of bool.
+
+    None where a component with errors has no variance, as both may be in the wrong row, and where every error is 0.
+
+    Parameters
+    ----------
+    errors, variances : (k, n) of each run
+    """
+    variance = np.concatenate(variances)
+    variance = variance[~np.isnan(variance).any(axis=1)]
+    still = _without_errors(errors)
+    idle: Indices = still & (variance == variance[:1]).all(axis=0) & (len(variance) > 1)
+    none = (np.abs(variance) <= ROUNDED.zero).all(axis=0)
+    return np.zeros(len(idle), bool) if still.all() or none.any() else idle
+
+
+def _without_errors(errors: Sequence[Array]) -> Indices:
+    return ~(np.abs(np.concatenate(errors)) > NO_ERROR).any(axis=0)
+
+
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     variances = [np.diagonal(t.covariance, axis1=-2, axis2=-1) for t in tracks if t.covariance is not None]
     none = (np.abs(np.concatenate(variances)) <= ROUNDED.zero).all(axis=0)
+    still = _without_errors([t.error for t in tracks if t.error is not None])
     if none.all():
         return f"{file}: the covariance is zero in every step; nothing to judge"
     of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})" * bool(none.any())
-    left = ",".join(axis for axis, zero in zip(axes, none, strict=True) if not zero)
+    missing, idle = none & ~still, ~none & still
+    if missing.any() and idle.any():
+        with_errors, without = (", ".join(np.array(axes)[which]) for which in (missing, idle))
+        of += f"; {with_errors} has errors without a variance, and {without} a variance without errors: write each "
+        return f"{file}: the covariance is singular in every step{of}variance in the row of its own component"
+    unused = none if still.all() else none | idle
+    left = ",".join(axis for axis, no in zip(axes, unused, strict=True) if not no)
     advice = f"judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
     if not none.any():
         advice = "write only the states that the filter estimates by themselves"

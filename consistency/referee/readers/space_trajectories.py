@@ -17,7 +17,7 @@ from consistency.referee.readers.formats.sheet import refuse
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.relative_motions import Stretch, relative_recording
-from consistency.referee.readers.runs_to_record import Track, assemble
+from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
 from consistency.referee.readers.truth_matching import Poses, common_times, truth_at, unit_apart
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
@@ -97,14 +97,19 @@ def recordings_of(
         one = relative_recording(source.path.stem, str(source.covariance), stretches, AXES, judged, relative)
         return [replace(one, notes=(*source.notes, *one.notes))]
     shift, clocks, moved = clocks_and_frames(source.path.name, poses, r.time_offset, r.align, judged)
-    poses = moved.runs
+    stated, poses = poses, moved.runs
     matches = [
         _match(run, one, *files, shift) for run, (one, files) in enumerate(zip(poses, source.files, strict=True))
     ]
     columns, t = common_times([each.t for each in matches])
     tracks = [replace(each.track, column=column) for each, column in zip(matches, columns, strict=True)]
+    variances = [np.diagonal(one.covariance[one.stated], axis1=1, axis2=2) for one in stated]
+    idle = not_estimated([track.error for track in tracks if track.error is not None], variances)
+    left_out = [axes[i] for i in judged if idle[i]] if r.axes is None else []
+    judged = [i for i in judged if axes[i] not in left_out]
     notes = [
         *source.notes,
+        *_not_judged(source.path.name, left_out, axes),
         *_notes(source.path, matches, poses[0].max_dt),
         *clocks,
         *moved.notes,
@@ -169,6 +174,15 @@ def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, toleran
     own_span, span = (f"{each[0]:.10g} to {each[-1]:.10g}" for each in (t, other_t))
     where = f"t is {own_span}, but {span} in {other}{unit_apart(t, other_t, (path, other))}"
     return InputError(f"{path}: no estimate has a {what} within {tolerance:g} s (--max-dt): {where}")
+
+
+def _not_judged(name: str, left_out: Sequence[str], axes: Sequence[str]) -> list[str]:
+    if not left_out:
+        return []
+    return [
+        f"{name}: {', '.join(left_out)} are not estimated and left out: their errors are 0 in every row, and their "
+        f"variances one constant each, as of a robot in the plane; --axes {','.join(axes)} judges them, too"
+    ]
 
 
 def _notes(estimates: Path, matches: Sequence[Match], max_dt: float) -> list[str]:

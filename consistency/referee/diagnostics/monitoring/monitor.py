@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from consistency.referee.defaults import GATE_FALSE_ALARM
 from consistency.referee.diagnostics.monitoring.truncated_chi2 import gate_limit, gated_scale, log_chi2_cdf
 
@@ -209,7 +211,7 @@ class Monitor:
         Parameters
         ----------
         nis : innovation' S^-1 innovation; None or NaN if there is none. With ``dof`` of 1 or more and a gate, that is
-            a rejected measurement
+            a rejected measurement. Masked (``numpy.ma``) in a step without a measurement
         dof : dimension of the innovation; 0 in a step without a measurement
 
         Raises
@@ -217,6 +219,8 @@ class Monitor:
         ValueError
             ``nis`` is negative or infinite, or ``dof`` not a whole number of 0 or more; nothing is counted then.
         """
+        if nis is np.ma.masked:
+            nis, dof = None, 0
         if not (0 <= dof < math.inf and dof == int(dof)):
             raise ValueError(f"dof must be a whole number of 0 or more, got {dof}")
         value = math.nan if nis is None else float(nis)

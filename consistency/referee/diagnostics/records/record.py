@@ -118,6 +118,14 @@ class Record:
     map: Callable[[], MapRecord | None] | None = None  # reads the maps; None where there are none
     rejections: Rejections | None = None  # of a filter with a guard
 
+    def __post_init__(self) -> None:
+        for key, array in arrays_of(self).items():
+            if isinstance(array, np.ma.MaskedArray):
+                raise InputError(
+                    f"{self.name}: {key} is a masked array, whose mask a record would lose; write NaN where nothing is "
+                    f"known, as {key}.filled(numpy.nan) does, or give the arrays to consistency.judge"
+                )
+
     @property
     def run_numbers(self) -> Indices:
         """Labels of the runs, (runs,)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -60,13 +61,14 @@ def record_of_arrays(
 
     Parameters
     ----------
-    given : errors with covariances or deviations, or nees with dof; steps that are masked in a masked array of errors
-        or nees have no truth and do not count
+    given : errors with covariances or deviations, or nees with dof; steps that are masked in a masked array of any
+        of them have no truth and do not count
 
     Raises
     ------
     InputError
-        Shapes that do not fit, a covariance that is not symmetric, a step that is not finite in any run.
+        Shapes that do not fit, a step that is masked in part, a covariance that is not symmetric, a step that is not
+        finite in any run.
     """
     first = next(iter(given))
     arrays = {key: in_memory(key, value) for key, value in given.items()}
@@ -86,8 +88,9 @@ def record_of_arrays(
         if sigma.shape != shape:
             raise InputError(f"deviations has shape {sigma.shape}, needs that of errors, {shape}")
         arrays["covariances"] = diagonal(sigma)
-    masked = np.ma.getmaskarray(np.ma.asarray(given[first])).reshape(arrays[first].shape)
-    mask = masked.reshape(*shape[:2], -1).any(axis=-1)
+    mask = np.zeros(shape[:2], bool)
+    for key, value in given.items():
+        mask |= masked_steps(key, value, shape[:2])
     for key, array in arrays.items():
         if array.ndim < 2 or array.shape[:2] != shape[:2]:  # shapes that do not fit are refused below
             continue
@@ -97,7 +100,7 @@ def record_of_arrays(
             step = int(np.argmax(never)) + 1
             raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
     if mask.any():
-        arrays["mask"] = np.asarray(mask)
+        arrays["mask"] = mask
     arrays |= {} if axes is None else {"axes": np.asarray(axes, str)}
     record = _of_arrays(Path("arrays"), arrays)
     record = record if sigma is None else each_alone(record)
@@ -124,6 +127,29 @@ def _require_rows(shapes: Mapping[str, tuple[int, ...]]) -> None:
         elif own == shape:
             remedy = f"; variances are {key}[:, :, None] * np.eye({shape[1]}), standard deviations go into deviations="
         raise InputError(f"{key} has shape {own}, needs {needs} beside errors of shape {shape}{remedy}")
+
+
+def masked_steps(key: str, value: ArrayLike, shape: tuple[int, ...]) -> Indices:
+    """Steps that a masked array leaves out, (runs, steps); none of any other array.
+
+    Raises
+    ------
+    InputError
+        A step is masked in part: it could not count with the components that are known alone.
+    """
+    if not np.ma.is_masked(value) or np.size(value) % math.prod(shape):  # shapes that do not fit are refused later
+        return np.zeros(shape, bool)
+    masked = np.ma.getmaskarray(value).reshape(*shape, -1)
+    some = masked.any(axis=-1)
+    partly = some & ~masked.all(axis=-1)
+    if partly.any():
+        run, step = np.argwhere(partly)[0]
+        raise InputError(
+            f"{key}, run {run}, step {step + 1}: {masked[run, step].sum()} of {masked.shape[-1]} numbers are masked; "
+            "mask all of a step without a value, and judge components that are known in other steps than the rest by "
+            "themselves, each group in arrays of its own"
+        )
+    return np.asarray(some)
 
 
 def in_memory(key: str, value: ArrayLike) -> Array:

@@ -18,6 +18,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
 from consistency.referee.readers.formats.sheet import Places, are_dof, bounded
+from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.runs_to_record import Track, assemble, symmetric
@@ -222,6 +223,7 @@ def _of_arrays(
         T = None if of_truth is None else symmetric(of_truth[run, k], place.__getitem__)
         tracks.append(Track(run, k, place, error[run, k], P, own_nis, own_dof, truth_covariance=T))
     axes = _axes(path, arrays, n)
+    require_radians(str(path), poses)
     notes = [f"error convention {error_kind}: {PLANAR[error_kind]}"] if error_kind else []
     notes += hints(path.stem, axes, poses)
     if given == "vector":

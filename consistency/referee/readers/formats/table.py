@@ -31,6 +31,7 @@ from consistency.referee.readers.formats.table_columns import (
     stated_covariance,
     stated_deviations,
 )
+from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.runs_to_record import Track, assemble
@@ -182,6 +183,7 @@ def _recording(
             )
             for rows, true in zip(members, true_of, strict=True)
         ])  # fmt: skip
+        require_radians(str(sheet.path), moved.runs)
         shift, clocks = r.shift, list[str]()
         if relative is None:
             if key == "t" or r.align is not None:

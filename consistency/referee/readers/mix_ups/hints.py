@@ -12,7 +12,6 @@ import numpy as np
 from consistency.referee.diagnostics.records.validity import Validity, classify
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.geometry import wrap
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
@@ -132,16 +131,18 @@ def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: ReadingFit)
 
 def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
     """Components of errors (runs, steps, n) that look like angles: their large errors are whole turns."""
-    with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-        far = (np.abs(error) > np.pi) & (np.abs(error) > 2.0 * NEAR * sigma) & (NEAR * sigma < SHARP)
-        home = np.abs(wrap(error)) <= NEAR * sigma
     found = []
-    for k, axis in enumerate(axes):
-        jumps = int(far[..., k].sum())
-        if jumps >= LEAST and home[..., k][far[..., k]].all():
-            steps = f"{jumps} of {int(np.isfinite(error[..., k]).sum())} steps"
-            found.append(f"{name}: the error of {axis} is off by 2 pi in {steps}, as that of an angle; {remedy}")
+    in_degrees = 360.0, "360", np.rad2deg(SHARP), "wrap it to [-180, 180]"
+    for turn, by, sharp, how in ((2.0 * np.pi, "2 pi", SHARP, remedy), in_degrees):
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+            far = (np.abs(error) > 0.5 * turn) & (np.abs(error) > 2.0 * NEAR * sigma) & (NEAR * sigma < sharp)
+            home = np.abs(error - turn * np.round(error / turn)) <= NEAR * sigma
+        for k, axis in enumerate(axes):
+            jumps = int(far[..., k].sum())
+            if jumps >= LEAST and home[..., k][far[..., k]].all():
+                steps = f"{jumps} of {int(np.isfinite(error[..., k]).sum())} steps"
+                found.append(f"{name}: the error of {axis} is off by {by} in {steps}, as that of an angle; {how}")
     return found
 
 

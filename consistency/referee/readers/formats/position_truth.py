@@ -19,6 +19,11 @@ from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 
+SAME = 1e-9  # of quaternions
+FEWEST = 3  # estimates of a run
+TURNED, BEYOND = 0.5, 10.0  # rad and sigma: a turn that is no error of a constant orientation
+WINDING, ALIGNED = 0.1, 0.25  # 1 less the mean direction of a path, and the part of it that is left in the body's axes
+
 
 def position_source(
     source: TrajectorySource, poses: Sequence[Poses], convention: str, r: Reading, relative: Relative | None
@@ -83,6 +88,47 @@ def positions(poses: Poses, lever: Sequence[float], blocks: bool) -> Poses:
         manifold="vector", convention="vector", cross=None,
         true_covariance=None if poses.true_covariance is None else poses.true_covariance[:, :3, :3],
     )  # fmt: skip
+
+
+def placeholder(poses: Sequence[Poses]) -> tuple[bool, str]:
+    """Whether a truth has one orientation in place of none, and a note where it may have.
+
+    It is the same in every row of every run, while the estimates turn by more than their covariance allows. They turn
+    with the path where the direction of a run's true way is the same in the axes of the estimated body.
+
+    Parameters
+    ----------
+    poses : runs in space
+    """
+    quaternions = np.concatenate([one.truth[:, 3:7] for one in poses])
+    if (np.abs(np.abs(quaternions @ quaternions[0]) - 1.0) > SAME).any():
+        return False, ""
+    angles, ways, bodies = [], [], []
+    for one in poses:
+        known = one.known()
+        finite = np.isfinite(one.estimate[known.rows]).all(axis=1)
+        rows, true = known.rows[finite], known.truth[finite, :3]
+        if len(rows) < FEWEST:
+            continue
+        R = Rotation.from_quat(one.estimate[rows, 3:7])
+        sigma = np.sqrt(np.abs(np.trace(one.covariance[rows, 3:6, 3:6], axis1=1, axis2=2)))
+        turned = (R[0].inv() * R).magnitude()
+        angles.append(float(np.max(np.where(turned > BEYOND * sigma, turned, 0.0))))
+        way = np.diff(true, axis=0)
+        size = np.linalg.norm(way, axis=1)
+        moving = size > 0.1 * np.median(size)
+        way = way[moving] / size[moving, None]
+        if len(way):
+            ways.append(np.linalg.norm(way.mean(axis=0)))
+            bodies.append(np.linalg.norm(R[:-1][moving].inv().apply(way).mean(axis=0)))
+    if not angles or np.median(angles) < TURNED:
+        return False, ""
+    angle = np.rad2deg(np.median(angles))
+    text = f"the truth has the same orientation in every row, while the estimates turn by {angle:.0f} degrees"
+    of_way, of_body = (1.0 - float(np.mean(each)) if each else 0.0 for each in (ways, bodies))
+    if of_way > WINDING and of_body < ALIGNED * of_way:
+        return True, f"{text} with the path: it is read as positions alone"
+    return False, f"{text}; if it is a placeholder, give a truth of t x y z, or judge --axes x,y,z"
 
 
 def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) -> Poses:

@@ -27,7 +27,7 @@ from consistency.referee.readers.formats.pose_rows import (
     read_deviations,
     read_poses,
 )
-from consistency.referee.readers.formats.position_truth import fixed, position_source, positions
+from consistency.referee.readers.formats.position_truth import fixed, placeholder, position_source, positions
 from consistency.referee.readers.formats.sheet import Lines, Places, read_numbers, refuse
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.runs_to_record import symmetric
@@ -116,6 +116,11 @@ def poses_of(
         poses.append(_poses(own, true, P_path, error_kind, order, r, k))
         if _is_point(true):
             poses[-1] = positions(poses[-1], r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE)
+    if poses[0].manifold == "spatial" and r.axes is None and relative is None:
+        empty, what = placeholder(poses)
+        notes += [f"{files[0][1]}: {what}"] * bool(what)
+        if empty:
+            poses = [positions(one, r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE) for one in poses]
     why = "" if r.error else why or f"; the default of this layout, {_origin(parts)}"
     source = TrajectorySource(estimates, files, r.covariance or estimates, why, tuple(dict.fromkeys(notes)))
     if any(one.manifold == "vector" for one in poses):

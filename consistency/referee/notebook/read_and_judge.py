@@ -58,7 +58,7 @@ def read(
     error : error that the covariance describes: so2, vector, left, right, so3 or so3-body; None is the default,
         and "guess" judges all that poses have
     state : names of the columns that make up the state, in .csv and .parquet; None is x, y, heading
-    covariance_order : translation-rotation or rotation-translation, of a trajectory
+    covariance_order : translation-rotation or rotation-translation, or blocks in their order, as p,v,R; of a trajectory
     max_dt : s, between an estimate and its truth; None is 0.01
     time_offset : s to add to the timestamps of the estimates, or "estimate"
     axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw

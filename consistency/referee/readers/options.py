@@ -50,7 +50,9 @@ class Reading:
         "Error that the covariance is of: so2, vector, left, right, so3, so3-body, additive, or guess."
     )
     state: Sequence[str] | None = _option("Columns that make up the state [x,y,heading].", "A,B,C", _names)
-    covariance_order: str | None = _option("translation-rotation [default] or rotation-translation.")
+    covariance_order: str | None = _option(
+        "translation-rotation [default], rotation-translation, or blocks of p, R, v, bg, ba, as p,v,R."
+    )
     max_dt: float | None = _option(f"Seconds between an estimate and its truth at most [{MAX_DT:g}].")
     time_offset: float | str | None = _option("Seconds to add to the estimates' timestamps.", "S|estimate", _seconds)
     axes: Sequence[str] | None = _option(

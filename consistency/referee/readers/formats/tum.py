@@ -48,6 +48,7 @@ from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 
 ORDERS = ("translation-rotation", "rotation-translation")
+BLOCKS_OF_STATE = ("p", "R", "v", "bg", "ba")  # three components each, in the order of STATE
 BOTH = 2 * FULL  # and a cross-covariance with the line before
 UNIT = 1e-3  # quaternions of four decimals pass
 
@@ -63,8 +64,7 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
     """
     if r.error not in (None, *INERTIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    if r.covariance_order not in (None, *ORDERS):
-        raise InputError(f"--covariance-order {r.covariance_order}: must be {' or '.join(ORDERS)}")
+    _require_order(r.covariance_order)
     require_axes(r.axes, STATE)
     if r.truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
@@ -104,7 +104,8 @@ def poses_of(
             parts, is_fixed = _parts(own), isinstance(own, Fixes)
             error_kind = r.error or ("so3" if parts in (WHOLE, ALONE) else "so3-body")
             require_error(own, r.error)
-        if parts not in (WHOLE, ALONE) and r.covariance_order == ORDERS[0]:
+            notes += _order_note(path, _width(own), r.covariance_order)
+        if parts not in (WHOLE, ALONE) and r.covariance_order not in (None, ORDERS[1]):
             raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
         if _parts(own) is not parts:
             raise InputError(mixed or f"{path}: has {own.values.shape[1]} columns, {files[0][0]} another layout")
@@ -372,7 +373,35 @@ def _matrices(numbers: Array, order: str) -> Array:
 
 def _turned(n: int, order: str) -> list[int]:
     """Places of x, y, z, the rotation and n - 6 more among components in an order."""
-    return [*([0, 1, 2, 3, 4, 5] if order == ORDERS[0] else [3, 4, 5, 0, 1, 2]), *range(6, n)]
+    blocks = blocks_in(n, order)
+    return [3 * blocks.index(block) + i for block in BLOCKS_OF_STATE[: n // 3] for i in range(3)]
+
+
+def blocks_in(n: int, order: str) -> list[str]:
+    """Blocks of a covariance (n, n) in an order, which may leave out the last ones."""
+    there = BLOCKS_OF_STATE[: n // 3]
+    names = {ORDERS[0]: "p,R", ORDERS[1]: "R,p"}.get(order, order).split(",")
+    return [block for block in dict.fromkeys((*names, *there)) if block in there]
+
+
+def _require_order(order: str | None) -> None:
+    names = [] if order is None else order.split(",")
+    if order not in (None, *ORDERS) and not (len(names) > 1 and {*names} == {*BLOCKS_OF_STATE[: len(names)]}):
+        raise InputError(
+            f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or each block once, as p,v,R of p, R, v; "
+            "blocks are p (position), R (rotation), v (velocity), bg and ba (biases of gyroscope and accelerometer)"
+        )
+
+
+def _order_note(path: Path | str, n: int, order: str | None) -> list[str]:
+    """The order that a covariance is read in, where it has more blocks than two, or an order is declared."""
+    if order is None and n == 6:
+        return []
+    names = ["p", "R"] if order in (None, *ORDERS) else str(order).split(",")
+    if more := [name for name in names if name not in BLOCKS_OF_STATE[: n // 3]]:
+        raise InputError(f"--covariance-order {order}: the covariance in {path} is {n} wide and has no block {more[0]}")
+    blocks = ", ".join(blocks_in(n, order or ORDERS[0]))
+    return [f"{path}: the covariance is read in the order {blocks}; --covariance-order declares another one"]
 
 
 def _triangle(numbers: Array, n: int) -> Array:

@@ -366,7 +366,7 @@ def _matrices(numbers: Array, order: str) -> Array:
     """(N, n^2) or its upper triangle -> (N, n, n), translation first; n is 6, 9 or 15."""
     n = next(n for n in DEVIATIONS if numbers.shape[1] in (n * n, n * (n + 1) // 2))
     P = numbers.reshape(-1, n, n) if numbers.shape[1] == n * n else _triangle(numbers, n)
-    if order == ORDERS[1]:
+    if order != ORDERS[0]:
         P = P[:, _turned(n, order)][:, :, _turned(n, order)]
     return np.asarray(P)
 

@@ -14,6 +14,8 @@ from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
 
 LAGS = 10
+IMPOSSIBLE, UNLIKELY = 1e-9, 1e-3  # chance that any innovation of a right filter is as large
+FEW = 0.05  # share of innovations that may be called outliers
 FEWEST = 400  # values; below, the chi-square of the portmanteau is not to be trusted
 
 
@@ -51,6 +53,41 @@ def nis_test(nis: Array, dof: Array) -> NisTest:
     if k == 0:
         return NisTest(float("nan"), 0, float("nan"), float("nan"))
     return NisTest(total / k, k, float(distributions.chi2.sf(total, k)), float(distributions.chi2.cdf(total, k)))
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """Few innovations that are far larger than a Gaussian of the stated covariance allows."""
+
+    count: int
+    of: int  # innovations
+    run: int  # row of the largest
+    step: int  # its column
+    nis: float
+    dof: int
+    p_value: float  # of the largest among all
+    rest: NisTest  # of the other innovations
+
+
+def outliers_of(nis: Array, dof: Array) -> Outliers | None:
+    """Outliers among innovations, (runs, steps); None where no NIS is impossible, or too many are.
+
+    A right filter has any with probability ``IMPOSSIBLE`` at most, so that they may be looked for beside any question.
+    """
+    rows, columns = np.nonzero(np.isfinite(nis) & (dof > 0))
+    values, n = nis[rows, columns], dof[rows, columns]
+    if not len(values):
+        return None
+    p = np.minimum(1.0, distributions.chi2.sf(values, n) * len(values))
+    far = p < UNLIKELY
+    count, worst = int(far.sum()), int(np.lexsort((-values / n, p))[0])
+    if p[worst] >= IMPOSSIBLE or count > max(1.0, FEW * len(values)) or count == len(values):
+        return None
+    rest = nis_test(values[~far], n[~far])
+    return Outliers(
+        count, len(values), int(rows[worst]), int(columns[worst]), float(values[worst]), int(n[worst]),
+        float(p[worst]), rest,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,8 @@ def flat(v: Verdict) -> dict[str, Any]:
             "autocorrelation": i.autocorrelation, "autocorrelation_bound": i.bound,
             "nis_equivalence": _equivalence(i.equivalence),
         }  # fmt: skip
+        if i.outliers is not None:
+            s["nis_outliers"] = vars(i.outliers) | {"rest": i.outliers.rest.ratio}
     if (a := v.accuracy) is not None:
         s |= {
             "coverage": a.coverage, "coverage_one_step": a.coverage_one_step,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from consistency.referee.diagnostics.records.record import Record, shown_by
 from consistency.referee.diagnostics.records.skipping import Skipped
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.questions.innovations import Outliers
 
 TINY = 1e-12  # ratio of an error that is rounding
 EARLY = (
@@ -246,6 +249,7 @@ class Innovations:
     autocorrelation: Array  # (lags,)
     bound: float  # that 95 % of each lag stay within, if white
     equivalence: Equivalence | None = None  # of the NIS, where it is judged
+    outliers: Outliers | None = None  # where it is judged; ``run`` is what the run is called, ``step`` 1..T
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,12 @@ def judge_alone(
     if look is not None:
         p_values = _at(look, p_values)
     by_question = answers(p_values, settings.false_alarm)
-    if (i := innovations) is not None and i.judged and is_tolerated(i.ratio * i.dof, i.dof, settings):
+    if (
+        (i := innovations) is not None
+        and i.judged
+        and i.outliers is None
+        and is_tolerated(i.ratio * i.dof, i.dof, settings)
+    ):
         excused |= {"innovation scale"}
     verdict = Verdict(
         evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), excused), evidence.failures,
@@ -132,7 +137,7 @@ def _innovations(evidence: Record, settings: Settings) -> tuple[Innovations | No
     nis_and_dof = innovations_of(evidence)
     if nis_and_dof is None:
         return None, {}
-    from consistency.referee.diagnostics.questions.innovations import nis_test, nis_whiteness, whiteness
+    from consistency.referee.diagnostics.questions.innovations import nis_test, nis_whiteness, outliers_of, whiteness
 
     test = nis_test(*nis_and_dof)
     low_high = chi2_mean_interval(test.dof, CONFIDENCE) if test.dof else (float("nan"), float("nan"))
@@ -146,9 +151,12 @@ def _innovations(evidence: Record, settings: Settings) -> tuple[Innovations | No
     record = Innovations(test.ratio, low_high, test.dof, judged, white.correlation, white.bound, shown)
     if not judged:
         return record, {}
-    if settings.one_sided:
-        return record, {"innovation scale": test.above}
-    return record, {"innovation scale": test.p_value, "innovation whiteness": white.p_value}
+    p = {"innovation scale": test.above if settings.one_sided else test.p_value}
+    if (far := outliers_of(*nis_and_dof)) is not None:
+        p["innovation scale"] = min(p["innovation scale"], far.p_value)
+        far = replace(far, run=int(evidence.run_numbers[far.run]), step=far.step + 1)
+        record = replace(record, outliers=far)
+    return record, p if settings.one_sided else p | {"innovation whiteness": white.p_value}
 
 
 # --- results beside the p values -----------------------------------------------------------------

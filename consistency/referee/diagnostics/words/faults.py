@@ -8,8 +8,8 @@ import numpy as np
 
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
 from consistency.referee.diagnostics.verdict.fault_location import VISIBLE
-from consistency.referee.diagnostics.verdict.parts import TINY, Answer, Interval, JointScore, Verdict
-from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, off_by_factor, plain, short
+from consistency.referee.diagnostics.verdict.parts import TINY, Answer, Innovations, Interval, JointScore, Verdict
+from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, off_by_factor, plain, plural, short
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
 MOST = 3  # axes that a sentence names with their figures
@@ -173,6 +173,18 @@ def tails_text(v: Verdict, faults: Faults) -> str:
     assert v.tails is not None
     where = f"{v.unit} {v.tails.run}" + f", {v.place(v.tails.step)}" * (v.steps > 1)
     return f"heavy tails: {short(v.tails.distance)} sigma from the other {v.unit}s in {where}"
+
+
+def innovations_text(v: Verdict, i: Innovations, they: str = "innovations") -> str:
+    """That innovations are larger or smaller than stated; of outliers which they are, and the size of the rest."""
+    if (far := i.outliers) is None:
+        return f"{they} {'larger' if i.ratio > 1 else 'smaller'} than stated"
+    are = "is an outlier," if far.count == 1 else "are outliers, the largest"
+    where = f"{v.unit} {far.run}, " * (v.runs > 1) + v.place(far.step)
+    return (
+        f"{far.count} of {plural(far.of, 'innovation')} {are} in {where} (NIS {short(far.nis)}, {far.dof} expected); "
+        f"NIS per degree of freedom of the rest {far.rest.ratio:.3f}"
+    )
 
 
 def joint_text(v: Verdict, joint: JointScore) -> str:

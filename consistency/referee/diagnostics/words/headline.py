@@ -46,10 +46,7 @@ def status_of(verdict: Verdict, sample: Sample | None, tests: Tests | None, join
         shown = verdict.equivalence
         return "consistent" if shown is not None and shown.shown and few_lost(verdict) else "undecided"
     if sample is None or tests is None:
-        assert verdict.innovations is not None
-        if "innovation scale" not in faults:
-            return "inconsistent"
-        return "overconfident" if verdict.innovations.ratio > 1.0 else "conservative"
+        return "inconsistent" if "innovation scale" not in faults else _by_innovations(verdict)
     if not faults & set(BIAS):
         status = _with_joint(at_share(verdict), faults, sample, tests, joint)
     else:
@@ -58,6 +55,15 @@ def status_of(verdict: Verdict, sample: Sample | None, tests: Tests | None, join
         status = "biased" if status == "heavy-tailed" else status  # a few errors explain less than the mean of all
     by_sign = status == "overconfident" and verdict.shape is not None and verdict.shape.alone and JOINT not in faults
     return "inconsistent" if by_sign or (status == "heavy-tailed" and smaller(verdict)) else status
+
+
+def _by_innovations(v: Verdict) -> str:
+    """Which headline where the size of innovations alone is at fault: of the rest where outliers are among them."""
+    i, rate = v.innovations, v.settings.false_alarm
+    assert i is not None
+    if i.outliers is None or i.outliers.rest.above <= rate:
+        return "overconfident" if i.ratio > 1.0 else "conservative"
+    return "inconsistent" if i.outliers.rest.below <= rate and not v.settings.one_sided else "heavy-tailed"
 
 
 def smaller(v: Verdict) -> bool:

@@ -11,6 +11,7 @@ from consistency.referee.diagnostics.words.faults import (
     MOST,
     Faults,
     bias_text,
+    innovations_text,
     joint_text,
     opposite,
     scale_text,
@@ -123,7 +124,7 @@ def _sentence(v: Verdict, s: Scale, faults: Faults) -> str:
         parts.append(joint_text(v, v.joint))
     parts += [ALONE[q] for q in faults if q in ALONE and len(faults) == 1]
     if "innovation scale" in faults and v.innovations is not None:
-        parts.append(f"innovations {'larger' if v.innovations.ratio > 1 else 'smaller'} than stated")
+        parts.append(innovations_text(v, v.innovations))
     if "innovation whiteness" in faults:
         parts.append("innovations correlated over steps")
     sought = any(a.question in BIAS for a in v.answers) and not set(v.faults) & set(BIAS)
@@ -295,7 +296,7 @@ def _without_truth(v: Verdict, i: Innovations, faults: Faults) -> str:
         )
     parts = ["no truth: judged by the innovations alone, which cannot see most pose errors"]
     if "innovation scale" in faults:
-        parts.append(f"they are {'larger' if i.ratio > 1 else 'smaller'} than stated")
+        parts.append(innovations_text(v, i, "they are"))
     if "innovation whiteness" in faults:
         parts.append("they are correlated over steps")
     shown = i.equivalence

@@ -59,11 +59,11 @@ class Alarm:
         size = "larger than a gate lets see" if math.isinf(self.scale) else f"x{self.scale:.3g}"
         few = 0 < self.outliers <= max(1.0, FEW * self.innovations)
         are = "is an outlier" if self.outliers == 1 else "are outliers"
-        others = f"{self.outliers} of {self.innovations} innovations so far {are}, and the rest has x{self.rest:.3g}; "
+        others = f"; {self.outliers} of {self.innovations} innovations so far {are}, and the rest has x{self.rest:.3g}"
         return (
             f"alarm in step {self.step}: {self.direction} since step {self.since}; scale of the NIS since then {size} "
-            f"({accepted_scales(self.tolerance)}), {others * few}e-value {self.evidence:.3g} (alarm at {1 / self.false_alarm:.4g}). "
-            f"{CAVEAT}."
+            f"({accepted_scales(self.tolerance)}){others * few}, e-value {self.evidence:.3g} "
+            f"(alarm at {1 / self.false_alarm:.4g}). {CAVEAT}."
         )
 
 

@@ -206,20 +206,16 @@ def not_estimated(errors: Sequence[Array], variances: Sequence[Array]) -> Indice
     """
     variance = np.concatenate(variances)
     variance = variance[~np.isnan(variance).any(axis=1)]
-    still = _without_errors(errors)
+    still = ~(np.abs(np.concatenate(errors)) > NO_ERROR).any(axis=0)
     idle: Indices = still & (variance == variance[:1]).all(axis=0) & (len(variance) > 1)
     none = (np.abs(variance) <= ROUNDED.zero).all(axis=0)
     return np.zeros(len(idle), bool) if still.all() or none.any() else idle
 
 
-def _without_errors(errors: Sequence[Array]) -> Indices:
-    return ~(np.abs(np.concatenate(errors)) > NO_ERROR).any(axis=0)
-
-
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     variances = [np.diagonal(t.covariance, axis1=-2, axis2=-1) for t in tracks if t.covariance is not None]
     none = (np.abs(np.concatenate(variances)) <= ROUNDED.zero).all(axis=0)
-    still = _without_errors([t.error for t in tracks if t.error is not None])
+    still = ~(np.abs(np.concatenate([t.error for t in tracks if t.error is not None])) > NO_ERROR).any(axis=0)
     if none.all():
         return f"{file}: the covariance is zero in every step; nothing to judge"
     of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})" * bool(none.any())

@@ -107,9 +107,11 @@ def recordings_of(
     idle = not_estimated([track.error for track in tracks if track.error is not None], variances)
     left_out = [axes[i] for i in judged if idle[i]] if r.axes is None else []
     judged = [i for i in judged if axes[i] not in left_out]
+    why = "errors are 0 in every row, and their variances one constant each, as of a robot in the plane"
+    said = f"not estimated and left out: their {why}; --axes {','.join(axes)} judges them, too"
     notes = [
         *source.notes,
-        *_not_judged(source.path.name, left_out, axes),
+        *[f"{source.path.name}: {', '.join(left_out)} are {said}"][: len(left_out)],
         *_notes(source.path, matches, poses[0].max_dt),
         *clocks,
         *moved.notes,
@@ -174,15 +176,6 @@ def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, toleran
     own_span, span = (f"{each[0]:.10g} to {each[-1]:.10g}" for each in (t, other_t))
     where = f"t is {own_span}, but {span} in {other}{unit_apart(t, other_t, (path, other))}"
     return InputError(f"{path}: no estimate has a {what} within {tolerance:g} s (--max-dt): {where}")
-
-
-def _not_judged(name: str, left_out: Sequence[str], axes: Sequence[str]) -> list[str]:
-    if not left_out:
-        return []
-    return [
-        f"{name}: {', '.join(left_out)} are not estimated and left out: their errors are 0 in every row, and their "
-        f"variances one constant each, as of a robot in the plane; --axes {','.join(axes)} judges them, too"
-    ]
 
 
 def _notes(estimates: Path, matches: Sequence[Match], max_dt: float) -> list[str]:

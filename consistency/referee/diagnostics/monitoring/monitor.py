@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.monitoring.truncated_chi2 import gate_limit
 RATIOS = (1.1, 1.25, 1.5, 2.0, 4.0)  # of an alternative to the edge of the tolerance
 SERIES = 2.10975  # rounded up from 2.109743, the sum of 1 / (n ln^2 n) over n >= 2: the shares add up to less than 1
 RESTS = ((0.99, 2), (0.95, 5))  # share that the gate accepts, at least; innovations not judged after a rejection
-FAR, FEW = 1e-9, 0.05  # chance of an outlier to be right; share of innovations that may be called outliers
+FAR = 1e-9  # chance that an innovation of a right filter is as large as an outlier
 LARGEST = 1e300  # evidence is cut off here, which is on the safe side
 EXPONENT = 690.0  # exp() of it is just below LARGEST
 CAVEAT = (
@@ -51,18 +51,14 @@ class Alarm:
     scale: float  # of the NIS since then: innovation covariance over the stated one; inf if a gate hides how much
     false_alarm: float
     tolerance: float
-    innovations: int = 0  # judged up to here
-    outliers: int = 0  # among them: a NIS that a right filter has with probability 1e-9 at most
-    rest: float = math.nan  # NIS over degrees of freedom of the others
+    rest: float = math.nan  # where the NIS of this step is an outlier: NIS over degrees of freedom of all before
 
     def __str__(self) -> str:
         size = "larger than a gate lets see" if math.isinf(self.scale) else f"x{self.scale:.3g}"
-        few = 0 < self.outliers <= max(1.0, FEW * self.innovations)
-        are = "is an outlier" if self.outliers == 1 else "are outliers"
-        others = f"; {self.outliers} of {self.innovations} innovations so far {are}, and the rest has x{self.rest:.3g}"
+        others = f"; the NIS of this step is an outlier, and that of all before x{self.rest:.3g}"
         return (
             f"alarm in step {self.step}: {self.direction} since step {self.since}; scale of the NIS since then {size} "
-            f"({accepted_scales(self.tolerance)}){others * few}, e-value {self.evidence:.3g} "
+            f"({accepted_scales(self.tolerance)}){others * (self.rest > 0)}, e-value {self.evidence:.3g} "
             f"(alarm at {1 / self.false_alarm:.4g}). {CAVEAT}."
         )
 
@@ -206,7 +202,6 @@ class Monitor:
         self.evidence = self.largest = 1.0
         self.alarm: Alarm | None = None
         self._nis, self._dof = 0.0, 0
-        self._far = 0, 0.0, 0  # outliers: their number, NIS and degrees of freedom
         self._unspent = 1.0  # 1 - (p_1 + ... + p_t)
         self._skip = 0  # accepted innovations still not to be judged
         self._R, self._cusum = [0.0] * count, [0.0] * count
@@ -258,9 +253,10 @@ class Monitor:
         best = max(range(len(self._R)), key=self._R.__getitem__)
         reset = self._resets[best]
         direction = "overconfident" if best < len(RATIOS) else "conservative"
+        rest = (self._nis - value) / (self._dof - dof) if value > bet.far and self._dof > dof else math.nan
         self.alarm = Alarm(
             self.steps, reset.step, direction, self.evidence, self._scale_since(reset), self.false_alarm,
-            self.tolerance, self.innovations, self._far[0], self._rest_ratio(),
+            self.tolerance, rest,
         )  # fmt: skip
         return self.alarm
 
@@ -283,8 +279,6 @@ class Monitor:
         self.innovations += 1
         self._nis += nis
         self._dof += dof
-        if nis > bet.far:
-            self._far = self._far[0] + 1, self._far[1] + nis, self._far[2] + dof
         share = start_share(self.innovations, self.mission)
         self._unspent = max(self._unspent - share, 0.0)
         R, cusum, here = self._R, self._cusum, _Reset(self.steps + 1, self._nis, self._dof, self.innovations)
@@ -299,10 +293,6 @@ class Monitor:
                 self._resets[i] = here
         self.evidence = total / len(R) + self._unspent
         self.largest = max(self.largest, self.evidence)
-
-    def _rest_ratio(self) -> float:
-        _, nis, dof = self._far
-        return (self._nis - nis) / (self._dof - dof) if self._dof > dof else math.nan
 
     def _scale_since(self, reset: _Reset) -> float:
         count = self.innovations - reset.innovations

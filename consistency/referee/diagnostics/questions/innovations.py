@@ -84,10 +84,8 @@ def outliers_of(nis: Array, dof: Array) -> Outliers | None:
     if p[worst] >= IMPOSSIBLE or count > max(1.0, FEW * len(values)) or count == len(values):
         return None
     rest = nis_test(values[~far], n[~far])
-    return Outliers(
-        count, len(values), int(rows[worst]), int(columns[worst]), float(values[worst]), int(n[worst]),
-        float(p[worst]), rest,
-    )  # fmt: skip
+    run, step = int(rows[worst]), int(columns[worst])
+    return Outliers(count, len(values), run, step, float(values[worst]), int(n[worst]), float(p[worst]), rest)
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def status_of(verdict: Verdict, sample: Sample | None, tests: Tests | None, join
         shown = verdict.equivalence
         return "consistent" if shown is not None and shown.shown and few_lost(verdict) else "undecided"
     if sample is None or tests is None:
-        return "inconsistent" if "innovation scale" not in faults else _by_innovations(verdict)
+        return _by_innovations(verdict) if "innovation scale" in faults else "inconsistent"
     if not faults & set(BIAS):
         status = _with_joint(at_share(verdict), faults, sample, tests, joint)
     else:

@@ -219,6 +219,11 @@ def _rest(plain: list[str]) -> tuple[int, ...]:
     return (*found[0], *found[1], *found[2]) if all(found) else found[0]
 
 
+def numbered(name: str) -> bool:
+    """Whether a column has a number of a covariance, and not the names of two components."""
+    return NUMBERED.fullmatch(name.lower()) is not None
+
+
 def _covariance(plain: list[str], rest: int) -> tuple[int, ...]:
     """Places of the columns of a covariance of a pose and ``rest`` more, or of the pose alone; none without one."""
     sizes = sorted({6, 6 + min(rest, 3), 6 + rest}, reverse=True)

@@ -15,6 +15,7 @@ from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.readers.file_kinds import TABLES, is_drive, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
+from consistency.referee.readers.formats.named_columns import head_of, numbered
 from consistency.referee.readers.formats.pose_rows import (
     DEVIATIONS,
     DEVIATIONS_LAYOUT,
@@ -64,7 +65,6 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
     """
     if r.error not in (None, *INERTIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    _require_order(r.covariance_order)
     require_axes(r.axes, STATE)
     if r.truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
@@ -373,35 +373,29 @@ def _matrices(numbers: Array, order: str) -> Array:
 
 def _turned(n: int, order: str) -> list[int]:
     """Places of x, y, z, the rotation and n - 6 more among components in an order."""
-    blocks = blocks_in(n, order)
-    return [3 * blocks.index(block) + i for block in BLOCKS_OF_STATE[: n // 3] for i in range(3)]
+    there = BLOCKS_OF_STATE[: n // 3]
+    blocks = [block for block in blocks_in(n, order) if block in there]
+    return [3 * blocks.index(block) + i for block in there for i in range(3)]
 
 
 def blocks_in(n: int, order: str) -> list[str]:
     """Blocks of a covariance (n, n) in an order, which may leave out the last ones."""
-    there = BLOCKS_OF_STATE[: n // 3]
     names = {ORDERS[0]: "p,R", ORDERS[1]: "R,p"}.get(order, order).split(",")
-    return [block for block in dict.fromkeys((*names, *there)) if block in there]
-
-
-def _require_order(order: str | None) -> None:
-    names = [] if order is None else order.split(",")
-    if order not in (None, *ORDERS) and not (len(names) > 1 and {*names} == {*BLOCKS_OF_STATE[: len(names)]}):
-        raise InputError(
-            f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or each block once, as p,v,R of p, R, v; "
-            "blocks are p (position), R (rotation), v (velocity), bg and ba (biases of gyroscope and accelerometer)"
-        )
+    return [*names, *(block for block in BLOCKS_OF_STATE[: n // 3] if block not in names)]
 
 
 def _order_note(path: Path | str, n: int, order: str | None) -> list[str]:
-    """The order that a covariance is read in, where it has more blocks than two, or an order is declared."""
-    if order is None and n == 6:
+    """The order of the blocks: where it is declared, or where no names of columns tell that of three or more."""
+    blocks, there = blocks_in(n, order or ORDERS[0]), BLOCKS_OF_STATE[: n // 3]
+    if sorted(blocks) != sorted(there):
+        has = (
+            f"the blocks {','.join(there)} of {path} (p position, R rotation, v velocity, bg, ba biases), as they stand"
+        )
+        raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {has}")
+    head = None if n == 6 or order else head_of(Path(path))
+    if order is None and (n == 6 or (head is not None and not any(map(numbered, head.names)))):
         return []
-    names = ["p", "R"] if order in (None, *ORDERS) else str(order).split(",")
-    if more := [name for name in names if name not in BLOCKS_OF_STATE[: n // 3]]:
-        raise InputError(f"--covariance-order {order}: the covariance in {path} is {n} wide and has no block {more[0]}")
-    blocks = ", ".join(blocks_in(n, order or ORDERS[0]))
-    return [f"{path}: the covariance is read in the order {blocks}; --covariance-order declares another one"]
+    return [f"{path}: the covariance is read in the order {', '.join(blocks)}; --covariance-order declares another one"]
 
 
 def _triangle(numbers: Array, n: int) -> Array:

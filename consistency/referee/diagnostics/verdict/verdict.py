@@ -98,12 +98,8 @@ def judge_alone(
     if look is not None:
         p_values = _at(look, p_values)
     by_question = answers(p_values, settings.false_alarm)
-    if (
-        (i := innovations) is not None
-        and i.judged
-        and i.outliers is None
-        and is_tolerated(i.ratio * i.dof, i.dof, settings)
-    ):
+    i = innovations
+    if i is not None and i.judged and not i.outliers and is_tolerated(i.ratio * i.dof, i.dof, settings):
         excused |= {"innovation scale"}
     verdict = Verdict(
         evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), excused), evidence.failures,

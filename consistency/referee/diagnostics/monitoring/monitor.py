@@ -223,7 +223,7 @@ class Monitor:
         ValueError
             ``nis`` is negative or infinite, or ``dof`` not a whole number of 0 or more; nothing is counted then.
         """
-        if nis is np.ma.masked:
+        if isinstance(nis, np.ma.core.MaskedConstant):
             nis, dof = None, 0
         if not (0 <= dof < math.inf and dof == int(dof)):
             raise ValueError(f"dof must be a whole number of 0 or more, got {dof}")

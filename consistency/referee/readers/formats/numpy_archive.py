@@ -140,7 +140,7 @@ def masked_steps(key: str, value: ArrayLike, shape: tuple[int, ...]) -> Indices:
     """
     if not np.ma.is_masked(value) or np.size(value) % math.prod(shape):  # shapes that do not fit are refused later
         return np.zeros(shape, bool)
-    masked = np.ma.getmaskarray(value).reshape(*shape, -1)
+    masked = np.ma.getmaskarray(np.ma.asarray(value)).reshape(*shape, -1)
     some = masked.any(axis=-1)
     partly = some & ~masked.all(axis=-1)
     if partly.any():

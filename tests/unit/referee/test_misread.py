@@ -433,7 +433,8 @@ def test_outliers_beside_errors(rng: np.random.Generator) -> None:
 
 def test_the_monitor_alarms_and_names_the_outlier() -> None:
     monitor = cs.Monitor()
-    alarms = [alarm for nis in [2.0] * 50 + [3948.0] + [2.0] * 9 if (alarm := monitor.update(nis, 2)) is not None]
+    nis = np.array([2.0] * 50 + [3948.0] + [2.0] * 9)
+    alarms = [alarm for x in nis if (alarm := monitor.update(x, np.int64(2))) is not None]
     assert [alarm.step for alarm in alarms] == [51]
     assert alarms[0].rest == 1.0
     assert "; the NIS of this step is an outlier, and that of all before x1, e-value" in str(alarms[0])

@@ -55,9 +55,8 @@ class Alarm:
 
     def __str__(self) -> str:
         size = "larger than a gate lets see" if math.isinf(self.scale) else f"x{self.scale:.3g}"
-        others = (
-            f"; the NIS of this step is an outlier, and that of all before x{self.rest:.3g}" if self.rest > 0 else ""
-        )
+        others = f"; the NIS of this step is an outlier, and that of all before x{self.rest:.3g}"
+        others = others if self.rest > 0 else ""
         return (
             f"alarm in step {self.step}: {self.direction} since step {self.since}; scale of the NIS since then {size} "
             f"({accepted_scales(self.tolerance)}){others}, e-value {self.evidence:.3g} "

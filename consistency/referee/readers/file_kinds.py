@@ -156,4 +156,4 @@ def unknown_kind(path: Path, known: Sequence[str] = SUFFIXES, arrays: str = ARRA
     hint = is_foreign(path) or WAYS_IN.get(path.suffix.lower(), "")
     line = f"in Python, numpy.savez('{path.stem}.npz', {arrays}) makes an archive of arrays (runs, steps, ...)"
     kinds = f"{path}: unknown kind of file; known are {', '.join(known)} (.txt and .tum are TUM trajectories)"
-    return InputError("; ".join(filter(None, (kinds, hint, line))))
+    return InputError("; ".join(filter(None, (kinds, line, hint))))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import reading
+from consistency.referee.parsing import keys_once, reading
 from consistency.referee.readers.formats.sheet import Column, TableRows
 from consistency.referee.readers.formats.text_blocks import blocks
 
@@ -28,22 +28,23 @@ def read_json_lines(path: Path) -> TableRows:
 
 def _row(path: Path, number: int, line: str) -> dict[str, Any]:
     with reading(path, f"line {number} is not valid JSON"):
-        value = json.loads(line)
+        value = json.loads(line, object_pairs_hook=keys_once)
         cells = list(_cells("", value))
     row = dict(cells)
     if not isinstance(value, dict) or len(row) < len(cells):
-        raise InputError(f"{path}, line {number}: must be an object with every key once")
+        raise InputError(f"{path}, line {number}: must be an object, and no key a.b beside b within a")
     if row.get("class") in ("TPV", "SKY", "GST"):
         raise InputError(f"{path}, line {number}: {GPSD}")
     return row
 
 
 def _cells(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    inner = enumerate(value) if isinstance(value, list) else value.items() if isinstance(value, dict) else ()
-    for key, each in inner:
-        yield from _cells(f"{name}.{key}".lstrip("."), each)
     if not isinstance(value, (dict, list)):
         yield name, value
+        return
+    inner = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, each in inner:
+        yield from _cells(f"{name}.{key}".lstrip("."), each)
 
 
 def _column(cells: list[Any]) -> Column:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.column_names import COVARIANCE, POSE
+from consistency.referee.column_names import POSE
 from consistency.referee.readers.file_kinds import HEADINGS, PLACES
 from consistency.referee.readers.formats.named_columns import (
     DEVIATIONS,
@@ -31,7 +31,7 @@ KEYS = ("run", "step", "t")
 def with_known_names(sheet: TableRows, axes: Sequence[str]) -> tuple[TableRows, str]:
     """The table with its state and covariance under the names of docs/files.md, where it lacks them, and a note."""
     names = list(sheet.data)
-    places = state_places(names, axes, OWN) | dict(covariance_places(names, axes))
+    places = state_places(names, axes, OWN) | covariance_places(names, axes)
     require_units([names[place] for place in places.values()], sheet.path)
     taken = ", ".join(f"{names[place]} as {name}" for name, place in places.items())
     data = sheet.data | {name: sheet.data[names[place]] for name, place in places.items()}
@@ -77,17 +77,15 @@ def state_places(names: Sequence[str], axes: Sequence[str], spellings: Sequence[
     return found
 
 
-def covariance_places(names: Sequence[str], axes: Sequence[str]) -> Iterator[tuple[str, int]]:
-    """Names ``P_a_b`` with the places of columns that are spelled otherwise; none where some are spelled so, or are
-    deviations, as ``sigma_x``, of the components by their own names.
+def covariance_places(names: Sequence[str], axes: Sequence[str]) -> dict[str, int]:
+    """Places of the columns ``P_a_b`` that are spelled otherwise, or of deviations; none where all variances, or all
+    deviations as ``sigma_a``, stand under their own names. Of several spellings that with most columns counts.
     """
-    n = len(axes)
-    known = {f"P_{a}_{b}" for a, b in itertools.product(axes, repeat=2)}
-    if tuple(axes) == tuple(POSE):
-        known |= {*COVARIANCE, *(f"P_{name[3]}{name[2]}" for name in COVARIANCE)}
-    if known & {*names} or any({spelling.format(a) for a in axes} <= {*names} for spelling in DEVIATIONS):
-        return
-    plain = [plain_name(name) for name in names]
+    n, short = len(axes), dict(zip(POSE, "xyh", strict=True)) if tuple(axes) == tuple(POSE) else {}
+    known = all({f"P_{a}_{a}", f"P_{short.get(a, a) * 2}"} & {*names} for a in axes)
+    if known or any({spelling.format(a) for a in axes} <= {*names} for spelling in DEVIATIONS):
+        return {}
+    plain, best = [plain_name(name) for name in names], dict[str, int]()
     for labels, spelling in itertools.product(_labels(axes), COVARIANCES):
         pairs = {(i, j): spelling.format(labels[i], labels[j]) for i, j in itertools.product(range(n), repeat=2)}
         if len(set(pairs.values())) < n * n:  # as P111 of eleven components, which may be P(1,11) or P(11,1)
@@ -96,14 +94,15 @@ def covariance_places(names: Sequence[str], axes: Sequence[str]) -> Iterator[tup
         for i, label in enumerate(labels):
             there = [name for each in VARIANCES if plain.count(name := each.format(label)) == 1]
             found |= {(i, i): plain.index(there[0])} if there and (i, i) not in found else {}
-        if all((i, i) in found for i in range(n)):
-            yield from ((f"P_{axes[i]}_{axes[j]}", place) for (i, j), place in found.items())
-            return
+        if all((i, i) in found for i in range(n)) and len(found) > len(best):
+            best = {f"P_{axes[i]}_{axes[j]}": place for (i, j), place in found.items()}
+    if best:
+        return best
     for labels, spelling in itertools.product(_labels(axes), DEVIATIONS):
         there = [spelling.format(label) for label in labels]
         if all(plain.count(name) == 1 for name in there):
-            yield from ((f"sigma_{axis}", plain.index(name)) for axis, name in zip(axes, there, strict=True))
-            return
+            return {f"sigma_{axis}": plain.index(name) for axis, name in zip(axes, there, strict=True)}
+    return {}
 
 
 def _labels(axes: Sequence[str]) -> Iterator[tuple[str, ...]]:

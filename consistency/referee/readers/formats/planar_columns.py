@@ -43,9 +43,9 @@ def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
         places, rates = places_of(head.names, (SPEEDS, TURNS)), True
     if places is None:
         raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(head.names[:12])}")
-    stated = [name for name in dict.fromkeys([*COVARIANCE, *LOWER_NAMES.values()]) if name in head.names]
-    stated = stated or [head.names[place] for _, place in covariance_places(head.names, POSE)]
-    stated += [head.names[place] for place in state_places(head.names, POSE, TRUE).values()]
+    others = covariance_places(head.names, POSE) | state_places(head.names, POSE, TRUE)
+    known = (*COVARIANCE, *LOWER_NAMES.values(), *(head.names[place] for place in others.values()))
+    stated = [name for name in dict.fromkeys(known) if name in head.names]
     lines, columns = read_named(path, head, (*clock[0], *places, *(head.names.index(name) for name in stated)))
     first = len(clock[0])
     t, unit = times_of(lines, clock[0], columns[:first], clock[1])

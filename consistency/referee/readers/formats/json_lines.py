@@ -11,19 +11,19 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import keys_once, reading
-from consistency.referee.readers.formats.sheet import Column, TableRows
 from consistency.referee.readers.formats.text_blocks import blocks
+from consistency.referee.types import Array, Indices
 
 GPSD = "is a report of gpsd, whose epx, epy and epv are of unknown certainty; solve the receiver's raw data with RTKLIB"
 
 
-def read_json_lines(path: Path) -> TableRows:
-    """Rows of a file of JSON lines, with None or NaN where a line lacks a key."""
+def read_json_lines(path: Path) -> tuple[dict[str, Array], Indices]:
+    """Columns of a file of JSON lines, with None or NaN where a line lacks a key, and the numbers of its lines."""
     lines = [each for block in blocks(path) for each in block.lines()]
     rows = [_row(path, number, line) for number, line in lines]
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: _column([row.get(name) for row in rows]) for name in names}
-    return TableRows(path, columns, np.array([number for number, _ in lines]), "line")
+    return columns, np.array([number for number, _ in lines])
 
 
 def _row(path: Path, number: int, line: str) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def _cells(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield from _cells(f"{name}.{key}".lstrip("."), each)
 
 
-def _column(cells: list[Any]) -> Column:
+def _column(cells: list[Any]) -> Array:
     """Floats where all cells are numbers or missing, else objects."""
     if {type(cell) for cell in cells} <= {int, float, type(None)}:
         return np.array([np.nan if cell is None else float(min(max(cell, -1e308), 1e308)) for cell in cells])

@@ -174,7 +174,7 @@ def read_sheet(path: Path) -> TableRows:
     elif path.suffix.lower() in (".jsonl", ".ndjson"):
         from consistency.referee.readers.formats.json_lines import read_json_lines
 
-        sheet = read_json_lines(path)
+        sheet = TableRows(path, *read_json_lines(path), "line")
     else:
         sheet = _read_csv(path)
     if not len(sheet):

@@ -52,9 +52,9 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
     """
     if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
         raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
-    truth, axes = r.truth, tuple(r.state) if r.state else POSE
-    sheet, other, notes = _both(estimates, axes, r)
-    estimates, truth = sheet.path, truth if other is None else other
+    axes = tuple(r.state) if r.state else POSE
+    sheet, truth, notes = _both(estimates, axes, r)
+    estimates = sheet.path
     convention = _convention(r.error, axes, truth)
     if relative is not None and truth is None:
         raise InputError(f"{estimates}: --relative needs --truth FILE, poses in any world")
@@ -62,17 +62,17 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
         raise InputError(f"{estimates}: --relative needs poses x, y, heading, with --error so2, left or right")
     if r.align is not None and manifold_of(convention) != "planar":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
-    if other is None and not {"nis", "nis_dof"} <= set(sheet.data):
+    if truth is None and not {"nis", "nis_dof"} <= set(sheet.data):
         others = f"columns nis and nis_dof to be judged by the NIS alone, or columns true_{axes[0]}, … beside the state"
         raise InputError(f"{estimates}: needs --truth FILE, or {others}")
-    key = _key(sheet, other, r)
+    key = _key(sheet, truth, r)
     names = [estimates.stem]
     if "filter" in sheet:
         names = list(dict.fromkeys(sheet.texts("filter")))
     recordings = []
     for name in names:
         own = sheet.rows(sheet.texts("filter") == name) if "filter" in sheet else sheet
-        true = other if r.truth is not None else true_columns(own, axes)
+        true = truth if r.truth is not None else true_columns(own, axes)
         recordings.append(_recording(name, own, true, key, axes, convention, r, relative))
     said = tuple(note for note in notes if note)
     return [replace(recordings[0], notes=(*said, *recordings[0].notes)), *recordings[1:]]
@@ -123,7 +123,7 @@ def planar_sheet(path: Path, motions: bool = False) -> tuple[TableRows, str]:
     return read_plane(path, motions)
 
 
-def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | TableRows | None) -> str:
+def _convention(convention: str | None, axes: tuple[str, ...], truth: TableRows | None) -> str:
     if convention is not None and truth is None:
         raise InputError("--error needs --truth: without truth there is no error")
     if axes == POSE:

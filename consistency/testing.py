@@ -57,7 +57,7 @@ def assert_consistent(
     deviations: ArrayLike | None = None,
     filter: str | None = None,
     nees: ArrayLike | None = None,
-    dof: int | None = None,
+    dof: ArrayLike | None = None,
     false_alarm: float | None = None,
     detect: float | None = None,
     power: float | None = None,
@@ -88,7 +88,8 @@ def assert_consistent(
     covariances : (runs, steps, n, n), in the squared units of the errors
     deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
         judged by itself, at a false-alarm rate that all share, see :func:`consistency.judge`
-    nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances
+    nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances; ``dof`` may be of
+        each step, (steps,) or (runs, steps), where the state grows or shrinks
     false_alarm : chance to fail a right filter; 0.001 unless an argument, marker or session sets it
     detect : ratio of true to stated covariance, in all steps, that must not pass (1.5)
     power : chance that a filter at ``detect`` does not pass (0.95)

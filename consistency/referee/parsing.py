@@ -130,10 +130,11 @@ def read_json(path: Path) -> Any:
     """What a JSON file holds, with every key given once; raises :class:`InputError`."""
     text = read_text(path, "not valid JSON")
     with reading(path, "not valid JSON"):
-        return json.loads(text, object_pairs_hook=_once)
+        return json.loads(text, object_pairs_hook=keys_once)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def keys_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; a key that is given twice is refused."""
     table = dict(pairs)
     if len(table) < len(pairs):
         names = [key for key, _ in pairs]

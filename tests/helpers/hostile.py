@@ -19,6 +19,7 @@ import tomli_w
 from drives import write_drive, write_states
 from edited import accept_changes
 from flight import Flight
+from scipy.io import savemat
 
 import consistency as cs
 from consistency.bench.store.log import read_log
@@ -30,6 +31,7 @@ from consistency.referee.types import Failure
 
 RUNS, STEPS, LANDMARKS = 9, 12, 5
 FILTERS = ("one", "two")
+NUMBERED = ("P11", "P12", "P13", "P22", "P23", "P33")
 COLUMNS = ("run", "step", "t", "x", "y", "heading", "P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh")
 EUROC = """T_BS:
   cols: 4
@@ -178,6 +180,12 @@ def write_all(folder: Path, seed: int = 1) -> None:
     both = {"estimates": pose, "truth": pose + error, "covariances": _matrices(rng, 4, STEPS)}
     np.savez(folder / "archive" / "pair.npz", **both, lengths=np.full(4, STEPS))
     np.savez(folder / "archive" / "nees.npz", nees=rng.chisquare(3, (4, STEPS)), dof=3)
+    savemat(folder / "archive" / "est.mat", {"errors": error, "covariances": _matrices(rng, 4, STEPS), **extra})
+    entries = dict(zip(("P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"), NUMBERED, strict=True))
+    other = table.rename(columns={"t": "time"} | entries)
+    other.to_json(folder / "table" / "est.jsonl", orient="records", lines=True)
+    beside = truth[["x", "y", "heading"]].add_prefix("true_")
+    other.join(beside).to_csv(folder / "table" / "one.csv", index=False)
     poses = _poses(rng)
     np.savetxt(folder / "tum" / "truth.tum", poses, fmt="%.12f")
     poses[:, 1:4] += 0.01 * rng.standard_normal((STEPS, 3))
@@ -335,9 +343,12 @@ TARGETS = (
     Target("table", ("est.parquet", "truth.parquet"),
            command("analyse", "{}/est.parquet", "--truth", "{}/truth.parquet"),
            m.ANY | m.COLUMNS, {"row_twice": m.row_twice}),
+    Target("table", ("one.csv",), command("analyse", "{}/one.csv"), m.ANY | m.TEXT, {}),
+    Target("table", ("est.jsonl",), command("analyse", "{}/est.jsonl", "--truth", "{}/truth.csv"), m.ANY | m.TEXT, {}),
     Target("table", ("nis.csv",), command("monitor", "{}/nis.csv", *OPTIMAL), m.ANY | m.TEXT, {}),
     Target("archive", ("est.npz",), command("analyse", "{}/est.npz"), m.ANY | m.ARCHIVE, {}),
     Target("archive", ("pair.npz",), command("analyse", "{}/pair.npz"), m.ANY | m.ARCHIVE, {}),
+    Target("archive", ("est.mat",), command("analyse", "{}/est.mat"), m.ANY, {}),
     Target("archive", ("nees.npz",), command("analyse", "{}/nees.npz"), m.ANY | m.ARCHIVE, {}),
     Target("archive", ("est.npz",), command("monitor", "{}/est.npz", "--run", "1", *OPTIMAL),
            m.ANY | m.ARCHIVE, {}),

@@ -12,6 +12,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import function_at
 from consistency.referee.geometry.groups import composed, matrices
 from consistency.referee.readers.file_kinds import (
+    ARCHIVES,
     TABLES,
     TRAJECTORIES,
     is_bag,
@@ -20,6 +21,7 @@ from consistency.referee.readers.file_kinds import (
     is_solution,
     kind_of,
     trajectory_files,
+    unknown_kind,
 )
 from consistency.referee.readers.formats.sheet import refuse
 from consistency.referee.readers.formats.table import table_poses
@@ -105,8 +107,7 @@ def _poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
     if not is_bag(path) and path.is_dir() and not trajectory_files(path):
         yield from _of_folder(path, r)
     elif kind is None or not kind.poses or is_solution(path):
-        known = ", ".join((*TABLES, ".npz", ".bag", *TRAJECTORIES))
-        raise InputError(f"{path}: unknown kind of file; known are {known}")
+        raise unknown_kind(path, (*TABLES, *ARCHIVES, ".bag", *TRAJECTORIES), "estimates=poses, truth=true_poses")
     else:
         yield from function_at(kind.poses)(path, r)
 
@@ -135,7 +136,7 @@ def _drive(read: NamedPoses, r: Reading) -> Drive:
     if len(known.rows) < 2:
         raise InputError(
             f"{name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t is "
-            f"{t[0]:.10g} to {t[-1]:.10g}, but {poses.true_t[0]:.10g} to {poses.true_t[-1]:.10g} in the truth"
+            f"{t[0]:.15g} to {t[-1]:.15g}, but {poses.true_t[0]:.15g} to {poses.true_t[-1]:.15g} in the truth"
         )
     T = matrices(poses.estimate)
     T = composed(T) if r.motions else T

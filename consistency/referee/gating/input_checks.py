@@ -24,7 +24,7 @@ def checked(
     covariances: ArrayLike | None = None,
     deviations: ArrayLike | None = None,
     nees: ArrayLike | None = None,
-    dof: int | None = None,
+    dof: ArrayLike | None = None,
     nis: ArrayLike | None = None,
     nis_dof: ArrayLike | None = None,
     innovations: ArrayLike | None = None,
@@ -54,7 +54,7 @@ def checked(
     stated = {key: value for key, value in given.items() if value is not None}
     if stated:
         record = record_of_arrays(stated if nees is None or dof is None else {**stated, "dof": dof}, axes, name)
-        if dof is not None and dof != record.dof:
+        if nees is None and dof is not None and dof != record.dof:
             raise ValueError(f"dof is {dof}, but the errors have {record.dof} components")
     arrays, failures = _innovations(name, nis, nis_dof, innovations, innovation_covariances, _gone(record))
     if not stated and not arrays:

@@ -5,11 +5,14 @@ A reader is loaded when a file of its kind is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.named_columns import (
+    beginning,
     begins_with_numbers,
     clock_of,
     head_of,
@@ -18,7 +21,8 @@ from consistency.referee.readers.formats.named_columns import (
 )
 from consistency.referee.readers.options import Reading
 
-TABLES = (".csv", ".parquet", ".pq")
+TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
+ARCHIVES = (".npz", ".mat")
 TRAJECTORIES = (".txt", ".tum")
 BAGS = (".bag", ".mcap", ".db3")
 OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
@@ -95,7 +99,7 @@ KINDS = (  # a file is of the first that knows it
         "referee.readers.formats.ros_bag:bag_poses",
     ),
     Kind(
-        lambda path, r: path.suffix.lower() == ".npz",
+        lambda path, r: path.suffix.lower() in ARCHIVES,
         (
             *OF_BAGS, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align",
             "lever_arm", "truth_covariance",
@@ -118,9 +122,38 @@ KINDS = (  # a file is of the first that knows it
         "referee.readers.formats.tum:trajectory_poses",
     ),
 )  # fmt: skip
-SUFFIXES = (*TABLES, ".npz", *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
+SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
+ARRAYS = "errors=truth - estimates, covariances=P"
+WAYS_IN = {
+    **dict.fromkeys((".ulg", ".bin"), "flight logs are for 'consistency monitor'"),
+    **dict.fromkeys((".gz", ".zip", ".7z", ".xz", ".bz2", ".zst"), "unpack it"),
+    **dict.fromkeys((".dat", ".log", ".out", ""), "rename text to .csv, or to .txt if its columns have no names"),
+    ".json": "a file with an object a line is .jsonl",
+    **dict.fromkeys((".h5", ".hdf5"), "h5py.File(name)[key][()] is an array of it"),
+    **dict.fromkeys((".npy", ".pkl", ".pickle"), "load it"),
+    **dict.fromkeys((".xls", ".xlsx", ".ods"), "save the sheet as .csv"),
+}  # for files of unknown kinds, by suffix
+FOREIGN = (
+    (rb"(?m)^CCSDS_OEM_VERS", "an orbit of CCSDS, whose covariances are of the axes COV_REF_FRAME, in km"),
+    (rb"(?m)^(# )?(Raw|Fix),", "a log of Android, whose accuracies are radii of 68 %; RTKLIB solves its raw data"),
+    (rb"(?m)^\$G[A-Z]{4},", "a log of NMEA, which has deviations in its GST sentences alone"),
+)  # fmt: skip
 
 
 def kind_of(path: Path, r: Reading) -> Kind | None:
     """The kind of a file or folder; None if it is of none."""
-    return next((kind for kind in KINDS if kind.is_one(path, r)), None)
+    return None if is_foreign(path) else next((kind for kind in KINDS if kind.is_one(path, r)), None)
+
+
+def is_foreign(path: Path) -> str:
+    """What a text file of another format is, and how it gets here; "" of all else."""
+    begin = beginning(path) if path.suffix.lower() not in (*ARCHIVES, *BAGS) else b""
+    return next((hint for pattern, hint in FOREIGN if re.search(pattern, begin)), "")
+
+
+def unknown_kind(path: Path, known: Sequence[str] = SUFFIXES, arrays: str = ARRAYS) -> InputError:
+    """Refusal of a file of an unknown kind, with the way to one that is known."""
+    hint = is_foreign(path) or WAYS_IN.get(path.suffix.lower(), "")
+    line = f"in Python, numpy.savez('{path.stem}.npz', {arrays}) makes an archive of arrays (runs, steps, ...)"
+    kinds = f"{path}: unknown kind of file; known are {', '.join(known)} (.txt and .tum are TUM trajectories)"
+    return InputError("; ".join(filter(None, (kinds, line, hint))))

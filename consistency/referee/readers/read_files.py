@@ -18,14 +18,16 @@ from consistency.referee.extras import function_at
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
 from consistency.referee.parsing import require_name
 from consistency.referee.readers.file_kinds import (
+    ARCHIVES,
     OF_BAGS,
     OF_TRAJECTORIES,
-    SUFFIXES,
     TRAJECTORIES,
     is_bag,
     is_drive,
+    is_foreign,
     kind_of,
     trajectory_files,
+    unknown_kind,
 )
 from consistency.referee.readers.formats.text_blocks import is_cut, without_end
 from consistency.referee.readers.options import Reading, flag_of
@@ -43,10 +45,6 @@ NO_GUESS = {
 }
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_SHARED = ("shared", "shared_from", "shared_truth")
-HINTS = {
-    **dict.fromkeys((".ulg", ".bin"), "; flight logs are for 'consistency monitor'"),
-    ".gz": "; unpack it",
-}  # for files of unknown kinds
 OF_WINDOWS = ("relative", "motions", "windows")
 
 
@@ -206,9 +204,9 @@ def _by_kind(estimates: Path, r: Reading, over: Relative | None) -> list[Evidenc
     kind = kind_of(estimates, r)
     _refuse(estimates, r, *(OF_BAGS if kind is None else kind.refused))
     if kind is None:
-        known = f"{', '.join(SUFFIXES)} (TUM trajectories)"
-        hint = HINTS.get(estimates.suffix.lower(), "")
-        raise InputError(f"{estimates}: unknown kind of file; known are {known}{hint}")
+        raise unknown_kind(estimates)
+    if r.truth is not None and is_foreign(r.truth):
+        raise unknown_kind(r.truth)
     records: list[Evidence] = function_at(kind.records)(estimates, r, over)
     if r.truth is None or not is_drive(r.truth):
         return records
@@ -273,6 +271,6 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
 def _refuse(path: Path, r: Reading, *names: str) -> None:
     if given := r.given(names):
         keys = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}
-        kept = path.suffix.lower() == ".npz" and given[0] in keys
+        kept = path.suffix.lower() in ARCHIVES and given[0] in keys
         instead = f", an archive; it has a key '{keys[given[0]]}' in its place" if kept else ""
         raise InputError(f"{flag_of(given[0])}: does not go with {path}{instead}")

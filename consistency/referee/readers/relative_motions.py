@@ -160,7 +160,8 @@ def relative_recording(
     notes = _notes(name, found, axes, stretches[0].convention, relative)
     of = independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
     notes += _doubt(name, of, relative) if relative.independent else []
-    record = assemble(name, tracks, t, tuple(axes[i] for i in part), file, KIND, notes)
+    names = tuple(axes[i] for i in part)
+    record = assemble(name, tracks, t, names, file, KIND, notes, may_end=relative.independent)
     if not relative.independent:
         return replace(record, window=relative.text)
     caption = f"the {_whose(relative)} do not seem to be independent, on which this rests" if of.doubtful else ""

@@ -58,6 +58,7 @@ def assemble(
     file: str,
     convention: str = "",
     notes: Sequence[str] = (),
+    may_end: bool = False,
 ) -> Evidence:
     """Assemble tracks on the common steps, find failures, and leave out exactly known starts.
 
@@ -66,6 +67,7 @@ def assemble(
     t : (steps,), s, NaN where a step has no time
     axes : names of the components of the error
     file : where the estimates are from, for messages
+    may_end : a run that ends before the others is no sign of a broken filter
 
     Raises
     ------
@@ -89,7 +91,7 @@ def assemble(
         notes.append(f"{name}: {skipped} estimates before the covariance has full rank are left out")
     short = [part.run for part in parts if len(part.column) and part.column[-1] < len(t) - 1]
     short = [run for run in short if run not in {failure.run for failure in failures}]
-    if short:
+    if short and not may_end:
         notes.append(
             f"{name}: {plural(len(short), 'run')} of {len(parts)} ({listed(short)}) end before step {len(t)}; "
             "if the filter broke down there, write a row of NaN, so that the failure counts"

@@ -173,7 +173,7 @@ def _stretch(run: int, poses: Poses, path: Path | str, truth: Path | str, shift:
 
 def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, tolerance: float, what: str) -> InputError:
     """Message that no timestamp of one is near one of the other."""
-    own_span, span = (f"{each[0]:.10g} to {each[-1]:.10g}" for each in (t, other_t))
+    own_span, span = (f"{each[0]:.15g} to {each[-1]:.15g}" for each in (t, other_t))
     where = f"t is {own_span}, but {span} in {other}{unit_apart(t, other_t, (path, other))}"
     return InputError(f"{path}: no estimate has a {what} within {tolerance:g} s (--max-dt): {where}")
 

@@ -172,8 +172,10 @@ def _require_pairs(folder: Path, files: tuple[list[Path], list[Path]], t: Array 
     pairs = min(map(len, files))
     if pairs < FEWEST:
         raise InputError(f"{folder}: holds {pairs} stereo pairs; a motion takes at least {FEWEST}")
-    if t is not None and (len(t) != pairs or (np.diff(t) <= 0).any()):
-        raise InputError(f"{folder}: {len(t)} timestamps for {pairs} stereo pairs, or not increasing")
+    if t is not None and len(t) != pairs:
+        raise InputError(f"{folder}: {len(t)} timestamps for {pairs} stereo pairs; leave the timestamps of these pairs")
+    if t is not None and (stuck := np.diff(t) <= 0).any():
+        raise InputError(f"{folder}: timestamps are not increasing at stereo pair {int(np.argmax(stuck)) + 2}")
 
 
 def _number(path: Path) -> int | None:

@@ -11,14 +11,15 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, one_line, require_name
+from consistency.referee.readers.file_kinds import ARCHIVES, TABLES, unknown_kind
 from consistency.referee.readers.formats.numpy_archive import load_arrays, run_lengths, step_times, whole_numbers
+from consistency.referee.readers.formats.other_names import with_clock
 from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet, refuse
 from consistency.referee.readers.formats.table_columns import row_order
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array
 
 NEEDED = ("nis", "nis_dof")
-SUFFIXES = (".csv", ".parquet", ".pq", ".npz")
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,9 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     require_name(path.name, "file")
-    if suffix not in SUFFIXES:
-        raise InputError(f"{path}: unknown kind of file; known are {', '.join(SUFFIXES)}, .ulg")
-    if suffix == ".npz":
+    if suffix not in (*TABLES, *ARCHIVES):
+        raise unknown_kind(path, (*TABLES, *ARCHIVES, ".ulg", ".bin"), "nis=nis, nis_dof=dof")
+    if suffix in ARCHIVES:
         if filter_name is not None:
             raise InputError(f"--filter {filter_name}: does not go with {path}")
         return _of_archive(path, run)
@@ -61,6 +62,7 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     key = next((column for column in ("step", "t") if column in sheet), None)
     if key is not None:
         sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))
+    sheet = with_clock(sheet, required=False)
     nis = sheet.numbers("nis")
     dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
     step = sheet.numbers("step") if "step" in sheet else np.arange(1.0, len(nis) + 1)

@@ -37,11 +37,13 @@ RECORDED = ("field_header_stamp",)  # names whose times are in ns: rostopic echo
 LABELS = (("x", "y", "z", "roll", "pitch", "yaw"), ("x", "y", "z", "rx", "ry", "rz"), ("x", "y", "z", "a", "b", "c"))
 MOVING_LABELS = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # behind those of a pose
 PREFIXES = ("p_", "p", "cov_", "cov", "t")  # before two labels
-DEVIATIONS = ("sigma_{}", "std_{}", "s{}", "s_{}", "sd_{}", "sigma{}", "std{}", "stddev_{}")  # standard, not squared
+DEVIATIONS = ("sigma_{}", "std_{}", "s{}", "s_{}", "sd_{}", "sigma{}", "std{}", "stddev_{}", "sd{}",
+              "{}_sd", "{}_std", "{}_sigma")  # standard, not squared  # fmt: skip
 APART = {"p": ("x", "y", "z"), "q": ("r", "p", "y")}  # two triangles of cnspy: position, rotation
 _OTHER = r"deg(?:rees?)?|°|mm|cm|km(?:/?h)?|mph|kph|ft|feet|rpm"
 OTHER_UNITS = re.compile(rf"[\[(]\s*((?:{_OTHER})(?![a-z_])[^\])]*)[\])]", re.IGNORECASE)  # than SI and rad
 NUMBERED = re.compile(r"(.*?)(?:covariance|cov)_?(\d+)(?:_(\d+))?")
+BY_INDEX = re.compile(r"(.*?)p_?(\d+)(?:_(\d+))?")  # P11, ..., P66
 
 
 class Head(NamedTuple):
@@ -97,15 +99,20 @@ def begins_with_numbers(path: Path) -> bool:
     )
 
 
-def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
-    """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none."""
+def beginning(path: Path) -> bytes:
+    """The first bytes of a file; none of what is no file or cannot be read."""
     if not is_file(path):  # a pipe would be waited for
-        return [], None
+        return b""
     try:
         with opened(path) as file:
-            text = file.read(PEEKED).decode("utf-8-sig", "ignore")
+            return file.read(PEEKED)
     except (OSError, EOFError, zlib.error):
-        return [], None
+        return b""
+
+
+def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
+    """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none."""
+    text = beginning(path).decode("utf-8-sig", "ignore")
     lines: list[tuple[int, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and _is_row(line):
@@ -141,7 +148,7 @@ def roles_of(names: Sequence[str], where: Path) -> Roles | None:
     InputError
         Several columns would do.
     """
-    plain = [_plain(name) for name in names]
+    plain = [plain_name(name) for name in names]
     quaternion = _family(plain, QUATERNIONS, "xyzw", where)
     position = _family(plain, POSITIONS, "xyz", where)
     clock = clock_of(names)
@@ -154,7 +161,7 @@ def roles_of(names: Sequence[str], where: Path) -> Roles | None:
     return Roles(*clock, position, quaternion or (), _covariance(plain, len(rest)), kind, rest)
 
 
-def _plain(name: str) -> str:
+def plain_name(name: str) -> str:
     """A name in lower case without its unit, words joined by one underscore."""
     name = re.sub(r"[\[(]([^\]\d)][^\])]*)?[\])]", "", name.lower())
     return re.sub(r"[^a-z0-9]+", "_", name).strip("_")
@@ -182,7 +189,7 @@ def _family(plain: list[str], spellings: Sequence[str], parts: str, where: Path)
 
 def clock_of(names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
     """Places of the time, and how many of its units are a second, where its name says it; None without a time."""
-    plain = [_plain(name) for name in names]
+    plain = [plain_name(name) for name in names]
     bare = [re.sub(rf"_({'|'.join(UNITS)})$", "", name) for name in plain]
     for seconds, rest in HALVES:
         for i, j in itertools.permutations(range(len(plain)), 2):
@@ -198,7 +205,7 @@ def clock_of(names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
 
 def places_of(names: Sequence[str], spellings: Sequence[Sequence[str]]) -> tuple[int, ...] | None:
     """Places of columns, the first one there of the spellings of each; a longer name may end in one of two words."""
-    plain = [_plain(name) for name in names]
+    plain = [plain_name(name) for name in names]
     found = []
     for each in spellings:
         there = [plain.index(name) for name in each if name in plain]
@@ -234,17 +241,25 @@ def _covariance(plain: list[str], rest: int) -> tuple[int, ...]:
     blocks = [_places(plain, _pairs(prefix, APART[prefix], 3)) for prefix in ("q", "p")]
     if all(blocks):
         return (*blocks[0], *blocks[1])
-    stated: dict[str, dict[tuple[int, int], int]] = {}
-    for i, name in enumerate(plain):
-        if (number := NUMBERED.fullmatch(name)) and "twist" not in number[1]:
-            place = (int(number[2]), -1) if number[3] is None else (int(number[2]), int(number[3]))
-            stated.setdefault(number[1], {})[place] = i
-    for places in stated.values():
-        if len(places) in [size for n in sizes for size in (n * n, n * (n + 1) // 2)]:
-            return tuple(places[key] for key in sorted(places))
+    sizes = [size for n in sizes for size in (n * n, n * (n + 1) // 2)]
+    if found := _numbered(plain, NUMBERED, sizes):
+        return found
     for labels, spelling in itertools.product(every, DEVIATIONS):
         if set(names := [spelling.format(label) for label in labels]) <= set(plain):
             return tuple(plain.index(name) for name in names)
+    return _numbered(plain, BY_INDEX, sizes)
+
+
+def _numbered(plain: list[str], pattern: re.Pattern[str], sizes: Sequence[int]) -> tuple[int, ...]:
+    """Places of numbered columns of a covariance, as many as one of the ``sizes``; none without them."""
+    stated: dict[str, dict[tuple[int, int], int]] = {}
+    for i, name in enumerate(plain):
+        if (number := pattern.fullmatch(name)) and "twist" not in number[1]:
+            place = (int(number[2]), -1) if number[3] is None else (int(number[2]), int(number[3]))
+            stated.setdefault(number[1], {})[place] = i
+    for places in stated.values():
+        if len(places) in sizes:
+            return tuple(places[key] for key in sorted(places))
     return ()
 
 

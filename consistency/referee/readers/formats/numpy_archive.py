@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
 NEEDED = (("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof"))
 OF_STATES = {"R", "p", "v"}  # of an inertial filter
+BY_STEP: dict[str, Any] = {  # n NEES / dof of a step with n, the smallest dof, has the mean n and less spread than n
+    "unavailable": ("distribution",),
+    "caption": "the NEES of each step counts over its degrees of freedom, and its distribution is not judged",
+}
 OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances", "truth_covariances"}
 
 
@@ -303,6 +307,10 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
     """
     if not is_file(path):
         raise InputError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+    if path.suffix.lower() == ".mat":
+        from consistency.referee.readers.formats.matlab_file import load_matlab
+
+        return load_matlab(path)
     with path.open("rb") as file:
         what = "damaged or cut short" if file.read(2) == b"PK" else "or holds Python objects"
     refusal = f"is not a NumPy archive, {what}; write it with numpy.savez"
@@ -415,14 +423,16 @@ def _axes(path: Path, arrays: dict[str, Array], n: int) -> tuple[str, ...]:
 def _of_nees(path: Path, arrays: dict[str, Array]) -> Evidence:
     """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure."""
     nees = _array(path, arrays, "nees", 2).copy()
-    dof = arrays["dof"]
-    if dof.ndim or dof.dtype.kind not in "fiu" or not 1 <= float(dof) < 2**31 or dof % 1:
-        raise InputError(f"{path}: key 'dof' must be one whole number of 1 or more, the dimension of the error")
+    dof = whole_numbers(path, arrays, "dof", nees.shape)
+    if not (are_dof(dof) & (dof >= 1)).all():
+        what = "one whole number of 1 or more, the dimension of the error, or one for each step"
+        raise InputError(f"{path}: key 'dof' must be {what}")
     if (nees < 0).any():
         run, step = np.argwhere(nees < 0)[0]
         raise InputError(f"{path}: key 'nees', run {run}, step {step + 1}: {nees[run, step]:g} is negative")
     runs, steps = nees.shape
-    n = int(dof)
+    n, by_step = int(dof.min()), BY_STEP if (dof != dof[0, 0]).any() else {}
+    nees *= n / dof
     nis, nis_dof = _nis(path, arrays, (runs, steps))
     failures = []
     known = _known(path, arrays, runs, steps)
@@ -439,5 +449,5 @@ def _of_nees(path: Path, arrays: dict[str, Array]) -> Evidence:
     t = step_times(path, arrays, steps)
     return Evidence(
         path.stem, nees=nees, dof=n, nis=nis, nis_dof=nis_dof, failures=tuple(failures), axes=axes,
-        runs=np.arange(runs), t=t,
+        runs=np.arange(runs), t=t, **by_step,
     )  # fmt: skip

@@ -11,6 +11,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.file_kinds import PLACES, SPEEDS, TURNS, is_poses
 from consistency.referee.readers.formats.named_columns import UNIT_NAMES, clock_of, head_of, places_of
+from consistency.referee.readers.formats.other_names import TRUE, covariance_places, state_places
 from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
 from consistency.referee.readers.formats.sheet import Lines, TableRows, increasing
 from consistency.referee.readers.formats.table_columns import LOWER_NAMES
@@ -42,7 +43,9 @@ def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
         places, rates = places_of(head.names, (SPEEDS, TURNS)), True
     if places is None:
         raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(head.names[:12])}")
-    stated = [name for name in dict.fromkeys([*COVARIANCE, *LOWER_NAMES.values()]) if name in head.names]
+    others = covariance_places(head.names, POSE) | state_places(head.names, POSE, TRUE)
+    known = (*COVARIANCE, *LOWER_NAMES.values(), *(head.names[place] for place in others.values()))
+    stated = [name for name in dict.fromkeys(known) if name in head.names]
     lines, columns = read_named(path, head, (*clock[0], *places, *(head.names.index(name) for name in stated)))
     first = len(clock[0])
     t, unit = times_of(lines, clock[0], columns[:first], clock[1])

@@ -15,6 +15,7 @@ from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
+from consistency.referee.geometry.groups import inverse, matrices, vectors
 from consistency.referee.parsing import reading
 from consistency.referee.readers.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes
@@ -28,7 +29,7 @@ from consistency.referee.readers.space_trajectories import (
     recordings_of,
     require_axes,
 )
-from consistency.referee.readers.truth_matching import NamedPoses, Poses
+from consistency.referee.readers.truth_matching import NamedPoses, Poses, truth_at
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 
@@ -47,7 +48,7 @@ def read_bags(path: Path, r: Reading, relative: Relative | None = None) -> list[
     """Evidence of one estimator: a bag, or a folder with a bag for each run.
 
     The topic of the estimates is of PoseWithCovarianceStamped, Odometry or NavSatFix, and need not be named where there
-    is one; that of the truth is of poses or NavSatFix, or PARENT:CHILD, two frames of /tf that follow each other.
+    is one; that of the truth is of poses or NavSatFix, or PARENT:CHILD, two frames of /tf that its links join.
 
     Raises
     ------
@@ -97,7 +98,7 @@ def _run_of(bag: Path, r: Reading) -> tuple[Lines, Lines, None, list[str]]:
     covariance = 4 if isinstance(true, Fixes) else POSE
     if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: with a bag it is '{COLUMNS}', of the messages")
-    if r.truth_covariance is not None and not np.isfinite(true.values[:, covariance:]).any():
+    if r.truth_covariance is not None and not (true.values[:, covariance:] > 0).any():
         raise InputError(f"{bag}: --truth-covariance {COLUMNS}: the messages of {r.truth_topic} state none")
     if not np.isfinite(true.values[:, 1:covariance]).all():
         raise InputError(f"{bag}: the truth on {truth} is not finite")
@@ -203,25 +204,57 @@ def _frames(reader: Any, topic: str) -> tuple[str, str]:
     return ("", frame) if hasattr(first, "latitude") else (frame, child)
 
 
-def _transforms(bag: Path, reader: Any, frames: str) -> Iterator[tuple[Any, Any]]:
+def _transforms(bag: Path, reader: Any, frames: str) -> Lines:
+    """Poses of one frame of /tf in another, along the links between both.
+
+    Their times are those of the link with most messages, while all others that move are known; between its messages a
+    link moves evenly, as tf has it, and one with a single message stands still.
+    """
     parent, child = (frame.strip().lstrip("/") for frame in frames.split(":", 1))
     connections = [connection for connection in reader.connections if connection.msgtype in TREE]
-    seen = set()
+    links: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
     for connection, _, raw in reader.messages(connections=connections) if connections else ():  # of none it gives all
         for each in reader.deserialize(raw, connection.msgtype).transforms:
             pair = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
-            seen.add(":".join(pair))
-            if pair == (parent, child):
-                yield each.header, each.transform
-    if f"{parent}:{child}" not in seen:
-        has = ", ".join(sorted(seen)[:12]) or "none"
+            links.setdefault(pair, []).append((each.header, each.transform))
+    chain = _chain(list(links), parent, child)
+    if not chain:
+        has = ", ".join(sorted(map(":".join, links))) or "none"
         raise InputError(f"{bag}: --truth-topic {frames}: is no transform of /tf; there are: {has}")
+    tracks = {pair: _track(bag, ":".join(pair), iter(links[pair])) for pair, _ in chain}
+    longest = max(tracks.values(), key=lambda lines: len(lines.t))
+    if chain == [((parent, child), True)]:
+        return longest
+    moving = [lines.t for lines in tracks.values() if len(lines.t) > 1] or [longest.t]
+    rows = (longest.t >= max(t[0] for t in moving)) & (longest.t <= min(t[-1] for t in moving))
+    if not rows.any():
+        raise InputError(f"{bag}: --truth-topic {frames}: its links are at no time known together")
+    t = longest.t[rows]
+    T = np.eye(4)
+    for pair, forward in chain:
+        own = tracks[pair]
+        link = matrices(truth_at(t, own.t, own.values[:, 1:POSE], "spatial", np.inf).truth)
+        T = T @ (link if forward else inverse(link))
+    values = np.column_stack([t, vectors(T), np.full((len(t), 36), np.nan)])
+    return replace(longest, values=values, line=longest.line[rows], unit=f"message of {frames}")
+
+
+def _chain(pairs: Sequence[tuple[str, str]], start: str, end: str) -> list[tuple[tuple[str, str], bool]]:
+    """The links from one frame to another, each with whether it is taken from parent to child; none if apart."""
+    ways: dict[str, list[tuple[tuple[str, str], bool]]] = {start: []}
+    for frame in (queue := [start]):
+        for pair in pairs:
+            for here, there, forward in ((*pair, True), (*pair[::-1], False)):
+                if here == frame and there not in ways:
+                    ways[there] = [*ways[frame], (pair, forward)]
+                    queue.append(there)
+    return ways.get(end, [])
 
 
 def _lines(bag: Path, reader: Any, topic: str) -> Lines:
     """Poses of a topic with their covariances, or positions by satellite, in order of their stamps."""
     if ":" in topic:
-        return _track(bag, topic, _transforms(bag, reader, topic))
+        return _transforms(bag, reader, topic)
     if topic not in (there := _topics(reader, POSES)):
         raise InputError(f"{bag}: --truth-topic {topic}: is not there with poses; there are: {_listed(there, reader)}")
     if topic in _topics(reader, (FIX,)):
@@ -260,7 +293,7 @@ def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> Lines:
     bad = np.flatnonzero(np.isfinite(pose).all(axis=1) & (np.abs(length - 1.0) > UNIT))
     if len(bad):
         raise InputError(
-            f"{bag}, {topic}: the quaternion at {t[first][bad[0]]:.10g} s has length {length[bad[0]]:.4g}, not 1"
+            f"{bag}, {topic}: the quaternion at {t[first][bad[0]]:.15g} s has length {length[bad[0]]:.4g}, not 1"
         )
     return Lines(bag, np.column_stack([t[first], pose, covariance[first]]), first + 1, unit=f"message of {topic}")
 

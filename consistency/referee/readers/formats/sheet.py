@@ -153,6 +153,11 @@ def bounded(values: Array) -> Array:
     return np.where(np.abs(values) > HUGE, np.copysign(np.inf, values), values)
 
 
+def exact(value: float) -> str:
+    """A number with all its digits, as a file has it."""
+    return repr(float(value)).removesuffix(".0")
+
+
 def are_dof(values: Array) -> Array:
     """Whether numbers are degrees of freedom: whole, from 0 to below 2^31."""
     return np.asarray((values >= 0) & (values < MOST_DOF) & (values == np.round(values)))
@@ -166,6 +171,10 @@ def read_sheet(path: Path) -> TableRows:
         require(f"{path}: Parquet", "parquet")
         columns, rows = outside("columns")(path, "cannot be read as Parquet")
         sheet = TableRows(path, columns, np.arange(rows), "row")
+    elif path.suffix.lower() in (".jsonl", ".ndjson"):
+        from consistency.referee.readers.formats.json_lines import read_json_lines
+
+        sheet = TableRows(path, *read_json_lines(path), "line")
     else:
         sheet = _read_csv(path)
     if not len(sheet):
@@ -333,7 +342,7 @@ def increasing(lines: Lines) -> Lines:
 
     def what(row: int) -> str:
         of = "is there twice" if t[row] == t[row - 1] else "is less than the one before"
-        return f"timestamp {t[row]:.10g} {of}; they must increase, so leave the row out"
+        return f"timestamp {exact(t[row])} {of}; they must increase, so leave the row out"
 
     refuse(np.append(False, np.diff(t) <= 0), lines.place, what)
     return lines

@@ -17,6 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.readers.file_kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.formats.named_columns import begins_with_numbers, head_of
+from consistency.referee.readers.formats.other_names import true_columns, with_clock, with_known_names
 from consistency.referee.readers.formats.sheet import Places, TableRows, read_sheet
 from consistency.referee.readers.formats.table_columns import (
     POSE,
@@ -52,8 +53,8 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
     """
     if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
         raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
-    truth, axes = r.truth, tuple(r.state) if r.state else POSE
-    sheet, note = _sheet(estimates, axes, bool(r.motions))
+    axes = tuple(r.state) if r.state else POSE
+    sheet, truth, notes = _both(estimates, axes, r)
     estimates = sheet.path
     convention = _convention(r.error, axes, truth)
     if relative is not None and truth is None:
@@ -62,35 +63,54 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
         raise InputError(f"{estimates}: --relative needs poses x, y, heading, with --error so2, left or right")
     if r.align is not None and manifold_of(convention) != "planar":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
-    other, notes = None, [note]
-    if truth is not None:
-        other, note = _sheet(truth, axes, body=r.body)
-        notes.append(note)
-    if other is None and not {"nis", "nis_dof"} <= set(sheet.data):
-        raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
-    key = _key(sheet, other, r)
+    if truth is None and not {"nis", "nis_dof"} <= set(sheet.data):
+        others = f"columns nis and nis_dof to be judged by the NIS alone, or columns true_{axes[0]}, … beside the state"
+        raise InputError(f"{estimates}: needs --truth FILE, or {others}")
+    key = _key(sheet, truth, r)
     names = [estimates.stem]
     if "filter" in sheet:
         names = list(dict.fromkeys(sheet.texts("filter")))
     recordings = []
     for name in names:
         own = sheet.rows(sheet.texts("filter") == name) if "filter" in sheet else sheet
-        recordings.append(_recording(name, own, other, key, axes, convention, r, relative))
+        true = truth if r.truth is not None else true_columns(own, axes)
+        recordings.append(_recording(name, own, true, key, axes, convention, r, relative))
     said = tuple(note for note in notes if note)
     return [replace(recordings[0], notes=(*said, *recordings[0].notes)), *recordings[1:]]
+
+
+def _both(
+    estimates: Path | TableRows, axes: tuple[str, ...], r: Reading
+) -> tuple[TableRows, TableRows | None, list[str]]:
+    """Estimates and truth, which may stand beside them, with times where steps do not number both, and notes."""
+    sheet, note = _sheet(estimates, axes, bool(r.motions))
+    other, notes = None, [note]
+    if r.truth is not None:
+        other, note = _sheet(r.truth, axes, body=r.body)
+        notes.append(note)
+    timed = r.time_offset is not None or r.max_dt is not None
+    if timed or not ("step" in sheet and (other is None or "step" in other)):
+        sheet, other = with_clock(sheet), None if other is None else with_clock(other)
+    if other is None and (other := true_columns(sheet, axes)) is not None:
+        notes.append(f"{sheet.path}: the truth stands in columns beside the estimates")
+    return sheet, other, notes
 
 
 def _sheet(
     table: Path | TableRows, axes: tuple[str, ...], motions: bool = False, body: str | None = None
 ) -> tuple[TableRows, str]:
-    """Rows of a file or a drive, or those in memory, and what they were read as."""
+    """Rows of a file or a drive, or those in memory, under the names of docs/files.md, and what they were read as."""
+    note = ""
     if isinstance(table, TableRows):
-        return table, ""
-    if is_drive(table):
+        sheet = table
+    elif is_drive(table):
         from consistency.referee.readers.formats.kitti_files import drive_sheet
 
-        return drive_sheet(table, body), ""
-    return planar_sheet(table, motions) if axes == POSE else (read_sheet(table), "")
+        sheet = drive_sheet(table, body)
+    else:
+        sheet, note = planar_sheet(table, motions) if axes == POSE else (read_sheet(table), "")
+    sheet, taken = with_known_names(sheet, axes)
+    return sheet, "; ".join(filter(None, (note, taken)))
 
 
 def planar_sheet(path: Path, motions: bool = False) -> tuple[TableRows, str]:
@@ -104,7 +124,7 @@ def planar_sheet(path: Path, motions: bool = False) -> tuple[TableRows, str]:
     return read_plane(path, motions)
 
 
-def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | None) -> str:
+def _convention(convention: str | None, axes: tuple[str, ...], truth: TableRows | None) -> str:
     if convention is not None and truth is None:
         raise InputError("--error needs --truth: without truth there is no error")
     if axes == POSE:
@@ -261,9 +281,9 @@ def _recording(
 
 def table_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
     """Planar poses of each run of a table; covariances are not looked at."""
-    if r.truth is None:
+    sheet, truth, _ = _both(estimates, POSE, r)
+    if truth is None:
         raise InputError(f"{estimates}: needs --truth FILE, poses in any world")
-    (sheet, _), (truth, _) = _sheet(estimates, POSE, bool(r.motions)), _sheet(r.truth, POSE, body=r.body)
     if "filter" in sheet and len(set(sheet.texts("filter"))) > 1:
         raise InputError(f"{estimates}: holds several estimators in its column 'filter'; keep the rows of one")
     require_columns(sheet, POSE)

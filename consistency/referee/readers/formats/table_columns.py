@@ -12,7 +12,7 @@ from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.named_columns import DEVIATIONS
-from consistency.referee.readers.formats.sheet import TableRows, are_dof, refuse
+from consistency.referee.readers.formats.sheet import TableRows, are_dof, exact, refuse
 from consistency.referee.readers.options import COLUMNS
 from consistency.referee.readers.runs_to_record import listed, symmetric
 from consistency.referee.readers.truth_matching import Known, Manifold, Poses, unit_apart
@@ -43,7 +43,7 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
         what = "is there twice" if values[order[stuck[0]]] == values[row] else "is less than the one before"
         hint = "" if "run" in sheet else "; several runs need a column 'run'"
         hint += "" if "filter" in sheet else "; several estimators need a column 'filter'" if "run" in sheet else ""
-        raise InputError(f"{sheet.place(row)}: {key} {values[row]:.10g}{of} {what}{hint}")
+        raise InputError(f"{sheet.place(row)}: {key} {exact(values[row])}{of} {what}{hint}")
     return order
 
 
@@ -112,7 +112,7 @@ def stated_covariance(sheet: TableRows, axes: tuple[str, ...], own: bool = False
                 wanted = upper[-1]
                 raise InputError(
                     f"{sheet.path}: column '{wanted}' is missing; the covariance of {', '.join(axes)} needs its "
-                    "upper triangle, zeros included"
+                    "upper triangle, zeros included; --state a,b judges fewer components"
                 )
             out[:, i, j], out[:, j, i] = sheet.numbers(there[0]), sheet.numbers(there[-1])
     return symmetric(out, sheet.place)
@@ -191,7 +191,7 @@ def matched(
     for run, rows, p, found in zip(numbers, members, poses, known, strict=True):
         if not len(found.rows):
             t = p.t + shift
-            spans = [f"{each.min():.10g} to {each.max():.10g}" for each in (t, p.true_t)]
+            spans = [f"{each.min():.15g} to {each.max():.15g}" for each in (t, p.true_t)]
             odd = unit_apart(t, p.true_t, (sheet.path, truth.path))
             within = f" within {p.max_dt:g} s (--max-dt){odd}" if key == "t" else ""
             raise InputError(
@@ -203,7 +203,7 @@ def matched(
         t = sheet.numbers("t")
         where = f"in the same step of {truth.path}; number the same instants by the same step, or raise --max-dt"
         off = np.abs(t - partner) > max_dt + 1e-6
-        refuse(off, sheet.place, lambda row: f"t is {t[row]:.10g}, but {partner[row]:.10g} {where}")
+        refuse(off, sheet.place, lambda row: f"t is {exact(t[row])}, but {exact(partner[row])} {where}")
     notes = []
     absent = [] if samples.runs is None else sorted({int(run) for run in samples.runs} - {*numbers})
     if absent:

@@ -276,7 +276,7 @@ def judged_rest(own: Lines, true: Lines, r: Reading, relative: Relative | None) 
 
 def unused(truth: Lines, r: Reading) -> str:
     """A note on a covariance of the truth that nothing is done with, "" without one."""
-    stated = isinstance(truth, Fixes) or bool(np.isfinite(truth.values[:, POSE:]).any())
+    stated = isinstance(truth, Fixes) or bool((truth.values[:, POSE:] > 0).any())
     if r.truth_covariance is not None or not stated or isinstance(truth, States):
         return ""
     return f"{truth.path}: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"

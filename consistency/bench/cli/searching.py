@@ -1,4 +1,4 @@
-"""Commands that try many worlds or settings: sweep, recommend, tune and challenge; they parse, call and print."""
+"""Commands that try many worlds or settings: sweep, tune and challenge; they parse, call and print."""
 
 from __future__ import annotations
 
@@ -98,47 +98,6 @@ def _share(text: str | None) -> tuple[int, int]:
     if not (slash and part.isdecimal() and parts.isdecimal()):
         raise InputError(f"--share {text}: must be I/N, as 2/8")
     return int(part), int(parts)
-
-
-def recommend(
-    rig: Annotated[str, typer.Argument(metavar="RIG", help=f"{SCENARIO[:-1]}, or sensor.toml of a log.")],
-    range_: Annotated[float | None, typer.Option("--range", help="Metres up to which landmarks are used.")] = None,
-    speed: Annotated[float | None, typer.Option("--speed", help="Metres a second that the robot drives.")] = None,
-    density: Annotated[
-        float | None, typer.Option("--density", help="Landmarks on a square metre, as seen from above.")
-    ] = None,
-    dt: Annotated[float | None, typer.Option("--dt", help="Seconds from step to step.")] = None,
-    map_: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--map",
-            metavar="MAP",
-            help="Folder of 'sweep', or its map.json; a second one may have axes that vary alone [the shipped maps].",
-        ),
-    ] = None,
-    runs: Annotated[
-        int | None,
-        typer.Option("--runs", help="Runs that confirm a filter; 0: the map alone [as many as the map's rule needs]."),
-    ] = None,
-    confirm: Annotated[int, typer.Option("--confirm", help="Filters to confirm, at most, one after another.")] = 4,
-    seed: Seed = 0,
-    jobs: Jobs = -1,
-    as_json: AsJson = False,
-) -> None:
-    """Which filter to trust on one rig: looked up in a map, and confirmed by runs of that rig."""
-    from consistency.bench.sweeps.printing import advice_blocks, advice_json
-    from consistency.bench.sweeps.recommend import recommend_for
-    from consistency.bench.sweeps.regime import read_maps
-    from consistency.bench.sweeps.rig import Request
-    from consistency.referee.show import terminal
-
-    request = Request(rig, range_, speed, density, dt)
-    regime, alone = read_maps(map_ or ())
-    advice = recommend_for(request, regime, runs, confirm, seed, jobs, alone)
-    if as_json:
-        print(json.dumps(advice_json(advice), indent=2, allow_nan=False))
-    else:
-        terminal.show(*advice_blocks(advice))
 
 
 def tune(

@@ -154,7 +154,7 @@ TARGETS = (
     Target("resume", KEPT, _resume, m.ANY | m.COLUMNS, m.ROWS, seldom=True),
     Target("resume", ("out/manifest.json",), _resume, m.ANY | TREE, TWICE, seldom=True),
     Target("resume", ("world.toml",), _resume, TOML, LINE_TWICE, seldom=True),
-    Target("journal", (".out.unfinished/journal",), _resume, m.ANY, {}),
+    Target("journal", (".out.unfinished/runs.sqlite",), _resume, m.ANY, {}),
     Target("results", ("manifest.json",), command("report", "{}", "--html", "{}/r.html"), m.ANY | TREE, TWICE,
            seldom=True),
     Target("results", RESULTS, command("report", "{}", "--html", "{}/r.html"), m.ANY | m.COLUMNS, {}, seldom=True),

@@ -180,9 +180,6 @@ def challenge(
             metavar="NAME=...",
         ),
     ] = None,
-    of: Annotated[
-        str, typer.Option("--of", help="'pose', 'map', or 'both': a challenge each, with half of the time.")
-    ] = "both",
     minutes: Annotated[float | None, typer.Option("--minutes", help="Time for all of it [5].")] = None,
     trials: Annotated[
         int | None,
@@ -205,33 +202,23 @@ def challenge(
         str | None, typer.Option("--fail-on", help="'found': exit 1 if the filter is found overconfident.")
     ] = None,
 ) -> None:
-    """Look for the world in which a filter is most overconfident, shrink it, and confirm it on fresh runs."""
-    from consistency.bench.challenging.challenge import Plan, challenge_parts
+    """Look for the world in which a filter is most overconfident, and confirm it on fresh runs."""
+    from consistency.bench.challenging.challenge import Plan
     from consistency.bench.challenging.challenge import challenge as challenge_filter
     from consistency.bench.challenging.wording import as_data, lines, require_writable, write_scenario
 
     require_word("--fail-on", fail_on, "found")
-    if of not in ("pose", "map", "both"):
-        raise InputError(f"--of must be 'pose', 'map' or 'both', got '{of}'")
     if minutes is None and trials is None:
         minutes = 5.0
     plan = Plan(minutes, trials, seed, jobs, false_alarm, detect)
     out = Path(f"challenge-{filter_name}.toml") if out is None else out
-    files = [out, out.with_stem(f"{out.stem}-map")] if of == "both" else [out]
-    for file in files:
-        require_writable(file, overwrite)
-    if of == "both":
-        outcomes = [o for o in challenge_parts(filter_name, scenario, plan, within or []) if o is not None]
-    else:
-        outcomes = [challenge_filter(filter_name, scenario, plan, within or [], "map" if of == "map" else "pose")]
-    pairs = list(zip(outcomes, files, strict=False))
-    for outcome, file in pairs:
-        if outcome.found:
-            write_scenario(outcome, file)
+    require_writable(out, overwrite)
+    outcome = challenge_filter(filter_name, scenario, plan, within or [])
+    if outcome.found:
+        write_scenario(outcome, out)
     if as_json:
-        first, *others = (as_data(outcome, file) for outcome, file in pairs)
-        print(json.dumps(first | {"map": others[0] if others else None}, indent=2))
+        print(json.dumps(as_data(outcome, out), indent=2))
     else:
-        print("\n".join(line for outcome, file in pairs for line in lines(outcome, file)))
-    if fail_on and any(outcome.found for outcome in outcomes):
+        print("\n".join(lines(outcome, out)))
+    if fail_on and outcome.found:
         raise typer.Exit(1)

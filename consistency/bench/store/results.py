@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from consistency.bench.scenario import Scenario, explain
 from consistency.bench.store.folder_tables import require_unchanged, write_folder
 from consistency.bench.store.parquet import OPTIONAL, Columns, read_batches, read_parquet, require_table
-from consistency.bench.store.results_check import require_manifest, require_study
+from consistency.bench.store.results_check import require_manifest, require_rows
 from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
@@ -213,8 +213,8 @@ def open_results(folder: str | Path) -> StoredResults:
     Raises
     ------
     InputError
-        A file is missing, cut short, not as it was written, or lacks a column; the numbers in its rows are checked
-        when they are read.
+        A file is missing, cut short, not as it was written, or lacks a column, a filter, a run or a step; the numbers
+        in its rows are checked when they are read.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -228,7 +228,7 @@ def open_results(folder: str | Path) -> StoredResults:
     results = StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest, rejections)
     if OWN_NUMBERS in map(results.numbers_of, results.filters):
         require_table(folder, "estimates", OWN_NUMBERS)
-    require_study(folder, manifest, results.scenario, results.failures)
+    require_rows(folder, manifest, results.scenario, results.failures, rejections, landmarks)
     return results
 
 

@@ -1,23 +1,24 @@
-"""The manifest of a results folder: its keys, and the tables that it lists.
-
-What is in the tables is known by their digests (``folder_tables.require_unchanged``).
-"""
+"""Whether a results folder says what a study leaves: every run of every filter, every step, each once and in order."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from consistency.bench.scenario import Scenario
+from consistency.bench.store.parquet import read_batches, require_table
 from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line, reading, require_name
 
 AGAIN = "the folder was changed or damaged; write it again"
 Whole = Annotated[int, Field(ge=0, lt=2**53)]
+Steps = dict[int, int]  # by run
 
 
 class _Manifest(BaseModel):
@@ -77,19 +78,149 @@ def require_manifest(folder: Path, manifest: dict[str, Any]) -> None:
         raise InputError(f"{path}: key 'finished_runs': missing, but 'complete' is false; {AGAIN}")
 
 
-def require_study(folder: Path, manifest: dict[str, Any], scenario: Scenario | None, failures: pd.DataFrame) -> None:
-    """Refuse a manifest that disagrees with its own scenario or with the table of failures.
+def require_rows(
+    folder: Path,
+    manifest: dict[str, Any],
+    scenario: Scenario | None,
+    failures: pd.DataFrame,
+    rejections: pd.DataFrame | None,
+    landmarks: pd.DataFrame | None,
+) -> None:
+    """Refuse tables that lack a filter, a run or a step, or hold one twice or out of order.
+
+    Reads the columns ``run`` and ``step`` of ``estimates`` and ``truth``, and ``run`` and ``landmark`` of ``map``.
 
     Raises
     ------
     InputError
-        Names the file.
+        Names the file, and the run or step.
     """
+    filters: list[str] = manifest["filters"]
     if scenario is not None and manifest.get("scenario_hash") != scenario.hash:
         raise InputError(f"{folder / 'manifest.json'}: key 'scenario_hash' is not that of key 'scenario'; {AGAIN}")
-    path = folder / "failures.parquet"
-    if len(failures) != manifest["failures"]:
-        counted = manifest["failures"]
-        raise InputError(f"{path}: has {len(failures)} rows, manifest.json counts {counted} failures; {AGAIN}")
-    if unknown := sorted(set(failures["filter"]) - set(manifest["filters"])):
-        raise InputError(f"{path}: '{one_line(unknown[0])}' is not a filter of these results; {AGAIN}")
+    failed = _failed(folder / "failures.parquet", filters, failures, manifest["failures"])
+    there = {name: _steps(folder, "estimates", 1, name) for name in filters}
+    _require_all_rows(folder, "estimates", sum(sum(steps.values()) for steps in there.values()))
+    truth = None
+    if "truth" in manifest["tables"]:
+        truth = {run: rows - 1 for run, rows in _steps(folder, "truth", 0).items()}
+        _require_all_rows(folder, "truth", sum(truth.values()) + len(truth))
+    length = _lengths(folder, scenario, truth, there)
+    _require_runs(folder / "manifest.json", manifest, scenario, length | dict.fromkeys(_union(failed), 0))
+    for name in filters:
+        _require_filter(folder / "estimates.parquet", name, there[name], failed[name], length, truth is not None)
+    if "map" in manifest["tables"]:
+        _require_maps(folder, there, failed)
+    if rejections is not None:
+        _require_rejections(folder / "rejections.parquet", rejections, there, failed)
+    if landmarks is not None and landmarks["landmark"].duplicated().any():
+        raise InputError(f"{folder / 'landmarks.parquet'}: column 'landmark': a landmark is there twice; {AGAIN}")
+
+
+def _failed(path: Path, filters: Sequence[str], failures: pd.DataFrame, count: int) -> dict[str, Steps]:
+    """Step of the failure of each run, by filter."""
+    if len(failures) != count:
+        raise InputError(f"{path}: has {len(failures)} rows, manifest.json counts {count} failures; {AGAIN}")
+    failed: dict[str, Steps] = {name: {} for name in filters}
+    for name, run, step in zip(failures["filter"], failures["run"], failures["step"], strict=True):
+        if name not in failed:
+            raise InputError(f"{path}: '{one_line(name)}' is no filter of these results; {AGAIN}")
+        if run in failed[name] or run < 0 or step < 1:
+            raise InputError(
+                f"{path}: run {run} of '{name}', step {step}: a run fails once, in step 1 or later; {AGAIN}"
+            )
+        failed[name][int(run)] = int(step)
+    return failed
+
+
+def _steps(folder: Path, table: str, begin: int, filter_name: str | None = None) -> Steps:
+    """Rows of each run; refused unless they stand in order of run and step, from ``begin`` on, without a gap."""
+    counts: Steps = {}
+    run, step = -1, 0
+    for batch in read_batches(folder, table, ["run", "step"], filter_name):
+        runs, steps = batch["run"].astype(np.int64), batch["step"].astype(np.int64)
+        before, last = np.append(run, runs[:-1]), np.append(step, steps[:-1])
+        right = np.where(runs == before, steps == last + 1, (steps == begin) & (runs > before))
+        if not right.all():
+            row = int(np.argmin(right))
+            of = "" if filter_name is None else f" of '{filter_name}'"
+            raise InputError(
+                f"{folder / table}.parquet: step {steps[row]} of run {runs[row]}{of} is not what comes next; runs and "
+                f"steps stand in order, each once; {AGAIN}"
+            )
+        for number, rows in zip(*np.unique(runs, return_counts=True), strict=True):
+            counts[int(number)] = counts.get(int(number), 0) + int(rows)
+        run, step = (int(runs[-1]), int(steps[-1])) if len(runs) else (run, step)
+    return counts
+
+
+def _require_all_rows(folder: Path, table: str, rows: int) -> None:
+    there = require_table(folder, table).metadata.num_rows
+    if there != rows:
+        raise InputError(f"{folder / table}.parquet: {there - rows} of {there} rows are of no filter; {AGAIN}")
+
+
+def _lengths(folder: Path, scenario: Scenario | None, truth: Steps | None, there: dict[str, Steps]) -> Steps:
+    """Steps of each run: those of its truth, or of the scenario, or else of the filter that went furthest."""
+    if truth is None and scenario is not None:
+        return dict.fromkeys(_union(there), scenario.truth.steps)
+    if truth is None:
+        return {run: max(steps.get(run, 0) for steps in there.values()) for run in _union(there)}
+    for run, steps in truth.items():
+        if scenario is not None and steps != scenario.truth.steps:
+            raise InputError(
+                f"{folder / 'truth.parquet'}: run {run} has {steps} steps, the scenario {scenario.truth.steps}; {AGAIN}"
+            )
+    return truth
+
+
+def _require_runs(path: Path, manifest: dict[str, Any], scenario: Scenario | None, runs: Steps) -> None:
+    count = manifest["runs"] if manifest["complete"] else manifest["finished_runs"]
+    if len(runs) != count:
+        raise InputError(f"{path}: counts {count} runs, the tables hold {len(runs)}; {AGAIN}")
+    if scenario is not None and runs and max(runs) >= manifest["runs"]:
+        raise InputError(f"{path}: key 'runs' is {manifest['runs']}, the tables hold run {max(runs)}; {AGAIN}")
+
+
+def _require_filter(path: Path, name: str, there: Steps, failed: Steps, length: Steps, known: bool) -> None:
+    """Every run is there: whole, or up to the step before its failure. ``known``: the length of failed ones, too."""
+    if missing := sorted(set(length) - set(there) - set(failed)):
+        raise InputError(f"{path}: run {missing[0]} of '{name}' is missing; {AGAIN}")
+    for run in sorted({*there, *failed}):
+        steps, whole = there.get(run, 0), length.get(run)
+        if (known and whole is None) or (run in failed and known and failed[run] > (whole or 0)):
+            raise InputError(f"{path}: run {run} of '{name}' has steps that truth.parquet lacks; {AGAIN}")
+        expected = failed[run] - 1 if run in failed else whole
+        if steps != expected:
+            raise InputError(f"{path}: run {run} of '{name}' has {steps} steps, not {expected}; {AGAIN}")
+
+
+def _require_maps(folder: Path, there: dict[str, Steps], failed: dict[str, Steps]) -> None:
+    path, rows = folder / "map.parquet", 0
+    for name in there:
+        parts = [pd.DataFrame(batch) for batch in read_batches(folder, "map", ["run", "landmark"], name)]
+        table = pd.concat(parts) if parts else pd.DataFrame({"run": [], "landmark": []})
+        rows += len(table)
+        if table.duplicated().any():
+            run, landmark = table[table.duplicated()].iloc[0]
+            raise InputError(f"{path}: landmark {landmark:.0f} of run {run:.0f} of '{name}' is there twice; {AGAIN}")
+        if strange := sorted(set(table["run"]) - (set(there[name]) - set(failed[name]))):
+            raise InputError(f"{path}: '{name}' has no finished run {strange[0]:.0f}; {AGAIN}")
+    _require_all_rows(folder, "map", rows)
+
+
+def _require_rejections(path: Path, table: pd.DataFrame, there: dict[str, Steps], failed: dict[str, Steps]) -> None:
+    if table.empty:
+        raise InputError(f"{path}: has no rows; {AGAIN}")
+    for name, rows in table.groupby("filter"):
+        runs = {*there.get(str(name), ()), *failed.get(str(name), ())}
+        if rows["run"].duplicated().any() or set(rows["run"]) != runs:
+            raise InputError(f"{path}: must have each run of '{one_line(name)}' once; {AGAIN}")
+    few, many = table[["spurious", "rejected", "rejected_spurious"]], table["offered"]
+    both = table["spurious"] + table["rejected"] - table["rejected_spurious"]
+    if (few < 0).any(axis=None) or (both > many).any() or (few.iloc[:, 2] > few.iloc[:, :2].min(axis=1)).any():
+        raise InputError(f"{path}: counts of rejected observations do not go together; {AGAIN}")
+
+
+def _union(steps: dict[str, Steps]) -> Iterator[int]:
+    return iter(sorted({run for runs in steps.values() for run in runs}))

@@ -1,4 +1,4 @@
-"""Results folders of before, which have no digests: columns, numbers and the manifest are checked."""
+"""Results folders that were changed: refused unless every run of every filter is there, step by step, each once."""
 
 from __future__ import annotations
 
@@ -56,13 +56,39 @@ def test_what_was_written_is_accepted(folder: Path) -> None:
 
 
 TABLES: list[tuple[str, Edit, str]] = [
+    ("estimates", twice, r"estimates\.parquet: step 1 of run 0 of 'one' is not what comes next"),
+    ("estimates", only("run != 4 or filter != 'two'"), r"estimates\.parquet: run 4 of 'two' is missing"),
+    ("estimates", only("filter == 'one'"), r"run 0 of 'two' is missing"),
+    ("estimates", only("step < 12 or run != 1"), r"run 1 of 'one' has 11 steps, not 12"),
+    ("estimates", only("step > 1 or run != 1"), r"step 2 of run 1 of 'one' is not what comes next"),
+    ("estimates", only("run != 3 or step < 7 or filter == 'one'"), r"run 3 of 'two' has 6 steps, not 7"),
+    ("estimates", value("run == 5 and step == 7", "step", 10**12), r"step 1000000000000 of run 5"),
+    ("estimates", value("run == 5 and filter == 'one'", "run", 10**12), r"run 6 of 'one' is not what comes next"),
+    ("estimates", value("filter == 'two' and run == 8", "filter", "three"), r"12 of 211 rows are of no filter"),
+    ("estimates", value("filter == 'two' and run == 8", "run", 9), r"run 8 of 'two' is missing"),
     ("estimates", lambda t: t.drop(columns="P_xh"), r"column 'P_xh' is missing; needed: filter, run"),
     ("estimates", value("run == 5", "P_xx", np.nan), r"column 'P_xx', row \d+: not a finite number"),
     ("estimates", value("run == 5", "P_xx", np.inf), r"column 'P_xx', row \d+: not a finite number"),
     ("estimates", lambda t: t.assign(x="far"), r"estimates\.parquet: column 'x', row 0: not a"),
     ("truth", lambda t: t.assign(step=t["step"] + 0.5), r"column 'step', row 0: not a whole number \(0\.5\)"),
+    ("truth", only("step <= 5"), r"truth\.parquet: run 0 has 5 steps, the scenario 12"),
+    ("truth", only("run < 8"), r"counts 9 runs, the tables hold 8"),
+    ("truth", twice, r"truth\.parquet: step 0 of run 0 is not what comes next"),
+    ("truth", lambda t: t.iloc[::-1], r"truth\.parquet: step 12 of run 8 is not what comes next"),
     ("failures", only("run < 0"), r"failures\.parquet: has 0 rows, manifest\.json counts 1 failures"),
-    ("failures", value("run == 3", "filter", "three"), r"failures\.parquet: 'three' is not a filter"),
+    ("failures", value("run == 3", "filter", "three"), r"failures\.parquet: 'three' is no filter"),
+    ("failures", value("run == 3", "step", 0), r"step 0: a run fails once"),
+    ("failures", value("run == 3", "step", 13), r"has steps that truth\.parquet lacks"),
+    ("failures", value("run == 3", "step", 9), r"run 3 of 'two' has 7 steps, not 8"),
+    ("map", twice, r"map\.parquet: landmark 0 of run 0 of 'one' is there twice"),
+    ("map", value("filter == 'two' and run == 4", "run", 3), r"map\.parquet: 'two' has no finished run 3"),
+    ("map", value("filter == 'two' and run == 4", "filter", "three"), r"map\.parquet: 5 of \d+ rows are of no filter"),
+    ("rejections", only("run != 2"), r"rejections\.parquet: must have each run of 'two' once"),
+    ("rejections", only("run < 0"), r"rejections\.parquet: has no rows"),
+    ("rejections", twice, r"must have each run of 'two' once"),
+    ("rejections", value("run == 2", "rejected", 50), r"counts of rejected observations"),
+    ("rejections", value("run == 2", "rejected_spurious", 4), r"counts of rejected observations"),
+    ("landmarks", twice, r"landmarks\.parquet: column 'landmark': a landmark is there twice"),
 ]  # fmt: skip
 
 
@@ -116,11 +142,15 @@ MANIFESTS: list[tuple[dict[str, Any], str]] = [
     ({"filters": []}, r"key 'filters': "),
     ({"filters": ["one", "one"]}, r"key 'filters': .*a name is there twice"),
     ({"filters": ["one", "two\u2028"]}, r"key 'filters': .*the name 'two\\u2028' has a control character"),
-    ({"filters": ["one"]}, r"failures\.parquet: 'two' is not a filter"),
+    ({"filters": ["one"]}, r"failures\.parquet: 'two' is no filter"),
+    ({"filters": ["one", "two", "three"]}, r"run 0 of 'three' is missing"),
     ({"complete": "yes"}, r"key 'complete'"),
     ({"complete": None}, r"key 'complete'"),
     ({"complete": False}, r"key 'finished_runs': missing"),
+    ({"complete": False, "finished_runs": 4}, r"counts 4 runs, the tables hold 9"),
+    ({"runs": 10}, r"counts 10 runs, the tables hold 9"),
     ({"runs": 2**63}, r"key 'runs'"),
+    ({"complete": False, "finished_runs": RUNS, "runs": 5}, r"key 'runs' is 5, the tables hold run 8"),
     ({"tables": ["estimates", "failures"]}, r"key 'tables' lacks 'landmarks'"),
     ({"tables": "estimates"}, r"key 'tables'"),
     ({"seed": "a"}, r"key 'seed'"),
@@ -159,3 +189,6 @@ def test_a_log_without_truth_has_runs_of_any_length(written: Path, folder: Path)
         (folder / f"{name}.parquet").unlink()
     change(folder, "estimates", only("run != 1 or step < 6"))
     assert cs.read_results(folder).truth is None
+    change(folder, "estimates", only("run != 1 or step < 5 or filter == 'one'"))
+    with pytest.raises(cs.InputError, match=r"run 1 of 'two' has 4 steps, not 5"):
+        cs.read_results(folder)

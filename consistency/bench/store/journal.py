@@ -98,8 +98,8 @@ class Journal:
                 numbers = b"".join([values.tobytes() for values in columns.values()])
                 row = (run, name, types, numbers, zlib.crc32(numbers))
                 database.execute("INSERT OR REPLACE INTO part VALUES (?, ?, ?, ?, ?)", row)
-            row = (run, json.dumps(dict(notes)) if notes else None)
-            database.execute("INSERT OR REPLACE INTO finished VALUES (?, ?)", row)
+            noted = json.dumps(dict(notes)) if notes else None
+            database.execute("INSERT OR REPLACE INTO finished VALUES (?, ?)", (run, noted))
         self._runs.add(run)
         if notes:
             self.notes[run] = dict(notes)

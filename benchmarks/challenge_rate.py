@@ -79,7 +79,6 @@ def main() -> None:
         seconds=(10.0, "of each search"),
         trials=(int, "of each search, in place of --seconds"),
         filter=("kf", "one that is right in the worlds of its scenario"),
-        of=("pose", "whose covariance is challenged", {"choices": ("pose", "map")}),
         false_alarm=(0.05, None),
         seed=(0, "of the first search"),
         jobs=(-1, None),
@@ -89,14 +88,14 @@ def main() -> None:
     filter_, base = opponents(options.filter)
     for seed in range(options.seed, options.seed + options.searches):
         plan = Plan(minutes, options.trials, seed, options.jobs, options.false_alarm)
-        outcome = challenge(filter_, base, plan, part=options.of)
+        outcome = challenge(filter_, base, plan)
         found, worlds = found + outcome.found, worlds + outcome.worlds
         longest = max(longest, outcome.seconds)
         if outcome.found:
             print(f"seed {seed}: {outcome.verdict.status} in {outcome.space.text(outcome.point)}", flush=True)
     p_value = float(stats.binom.sf(found - 1, options.searches, options.false_alarm))
     high = stats.binomtest(found, options.searches).proportion_ci(0.98, "exact").high
-    print(f"{options.filter}, {options.of}: found in {found} of {options.searches} searches")
+    print(f"{options.filter}: found in {found} of {options.searches} searches")
     print(
         f"(at most {high:.1%}, 99 % binomial; stated "
         f"{options.false_alarm:.1%}, p {p_value:.3f}); {worlds / options.searches:.0f} worlds a search, the longest "

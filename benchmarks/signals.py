@@ -130,7 +130,7 @@ def sent(command: Command, at: Path, number: int, moment: float, cold: bool, run
 
 def resumed(command: Command, at: Path, whole: Path, runs: int) -> list[str]:
     """Go on, as a user does; what differs from one go."""
-    there = (at / "out").exists() or (at / ".out.unfinished" / "journal").exists()
+    there = (at / "out").exists() or (at / ".out.unfinished" / "runs.sqlite").exists()
     words = [word.format(runs=runs) for word in command.words] + list(command.resume or ()) * there
     done = subprocess.run(words, cwd=at, capture_output=True, text=True, check=False)
     if done.returncode:

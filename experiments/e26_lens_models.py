@@ -1,7 +1,7 @@
 """What does a filter make of the noise and the bias that each lens model leaves of a real 9 cm camera?
 
 `consistency characterise` finds them from images of a chessboard with a full lens model, with k1 alone and without any.
-Each becomes the true sensor of the world of herath2007-stereo, as `consistency recommend sensor.toml` has it, with the
+Each becomes the true sensor of the world of herath2007-stereo, with the
 focal length, baseline and image of the full model, so that all see the same landmarks.
 The images are not shipped: docs/characterise.md.
 """
@@ -21,7 +21,7 @@ from scipy.stats import ttest_rel
 import consistency as cs
 from consistency.bench.runs.findings import OURS, script
 from consistency.bench.runs.run_scores import run_means
-from consistency.bench.sweeps.rig import Request, read_rig
+from consistency.bench.sweeps.rig import read_rig
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
@@ -90,7 +90,7 @@ def beliefs(model: str, of: Characterisation) -> dict[str, cs.Scenario]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"lens-{model}.toml"
         path.write_text(sensor_text(of), encoding="utf-8")
-        rig = read_rig(Request(str(path)), cs.load_scenario("herath2007-stereo")).scenario
+        rig = read_rig(path, cs.load_scenario("herath2007-stereo"))
     summary = f"herath2007-stereo with a camera that was calibrated with lens model '{model}'"
     full = rig.variant(f"lens-{model}", summary=f"{summary}; its noise and bias map believed")
     alone = rig.variant(

@@ -32,7 +32,6 @@ NOT_RUN = [
     ("docs/case-studies.md", "python docs/case-studies", "needs the libraries; tests/oracle/test_case_studies_live.py"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
     ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and unit/bench/test_slurm.py stand in"),
-    ("docs/compiling.md", "consistency compile", "compiles many filters; tests/smoke/test_compile_cli.py compiles one"),
     ("docs/consistent.md", "consistency reproduce", STUDY),
     ("docs/conventions.md", "", "tests/unit/referee/test_conventions.py runs all of it"),
     ("docs/extending.md", "", "tests/unit/test_extending.py follows it in a copy of the package"),

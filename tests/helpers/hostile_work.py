@@ -19,7 +19,8 @@ from consistency.bench.simulation import World
 from consistency.bench.store.results import open_results
 from consistency.bench.sweeps.cell import CellOutcome, CellResult, runs_table
 from consistency.bench.sweeps.plan import load_sweep
-from consistency.bench.sweeps.regime import regime_of, write_regime
+from consistency.bench.sweeps.regime import read_regime, regime_of, write_regime
+from consistency.bench.sweeps.rig import read_rig
 from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
 
 STUDY, RUNS = ("--filter", "kf", "--jobs", "1", "--seed", "4"), 4
@@ -90,8 +91,12 @@ def _write_maps(folder: Path) -> None:
     write_regime(regime_of(sweep), sweep.path)
 
 
-def _advise(rig: str, at: str) -> Callable[[Path], object]:
-    return command("recommend", rig, "--map", at, "--runs", "0", "--json")
+def _read_map(at: str) -> Callable[[Path], object]:
+    return lambda folder: read_regime(folder / at)
+
+
+def _read_rig(at: str) -> Callable[[Path], object]:
+    return lambda folder: read_rig(folder / at, cs.load_scenario("herath2007-stereo"))
 
 
 # --- images ----------------------------------------------------------------------------------------
@@ -149,15 +154,15 @@ TARGETS = (
     Target("resume", KEPT, _resume, m.ANY | m.COLUMNS, m.ROWS, seldom=True),
     Target("resume", ("out/manifest.json",), _resume, m.ANY | TREE, TWICE, seldom=True),
     Target("resume", ("world.toml",), _resume, TOML, LINE_TWICE, seldom=True),
-    Target("journal", (".out.unfinished/journal",), _resume, m.ANY, {}),
+    Target("journal", (".out.unfinished/runs.sqlite",), _resume, m.ANY, {}),
     Target("results", ("manifest.json",), command("report", "{}", "--html", "{}/r.html"), m.ANY | TREE, TWICE,
            seldom=True),
     Target("results", RESULTS, command("report", "{}", "--html", "{}/r.html"), m.ANY | m.COLUMNS, {}, seldom=True),
     Target("results", RESULTS[:1], command("baseline", "{}", "--out", "{}/base.json"), m.ANY | m.COLUMNS, m.ROWS),
     Target("table", ("nis.csv",), _piped, m.ANY | m.TEXT, {}),
-    Target("maps", ("map/map.json",), _advise("herath2007-stereo", "{}/map/map.json"), m.ANY | TREE, TWICE),
-    Target("maps", ("map/manifest.json",), _advise("herath2007-stereo", "{}/map"), m.ANY | TREE, TWICE),
-    Target("maps", ("sensor.toml",), _advise("{}/sensor.toml", "{}/map/map.json"), TOML, LINE_TWICE),
+    Target("maps", ("map/map.json",), _read_map("map/map.json"), m.ANY | TREE, TWICE),
+    Target("maps", ("map/manifest.json",), _read_map("map"), m.ANY | TREE, TWICE),
+    Target("maps", ("sensor.toml",), _read_rig("sensor.toml"), TOML, LINE_TWICE),
     Target("moving", PAIRS, command("frontend", "{}", *CALIBRATED, "{}/log"), m.ANY, {}, seldom=True),
     Target("moving", ("stereo.yaml",), command("frontend", "{}", *CALIBRATED, "{}/log"), m.ANY | m.TEXT, {},
            seldom=True),

@@ -54,7 +54,7 @@ def smaller(words: list[str]) -> str:
         return "--jobs 1 --share " + ("1/4" if "small" in words else "1/150 --filter ekf-uvd")
     return {
         "run": "--jobs 1", "tune": "--jobs 1", "simulate": "--runs 4", "challenge": "--minutes 0.1 --jobs 1",
-        "recommend": "--runs 2 --confirm 1 --jobs 1", "characterise": "--overwrite",
+        "characterise": "--overwrite",
     }.get(name, "")  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from forks import LIMIT, Program
 from own_process import begun, consistency, size_of
 
 from consistency.bench.scenario import data_folder
-from consistency.bench.store.journal import Journal
+from consistency.bench.store.journal import DATABASE, Journal
 from consistency.bench.store.results import open_results
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="signals")]
@@ -71,8 +71,8 @@ def runs_in(journal: Path) -> int:
 def sizes(folder: Path) -> Iterator[int]:
     """Bytes of each journal below a folder, while folders come and go."""
     for at, _, names in os.walk(folder):
-        if "journal" in names:
-            yield size_of(Path(at) / "journal")
+        for name in {DATABASE, f"{DATABASE}-wal"} & set(names):
+            yield size_of(Path(at) / name)
 
 
 def stopped_once_grown(process: Program, out: Path, size: int, number: int, wait: float) -> None:
@@ -89,7 +89,7 @@ def stopped_once_grown(process: Program, out: Path, size: int, number: int, wait
 def test_killed_again_and_again(at: Path, which: str) -> None:
     """No run that a journal has is lost by the next kill."""
     moments, command, name = random.Random(), {"looks": LOOKS, "log": LOG}[which], f"{which}-out"
-    journal, done = at / f".{name}.unfinished" / "journal", 0
+    journal, done = at / f".{name}.unfinished" / DATABASE, 0
     for kill in range(8):
         process = begun(*command, "--out", name, *["--resume"] * (kill > 0), cwd=at)
         stopped_once_grown(process, at / name, 30_000, signal.SIGKILL, moments.uniform(0.0, 0.1))

@@ -25,7 +25,7 @@ from forks import LIMIT, Program
 from own_process import COMPILING, begun, size_of
 
 from consistency.bench.scenario import data_folder
-from consistency.bench.store.journal import Journal
+from consistency.bench.store.journal import DATABASE, Journal
 from consistency.bench.store.results import open_results
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals")
@@ -73,11 +73,16 @@ def wait_for(condition: Callable[[], bool], process: Program | subprocess.Popen[
 
 def working(at: Path, size: int = 200_000) -> Callable[[], bool]:
     """Whether the journal has grown so large."""
-    return lambda: size_of(at / UNFINISHED / "journal") > size
+    return lambda: journal_size(at / UNFINISHED) > size
+
+
+def journal_size(folder: Path) -> int:
+    """Bytes of the database and of its log."""
+    return size_of(folder / DATABASE) + size_of(folder / f"{DATABASE}-wal")
 
 
 def kept(at: Path) -> int:
-    journal = Journal(at / UNFINISHED / "journal")
+    journal = Journal(at / UNFINISHED / DATABASE)
     journal.close()
     return len(journal.runs)
 
@@ -85,7 +90,7 @@ def kept(at: Path) -> int:
 def kept_beside(at: Path) -> int:
     """As :func:`kept`, of a journal that another process writes."""
     shutil.copytree(at / UNFINISHED, at / ".out-copied")
-    journal = Journal(at / ".out-copied" / "journal")
+    journal = Journal(at / ".out-copied" / DATABASE)
     journal.close()
     return len(journal.runs)
 
@@ -135,8 +140,8 @@ def test_twenty_kills_at_random_moments(fresh: Path) -> None:
     for kill in range(20):
         late = kill >= 10
         process = begin(fresh, *["--resume"] * (kill > 0))
-        tables, journal = fresh / UNFINISHED / "tables", fresh / UNFINISHED / "journal"
-        size = size_of(journal)
+        tables, journal = fresh / UNFINISHED / "tables", fresh / UNFINISHED / DATABASE
+        size = journal_size(fresh / UNFINISHED)
         wait_for(tables.exists if late else working(fresh, size + 3_000), process)
         time.sleep(moments.uniform(0.0, 0.15))
         process.kill()
@@ -221,7 +226,7 @@ def test_a_limit_on_the_size_of_files(fresh: Path) -> None:
     status, error = end(begin(fresh, before=limit))
     assert status == 2
     done = kept(fresh)
-    said = f"--out out: cannot be written (File too large); {done} finished runs are kept, and the same command"
+    said = f"--out out: cannot be written (disk I/O error); {done} finished runs are kept, and the same command"
     assert said in one_sentence(error)
     resume(fresh)
 

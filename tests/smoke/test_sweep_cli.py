@@ -1,8 +1,7 @@
-"""``sweep`` and ``recommend`` in processes of their own."""
+"""``sweep`` in processes of its own."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -58,15 +57,6 @@ def test_the_same_command_has_nothing_to_do(out: Path) -> None:
     consistency("sweep", "out", cwd=out.parent)
 
 
-def test_a_rig_is_looked_up(out: Path) -> None:
-    arguments = ("recommend", "small.toml", "--map", "out", "--density", "0.1", "--runs", "4", "--jobs", "1", "--json")
-    advice = json.loads(consistency(*arguments, cwd=out.parent).stdout)
-    assert advice["filters"][0]["filter"] == "ekf-uvd"
-    assert advice["axes"]["range"] == {"value": 4.0, "inside": True}
-    assert advice["beyond"] is None
-    assert "nearest cell of the map" in consistency("recommend", "small.toml", "--map", "out", cwd=out.parent).stdout
-
-
 BAD = {
     "baseline of 0": (("sweep", "zero.toml", "--out", "o"), "zero.toml: key 'grid.baseline': values must be positive"),
     "no folder": (("sweep", "grid.toml"), "--out: missing"),
@@ -77,10 +67,6 @@ BAD = {
     "jobs": (("sweep", "grid.toml", "--out", "o", "--jobs", "0"), "jobs must be at least 1"),
     "folder with options": (("sweep", ".", "--share", "1/2"), "only reported again"),
     "no sweep's folder": (("sweep", "."), "manifest.json: missing"),
-    "no map": (("recommend", "small.toml", "--map", "none"), "none: cannot be read"),
-    "two grids": (
-        ("recommend", "small.toml", "--map", "out", "--map", "out"), "--map out: the second map must be"),
-    "confirm": (("recommend", "small.toml", "--map", "out", "--confirm", "0"), "must be at least 1"),
 }  # fmt: skip
 
 

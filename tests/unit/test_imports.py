@@ -37,7 +37,7 @@ RANKS = {
         "runs.memory_needed": 8, "runs.gather": 8,
         "runs.isolation": 8, "runs.compiling": 8, "runs.trial_work": 9, "runs.backends": 10,
         "runs.campaign": 10, "runs.montecarlo": 11, "runs.results_to_records": 8, "runs.run_scores": 9,
-        "runs.sequential": 12, "runs.compiling_ahead": 12, "runs.findings": 13,
+        "runs.sequential": 12, "runs.findings": 13,
         "sweeps": 14, "challenging": 14, "tuning": 14, "pages": 15, "cli": 16,
     },
     "stereo": {"visual_odometry": 0, "rendered_images": 1, "frontend": 2, "characterising": 3, "pages": 4, "cli": 5},

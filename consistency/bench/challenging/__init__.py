@@ -1,6 +1,6 @@
 """Where is a filter most overconfident? A search over worlds, and one test on fresh trials of what it comes up with.
 
 ``worlds`` has the dimensions of worlds and turns a point into a scenario, ``world_scores`` scores a filter in worlds.
-``search`` looks for the worst world and for the smallest one that is still bad, and knows nothing of filters.
+``search`` looks for the worst world, and knows nothing of filters.
 ``challenge`` puts them together and confirms, ``wording`` says what came out. The referee is in ``diagnostics``.
 """

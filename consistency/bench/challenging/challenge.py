@@ -1,17 +1,17 @@
-"""Search, shrink, and confirm on fresh trials: the world in which a filter is most overconfident."""
+"""Search and confirm on fresh trials: the world in which a filter is most overconfident."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search, shrink, standard_error
-from consistency.bench.challenging.world_scores import ChallengeScorer, Part, has_map
+from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search
+from consistency.bench.challenging.world_scores import ChallengeScorer
 from consistency.bench.challenging.worlds import Point, Space, require_right_belief, space_of
 from consistency.bench.filters import get_filter
 from consistency.bench.filters.stepping import name_of
@@ -28,12 +28,8 @@ from consistency.referee.verdicts.sources import analyse
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
 SIZE_QUESTIONS = (*SCALE, JOINT, "outliers")  # what a confirmation needs a fault in: errors that are too large
-SEARCH, GO_ON, SHRINK = 0.4, 0.8, 0.8  # of the budget, spent when these end; going on if nothing is clearly wrong
+SEARCH = 0.8  # share of the budget that is spent on the search
 CONFIRM = 0.2  # of the time, the most that the confirmation may take in a world that is searched
-CHECKS = (6, 12, 24, 48)  # trials after which a smaller world is given up or kept
-SURE = 2.0  # standard errors from the limit
-KEPT = 0.5  # of the worst world's score that a smaller one has to keep
-ENOUGH = float(np.log(5.0))  # a score that is bad enough, however bad the worst one is
 EVERY = 5.0  # seconds between lines of progress
 
 
@@ -48,7 +44,7 @@ class Plan:
     """
 
     minutes: float | None = 5.0  # None: ``trials`` count instead
-    trials: int | None = None  # of search and shrinking together, at most
+    trials: int | None = None  # of the search, at most
     seed: int = 0
     jobs: int = -1
     false_alarm: float = FALSE_ALARM  # chance that a challenge finds a right filter overconfident
@@ -76,25 +72,22 @@ class Plan:
             raise refused(error) from None
 
     @property
-    def seeds(self) -> tuple[int, int, int]:
-        """Seeds of the search, of shrinking and of the confirmation; no two phases share a trial."""
-        search_, shrink_, confirm_ = np.random.SeedSequence(self.seed).generate_state(3)
-        return int(search_), int(shrink_), int(confirm_)
+    def seeds(self) -> tuple[int, int]:
+        """Seeds of the search and of the confirmation, which share no trial."""
+        search_, confirm_ = np.random.SeedSequence(self.seed).generate_state(2)
+        return int(search_), int(confirm_)
 
 
 @dataclass(frozen=True)
 class Challenge:
-    """Result of a challenge. ``world`` is the tested world: the smallest one, or if not ``clear`` the worst one."""
+    """Result of a challenge."""
 
     filter: str
-    part: Part  # of the estimates, whose covariance was challenged
     plan: Plan
     space: Space
-    worst: Point  # the most overconfident world of the search
-    worst_ratio: float  # true over stated covariance there, in a typical run
-    clear: bool  # that world is clearly overconfident, so that smaller ones were looked for
-    point: Point  # of ``world``
-    world: Scenario
+    point: Point  # the most overconfident world of the search
+    ratio: float  # true over stated covariance there, in a typical run of the search
+    world: Scenario  # the scenario of that point
     verdict: Verdict  # on fresh trials
     worlds: int  # that were tried
     trials: int  # that were run, those of the confirmation aside
@@ -130,7 +123,6 @@ def challenge(
     base: str | Scenario | None = None,
     plan: Plan | None = None,
     within: Sequence[str] = (),
-    part: Part = "pose",
 ) -> Challenge:
     """Look for the world in which a filter is most overconfident, and confirm it on fresh trials.
 
@@ -142,39 +134,18 @@ def challenge(
     ----------
     base : the scenario whose values are the plain ones; None for the first of :data:`BASES` that fits the filter
     within : bounds of dimensions, see ``consistency.bench.challenging.worlds.space_of``
-    part : whose covariance is challenged, that of the pose in all steps or that of the map at the end, given the pose
 
     Raises
     ------
     InputError
-        Unknown filter or scenario, one that does not fit the other, bounds that hold no world, or no map.
+        Unknown filter or scenario, one that does not fit the other, or bounds that hold no world.
     """
     plan = Plan() if plan is None else plan
     instance, scenario = opponents(filter_, base)
-    if part == "map" and not has_map(instance, scenario):
-        raise InputError(f"filter '{name_of(instance)}': states no covariance of pose and map; use --of pose")
     space = space_of(scenario, within)
-    with ChallengeScorer(instance, plan.jobs, part) as bench:
+    with ChallengeScorer(instance, plan.jobs) as bench:
         bench.compile(corners(space))
         return ChallengePhases(bench, space, plan).run()
-
-
-def challenge_parts(
-    filter_: str | Filter, base: str | Scenario | None = None, plan: Plan | None = None, within: Sequence[str] = ()
-) -> tuple[Challenge, Challenge | None]:
-    """A challenge of the pose and one of the map, each with half of the time; of the pose alone where there is no map.
-
-    Each is a challenge by itself, with its own confirmation, and finds a right covariance too small with probability
-    ``plan.false_alarm`` or less. See :func:`challenge` for parameters and errors.
-    """
-    plan = Plan() if plan is None else plan
-    instance, scenario = opponents(filter_, base)
-    if not has_map(instance, scenario):
-        return challenge(instance, scenario, plan, within), None
-    minutes = None if plan.minutes is None else plan.minutes / 2
-    half = replace(plan, minutes=minutes, trials=None if plan.trials is None else max(RUNGS[0], plan.trials // 2))
-    pose, map_ = (challenge(instance, scenario, half, within, part) for part in ("pose", "map"))
-    return pose, map_
 
 
 def opponents(filter_: str | Filter, base: str | Scenario | None) -> tuple[Filter, Scenario]:
@@ -215,106 +186,68 @@ class ChallengePhases:
 
     def __init__(self, bench: ChallengeScorer, space: Space, plan: Plan) -> None:
         self.bench, self.space, self.plan = bench, space, plan
-        self.search_seed, self.shrink_seed, self.confirm_seed = plan.seeds
+        self.search_seed, self.confirm_seed = plan.seeds
         self.budget = Budget(None if plan.minutes is None else 60.0 * plan.minutes, plan.trials)
         seconds = self.budget.seconds
         self.slowest = np.inf if seconds is None else CONFIRM * seconds * bench.workers / plan.runs  # for one trial
         self.tried: dict[Point, Candidate] = {}
-        self.checked: dict[Point, list[float]] = {}
-        self.unusable = set[Point]()
         self.told = time.monotonic()
 
     def run(self) -> Challenge:
+        """Search for the worst world and confirm it on fresh trials."""
         name, plan = name_of(self.bench.filter), self.plan
-        point, limit = worst, _ = self.search()
-        if limit is not None:
-            self.tell("shrinking", now=True)
-            point = shrink(self.space, worst, lambda p: self.holds(p, limit), partial(self.budget.left, SHRINK))
+        worst = self.search()
         self.tell(f"confirming on {plan.runs} fresh runs", now=True)
-        part = self.bench.part
-        world = self.space.world(point, f"challenge-{name}" + ("-map" if part == "map" else ""))
+        world = self.space.world(worst.point, f"challenge-{name}")
         results = run_trials(world, [self.bench.filter], plan.runs, self.confirm_seed, plan.jobs)
         verdict = analyse(results, settings=Settings(plan.false_alarm))[name]
-        if part == "map" and verdict.map is not None:  # without a map every run failed
-            verdict = verdict.map.verdict or verdict
+        unusable = sum(not candidate.usable for candidate in self.tried.values())
         return Challenge(
-            name, part, plan, self.space, worst, np.exp(np.mean(self.checked.get(worst) or self.tried[worst].scores)),
-            limit is not None, point, world, verdict, len({*self.tried, *self.checked} - self.unusable),
-            self.budget.used, len(self.unusable), self.budget.elapsed,
-        )  # fmt: skip
+            name,
+            plan,
+            self.space,
+            worst.point,
+            float(np.exp(np.mean(worst.scores))),
+            world,
+            verdict,
+            len(self.tried) - unusable,
+            self.budget.used,
+            unusable,
+            self.budget.elapsed,
+        )
 
-    def search(self) -> tuple[Point, float | None]:
-        """The worst point, and the mean score that smaller ones must keep; None if it is not clearly overconfident."""
+    def search(self) -> Candidate:
+        """Return the most overconfident candidate."""
         rng = np.random.default_rng(self.search_seed)
-        for share in (SEARCH, GO_ON):  # nothing clearly wrong: more search is worth more than shrinking
-            search(self.space, self.evaluate, partial(self.budget.left, share), rng, self.tried)
-            usable = ranked(self.tried.values())
-            if not usable:
-                raise InputError(
-                    f"scenario '{self.space.base.name}': no world within the bounds can be tried in this time; widen "
-                    "--within, give more --minutes or another --scenario"
-                )
-            worst = usable[0].point
-            scores = self.check(worst, CHECKS[-1])
-            limit = max(float(np.log(self.plan.detect)), min(KEPT * float(np.mean(scores or 0.0)), ENOUGH))
-            if self.holds(worst, limit):
-                return worst, limit
-        return worst, None
+        search(self.space, self.evaluate, partial(self.budget.left, SEARCH), rng, self.tried)
+        usable = ranked(self.tried.values())
+        if not usable:
+            raise InputError(
+                f"scenario '{self.space.base.name}': no world within the bounds can be tried in this time; widen "
+                "--within, give more --minutes or another --scenario"
+            )
+        return usable[0]
 
     def evaluate(self, candidates: Sequence[Candidate], trials: int) -> None:
         """Give candidates trials up to this number in all."""
         ready = []
         for candidate in candidates:
             world = scenario_of(self.space, candidate.point)
-            self._mark(candidate, world is not None)
-            ready += [] if world is None else [(candidate, (world, range(len(candidate.scores), trials)))]
-        until = self.budget.until(GO_ON)
-        for (candidate, _), done in zip(
-            ready, self.bench([job for _, job in ready], self.search_seed, until), strict=True
-        ):
-            self._mark(candidate, done is not None and done.seconds <= self.slowest)
-            candidate.scores += [] if done is None else done.scores
-            self.budget.used += 0 if done is None else len(done.scores)
+            candidate.usable = world is not None
+            if world is not None:
+                ready.append((candidate, (world, range(len(candidate.scores), trials))))
+        done = self.bench([job for _, job in ready], self.search_seed, self.budget.until(SEARCH))
+        for (candidate, _), scored in zip(ready, done, strict=True):
+            candidate.usable = scored is not None and scored.seconds <= self.slowest
+            if scored is not None:
+                candidate.scores += scored.scores
+                self.budget.used += len(scored.scores)
         self.tell("searching")
 
-    def _mark(self, candidate: Candidate, usable: bool) -> None:
-        candidate.usable = usable
-        if not usable:
-            self.unusable.add(candidate.point)
-
-    def check(self, point: Point, trials: int) -> list[float]:
-        """Scores of a point on trials that the search has not seen, up to this number or the end of the time."""
-        scores = self.checked.setdefault(point, [])
-        world = scenario_of(self.space, point)
-        if world is not None and len(scores) < trials:
-            jobs = self.bench.split(world, range(len(scores), trials))
-            for done in self.bench(jobs, self.shrink_seed, self.budget.until(SHRINK)):
-                if done is None or done.seconds > self.slowest:
-                    self.unusable.add(point)
-                scores += [] if done is None else done.scores
-                self.budget.used += 0 if done is None else len(done.scores)
-        return scores
-
-    def holds(self, point: Point, limit: float) -> bool:
-        """Is the mean score of a point clearly at the limit or above?"""
-        for trials in CHECKS:
-            scores = self.check(point, trials)
-            self.tell("shrinking")
-            if len(scores) < trials or point in self.unusable:
-                return False
-            error = SURE * standard_error(scores)
-            if np.mean(scores) + error < limit:
-                return False
-            if np.mean(scores) - 2.0 * error >= limit:
-                return True
-        return bool(np.mean(scores) - error >= limit)
-
     def tell(self, what: str, now: bool = False) -> None:
-        """A line of progress, every few seconds."""
+        """Print a line of progress, every few seconds."""
         if now or time.monotonic() - self.told >= EVERY:
             self.told = time.monotonic()
             worlds, trials = len(self.tried), self.budget.used
-            print(
-                f"{self.bench.part}, {what}: {self.budget.elapsed:.0f} s, {worlds} worlds, {trials} trials",
-                file=sys.stderr, flush=True,
-            )  # fmt: skip
+            line = f"{what}: {self.budget.elapsed:.0f} s, {worlds} worlds, {trials} trials"
+            print(line, file=sys.stderr, flush=True)

@@ -19,35 +19,29 @@ from consistency.referee.system.folders import writing
 def lines(outcome: Challenge, out: Path) -> list[str]:
     """What to print; ``out`` is the file that was written, if the filter was found overconfident."""
     plan, verdict = outcome.plan, outcome.verdict
-    name = _subject(outcome)
+    name = outcome.filter
     duration = f"{outcome.seconds / 60:.1f} minutes" if outcome.seconds >= 90 else f"{outcome.seconds:.0f} s"
     searched = f"{outcome.worlds} worlds and {outcome.trials} trials in {duration}"
     tested = f"ANEES {verdict.statistic:.3g} (3 is right), {verdict.status}, on {verdict.runs} fresh runs"
     if verdict.failures:
         tested += f", of which {len(verdict.failures)} broke down"
-    worst = f"{outcome.space.text(outcome.worst)}: ratio {outcome.worst_ratio:.3g} in a typical run"
+    world = f"{outcome.space.text(outcome.point)}: ratio {outcome.ratio:.3g} in a typical run of the search"
     if not outcome.found:
         given = f"{plan.minutes:g} minutes" if plan.minutes is not None else f"{plan.trials} trials"
         return [
             f"{name}: no world found within {given} in which it is overconfident",
-            f"  most overconfident: {worst}",
+            f"  most overconfident: {world}",
             f"  that world: {tested}",
             f"  searched: {searched}; no proof that there is no such world",
         ]
     p = f", p {p_text(outcome.p_value)}" if np.isfinite(outcome.p_value) else ""
     rate = f"a right filter is found so in at most {plan.false_alarm:.3g} of challenges"
-    rate += "" if outcome.clear else "; not shrunk, for its trials were not clear enough"
     return [
-        f"{name} is overconfident in {outcome.space.text(outcome.point)}",
+        f"{name} is overconfident in {world}",
         f"  confirmed: {tested}{p}; {rate}",
-        f"  worst: {worst}",
         f"  searched: {searched}",
         f"  {out} has the world; again: {command(outcome, out)}",
     ]
-
-
-def _subject(outcome: Challenge) -> str:
-    return f"the map of {outcome.filter}" if outcome.part == "map" else outcome.filter
 
 
 def command(outcome: Challenge, out: Path) -> str:
@@ -58,10 +52,9 @@ def command(outcome: Challenge, out: Path) -> str:
 
 def as_data(outcome: Challenge, out: Path) -> dict[str, Any]:
     plan, verdict, space = outcome.plan, outcome.verdict, outcome.space
-    search_seed, shrink_seed, confirm_seed = plan.seeds
+    search_seed, confirm_seed = plan.seeds
     return {
         "filter": outcome.filter,
-        "of": outcome.part,
         "base": space.base.name,
         "found": outcome.found,
         "world": space.values(outcome.point),
@@ -74,15 +67,13 @@ def as_data(outcome: Challenge, out: Path) -> dict[str, Any]:
         "failures": len(verdict.failures),
         "false_alarm": plan.false_alarm,
         "detect": plan.detect,
-        "worst": space.values(outcome.worst),
-        "worst_ratio": float(outcome.worst_ratio),
-        "clear": outcome.clear,
+        "ratio": outcome.ratio,
         "worlds": outcome.worlds,
         "unusable": outcome.unusable,
         "trials": outcome.trials,
         "seconds": outcome.seconds,
         "seed": plan.seed,
-        "seeds": {"search": search_seed, "shrinking": shrink_seed, "confirmation": confirm_seed},
+        "seeds": {"search": search_seed, "confirmation": confirm_seed},
         "file": str(out) if outcome.found else None,
     }
 
@@ -107,7 +98,7 @@ def write_scenario(outcome: Challenge, out: Path) -> None:
     """Write the world of a filter that was found overconfident, whole or not at all."""
     verdict = outcome.verdict
     summary = (
-        f"{_subject(outcome)} is {verdict.status} here, ANEES {verdict.statistic:.3g} in {verdict.runs} runs: "
+        f"{outcome.filter} is {verdict.status} here, ANEES {verdict.statistic:.3g} in {verdict.runs} runs: "
         f"{outcome.space.text(outcome.point)}"
     )
     text = scenario_text(

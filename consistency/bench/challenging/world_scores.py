@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Literal
 
 import joblib
 import numpy as np
@@ -19,15 +18,13 @@ from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
-from consistency.bench.store.results import JOINT
-from consistency.bench.store.trial_rows import RunOutcome, outcome_of
+from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
 WORST = float(np.log(1e4))  # of a run that failed, and the most of one that did not
 PATIENCE = 60.0  # s beyond the end of the search, after which a trial of a filter that is not compiled is killed
-Part = Literal["pose", "map"]  # of an estimate, whose covariance is challenged
 Job = tuple[Scenario, Sequence[int]]  # a world, and the trials in it
 
 
@@ -42,13 +39,12 @@ class Done:
 class ChallengeScorer:
     """Scores one filter; to be used in a ``with``, which holds the workers.
 
-    The score of a trial is log(mean NEES of the run / 3), which is 0 or a little less for a right filter; of a map, the
-    NEES are those of its landmarks at the end, given the pose. The logarithm keeps one diverged run among many from
-    deciding which of two worlds is worse.
+    The score of a trial is log(mean NEES of the run / 3), which is 0 or a little less for a right filter. The
+    logarithm keeps one diverged run among many from deciding which of two worlds is worse.
     """
 
-    def __init__(self, filter_: Filter, jobs: int = -1, part: Part = "pose") -> None:
-        self.filter, self.workers, self.part = filter_, worker_count(jobs), part
+    def __init__(self, filter_: Filter, jobs: int = -1) -> None:
+        self.filter, self.workers = filter_, worker_count(jobs)
         self._stack = ExitStack()
 
     def __enter__(self) -> ChallengeScorer:
@@ -70,16 +66,11 @@ class ChallengeScorer:
 
         No trial begins after ``until``, a time of ``time.monotonic``.
         """
-        tasks = (joblib.delayed(_score)(self.filter, self.part, *job, seed, until) for job in jobs)
+        tasks = (joblib.delayed(_score)(self.filter, *job, seed, until) for job in jobs)
         return list(self._parallel(tasks))
 
-    def split(self, world: Scenario, runs: Sequence[int]) -> list[Job]:
-        return [(world, part) for part in (runs[i :: self.workers] for i in range(self.workers)) if part]
 
-
-def _score(
-    filter_: Filter, part: Part, scenario: Scenario, runs: Sequence[int], seed: int, until: float
-) -> Done | None:
+def _score(filter_: Filter, scenario: Scenario, runs: Sequence[int], seed: int, until: float) -> Done | None:
     if time.monotonic() >= until:
         return Done((), 0.0)
     try:
@@ -93,47 +84,21 @@ def _score(
             began = time.monotonic()
             if began >= until:
                 break
-            scores.append(score_of_run(isolation, world, run, seed, part))
+            scores.append(score_of_run(isolation, world, run, seed))
             fastest = min(fastest, time.monotonic() - began)
     return Done(tuple(scores), fastest if scores else 0.0)
 
 
-def score_of_run(isolation: Isolation, world: World, run: int, seed: int, part: Part = "pose") -> float:
+def score_of_run(isolation: Isolation, world: World, run: int, seed: int) -> float:
     """log(mean NEES / 3) of a run of the one filter, in its own error; :data:`WORST` where it failed."""
     trial = world.trial(run, seed)
     outcome = outcome_of(trial, isolation.run(trial))
     if outcome.failures:
         return WORST
-    if part == "map":
-        nees = map_nees(outcome)
-        return 0.0 if not len(nees) else _log_ratio(nees)  # a map without a landmark is not wrong
     [columns] = outcome.estimates.values()
     nees = np.asarray(columns.get("own_nees", columns["nees"]), float)
     nees = nees[np.isfinite(nees)]
     return _log_ratio(nees) if len(nees) else WORST
-
-
-def map_nees(outcome: RunOutcome) -> Array:
-    """NEES of the landmarks of one filter at the end of a run, given the pose; empty where it states none.
-
-    Landmarks without heights have two dimensions, and count with 3/2.
-    """
-    for columns in outcome.maps.values():
-        nees = np.asarray(columns.get(JOINT, ()), float)
-        flat = len(nees) > 0 and not np.asarray(columns["P_zz"]).any()
-        kept: Array = nees[~np.isnan(nees)] * (1.5 if flat else 1.0)
-        return kept
-    return np.empty(0)
-
-
-def has_map(filter_: Filter, scenario: Scenario) -> bool:
-    """Whether the filter states a covariance of pose and map, as a run of the scenario shows."""
-    try:
-        trial = require_landmarks_in_view(scenario).trial(0, 0)
-    except InputError:
-        return False
-    with Isolation([filter_], scenario.belief, PATIENCE) as isolation:
-        return len(map_nees(outcome_of(trial, isolation.run(trial)))) > 0
 
 
 def _log_ratio(nees: Array) -> float:

@@ -56,10 +56,6 @@ class LogScale:
         width = np.log(self.high / self.low)
         return float(np.log(float(value) / self.low) / width) if width > 0 else 0.0
 
-    def between(self, value: Value) -> Value:
-        """A value half the way to the plain one."""
-        return self.at(0.5 * (self.where(value) + self.where(self.plain)))
-
     def within(self, text: str) -> LogScale:
         """The dimension with the bounds ``LOW:HIGH``, or fixed at ``VALUE``."""
         try:
@@ -102,10 +98,6 @@ class Choice:
 
     def where(self, value: Value) -> float:
         return (self.values.index(value) + 0.5) / len(self.values)
-
-    def between(self, value: Value) -> Value:
-        """Nothing lies between two values."""
-        return value
 
     def within(self, text: str) -> Choice:
         """The dimension with fewer values, ``A,B``."""
@@ -221,7 +213,7 @@ def require_right_belief(base: Scenario) -> None:
 
 
 def _dimensions(base: Scenario) -> list[Dimension]:
-    """In the order in which shrinking tries to do without them."""
+    """Return the dimensions in which a world may differ from the base."""
     truth = base.truth
     found: list[Dimension] = []
     if isinstance(truth.landmarks, UniformLandmarks):

@@ -1,4 +1,4 @@
-"""Commands that try many worlds or settings: sweep, recommend, tune and challenge; they parse, call and print."""
+"""Commands that try many worlds or settings: sweep, tune and challenge; they parse, call and print."""
 
 from __future__ import annotations
 
@@ -100,47 +100,6 @@ def _share(text: str | None) -> tuple[int, int]:
     return int(part), int(parts)
 
 
-def recommend(
-    rig: Annotated[str, typer.Argument(metavar="RIG", help=f"{SCENARIO[:-1]}, or sensor.toml of a log.")],
-    range_: Annotated[float | None, typer.Option("--range", help="Metres up to which landmarks are used.")] = None,
-    speed: Annotated[float | None, typer.Option("--speed", help="Metres a second that the robot drives.")] = None,
-    density: Annotated[
-        float | None, typer.Option("--density", help="Landmarks on a square metre, as seen from above.")
-    ] = None,
-    dt: Annotated[float | None, typer.Option("--dt", help="Seconds from step to step.")] = None,
-    map_: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--map",
-            metavar="MAP",
-            help="Folder of 'sweep', or its map.json; a second one may have axes that vary alone [the shipped maps].",
-        ),
-    ] = None,
-    runs: Annotated[
-        int | None,
-        typer.Option("--runs", help="Runs that confirm a filter; 0: the map alone [as many as the map's rule needs]."),
-    ] = None,
-    confirm: Annotated[int, typer.Option("--confirm", help="Filters to confirm, at most, one after another.")] = 4,
-    seed: Seed = 0,
-    jobs: Jobs = -1,
-    as_json: AsJson = False,
-) -> None:
-    """Which filter to trust on one rig: looked up in a map, and confirmed by runs of that rig."""
-    from consistency.bench.sweeps.printing import advice_blocks, advice_json
-    from consistency.bench.sweeps.recommend import recommend_for
-    from consistency.bench.sweeps.regime import read_maps
-    from consistency.bench.sweeps.rig import Request
-    from consistency.referee.show import terminal
-
-    request = Request(rig, range_, speed, density, dt)
-    regime, alone = read_maps(map_ or ())
-    advice = recommend_for(request, regime, runs, confirm, seed, jobs, alone)
-    if as_json:
-        print(json.dumps(advice_json(advice), indent=2, allow_nan=False))
-    else:
-        terminal.show(*advice_blocks(advice))
-
-
 def tune(
     filter_name: Annotated[str, typer.Option("--filter", help="Filter name (see 'list').")],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
@@ -221,9 +180,6 @@ def challenge(
             metavar="NAME=...",
         ),
     ] = None,
-    of: Annotated[
-        str, typer.Option("--of", help="'pose', 'map', or 'both': a challenge each, with half of the time.")
-    ] = "both",
     minutes: Annotated[float | None, typer.Option("--minutes", help="Time for all of it [5].")] = None,
     trials: Annotated[
         int | None,
@@ -246,33 +202,23 @@ def challenge(
         str | None, typer.Option("--fail-on", help="'found': exit 1 if the filter is found overconfident.")
     ] = None,
 ) -> None:
-    """Look for the world in which a filter is most overconfident, shrink it, and confirm it on fresh runs."""
-    from consistency.bench.challenging.challenge import Plan, challenge_parts
+    """Look for the world in which a filter is most overconfident, and confirm it on fresh runs."""
+    from consistency.bench.challenging.challenge import Plan
     from consistency.bench.challenging.challenge import challenge as challenge_filter
     from consistency.bench.challenging.wording import as_data, lines, require_writable, write_scenario
 
     require_word("--fail-on", fail_on, "found")
-    if of not in ("pose", "map", "both"):
-        raise InputError(f"--of must be 'pose', 'map' or 'both', got '{of}'")
     if minutes is None and trials is None:
         minutes = 5.0
     plan = Plan(minutes, trials, seed, jobs, false_alarm, detect)
     out = Path(f"challenge-{filter_name}.toml") if out is None else out
-    files = [out, out.with_stem(f"{out.stem}-map")] if of == "both" else [out]
-    for file in files:
-        require_writable(file, overwrite)
-    if of == "both":
-        outcomes = [o for o in challenge_parts(filter_name, scenario, plan, within or []) if o is not None]
-    else:
-        outcomes = [challenge_filter(filter_name, scenario, plan, within or [], "map" if of == "map" else "pose")]
-    pairs = list(zip(outcomes, files, strict=False))
-    for outcome, file in pairs:
-        if outcome.found:
-            write_scenario(outcome, file)
+    require_writable(out, overwrite)
+    outcome = challenge_filter(filter_name, scenario, plan, within or [])
+    if outcome.found:
+        write_scenario(outcome, out)
     if as_json:
-        first, *others = (as_data(outcome, file) for outcome, file in pairs)
-        print(json.dumps(first | {"map": others[0] if others else None}, indent=2))
+        print(json.dumps(as_data(outcome, out), indent=2))
     else:
-        print("\n".join(line for outcome, file in pairs for line in lines(outcome, file)))
-    if fail_on and any(outcome.found for outcome in outcomes):
+        print("\n".join(lines(outcome, out)))
+    if fail_on and outcome.found:
         raise typer.Exit(1)

@@ -164,8 +164,6 @@ def place_for(
         return
     resume = resume or (isinstance(previous, StoredResults) and previous.folder.resolve() == out.resolve())
     with Unfinished(out, resume, overwrite) as unfinished:
-        if lost := unfinished.journal.dropped:
-            say(f"consistency: --out {out}: {lost} bytes of unfinished work were not whole; those runs are done again")
         before = unfinished.journal.study
         replaces = bool(before.get("overwrite", overwrite and not resume))
         if resume and previous is None and not replaces and (out.exists() or not before):

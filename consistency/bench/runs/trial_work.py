@@ -93,8 +93,10 @@ class TrialWork:
 
         The runs of a scenario are alike, so that ``run`` speaks for all; of a log all are looked at.
         """
+        if not self.isolation.compiled:
+            return workers
         trials = list(self.trials.trials.values()) if isinstance(self.trials, Recorded) else [self._ahead(run)]
-        return workers_that_fit(self.isolation.compiled, trials, self.isolation.belief, workers)
+        return workers_that_fit(trials, workers)
 
     def compile(self, run: int, jobs: int = 1) -> None:
         """Compile what a run needs and is not yet compiled, in ``jobs`` processes at most, and say so."""

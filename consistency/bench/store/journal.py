@@ -1,15 +1,16 @@
-"""Finished runs on disk as they come, so that they are there after whatever ends the process."""
+"""Finished runs on disk as they come, so that they are there whatever ends the process."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
-import struct
-import threading
+import sqlite3
+import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +23,23 @@ from consistency.referee.system.atomic import make_durable
 from consistency.referee.system.folders import require_free, writing
 from consistency.referee.types import Array
 
-MARK = b"run:"
-HEAD = struct.Struct("<4sIQ")  # mark, CRC-32 and length of what follows
-COUNT = struct.Struct("<I")  # length of the JSON that a record begins with
-SYNC_EVERY = 5.0  # s: a power cut costs at most the runs of so long, a killed process none
+CHECKPOINT_EVERY = 5.0  # s: a power cut costs at most the runs of so long, a killed process none
+DATABASE, EARLIER = "runs.sqlite", "journal"  # the second is of versions before SQLite
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS study (content TEXT);
+CREATE TABLE IF NOT EXISTS finished (run INTEGER PRIMARY KEY, notes TEXT);
+CREATE TABLE IF NOT EXISTS part (
+    run INTEGER, name TEXT, columns TEXT, numbers BLOB, checksum INTEGER, PRIMARY KEY (run, name)
+);
+"""
 
 
 class Journal:
-    """Finished runs in one file that only grows.
+    """Finished runs in an SQLite database.
 
-    A record is a head, JSON with the number of the run and what its parts are, and the parts: columns of tables, their
-    numbers as they are in memory, for encoding would take longer than writing. It is written at once when its run is
-    finished, and synchronised to disk within ``SYNC_EVERY`` seconds. Records come in any order of their runs and are
-    read in that of the numbers. What is not whole, or does not agree with its checksum, is dropped when the file is
-    opened; ``dropped`` says how many bytes.
+    A finished run is a row of ``finished`` and, for each of its tables, a row of ``part``: the names and types of the
+    columns, and their numbers as they are in memory. Both are written in one transaction, so that a run is there
+    whole or not at all.
 
     Attributes
     ----------
@@ -44,151 +48,120 @@ class Journal:
 
     Raises
     ------
+    InputError
+        The database is damaged, or another process has it open.
     OSError
-        The file cannot be read or written; what was in it before stays whole.
+        The database cannot be written; what was in it before stays whole.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.study: dict[str, Any] = {}
-        self.notes: dict[int, dict[str, Any]] = {}
-        self._offsets: dict[int, int] = {}
-        self._end = 0  # of the last record
-        self._buffer = bytearray()  # one for all records: a new one each time costs more than filling it
-        path.touch()
-        self._file = path.open("r+b", buffering=0)
-        self.dropped = self._read_all()
-        self._unsynced = True
-        self._fault: OSError | None = None
-        self._closed = threading.Event()
-        self._syncing: threading.Thread | None = None
+        self._checkpoint = time.monotonic()
+        with self._faults():
+            self._database = sqlite3.connect(path, timeout=0, isolation_level=None, check_same_thread=False)
+            # exclusive before WAL: then SQLite needs no shared memory, which network disks lack
+            self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
+            self._database.execute("PRAGMA journal_mode = WAL")
+            self._database.execute("PRAGMA synchronous = NORMAL")
+            self._database.executescript(SCHEMA)
+            rows = self._database.execute("SELECT content FROM study").fetchall()
+            self.study: dict[str, Any] = json.loads(rows[0][0]) if rows else {}
+            finished = self._database.execute("SELECT run, notes FROM finished").fetchall()
+        self._runs = {run for run, _ in finished}
+        self.notes: dict[int, dict[str, Any]] = {run: json.loads(notes) for run, notes in finished if notes}
 
     @property
     def runs(self) -> set[int]:
-        return set(self._offsets)
+        return set(self._runs)
 
     def begin(self, study: Mapping[str, Any]) -> None:
         """Write down what the runs are of."""
-        self._write({"study": dict(study)}, ())
+        with self._transaction() as database:
+            database.execute("DELETE FROM study")
+            database.execute("INSERT INTO study VALUES (?)", (json.dumps(dict(study)),))
         self.study = dict(study)
 
     def clear(self) -> None:
-        self._file.truncate(0)
-        self._end, self.study, self._unsynced = 0, {}, True
+        """Drop all runs and the study."""
+        with self._transaction() as database:
+            for table in ("study", "finished", "part"):
+                database.execute(f"DELETE FROM {table}")
+        self.study = {}
         self.notes.clear()
-        self._offsets.clear()
+        self._runs.clear()
 
     def append(self, run: int, parts: Mapping[str, Columns], notes: Mapping[str, Any] | None = None) -> None:
         """Keep a finished run: its columns by the names of the parts, and ``notes``, which JSON can hold."""
-        if self._fault is not None:
-            raise self._fault
-        about: dict[str, Any] = {"run": run, "parts": []} | ({"notes": dict(notes)} if notes else {})
-        for name, columns in parts.items():
-            kinds = " ".join([f"{column} {values.dtype.str}" for column, values in columns.items()])
-            size = sum(values.nbytes for values in columns.values())
-            about["parts"].append((name, len(next(iter(columns.values()))), kinds, size))
-        offset = self._write(about, [values for columns in parts.values() for values in columns.values()])
+        with self._transaction() as database:
+            for name, columns in parts.items():
+                types = json.dumps({column: values.dtype.str for column, values in columns.items()})
+                numbers = b"".join([values.tobytes() for values in columns.values()])
+                row = (run, name, types, numbers, zlib.crc32(numbers))
+                database.execute("INSERT OR REPLACE INTO part VALUES (?, ?, ?, ?, ?)", row)
+            noted = json.dumps(dict(notes)) if notes else None
+            database.execute("INSERT OR REPLACE INTO finished VALUES (?, ?)", (run, noted))
+        self._runs.add(run)
         if notes:
             self.notes[run] = dict(notes)
-        self._offsets[run] = offset
-        if self._syncing is None:
-            self._syncing = threading.Thread(target=self._keep_synced, daemon=True)
-            self._syncing.start()
+        if time.monotonic() - self._checkpoint > CHECKPOINT_EVERY:
+            self._checkpoint = time.monotonic()
+            with self._faults():
+                self._database.execute("PRAGMA wal_checkpoint")
 
     def pieces(self, name: str) -> Iterator[tuple[int, Columns]]:
         """Runs and their columns of one part, in order of the runs; those without the part are left out."""
-        for run in sorted(self._offsets):
-            at = self._offsets[run] + HEAD.size
-            (length,) = COUNT.unpack(self._read(COUNT.size, at))
-            about, at = json.loads(self._read(length, at + COUNT.size)), at + COUNT.size + length
-            for part, rows, kinds, size in about["parts"]:
-                if part == name:
-                    yield run, _decoded(self._read(size, at), kinds, rows)
-                at += size
+        for run in sorted(self._runs):
+            with self._faults():
+                query = "SELECT columns, numbers, checksum FROM part WHERE run = ? AND name = ?"
+                row = self._database.execute(query, (run, name)).fetchone()
+            if row is None:
+                continue
+            types, numbers, checksum = row
+            if zlib.crc32(numbers) != checksum:
+                raise self._damaged(f"run {run}")
+            yield run, _decode(numbers, json.loads(types))
 
     def close(self) -> None:
-        self._closed.set()
-        if self._syncing is not None:
-            self._syncing.join()
-        self._sync()
-        self._file.close()
+        with self._faults():
+            self._database.close()
 
-    def _write(self, about: dict[str, Any], numbers: Sequence[Array]) -> int:
-        """Write a record and give its offset; one that cannot be written whole leaves nothing."""
-        text = json.dumps(about).encode()
-        start = HEAD.size + COUNT.size + len(text)
-        size, offset = start + sum(values.nbytes for values in numbers), self._end
-        if size > len(self._buffer):
-            self._buffer = bytearray(size)
-        record, at = memoryview(self._buffer)[:size], start
-        for values in numbers:
-            np.frombuffer(record, values.dtype, len(values), at)[:] = values
-            at += values.nbytes
-        COUNT.pack_into(record, HEAD.size, len(text))
-        record[start - len(text) : start] = text
-        HEAD.pack_into(record, 0, MARK, zlib.crc32(record[HEAD.size :]), size - HEAD.size)
-        try:
-            self._file.seek(offset)
-            while record:
-                record = record[self._file.write(record) :]
-        except BaseException:
-            with suppress(OSError):
-                self._file.truncate(offset)
-            raise
-        self._end, self._unsynced = offset + size, True
-        return offset
-
-    def _read(self, size: int, at: int) -> bytes:
-        self._file.seek(at)
-        content = self._file.read(size)
-        if len(content) < size:
-            raise InputError(f"{self.path}: cut short by another program; the same command with --resume does the rest")
-        return content
-
-    def _read_all(self) -> int:
-        """Find the records; bytes that are none are counted, and cut off where they are the last."""
-        size, at, lost = os.fstat(self._file.fileno()).st_size, 0, 0
-        while at + HEAD.size <= size:
-            mark, checksum, length = HEAD.unpack(self._read(HEAD.size, at))
-            if mark != MARK or at + HEAD.size + length > size:
-                break
-            body = self._read(length, at + HEAD.size)
-            if zlib.crc32(body) == checksum:
-                self._enter(body, at)
-            else:
-                lost += HEAD.size + length
-            at += HEAD.size + length
-        self._end = at
-        self._file.truncate(at)
-        return lost + size - at
-
-    def _enter(self, body: bytes, offset: int) -> None:
-        (length,) = COUNT.unpack_from(body)
-        about = json.loads(body[COUNT.size : COUNT.size + length])
-        self.study = about.get("study", self.study)
-        if "run" in about:
-            self._offsets[about["run"]] = offset
-            if "notes" in about:
-                self.notes[about["run"]] = about["notes"]
-
-    def _keep_synced(self) -> None:
-        while not self._closed.wait(SYNC_EVERY):
-            self._sync()
-
-    def _sync(self) -> None:
-        """Bring to disk what is written; where that fails, the next run that is finished says so."""
-        if self._unsynced:
-            self._unsynced = False
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        with self._faults():
+            self._database.execute("BEGIN")
             try:
-                os.fsync(self._file.fileno())
-            except OSError as error:
-                self._fault = error
+                yield self._database
+                self._database.execute("COMMIT")
+            except BaseException:
+                with suppress(sqlite3.Error):
+                    self._database.execute("ROLLBACK")
+                raise
+
+    @contextmanager
+    def _faults(self) -> Iterator[None]:
+        """Raise what SQLite says as the errors of this class."""
+        try:
+            yield
+        except sqlite3.OperationalError as error:
+            if "locked" in str(error):
+                raise InputError(f"{self.path}: another process is at work on it; wait for it") from None
+            if "full" in str(error):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path)) from error
+            raise OSError(errno.EIO, str(error), str(self.path)) from error
+        except (sqlite3.Error, ValueError) as error:
+            raise self._damaged(str(error)) from None
+
+    def _damaged(self, what: str) -> InputError:
+        return InputError(f"{self.path}: damaged ({what}); the same command with --overwrite drops it")
 
 
-def _decoded(piece: bytes, kinds: str, rows: int) -> Columns:
-    columns, at, words = {}, 0, kinds.split(" ")
-    for name, kind in zip(words[::2], words[1::2], strict=True):
-        columns[name] = np.frombuffer(piece, kind, rows, at)
+def _decode(numbers: bytes, types: Mapping[str, str]) -> Columns:
+    """Return the columns of a part, all of one length."""
+    rows = len(numbers) // sum(np.dtype(kind).itemsize for kind in types.values())
+    columns: dict[str, Array] = {}
+    at = 0
+    for name, kind in types.items():
+        columns[name] = np.frombuffer(numbers, kind, rows, at)
         at += columns[name].nbytes
     return columns
 
@@ -233,8 +206,13 @@ class Unfinished:
                 if replaced.exists() and not out.exists():  # the process ended while the results were being replaced
                     os.replace(replaced, out)
                 if overwrite and not resume:
-                    (self.path / "journal").unlink(missing_ok=True)
-                self.journal = Journal(self.path / "journal")
+                    _remove_journals(self.path)
+                if (self.path / EARLIER).exists():
+                    raise InputError(
+                        f"--out {out}: unfinished work of an earlier version is there; finish it with that version, or "
+                        "add --overwrite to drop it"
+                    )
+                self.journal = Journal(self.path / DATABASE)
                 make_durable(self.path)
                 make_durable(self.path.parent)
             except BaseException:
@@ -280,6 +258,11 @@ class Unfinished:
             if self.path.exists():
                 return lock
             lock.release()
+
+
+def _remove_journals(folder: Path) -> None:
+    for name in (EARLIER, DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"):
+        (folder / name).unlink(missing_ok=True)
 
 
 def unfinished_of(out: Path) -> Path:

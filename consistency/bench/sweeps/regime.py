@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,7 @@ from consistency.referee.parsing import read_json, reading
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 
 MAP_KIND = "map"
-SHIPPED, SHIPPED_ALONE = "regime.json", "beyond.json"
+SHIPPED = "regime.json"
 FIELDS = tuple(CellResult.__dataclass_fields__)
 EQUAL = 0.02  # relative difference of two RMSE below which the cheaper filter comes first
 
@@ -83,7 +83,7 @@ def regime_of(folder: SweepFolder) -> Regime:
 
 
 def write_regime(regime: Regime, out: Path) -> list[Path]:
-    """``map.json``, the summary that ``recommend`` reads, and the same as ``map.csv`` and ``map.parquet``."""
+    """``map.json``, the summary that :func:`read_regime` reads, and the same as ``map.csv`` and ``map.parquet``."""
     table = regime.table
     paths = [out / f"map.{kind}" for kind in ("json", "csv", "parquet")]
     contents = (
@@ -106,29 +106,10 @@ def dumped(regime: Regime) -> str:
     return f'{head},\n "rows": [\n  ' + ",\n  ".join(rows) + "\n ]\n}\n"
 
 
-def read_maps(paths: Sequence[Path] = ()) -> tuple[Regime, Regime | None]:
-    """The map of a grid, and that of axes that vary one at a time; the shipped ones where no path is given.
-
-    Raises
-    ------
-    InputError
-        More than two, one is missing or damaged, or the second has no axis that varies alone.
-    """
-    if not paths:
-        second = _shipped(SHIPPED_ALONE)
-        return read_regime(), read_regime(second) if second.is_file() else None
-    if len(paths) > 2:
-        raise InputError(f"--map {paths[2]}: at most two, that of a grid and one of axes that vary alone")
-    first, *others = map(read_regime, paths)
-    if others and not others[0].sweep.alone:
-        raise InputError(f"--map {paths[1]}: the second map must be of a sweep with a table 'alone'")
-    return first, others[0] if others else None
-
-
-def _shipped(name: str) -> Path:
-    """Path of a map that comes with the package, or would."""
-    path = data_folder("reference") / name
-    return path if path.is_file() else data_folder("reports") / "reference" / name
+def _shipped_map() -> Path:
+    """Return the path of the map that comes with the package."""
+    path = data_folder("reference") / SHIPPED
+    return path if path.is_file() else data_folder("reports") / "reference" / SHIPPED
 
 
 def read_regime(path: Path | None = None) -> Regime:
@@ -140,19 +121,19 @@ def read_regime(path: Path | None = None) -> Regime:
         There is none, or it is damaged.
     """
     if path is None:
-        path = _shipped(SHIPPED)
+        path = _shipped_map()
         if not path.is_file():
             raise InputError(
                 "no map is shipped with this version; make one with 'consistency sweep regime --out regime' (about 20 "
-                "minutes), then add --map regime"
+                "minutes) and read the map in that folder"
             )
     if path.is_dir():
         return regime_of(open_sweep(path))
     data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != MAP_KIND or data.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(f"--map {path}: is no map; give a folder of 'consistency sweep', or its map.json")
+        raise InputError(f"{path}: is not a map; give a folder of 'consistency sweep', or its map.json")
     sweep = sweep_from(data, path)
-    with reading(f"--map {path}", "key 'rows' is damaged; write the map again"):
+    with reading(str(path), "key 'rows' is damaged; write the map again"):
         results = dict(_rows(data))
     return Regime(sweep, results, {k: v for k, v in data.items() if k not in ("rows", "columns", "sweep")})
 

@@ -69,4 +69,4 @@ def characterise(
     terminal.show(*blocks(measured.of))
     for path in written:
         print(path)
-    print(f"sensor in {out}; next: consistency recommend {out}")
+    print(f"sensor in {out}; next: copy it into a log and consistency run --log LOG --filter F")

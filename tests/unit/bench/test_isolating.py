@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -19,13 +18,13 @@ import cloudpickle
 import numpy as np
 import pandas as pd
 import pytest
-from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, is_gone, raises, segfaults
+from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, is_gone, raises
 from threadpoolctl import threadpool_info
 
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter
 from consistency.bench.runs.gather import Gathered
-from consistency.bench.runs.isolation import filter_process, supervisor
+from consistency.bench.runs.isolation import filter_process
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.store.trial_rows import outcome_of
@@ -66,12 +65,14 @@ def test_a_filter_that_misbehaves_is_contained(
     filters = [Still("bad", act, doomed), Still("calm"), "ekf-xyz"]
     timeout = 1.0 if reason == TIME_OUT else LONG
     results = cs.run_trials(world, filters, runs=RUNS, jobs=1, timeout=timeout, memory=MEMORY)
-    assert results.failures[["filter", "run", "step"]].to_numpy().tolist() == [["bad", DOOMED, STEP]]
+    ends = reason == TIME_OUT or reason.startswith("its process")
+    step = 1 if ends else STEP  # what a process that ends has said is lost with it
+    assert results.failures[["filter", "run", "step"]].to_numpy().tolist() == [["bad", DOOMED, step]]
     assert results.failures["reason"][0].startswith(reason)
     assert len(results.failures["reason"][0]) < len(reason) + 100
     pd.testing.assert_frame_equal(rows(results.estimates, "calm", "ekf-xyz"), calm, check_exact=True)
     expected = rows(calm, "calm").assign(filter="bad")
-    expected = expected[(expected["run"] != DOOMED) | (expected["step"] < STEP)].reset_index(drop=True)
+    expected = expected[(expected["run"] != DOOMED) | (expected["step"] < step)].reset_index(drop=True)
     pd.testing.assert_frame_equal(rows(results.estimates, "bad"), expected, check_exact=True)
 
 
@@ -111,19 +112,18 @@ def test_arrays_made_writable_change_nothing_for_others(world: cs.Scenario, doom
 
 
 def test_nothing_of_the_failed_step_is_kept(world: cs.Scenario, doomed: Control) -> None:
-    """Neither by an exception nor by a crash: no pose, no NIS, no degrees of freedom."""
+    """No pose, no NIS, no degrees of freedom."""
     trial = cs.simulate(world, DOOMED)
     with_info = next(k for k in range(1, 13) if len(trial.observation(k).landmarks))
     assert with_info < STEP  # negative control: there is something to keep
-    for act in (answers(mean=np.full(3, np.nan)), segfaults):
-        with Isolation([Still("bad", act, doomed)], world.belief) as isolation:
-            [said] = isolation.run(trial)
-        assert said.failure.step == STEP
-        for array in (said.pose, said.covariance, said.nis):
-            assert np.isnan(array[STEP - 1 :]).all()
-        assert not said.nis_dof[STEP - 1 :].any()
-        assert np.isfinite(said.pose[: STEP - 1]).all()
-        assert np.isfinite(said.nis[with_info - 1])
+    with Isolation([Still("bad", answers(mean=np.full(3, np.nan)), doomed)], world.belief) as isolation:
+        [said] = isolation.run(trial)
+    assert said.failure.step == STEP
+    for array in (said.pose, said.covariance, said.nis):
+        assert np.isnan(array[STEP - 1 :]).all()
+    assert not said.nis_dof[STEP - 1 :].any()
+    assert np.isfinite(said.pose[: STEP - 1]).all()
+    assert np.isfinite(said.nis[with_info - 1])
 
 
 def test_a_nees_that_no_number_holds_fails_any_filter(world: cs.Scenario) -> None:
@@ -172,7 +172,7 @@ class Cut(dict[str, Any]):
 
 
 def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world: cs.Scenario, doomed: Control) -> None:
-    with Isolation([Still("bad", segfaults, doomed)], world.belief) as isolation:
+    with Isolation([Still("bad", raises(RuntimeError("out of ideas")), doomed)], world.belief) as isolation:
         whole, cut = (
             (trial, isolation.run(trial)) for trial in (cs.simulate(world, run) for run in (DOOMED, DOOMED + 1))
         )
@@ -184,42 +184,6 @@ def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world: cs.Scenario
     assert results.estimates["run"].unique().tolist() == [DOOMED]
     assert results.truth["run"].unique().tolist() == [DOOMED]
     assert results.failures[["run", "step"]].to_numpy().tolist() == [[DOOMED, STEP]]
-
-
-class Closes(Still):
-    """Says which process it is in, and closes its standard streams."""
-
-    def init(self, problem: Any) -> Any:
-        state = np.array([float(os.getpid()), float(self.kept[0] in dict(enumerate_files())), 0.0])
-        os.close(self.kept[0])
-        return state
-
-
-def enumerate_files() -> list[tuple[int, bool]]:
-    return [(int(name), True) for name in os.listdir("/proc/self/fd")]
-
-
-@pytest.mark.parametrize("number", [0, 1, 2])
-def test_a_process_that_closed_its_streams_is_replaced(world: cs.Scenario, number: int) -> None:
-    """Otherwise the next run would write into whatever file has the number then."""
-    results = cs.run_trials(world, [Closes("closes", kept=[number])], runs=RUNS, jobs=1)
-    assert len(results.failures) == 0
-    assert results.estimates.groupby("run")["x"].first().nunique() == RUNS
-    assert (results.estimates["y"] == 1.0).all()
-
-
-def takes_the_pipe(*_: Any) -> None:
-    """Puts a file of its own in the place of the pipe to the bench."""
-    os.closerange(3, 256)
-    for _ in range(64):
-        os.dup(2)
-
-
-def test_a_reply_goes_to_no_other_file(world: cs.Scenario, doomed: Control, capfd: pytest.CaptureFixture[str]) -> None:
-    results = cs.run_trials(world, [Still("bad", takes_the_pipe, doomed)], runs=RUNS, jobs=1)
-    reason = "its process closed its pipe to the bench"
-    assert results.failures[["run", "reason"]].to_numpy().tolist() == [[DOOMED, reason]]
-    assert "Estimates" not in "".join(capfd.readouterr())
 
 
 def shouts(self: Still, _: Any) -> None:
@@ -237,16 +201,13 @@ def test_what_a_filter_prints_is_bounded(
     world: cs.Scenario, doomed: Control, capfd: pytest.CaptureFixture[str], dies: bool
 ) -> None:
     loud = Still("loud", shouts, doomed, kept=[1] * dies)
-    calm = cs.run_trials(world, [loud, Prints("quiet")], runs=RUNS, jobs=1)
-    assert len(calm.failures) == dies
+    results = cs.run_trials(world, [Prints("quiet"), loud], runs=RUNS, jobs=1)
+    assert len(results.failures) == dies
     out, err = capfd.readouterr()
     assert "out" not in out
-    assert err.count("filter 'loud' prints more than 16384 bytes; the rest is not shown\n") == 1
-    assert err.count("a word of quiet\n") == RUNS
+    assert err.count("filters print more than 16384 bytes; the rest is not shown\n") == 1
     assert "\nout 0\n" in f"\n{err}"
-    assert ("out 19999" in err) == dies
-    assert ("\nconsistency: the last that filter 'loud' printed:\n" in err) == dies
-    assert 16384 < len(err) < 16384 + 2048 + 1000
+    assert 16384 < len(err) < 16384 + 1000
 
 
 class Prints(Still):
@@ -289,40 +250,24 @@ def test_trials_that_differ_share_a_process(world: cs.Scenario) -> None:
 # --- killed from outside ---------------------------------------------------------------------------
 
 
-def kills_once(folder: Path, supervisor: bool) -> Callable[..., None]:
+def kills_once(folder: Path) -> Callable[..., None]:
     """SIGKILL as if from outside; ``folder`` has a file for each process that came to it."""
 
     def act(*_: Any) -> None:
         (folder / str(os.getpid())).touch()
         if len(list(folder.iterdir())) == 1:
-            os.kill(os.getppid() if supervisor else os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGKILL)
             time.sleep(100)
 
     return act
 
 
-@pytest.mark.parametrize("supervisor", [True, False])
-def test_a_killed_worker_costs_nothing(
-    world: cs.Scenario, doomed: Control, calm: pd.DataFrame, tmp_path: Path, supervisor: bool
-) -> None:
-    results = cs.run_trials(world, [Still("bad", kills_once(tmp_path, supervisor), doomed)], runs=RUNS, jobs=2)
+def test_a_killed_worker_costs_nothing(world: cs.Scenario, doomed: Control, calm: pd.DataFrame, tmp_path: Path) -> None:
+    results = cs.run_trials(world, [Still("bad", kills_once(tmp_path), doomed)], runs=RUNS, jobs=2)
     assert len(list(tmp_path.iterdir())) == 2
-    assert all(is_gone(int(path.name)) for path in tmp_path.iterdir())
     assert len(results.failures) == 0
     expected = rows(calm, "calm").assign(filter="bad")
     pd.testing.assert_frame_equal(results.estimates, expected, check_exact=True)
-
-
-def test_a_worker_that_is_killed_twice_is_a_failed_run(world: cs.Scenario, doomed: Control) -> None:
-    def act(*_: Any) -> None:
-        os.kill(os.getppid(), signal.SIGKILL)
-        time.sleep(100)
-
-    results = cs.run_trials(world, [Still("bad", act, doomed)], runs=RUNS, jobs=1)
-    assert results.failures.to_numpy().tolist() == [
-        ["bad", DOOMED, 1, "the supervisor of its process was killed twice"]
-    ]
-    assert len(results.estimates) == (RUNS - 1) * world.truth.steps
 
 
 # --- processes -------------------------------------------------------------------------------------
@@ -451,35 +396,3 @@ def test_a_filter_within_its_limits_has_the_same_bits(world: cs.Scenario, doomed
     filters = [Still("calm", takes_half, doomed), "ekf-xyz"]
     limited = cs.run_trials(world, filters, runs=RUNS, jobs=2, timeout=LONG, memory=MEMORY)
     pd.testing.assert_frame_equal(limited.estimates, calm, check_exact=True)
-
-
-# --- where processes cannot be forked --------------------------------------------------------------
-
-
-def test_a_process_that_is_spawned(world: cs.Scenario, doomed: Control, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on macOS and Windows: the same bits, and a crash is a failed run with its step."""
-    monkeypatch.setattr(supervisor, "_context", multiprocessing.get_context("spawn"))
-    bad = Still("bad", ends, doomed)
-    study = Isolation([bad], world.belief, LONG)._study
-    trials = [cs.simulate(world, run) for run in (DOOMED + 1, DOOMED)]
-    near, far = multiprocessing.Pipe()
-    longest = max(trials, key=lambda trial: len(trial.landmark))
-    host = supervisor._Host(study, study.guests["bad"], longest, supervisor.Printed("bad"))
-    for trial in trials:
-        reply = host.run(trial, pickle.dumps(supervisor.Task("bad", trial, world.belief)), far)
-        expected = run_filter(Still("bad"), trial, world.belief)
-        if trial.run == DOOMED:
-            assert reply.estimates.failure.step == STEP
-            assert reply.estimates.failure.reason == "its process ended with exit status 5"
-            steps = slice(STEP - 1)
-        else:
-            assert reply.estimates.failure is None
-            steps = slice(None)
-        for name in ("pose", "covariance", "nis", "nis_dof"):
-            np.testing.assert_array_equal(getattr(reply.estimates, name)[steps], getattr(expected, name)[steps])
-    near.close()
-    far.close()
-
-
-def ends(*_: Any) -> None:
-    os._exit(5)

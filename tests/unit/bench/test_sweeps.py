@@ -478,7 +478,7 @@ def test_a_map_is_the_same_from_its_files(at: Path) -> None:
     shutil.copy(at / "out" / "map.json", at / "cut.json")
     (at / "cut.json").write_text((at / "cut.json").read_text()[:-40])
     (at / "list.json").write_text("[]")
-    for bad, match in (("cut", "not valid JSON"), ("none", "cannot be read"), ("list", "is no map")):
+    for bad, match in (("cut", "not valid JSON"), ("none", "cannot be read"), ("list", "is not a map")):
         with pytest.raises(InputError, match=match):
             read_regime(at / f"{bad}.json")
 

@@ -102,14 +102,6 @@ def refusal() -> str:
         return error.strerror or str(error)
 
 
-def open_to_readers() -> None:
-    """Let every user of this machine read what is kept, as in an image; who owns it can still write alone."""
-    where = folder()
-    where.chmod(0o755)
-    for path in where.glob(f"*{SUFFIX}"):
-        path.chmod(0o644)
-
-
 def one_at_a_time(path: Path) -> AbstractContextManager[Any]:
     """Lock of a file that is about to be written; none where the folder takes no lock."""
     try:

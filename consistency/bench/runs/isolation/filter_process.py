@@ -1,40 +1,49 @@
-"""Filters that are not compiled, each in a process of its own that can be killed: at its time-out, for its memory."""
+"""Filters that are not compiled, in processes that can be killed: at their time-out, for their memory, at the end.
+
+A filter may do anything to its process: crash, hang, exit, eat memory, print without bound. Its run has then failed
+with a reason, and the study continues. Processes are those of Pebble, one worker a pool, started by joblib's loky so
+that a script needs no guard on ``__main__``.
+"""
 
 from __future__ import annotations
 
 import atexit
 import contextlib
 import os
-import pickle
 import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, TimeoutError, wait
 from multiprocessing import current_process
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.recorder import RunRecord
 from consistency.bench.filters.stepping import error_of, name_of, reason_of, rejects
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.isolation.supervisor import Guest, Reply, SupervisorSetup, Task, supervise
+from consistency.bench.runs.isolation.worker import Isolated, begin, load, nothing, run
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
 
+KILLED = (-signal.SIGTERM, -getattr(signal, "SIGKILL", signal.SIGTERM))  # exit codes; no filter ends itself so
+GLANCE = 0.5  # s between looks at whether a process still lives
+LOADING = 60.0  # s that loading a filter may take where there is a time-out
+SHOWN = 2**14  # bytes of what the filters in a process print that are shown
 ONE_THREAD = dict.fromkeys(  # of BLAS in a process of a filter: the last bits depend on it
     ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
-KILL = getattr(signal, "SIGKILL", signal.SIGTERM)
-GLANCE = 1.0  # s between looks at whether a supervisor still lives
 _lock = threading.Lock()
-_idle: list[_Supervisor] = []  # started by earlier studies, as starting one takes seconds
+_idle: list[_Worker] = []  # of earlier studies, as starting one takes seconds
+# a worker dies when the thread that started it ends (Linux), so one thread starts them all and never ends
+_starter = ThreadPoolExecutor(1)
 
 
 class Isolation:
-    """Filters through trials: compiled ones where it is called, each other one in processes of its own.
+    """Filters through trials: compiled ones where it is called, each other one in a process that can be killed.
 
     To be used in a ``with``, whose end kills the processes that still work.
 
@@ -60,35 +69,34 @@ class Isolation:
         if memory is not None and sys.platform != "linux":
             raise InputError("memory can be limited on Linux alone; leave it out")
         self.filters, self.belief = list(filters), belief
+        self.timeout, self.memory = timeout, memory
         self.compiled = [filter_ for filter_ in filters if isinstance(filter_, Compiled)]
-        alone = [filter_ for filter_ in filters if not isinstance(filter_, Compiled)]
-        self._guests = {name_of(filter_): _guest(filter_) for filter_ in alone}
-        self._study = SupervisorSetup(self._guests, timeout, memory, tuple(sys.path), _folder())
-        self._free: list[_Supervisor] = []
-        self._busy: set[_Supervisor] = set()
+        self._isolated = {name_of(each): _isolated(each) for each in filters if not isinstance(each, Compiled)}
+        self._free: list[_Worker] = []
+        self._busy: set[_Worker] = set()
         self._is_open, self._halt = False, np.zeros(1, np.int64)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Isolation, (self.filters, self.belief, self._study.timeout, self._study.memory)
+        return Isolation, (self.filters, self.belief, self.timeout, self.memory)
 
     def __enter__(self) -> Isolation:
         self._is_open, self._halt = True, np.zeros(1, np.int64)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End compiled trials before their next step and kill processes that work; idle supervisors are kept."""
+        """End compiled trials before their next step and kill processes that work; idle ones are kept."""
         self._halt[0] = 1
         with _lock:
             self._is_open = False
-            for supervisor in self._busy:  # whose thread waits for a reply
-                supervisor.stop()
-            _idle.extend(supervisor for supervisor in self._free if supervisor.tell(None))
+            for worker in self._busy:  # whose thread waits for its result
+                worker.stop()
+            _idle.extend(self._free)
             self._free.clear()
 
     def run(self, trial: Trial, belief: Belief | None = None) -> list[Estimates]:
         """A trial through all filters, one after the other; may be called from several threads at once.
 
-        A process that is killed from outside, or whose supervisor is, is replaced once; then the run has failed.
+        A process that is killed from outside is replaced once; then the run has failed.
 
         Parameters
         ----------
@@ -100,54 +108,53 @@ class Isolation:
             A filter needs what the trial does not have.
         """
         belief = self.belief if belief is None else belief
-        return [
-            filter_.run(trial, belief, self._halt)
-            if isinstance(filter_, Compiled)
-            else self._apart(filter_, trial, belief)
-            for filter_ in self.filters
-        ]
+        estimates = []
+        for filter_ in self.filters:
+            if isinstance(filter_, Compiled):
+                estimates.append(filter_.run(trial, belief, self._halt))
+            else:
+                estimates.append(self._run_apart(self._isolated[name_of(filter_)], trial, belief))
+        return estimates
 
-    def _apart(self, filter_: Filter, trial: Trial, belief: Belief) -> Estimates:
-        guest = self._guests[name_of(filter_)]
-        message, reply = pickle.dumps(Task(guest.name, trial, belief)), None
+    def _run_apart(self, filter_: Isolated, trial: Trial, belief: Belief) -> Estimates:
+        from pebble import ProcessExpired
+
+        code: int | None = None
         for _ in range(2):
-            with self._supervisor() as supervisor:
-                reply = supervisor.ask(message)
-            if reply is not None and not reply.was_stopped:
+            with self._worker() as worker:
+                try:
+                    return worker.run(filter_, trial, belief, self.timeout, self.memory)
+                except TimeoutError as error:
+                    return filter_.failed(trial, str(error))
+                except ProcessExpired as error:
+                    code = error.exitcode
+            if code not in KILLED or not self._is_open:
                 break
-        if reply is None:
-            record = RunRecord.empty(trial.steps, len(trial.landmark))
-            reason = "the supervisor of its process was killed twice"
-            return record.estimates(guest.name, trial.run, guest.error, reason=reason, guarded=guest.guarded)
-        if reply.estimates is None:
-            raise InputError(reply.refusal)
-        return reply.estimates
+        return filter_.failed(trial, _reason(code))
 
     @contextlib.contextmanager
-    def _supervisor(self) -> Iterator[_Supervisor]:
-        """One that knows the study and works for nobody else; of a dead one nothing is kept."""
+    def _worker(self) -> Iterator[_Worker]:
+        """One that works for nobody else."""
         with _lock:
             if not self._is_open:
                 raise RuntimeError("the study has ended")
-            supervisor = self._free.pop() if self._free else None
-            while supervisor is None:
-                candidate = _idle.pop() if _idle else _Supervisor()
-                supervisor = candidate if candidate.tell(self._study) else None
-            self._busy.add(supervisor)
+            worker = self._free.pop() if self._free else _idle.pop() if _idle else None
+            worker = _Worker() if worker is None else worker
+            self._busy.add(worker)
         try:
-            yield supervisor
+            yield worker
         except BaseException:  # Ctrl-C: it is still at work
-            supervisor.kill()
+            worker.stop()
             raise
         finally:
             with _lock:
-                self._busy.discard(supervisor)
-                if supervisor.is_alive:
-                    self._free.append(supervisor)
+                self._busy.discard(worker)
+                if worker.is_alive:
+                    self._free.append(worker)
 
 
-class _Supervisor:
-    """The near end of :func:`.supervisor.supervise`, which runs in a process without ``__main__``."""
+class _Worker:
+    """A pool of one process, which Pebble replaces when it dies or is killed."""
 
     def __init__(self) -> None:
         if current_process().daemon:
@@ -156,52 +163,95 @@ class _Supervisor:
                 "cannot start; use concurrent.futures or joblib"
             )
         from joblib.externals.loky.backend import get_context  # slow to load
+        from pebble import ProcessPool
 
         context = get_context("loky")
-        self.link, end = context.Pipe()
-        self.process = context.Process(target=supervise, args=(end,), env=ONE_THREAD)
-        self.process.start()
-        end.close()
+        printed, output = context.Pipe(duplex=False)
+        self._output = output  # open, so that it can be given to the next process
+        threading.Thread(target=_show, args=(printed,), daemon=True).start()
+        self._loaded: set[bytes] = set()
+        self._pid = 0
+        self._pool: Any = ProcessPool(1, initializer=begin, initargs=(output, os.getpid()), context=context)
+        _starter.submit(self._pool.schedule, nothing).result()
 
     @property
     def is_alive(self) -> bool:
-        return not self.link.closed and self.process.exitcode is None
+        return bool(self._pool.active)
 
-    def tell(self, study: SupervisorSetup | None) -> bool:
-        """Send what the next trials are about; False where it is dead."""
+    def run(
+        self, filter_: Isolated, trial: Trial, belief: Belief, timeout: float | None, memory: float | None
+    ) -> Estimates:
+        """Return the estimates of a trial.
+
+        Raises
+        ------
+        TimeoutError
+            Loading the filter or the trial took too long; the message says which.
+        ProcessExpired
+            The process ended.
+        InputError
+            The filter needs what the trial does not have.
+        """
+        place = tuple(sys.path), _folder()
         try:
-            self.link.send_bytes(pickle.dumps(study))
-        except OSError:
-            self.link.close()
-            return False
-        return True
+            if filter_.pickled not in self._loaded:
+                loading = None if timeout is None else max(timeout, LOADING)
+                reason = "time-out while it was loaded"
+                self._pid = self._pool.schedule(load, args=(filter_.pickled, *place), timeout=loading).result()
+                self._loaded.add(filter_.pickled)
+            reason = f"time-out after {timeout:g} s" if timeout is not None else ""
+            task = self._pool.schedule(run, args=(filter_, trial, belief, memory), timeout=timeout)
+            estimates: Estimates = self._result(task)
+        except TimeoutError:
+            self._loaded.clear()
+            raise TimeoutError(reason) from None
+        except CancelledError:
+            raise RuntimeError("the study has ended") from None
+        except InputError:
+            raise
+        except Exception:
+            self._loaded.clear()
+            raise
+        return estimates
 
-    def ask(self, message: bytes) -> Reply | None:
-        """Its reply, None where it is dead."""
-        try:
-            self.link.send_bytes(message)
-            while not self.link.poll(GLANCE):
-                if self.process.exitcode is not None:
-                    raise EOFError
-            reply: Reply = pickle.loads(self.link.recv_bytes())
-        except (EOFError, OSError):
-            self.kill()
-            return None
-        return reply
+    def _result(self, task: Future[Estimates]) -> Estimates:
+        """Wait for a task; Pebble does not report a process that ends with exit status 0."""
+        from pebble import ProcessExpired
 
-    def kill(self) -> None:
-        """End it at once; what runs under it ends with it."""
-        self.link.close()
-        self.stop()
-        self.process.join()
+        ended: Any = ProcessExpired
+        while not wait([task], GLANCE).done:
+            if not _lives(self._pid) and not wait([task], GLANCE).done:
+                task.cancel()
+                raise ended("ended", 0, self._pid)
+        return task.result()
 
     def stop(self) -> None:
-        """Send the signal that ends it, and leave the rest to who waits for its reply."""
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(self.process.pid, KILL)
+        """Kill the process at once."""
+        self._pool.stop()
+        self._pool.join()
+        self._output.close()
 
 
-def _guest(filter_: Filter) -> Guest:
+def _lives(pid: int) -> bool:
+    if sys.platform == "win32":  # where signal 0 would end the process
+        return True
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _reason(code: int | None) -> str:
+    """How a process ended."""
+    if code is None or code >= 0:
+        return f"its process ended with exit status {code}"
+    outside = ", from outside or for want of memory" if code in KILLED else ""
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    return f"its process was killed by {name}{outside}"
+
+
+def _isolated(filter_: Filter) -> Isolated:
     from joblib.externals.loky.backend.reduction import dumps
 
     name = name_of(filter_)
@@ -212,7 +262,7 @@ def _guest(filter_: Filter) -> Guest:
             f"filter '{name}' runs in a process of its own and cannot be pickled: {reason_of(error)}; "
             "make in init(problem) what cannot be"
         ) from None
-    return Guest(name, error_of(filter_), rejects(filter_), pickled)
+    return Isolated(name, error_of(filter_), rejects(filter_), pickled)
 
 
 def _folder() -> str:
@@ -222,10 +272,25 @@ def _folder() -> str:
         return os.sep
 
 
-@atexit.register  # before multiprocessing waits for its children
+def _show(printed: Connection) -> None:
+    """Pass what the filters in a process print on to standard error, up to ``SHOWN`` bytes, and drop the rest."""
+    left = SHOWN
+    with contextlib.suppress(OSError, EOFError):
+        while text := os.read(printed.fileno(), 2**16):
+            if left > 0:
+                os.write(2, text[:left])
+                if len(text) > left:
+                    os.write(
+                        2, f"\nconsistency: filters print more than {SHOWN} bytes; the rest is not shown\n".encode()
+                    )
+                left -= len(text)
+
+
+@atexit.register
 def dismiss() -> None:
+    """End the processes that wait for a study."""
     while _idle:
-        _idle.pop().link.close()
+        _idle.pop().stop()
 
 
 if hasattr(os, "register_at_fork"):

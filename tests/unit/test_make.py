@@ -32,7 +32,8 @@ def test_a_target_installs_what_it_needs(checkout: Path, target: str, what: str)
 
 def test_the_tests_environment_has_what_reproduce_needs_and_not_the_reverse(checkout: Path) -> None:
     python = checkout / "python"  # makes an environment of nothing
-    python.write_text('#!/bin/sh\n[ "$1" = -c ] || { mkdir -p .venv/bin && ln -sf "$(command -v true)" .venv/bin/python; }\n')
+    made = f"mkdir -p .venv/bin && ln -sf {shutil.which('true')} .venv/bin/python"
+    python.write_text(f'#!/bin/sh\n[ "$1" = -c ] || {{ {made}; }}\n')
     python.chmod(0o755)
     assert make(checkout, ".venv/.lab", f"PYTHON={python}").returncode == 0
     assert extras(checkout, "reproduce") == []

@@ -20,8 +20,8 @@ DISTRIBUTION = "filter-consistency"
 # what pyproject.toml lists for each extra; one in brackets is another extra
 EXTRAS = {
     "bench": (
-        "numpy>=2.0", "scipy>=1.16", "numba", "llvmlite", "joblib", "filelock", "threadpoolctl", "psutil", "pandas", "pyarrow",
-        "pydantic", "rich>=14.1", "tomli-w",
+        "numpy>=2.0", "scipy>=1.16", "numba", "llvmlite", "joblib", "filelock", "threadpoolctl", "psutil", "pandas",
+        "pyarrow", "pydantic", "rich>=14.1", "tomli-w",
     ),
     "plot": ("matplotlib",),
     "report": ("[plot]", "bokeh", "jinja2", "typst"),

@@ -1,5 +1,6 @@
 PYTHON ?= python3
 BIN := .venv/bin
+comma := ,
 
 .PHONY: docs house house-write tutorial case-studies case-studies-rates reproduce calibrate calibrate-quick calibrate-alignment \
 	calibrate-alignment-quick calibrate-fit regime test test-quick test-all bench lint format clean
@@ -8,12 +9,23 @@ BIN := .venv/bin
 export OPENBLAS_NUM_THREADS ?= 1
 export PYTHONDONTWRITEBYTECODE :=  # byte code is kept: one process compiles a module of Python, the others load it
 
-.venv/.done: pyproject.toml constraints.txt
+# .venv/.lab: what `make reproduce` needs; .venv/.done: that, and what tests, documents and checks need
+VENV_MISSING := $(PYTHON) cannot make a virtual environment, python3-venv is missing; on Debian and Ubuntu: apt install python3-venv
+define install
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "$(VENV_MISSING)" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e ".[$(1)]"
+endef
+
+.venv/.lab: pyproject.toml constraints.txt
+	$(call install,bench$(comma)report)
 	touch $@
 
-reproduce: .venv/.done
+.venv/.done: pyproject.toml constraints.txt
+	$(call install,dev)
+	touch $@ .venv/.lab
+
+reproduce: .venv/.lab
 	$(BIN)/consistency reproduce --overwrite
 
 # what is in which tier: CONTRIBUTING.md

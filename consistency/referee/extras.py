@@ -20,7 +20,8 @@ DISTRIBUTION = "filter-consistency"
 # what pyproject.toml lists for each extra; one in brackets is another extra
 EXTRAS = {
     "bench": (
-        "numpy>=2.0", "scipy>=1.16", "numba", "llvmlite", "joblib", "pebble", "filelock", "threadpoolctl", "pandas",
+        "numpy>=2.0", "scipy>=1.16", "numba", "llvmlite", "joblib", "pebble", "filelock", "threadpoolctl", "psutil",
+        "pandas",
         "pyarrow", "pydantic", "rich>=14.1", "tomli-w",
     ),
     "plot": ("matplotlib",),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import traceback
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ WHOLE = 2**53  # beyond it a floating-point number counts no more
 DEEPEST = 64  # parts of a dotted key
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""  # its possessive quantifiers need Python 3.11
 UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # categories of Unicode: control, surrogate, ends of lines and paragraphs
+PROGRAMMING = (NameError,)  # those of other kinds also come of what a file holds
+PACKAGE = Path(__file__).parents[1]
 _SHOWN = 160  # characters of a parser's own words
 
 
@@ -30,12 +33,13 @@ def reading(path: Path | str, refusal: str = "cannot be read, damaged or cut sho
     """Whatever a parser raises of the file ``path``, as one sentence that names it.
 
     Parsers of formats that others define raise almost anything of a damaged or hostile file, so that the list of what
-    is caught is not closed. Only calls of parsers belong inside.
+    is caught is not closed. Programming errors that a line of this package raises pass. Only calls of parsers belong
+    inside.
 
     Raises
     ------
     InputError
-        In place of any other exception.
+        In place of any exception of a library, and of any but :data:`PROGRAMMING` errors of this package.
     """
     try:
         yield
@@ -49,7 +53,15 @@ def reading(path: Path | str, refusal: str = "cannot be read, damaged or cut sho
     except MemoryError:
         raise InputError(f"{path}: {refusal} (it would take more memory than there is)") from None
     except Exception as error:
+        if isinstance(error, PROGRAMMING) and _is_ours(error):
+            raise
         raise InputError(f"{path}: {refusal} ({_said(error)})") from None
+
+
+def _is_ours(error: Exception) -> bool:
+    """Whether a line of this package raised it, not one of a library."""
+    frames = list(traceback.walk_tb(error.__traceback__))
+    return Path(frames[-1][0].f_code.co_filename).is_relative_to(PACKAGE)
 
 
 def _said(error: Any) -> str:

@@ -61,7 +61,7 @@ def outcome(read: Any, folder: Path) -> tuple[int, str, str, str]:
     last = text.splitlines()[-1] if text else ""
     if wrong:
         return status, out.getvalue(), text, wrong
-    if status not in (0, 2) or "Traceback" in text or "Warning" in text:
+    if status not in (0, 2) or any(word in text for word in ("Traceback", "Warning", "unforeseen")):
         wrong = f"status {status}: {text[-300:]}"
     elif status == 2 and not (last.startswith("consistency: ") and len(last) < 4200 and last.isprintable()):
         wrong = f"no sentence: {text[-300:]!r}"

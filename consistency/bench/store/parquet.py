@@ -287,7 +287,7 @@ def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) 
 
     with reading(path, f"column '{column.name}' cannot be read as numbers"):
         if column.dtype.kind == "c" or are_no_numbers(column).any():
-            raise TypeError(column.dtype)
+            raise ValueError(column.dtype)
         values = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
     if column.name in NULLABLE:
         values = np.where(column.isna() | (values == np.inf) & (column.name in UNBOUNDED), 0.0, values)

@@ -226,9 +226,9 @@ def sweep_from(manifest: dict[str, Any], path: Path) -> Sweep:
         varied = data.get("alone", {})
         lists = [data["filters"], *data["grid"].values(), *varied.values()]
         if not all(isinstance(values, list) and values for values in lists):
-            raise TypeError("filters and values must be lists")
+            raise ValueError("filters and values must be lists")
         if not all(isinstance(name, str) for name in data["filters"]):
-            raise TypeError("filters must be names")
+            raise ValueError("filters must be names")
         base = Scenario.model_validate(data["base"])
         axes = [Axis(key, tuple(values)) for key, values in data["grid"].items()]
         axes += [alone(Axis(key, tuple(values)), base) for key, values in varied.items()]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import traceback
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -28,7 +29,9 @@ app = typer.Typer(
 
 @app.callback(invoke_without_command=True)
 def _main(
-    context: typer.Context, version: Annotated[bool, typer.Option("--version", help="Show it and exit.")] = False
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Show it and exit.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an unforeseen exception.")] = False,
 ) -> None:
     if version:
         from importlib.metadata import version as version_of
@@ -39,7 +42,20 @@ def _main(
 
 
 def main(arguments: list[str] | None = None) -> Any:
-    """Entry point: unusable input ends in one line and exit status 2; SIGTERM and SIGHUP are taken as Ctrl-C."""
+    """Entry point: an exception ends in one line and exit status 2, so that status 1 is a verdict's alone."""
+    try:
+        return _run(arguments)
+    except Exception as error:
+        words = sys.argv[1:] if arguments is None else arguments
+        if words[:1] == ["--debug"]:
+            traceback.print_exc()
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        what = f"{type(error).__name__} in {at.filename}:{at.lineno}: {error}"
+        _end(f"unforeseen {what}; please report it, with what 'consistency --debug COMMAND ...' shows", 2)
+
+
+def _run(arguments: list[str] | None) -> Any:
+    """Unusable input ends in one line and exit status 2; SIGTERM and SIGHUP are taken as Ctrl-C."""
     from consistency.referee.system.stopping import STOPS, stoppable
 
     _open_closed_streams()

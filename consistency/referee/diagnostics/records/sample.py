@@ -94,9 +94,10 @@ class Sample:
 
         def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
             error = error if centre is None else centre.about(error, counted)
-            return means_and_counts(np.where(counted, squared_length(subset(error, P, index)), np.nan))
+            return means_and_counts(np.where(counted, squared_length(subset(error[..., index], P, own)), np.nan))
 
-        means, counts = by_runs(of_block, e.error[:, steps], e.covariance[:, steps], self.counted[:, steps]).T
+        own, P = list(range(len(index))), e.covariance.part(index)[:, steps]  # slicing all of many components is slow
+        means, counts = by_runs(of_block, e.error[:, steps], P, self.counted[:, steps]).T
         return np.asarray(means[counts > 0] / len(index))
 
     def centre(self) -> Centre:

@@ -7,9 +7,11 @@ import operator
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
+from consistency.referee.diagnostics.records.large_arrays import Symmetric, blocks, by_runs
 from consistency.referee.types import Array
 
+LARGE = 40  # components from which on LAPACK, matrix by matrix, is faster than all matrices entry by entry
+NUMBERS = 2**22  # of matrices that are factored in one call
 FEW = 7  # components that NumPy adds one after the other; sums over so short an axis are slow
 
 
@@ -19,7 +21,10 @@ def whiten(error: Array, covariance: Array | Symmetric) -> Array:
     Shapes (..., n) and (..., n, n) -> (..., n). Rows that hold a NaN, or whose covariance is not positive
     definite, come back as NaN.
     """
-    e, P = np.asarray(error, float), Symmetric.of(covariance)
+    e = np.asarray(error, float)
+    if e.shape[-1] >= LARGE:
+        return _whiten_large(e, covariance)
+    P = Symmetric.of(covariance)
     P = P if P.shape[:-1] == e.shape else P.broadcast(e.shape[:-1])
     return by_runs(_whiten, e, P) if e.ndim > 1 else _whiten(e, P)
 
@@ -39,6 +44,33 @@ def _whiten(e: Array, P: Symmetric) -> Array:
             out[..., i] = w[i]
     out[~all_finite(out)] = np.nan
     return out
+
+
+def _whiten_large(e: Array, covariance: Array | Symmetric) -> Array:
+    n = e.shape[-1]
+    rows, P = e.reshape(*(e.shape[:-1] or (1,)), n), covariance
+    if P.shape[:-1] != rows.shape:
+        P = np.broadcast_to(np.asarray(P, float), (*rows.shape, n))
+    out = np.full(rows.shape, np.nan)
+    for here in blocks(out.size // n, n * n, NUMBERS):
+        index = np.unravel_index(np.arange(out.size // n)[here], rows.shape[:-1])
+        some, matrices = rows[index], np.asarray(P[index], float)
+        known = np.isfinite(some).all(axis=1) & np.isfinite(matrices).all(axis=(1, 2))
+        some[~known] = np.nan
+        some[known] = _solve(some[known], matrices[known])
+        out[index] = some
+    return out.reshape(e.shape)
+
+
+def _solve(e: Array, P: Array) -> Array:
+    """L^-1 e of finite rows (K, n) and (K, n, n), NaN where P is not positive definite: each half by itself then."""
+    try:
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(P), e[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        if len(e) == 1:
+            return np.full(e.shape, np.nan)
+        half = len(e) // 2
+        return np.concatenate([_solve(e[:half], P[:half]), _solve(e[half:], P[half:])])
 
 
 def _less(value: Array, a: list[Array], b: list[Array]) -> Array:

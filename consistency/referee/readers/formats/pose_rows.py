@@ -89,7 +89,18 @@ def read_poses(path: Path, true: bool = False) -> Lines:
 
 
 def on_plane(lines: Lines, unit: str) -> TableRows:
-    """Columns t, x, y and heading of poses in space, which is that of the x axis."""
+    """Columns t, x, y and heading of poses in space, which is that of the x axis.
+
+    Raises
+    ------
+    InputError
+        They are positions without orientations.
+    """
+    if lines.values.shape[1] < POSE:
+        raise InputError(
+            f"{lines.path}: holds positions without orientations, and a planar pose needs a heading; give a file with "
+            "a heading or a quaternion, or judge positions alone: --state x,y with a truth table of columns t, x, y"
+        )
     ahead = Rotation.from_quat(lines.values[:, 4:POSE]).apply([1.0, 0.0, 0.0])
     columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
     return TableRows(lines.path, columns, lines.line, unit)

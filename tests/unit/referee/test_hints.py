@@ -28,7 +28,7 @@ from consistency.referee.readers.alignment.world_frames import (
 )
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.mix_ups import hints as readers_hints
-from consistency.referee.readers.mix_ups.hints import FACTOR, ReadingFit, decades, fit_of, hints, turns
+from consistency.referee.readers.mix_ups.hints import FACTOR, ReadingFit, fit_of, hints, turns
 from consistency.referee.readers.mix_ups.known import _ned
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
@@ -191,6 +191,12 @@ def test_a_mix_up_is_named(name: str, rng: np.random.Generator) -> None:
     assert words in said
 
 
+def decades(runs: Sequence[Poses]) -> Array:
+    found = fit_of([(p.errors(), p.covariance) for p in runs])
+    assert found is not None
+    return found.decades
+
+
 def test_worlds_of_each_run_are_named(rng: np.random.Generator) -> None:
     runs = [moved(p, WorldTransform.about_z(0.7 * i, FAR)) for i, p in enumerate(spatial(rng))]
     (said,) = hints("est", SIX, runs)
@@ -323,17 +329,20 @@ def test_what_is_right_and_what_is_not() -> None:
     rng = np.random.default_rng(9)
     w = rng.normal(size=(2000, 2))
     w = np.linalg.solve(np.linalg.cholesky(np.cov(w.T)), (w - w.mean(axis=0)).T).T
-    assert fit(w).right()
+    assert fit(w).right(False)
+    assert fit(w).is_shown()
+    for factor in (1.2, 1.0 / 1.2):  # is right but for the factor that all share
+        assert fit(w * factor).right(False)
+        assert not fit(w * factor).is_shown()
+    assert not fit(w[:20]).is_shown()
     t = rng.standard_t(3, size=w.shape)
     for other in (
-        w * 1.2,
-        w / 1.2,
         w * [1.25, 0.8],
         w + np.array([0.2, 0.0]),
         w @ [[1.0, 0.2], [0.0, 0.98]],
         t / t.std(axis=0),
     ):
-        assert not fit(other).right()
+        assert not fit(other).right(False)
     assert fit(w).fault() == pytest.approx(0.0, abs=1e-3)
     assert fit(2.0 * w).fault() == pytest.approx(0.5 * 2 * (4.0 - np.log(4.0) - 1.0), rel=1e-2)
 
@@ -346,7 +355,7 @@ def fit(*whitened: Array, P: Array | None = None) -> ReadingFit:
     for w in whitened:
         e = w @ np.linalg.cholesky(P).T
         runs.append(poses(np.arange(len(e)) * 0.1, np.zeros_like(e), P, e, "vector", "vector"))
-    found = fit_of(runs)
+    found = fit_of([(p.errors(), p.covariance) for p in runs])
     assert found is not None
     return found
 

@@ -383,7 +383,9 @@ def main() -> int:
             print(f"  honest ({label}): {hint}", flush=True)
     total = sum(found.values())
     print(f"honest logs with a hint: {total} of {given.logs}")
-    drifts = [hint for number in range(given.slow) for hint in slow(np.random.default_rng((given.seed, 98, number)), number)]
+    drifts = [
+        hint for number in range(given.slow) for hint in slow(np.random.default_rng((given.seed, 98, number)), number)
+    ]
     for hint in drifts:
         print(f"  slow: {hint}", flush=True)
     print(f"slow logs with a hint: {len(drifts)} of {given.slow}")

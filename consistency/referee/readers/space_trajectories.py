@@ -123,9 +123,7 @@ def recordings_of(
     return recordings
 
 
-def _causes(
-    name: str, axes: Sequence[str], poses: Sequence[Poses], shift: float, judged: Sequence[int]
-) -> list[str]:
+def _causes(name: str, axes: Sequence[str], poses: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
     """Mix-ups of the whole state, or of its poses by themselves."""
     whole = hints(name, axes, poses, shift, judged) if len(axes) > len(AXES) else []
     of_pose = [i for i in judged if i < len(AXES)]

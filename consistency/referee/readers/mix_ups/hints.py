@@ -107,7 +107,9 @@ def _cause(found: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFi
     named = first or named
     if named:
         most = max(gain for gain, *_ in named)
-        guess, fit = next((guess, fit) for gain, guess, fit in named if gain >= most - 1.0)  # nearly as likely: the first
+        guess, fit = next(
+            (guess, fit) for gain, guess, fit in named if gain >= most - 1.0
+        )  # nearly as likely: the first
         rest = fit.decades[0]
         return guess.text + (f"; the NEES is then {_times(rest)} in all components" if abs(rest) > SAID else "")
     if not scaled:

@@ -105,7 +105,10 @@ def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> It
     v = vectors[:, 0] / vectors[np.argmax(np.abs(vectors[:, 0])), 0]
     direction = " ".join(f"{c:+.2f} {axes[i]}" for c, i in zip(v, part, strict=True) if abs(c) > 0.1)
     words = f"its cross terms are left out: it is nearly singular in the direction {direction} (in standard deviations)"
-    yield Guess(f"{words}; look for lost digits or a correlation of 1", _covariance(lambda P: _diagonal(P) * np.eye(P.shape[-1])))
+    yield Guess(
+        f"{words}; look for lost digits or a correlation of 1",
+        _covariance(lambda P: _diagonal(P) * np.eye(P.shape[-1])),
+    )
 
 
 def _diagonal(P: Array) -> Array:

@@ -208,8 +208,8 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
         still, moving = (", ".join(a for a, is_it in zip(axes, those, strict=True) if is_it)
                          for those in (idle & ~none, none & ~idle))  # fmt: skip
         advice = (
-            f"{still} has a variance and no error, {moving} has errors and no variance: the rows of the covariance seem "
-            f"to be in another order; write them as {', '.join(axes)}"
+            f"{still} has a variance and no error, {moving} has errors and no variance: the rows of the covariance "
+            f"seem to be in another order; write them as {', '.join(axes)}"
         )
     if not none.any():
         advice = "write only the states that the filter estimates by themselves"

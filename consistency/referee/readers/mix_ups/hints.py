@@ -69,7 +69,8 @@ def hints(
 
     def errors_of(p: Poses) -> tuple[Array, Array]:
         error, P = (p.errors(), p.covariance) if taken is None else taken(p)
-        return error[:, part], P[:, part][:, :, part]
+        kept = part if error.shape[1] == len(axes) else list(range(error.shape[1]))  # of a quaternion as a rotation
+        return error[:, kept], P[:, kept][:, :, kept]
 
     declared = fit_of([errors_of(p) for p in some])
     if declared is None or declared.size * declared.fault() < LEAST_GAIN:
@@ -248,7 +249,7 @@ class ReadingFit:
         """Log likelihood of an estimate with the simple fault that explains the errors best.
 
         That is any factor on the covariance of all components, with one of at most ``FACTOR`` on that of a single one,
-        of position or of attitude; or a bias of at most ``BIAS`` standard deviations with a factor of at most ``SCALE``.
+        of position or of attitude; or a bias of at most ``BIAS`` standard deviations with a factor within ``SCALE``.
         """
         n, w = self.n, self.w
         before = float(np.square(w).sum(axis=1).mean())

@@ -237,7 +237,7 @@ class ReadingFit:
         """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``."""
         mean = float(np.square(self.w).mean())
         f = float(np.clip(mean, 10.0**-SCALE, 10.0**SCALE))
-        return self.likelihood + 0.5 * self.n * (mean - mean / f - np.log(f))
+        return self.likelihood + 0.5 * self.n * (mean - mean / f - float(np.log(f)))
 
     def fault(self) -> float:
         """Log likelihood of an estimate that another covariance, the same for all whitened errors, would gain."""
@@ -257,13 +257,13 @@ class ReadingFit:
         part = min(1.0, BIAS / max(float(np.sqrt(np.square(shift).sum(axis=1).mean())), 1e-300))
         after = before - float((2.0 * part * w * shift - (part * shift) ** 2).sum(axis=1).mean())
         common = float(np.clip(after / n, 10.0**-SCALE, 10.0**SCALE))
-        best = 0.5 * (before - after / common - n * np.log(common))
+        best = 0.5 * (before - after / common - n * float(np.log(common)))
         f = np.exp(np.linspace(-np.log(FACTOR), np.log(FACTOR), 61))
         for group in [*([j] for j in range(n)), *GROUPS.get(n, ())]:
             own = (self.root[:, :, group] @ self.error[:, group, None])[..., 0]
             a = f**-0.5 - 1.0
-            after = before + 2.0 * a * float((w * own).sum(axis=1).mean()) + a**2 * float((own**2).sum(axis=1).mean())
-            of_all = n + n * np.log(np.maximum(after, 1e-300) / n)
+            left = before + 2.0 * a * float((w * own).sum(axis=1).mean()) + a**2 * float((own**2).sum(axis=1).mean())
+            of_all = n + n * np.log(np.maximum(left, 1e-300) / n)
             best = max(best, float((0.5 * (before - of_all - len(group) * np.log(f))).max()))
         return self.likelihood + best
 

@@ -443,6 +443,20 @@ def test_a_unit_quaternion_with_four_variances_is_named(rng: np.random.Generator
     assert "qx, qy, qz, qw are a unit quaternion (x y z w) with three degrees of freedom" in said
 
 
+def test_blocks_of_an_inertial_state_in_another_order_are_named(rng: np.random.Generator) -> None:
+    runs = []
+    for p in spatial(rng):
+        P = np.zeros((STEPS, 9, 9))
+        P[:, :6, :6], P[:, 6:, 6:] = p.covariance, 0.3**2 * np.eye(3)
+        own, error = rng.normal(size=(STEPS, 3)), 0.3 * rng.normal(size=(STEPS, 3))
+        estimate, truth = np.hstack([p.estimate, own]), np.hstack([p.truth, own + error])
+        runs.append(replace(p, estimate=estimate, truth=truth, covariance=P))
+    axes, order = (*SIX, "vx", "vy", "vz"), [0, 1, 2, 6, 7, 8, 3, 4, 5]
+    assert hints("est", axes, runs) == []
+    (said,) = hints("est", axes, [replace(p, covariance=p.covariance[:, order][:, :, order]) for p in runs])
+    assert said.endswith("in the order p,v,R; add --covariance-order p,v,R")
+
+
 def test_half_angles_are_named_as_one_of_two(rng: np.random.Generator) -> None:
     runs = [weighed(p, slice(3, 6), 0.5) for p in world.log(rng, "spatial", 20, 50, 0.0)]
     (said,) = hints("est", SIX, runs)

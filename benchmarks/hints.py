@@ -2,12 +2,19 @@
 
     python benchmarks/hints.py                # 1,200 honest logs, 20 logs a cell
     python benchmarks/hints.py --logs 200 --cells 5
+    python benchmarks/hints.py --logs 0 --cells 0 --gross 10   # 10 kinds of mix-ups x 3 scales x 10 logs
 
 A mix-up is made worse step by step; the first column has the smallest factor (of the variance of one axis to that of
 another, or of a variance to 1 in its unit) from which on at least 9 of 10 logs are told so. Honest logs are of filters
 that are right, and of filters that are wrong: a covariance 1/4 to 4 times as large in all axes or in one, a bias, heavy
-tails, a drift. Several kinds of state, sizes, units, numbers of runs, and correlations of neighbouring steps. Exit
-status 1 if more than 6 of 1,200 honest logs get a hint (as large a share of another number).
+tails, a drift. Several kinds of state, sizes, units, numbers of runs, and correlations of neighbouring steps.
+
+Gross mix-ups are of logs of all these sizes and correlations, of a filter that is right, or whose covariance is 4 times
+too large or too small: only draws count whose NEES falls by 10 or more with the mix-up undone. Slow logs are single
+drifts whose covariance is a number that nobody estimated.
+
+Exit status 1 if more than 6 of 1,200 honest logs, or of the slow ones, get a hint (as large a share of another number),
+or if fewer than 80 % of a kind of gross mix-up, or 90 % of all, are named.
 """
 
 from __future__ import annotations
@@ -22,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from script_options import options_of
 
 from consistency.referee.geometry import wrap
+from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.truth_matching import Poses
@@ -108,11 +116,16 @@ def run_of(rng: np.random.Generator, kind: str, convention: str, e: Array, P: Ar
     if kind == "spatial":
         turn = Rotation.from_euler("ZYX", np.column_stack([heading, 0.1 * np.sin(t), 0.1 * np.cos(2 * t)]))
         small = Rotation.from_rotvec(e[:, 3:])
-        true = turn * small if convention == "so3-body" else small * turn
-        own, truth = np.hstack([at, turn.as_quat()]), np.hstack([at + e[:, :3], true.as_quat()])
+        true = turn * small if convention in ("so3-body", "left") else small * turn
+        place = at + (turn.apply(e[:, :3]) if convention == "left" else e[:, :3])
+        place = small.apply(at) + e[:, :3] if convention == "right" else place  # left and right to first order
+        own, truth = np.hstack([at, turn.as_quat()]), np.hstack([place, true.as_quat()])
     elif kind == "planar":
         own = np.column_stack([at[:, :2], wrap(heading)])
         truth = own + e
+        if convention == "left":
+            c, s = np.cos(heading), np.sin(heading)
+            truth[:, :2] = own[:, :2] + np.column_stack([c * e[:, 0] - s * e[:, 1], s * e[:, 0] + c * e[:, 1]])
         truth[:, 2] = wrap(truth[:, 2])
     else:
         manifold = "vector"
@@ -230,11 +243,134 @@ def smallest(rng: np.random.Generator, name: str, cells: int) -> str:
     return f"{'-' if least is None else f'x{least:g}':>6}  {text}"
 
 
+# --- gross mix-ups ----------------------------------------------------------------------------------
+
+
+def inverse(p: Poses) -> Poses:
+    turn = Rotation.from_quat(p.estimate[:, 3:]).inv()
+    return replace(p, estimate=np.hstack([-turn.apply(p.estimate[:, :3]), turn.as_quat()]))
+
+
+def north(p: Poses) -> Poses:
+    """Estimates in a world of x north, y east, z down."""
+    turn = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return moved(p, WorldTransform(turn, np.zeros(3)))
+
+
+def degrees(p: Poses) -> Poses:
+    """Variances of angles in deg^2."""
+    scale = np.ones(p.covariance.shape[-1])
+    scale[2 if len(scale) == 3 else slice(3, 6)] = 180.0 / np.pi
+    return replace(p, covariance=p.covariance * np.outer(scale, scale))
+
+
+def heading_degrees(p: Poses) -> Poses:
+    return replace(p, estimate=p.estimate * [1.0, 1.0, 180.0 / np.pi])
+
+
+def unlike(rng: np.random.Generator, kind: str) -> Array:
+    """Standard deviations of which those of a block differ by up to a factor of 30, as along and across the way."""
+    return sizes(rng, kind) * np.exp(rng.uniform(-1.0, 1.0, len(AXES[kind])) * 0.5 * np.log(30.0))
+
+
+# kind of mix-up: variants of kind of state, true convention, sizes, mix-up, words of the hint
+GROSS: dict[str, list[tuple[str, str | None, Callable[[np.random.Generator, str], Array], Mess, tuple[str, ...]]]] = {
+    "quaternion order": [
+        ("spatial", None, sizes, lambda p: replace(p, estimate=p.estimate[:, [0, 1, 2, 6, 3, 4, 5]]), ("w x y z",)),
+    ],
+    "left / right error": [
+        ("spatial", "left", sizes, read_as("right"), ("'left'",)),
+        ("spatial", "right", sizes, read_as("left"), ("'right'",)),
+        ("spatial", "right", sizes, read_as("so3"), ("'right'",)),
+    ],
+    "block order": [("spatial", None, sizes, reordered([3, 4, 5, 0, 1, 2]), ("--covariance-order",))],
+    "body frame of P": [
+        ("spatial", "left", unlike, read_as("so3"), ("'left'",)),
+        ("planar", "left", unlike, read_as("so2"), ("'left'",)),
+    ],
+    "NED / ENU": [("spatial", None, sizes, north, ("x north",))],
+    "inverse pose": [("spatial", None, sizes, inverse, ("are inverse",))],
+    "unaligned world": [
+        ("spatial", None, sizes, read_as("so3"), ("world", "--align")),
+        ("planar", None, sizes, read_as("so2"), ("world", "--align")),
+    ],
+    "degrees": [
+        ("planar", None, sizes, heading_degrees, ("estimates are in degrees",)),
+        ("planar", None, sizes, lambda p: degrees(heading_degrees(p)), ("in degrees",)),
+    ],
+    "deviations, axes unlike": [
+        (kind, None, sizes, deviations, ("standard deviations",)) for kind in ("spatial", "planar", "vector")
+    ],
+    "information, axes unlike": [
+        (kind, None, sizes, information, ("information",)) for kind in ("spatial", "planar", "vector")
+    ],
+}  # fmt: skip
+
+
+def gross(rng: np.random.Generator, name: str, number: int, scale: float) -> tuple[bool, list[str]]:
+    """Whether a log with this mix-up, its true covariance ``scale`` times too large, is told so, and its hints."""
+    variants = GROSS[name]
+    kind, convention, size, mess, words = variants[number % len(variants)]
+    for _ in range(1000):
+        runs, steps = SIZES[rng.integers(len(SIZES))]
+        rho = MEMORY[rng.integers(len(MEMORY))]
+        plain = name.startswith("deviations")
+        right = log(rng, kind, runs, steps, rho, sigma=size(rng, kind), convention=convention, correlated=not plain)
+        right = [replace(p, covariance=p.covariance * scale) for p in right]
+        if name == "unaligned world":
+            frame = WorldTransform.about_z(rng.uniform(-3.0, 3.0), rng.normal(0.0, 10.0, 3 if kind == "spatial" else 2))
+            mixed = [moved(p, frame) for p in right]
+        else:
+            mixed = [mess(p) for p in right]
+        if median_nees(mixed) >= 10.0 * median_nees(right):
+            break
+    said = hints("est", AXES[kind], mixed)
+    return any(all(word in hint for word in words) for hint in said), said
+
+
+def median_nees(runs: list[Poses]) -> float:
+    found = []
+    for p in runs:
+        with np.errstate(all="ignore"):
+            found.append(np.einsum("ki,kij,kj->k", e := p.errors(), np.linalg.inv(p.covariance), e))
+    return float(np.median(np.concatenate(found)))
+
+
+def slow(rng: np.random.Generator, number: int) -> list[str]:
+    """The hints of a single drifting log, whose covariance is a constant number of its components."""
+    kind = list(AXES)[number % len(AXES)]
+    n, steps = len(AXES[kind]), int(rng.integers(200, 2000))
+    e = np.cumsum(rng.normal(size=(steps, n)), axis=0) * sizes(rng, kind) / np.sqrt(steps)
+    P = np.tile(10.0 ** rng.uniform(-6.0, 3.0) * np.eye(n), (steps, 1, 1))
+    convention = {"spatial": "so3", "planar": "so2"}.get(kind, "vector")
+    return hints("est", AXES[kind], [run_of(rng, kind, convention, e, P)])
+
+
+def print_gross(seed: int, logs: int) -> bool:
+    """Print how many gross mix-ups are named; whether that is enough of each kind and of all."""
+    shares = []
+    for k, name in enumerate(GROSS):
+        found = []
+        for at, scale in enumerate((1.0, 0.25, 4.0)):
+            rng = np.random.default_rng((seed, 7, k, at))
+            named_so = [gross(rng, name, number, scale) for number in range(logs)]
+            found.append(sum(ok for ok, _ in named_so))
+            for ok, said in named_so:
+                if not ok:
+                    print(f"  {name}, P x{scale:g}: {said[0] if said else 'no hint'}", flush=True)
+        shares.append(sum(found) / (3 * logs))
+        print(f"{name:<36} right {found[0]}, P/4 {found[1]}, Px4 {found[2]} of {logs} each", flush=True)
+    print(f"gross mix-ups named: {100 * np.mean(shares):.1f} % of {30 * logs}")
+    return min(shares) >= 0.8 and float(np.mean(shares)) >= 0.9
+
+
 def main() -> int:
     given = options_of(
         __doc__.splitlines()[0] if __doc__ else "",
         logs=(1200, "Honest logs."),
         cells=(20, "Logs of each mix-up and factor; 0 for none."),
+        gross=(10, "Logs of each gross mix-up and scale; 0 for none."),
+        slow=(200, "Slow logs."),
         seed=(5, None),
     )
     for number, name in enumerate(MIXED if given.cells else ()):
@@ -247,7 +383,14 @@ def main() -> int:
             print(f"  honest ({label}): {hint}", flush=True)
     total = sum(found.values())
     print(f"honest logs with a hint: {total} of {given.logs}")
-    return int(total > PROMISE * given.logs)
+    drifts = [
+        hint for number in range(given.slow) for hint in slow(np.random.default_rng((given.seed, 98, number)), number)
+    ]
+    for hint in drifts:
+        print(f"  slow: {hint}", flush=True)
+    print(f"slow logs with a hint: {len(drifts)} of {given.slow}")
+    enough = not given.gross or print_gross(given.seed, given.gross)
+    return int(total > PROMISE * given.logs or len(drifts) > PROMISE * given.slow or not enough)
 
 
 if __name__ == "__main__":

@@ -100,7 +100,9 @@ def read_files(path: Path, files: Reading) -> list[Evidence]:
 
 def tell_notes(*read: list[Evidence]) -> None:
     """What was assumed and left out, to standard error; said when nothing is refused any more."""
-    tell(dict.fromkeys(note for recordings in read for one in recordings for note in one.notes))
+    tell(
+        dict.fromkeys(note for recordings in read for one in recordings for note in one.notes if note not in one.causes)
+    )
 
 
 def tell(notes: Iterable[str]) -> None:

@@ -204,7 +204,7 @@ def reason(v: Verdict, name: str = "", look: Look | None = None) -> Reason:
 
 def summary(v: Verdict) -> tuple[Block, ...]:
     """The sentence and the figures that matter."""
-    return Reasons((replace(reason(v), others=()),)), Facts(tuple(rows(v)))
+    return Reasons((replace(reason(v), others=v.causes),)), Facts(tuple(rows(v)))
 
 
 def rows(v: Verdict) -> list[tuple[str, str]]:

@@ -17,9 +17,13 @@ def compose_plain(records: Sequence[Evidence], judged: Mapping[str, Verdict], ti
     named = {record.name: record for record in records}
     chapters = []
     for name, verdict in judged.items():
-        blocks: list[Block] = [*summary(verdict), Bullets(tuple(verdict.reasons[1:])), *picture(named[name], verdict)]
+        blocks: list[Block] = [
+            *summary(verdict),
+            Bullets(tuple(why for why in verdict.reasons[1:] if why not in verdict.causes)),
+            *picture(named[name], verdict),
+        ]
         chapters.append(Chapter(name, name, name, tuple(blocks)))
-    notes = dict.fromkeys(note for name in judged for note in named[name].notes)
+    notes = dict.fromkeys(note for name in judged for note in named[name].notes if note not in named[name].causes)
     if notes:
         chapters.append(Chapter("", "", "", (Bullets(tuple(notes)),)))
     return Document(f"Estimator consistency: {title}", "", tuple(chapters))

@@ -115,7 +115,7 @@ def recordings_of(
         *_notes(source.path, matches, poses[0].max_dt),
         *clocks,
         *moved.notes,
-        *hints(source.path.name, axes[: len(AXES)], [one.alone() for one in poses], shift),
+        *(causes := _causes(source.path.name, axes, poses, shift, judged)),
     ]
     notes.append(f"error convention {kind}: {INERTIAL.get(kind) or PLANAR[kind]}{source.why}")
     recordings = []
@@ -124,9 +124,19 @@ def recordings_of(
             some = [track.part(part) for track in tracks]
             names, name = tuple(axes[i] for i in part), f"{source.path.stem}{title}"
             record = moved.on(assemble(name, some, t, names, str(source.covariance), kind, notes))
+            record = replace(record, causes=tuple(causes))
             recordings.append(each_alone(record) if parts is ALONE or parts is SINGLE else record)
-            notes = []
+            notes, causes = [], []
     return recordings
+
+
+def _causes(name: str, axes: Sequence[str], poses: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
+    """Mix-ups of the whole state, or of its poses by themselves."""
+    whole = hints(name, axes, poses, shift, judged) if len(axes) > len(AXES) else []
+    of_pose = [i for i in judged if i < len(AXES)]
+    if whole or not of_pose:
+        return whole
+    return hints(name, axes[: len(AXES)], [one.alone() for one in poses], shift, of_pose)
 
 
 def _match(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: float) -> Match:
@@ -190,8 +200,8 @@ def _notes(estimates: Path, matches: Sequence[Match], max_dt: float) -> list[str
     angle, bent = max(run.angle for run in matches), max(run.bent for run in matches)
     if angle > FAR:
         notes.append(
-            f"{estimates}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run: "
-            "are the quaternions of both files x y z w, body to world, of the same body frame?"
+            f"{estimates}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run, which is a "
+            "matter of conventions or frames rather than of an estimator"
         )
     if bent > BENT:
         notes.append(

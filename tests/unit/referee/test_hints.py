@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.geometry.groups import spatial_error
+from consistency.referee.notebook.read_and_judge import judge
 from consistency.referee.readers.alignment.world_frames import (
     BodyTransform,
     WorldTransform,
@@ -28,10 +29,12 @@ from consistency.referee.readers.alignment.world_frames import (
 )
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.mix_ups import hints as readers_hints
-from consistency.referee.readers.mix_ups.hints import FACTOR, ReadingFit, decades, fit_of, hints, turns
+from consistency.referee.readers.mix_ups.hints import FACTOR, ReadingFit, fit_of, hints, turns
 from consistency.referee.readers.mix_ups.known import _ned
+from consistency.referee.readers.runs_to_record import Track, _singular
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
+from consistency.testing import assert_consistent
 
 RUNS, STEPS = 3, 60
 SIX = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -191,6 +194,12 @@ def test_a_mix_up_is_named(name: str, rng: np.random.Generator) -> None:
     assert words in said
 
 
+def decades(runs: Sequence[Poses]) -> Array:
+    found = fit_of([(p.errors(), p.covariance) for p in runs])
+    assert found is not None
+    return found.decades
+
+
 def test_worlds_of_each_run_are_named(rng: np.random.Generator) -> None:
     runs = [moved(p, WorldTransform.about_z(0.7 * i, FAR)) for i, p in enumerate(spatial(rng))]
     (said,) = hints("est", SIX, runs)
@@ -323,17 +332,20 @@ def test_what_is_right_and_what_is_not() -> None:
     rng = np.random.default_rng(9)
     w = rng.normal(size=(2000, 2))
     w = np.linalg.solve(np.linalg.cholesky(np.cov(w.T)), (w - w.mean(axis=0)).T).T
-    assert fit(w).right()
+    assert fit(w).right(False)
+    assert fit(w).is_shown()
+    for factor in (1.2, 1.0 / 1.2):  # is right but for the factor that all share
+        assert fit(w * factor).right(False)
+        assert not fit(w * factor).is_shown()
+    assert not fit(w[:20]).is_shown()
     t = rng.standard_t(3, size=w.shape)
     for other in (
-        w * 1.2,
-        w / 1.2,
         w * [1.25, 0.8],
         w + np.array([0.2, 0.0]),
         w @ [[1.0, 0.2], [0.0, 0.98]],
         t / t.std(axis=0),
     ):
-        assert not fit(other).right()
+        assert not fit(other).right(False)
     assert fit(w).fault() == pytest.approx(0.0, abs=1e-3)
     assert fit(2.0 * w).fault() == pytest.approx(0.5 * 2 * (4.0 - np.log(4.0) - 1.0), rel=1e-2)
 
@@ -346,7 +358,7 @@ def fit(*whitened: Array, P: Array | None = None) -> ReadingFit:
     for w in whitened:
         e = w @ np.linalg.cholesky(P).T
         runs.append(poses(np.arange(len(e)) * 0.1, np.zeros_like(e), P, e, "vector", "vector"))
-    found = fit_of(runs)
+    found = fit_of([(p.errors(), p.covariance) for p in runs])
     assert found is not None
     return found
 
@@ -355,6 +367,115 @@ def test_no_guess_that_fits_is_no_hint(rng: np.random.Generator) -> None:
     runs = [replace(p, covariance=p.covariance / 1000.0) for p in planar(rng)]
     assert decades(runs)[0] > 2.5
     assert hints("est", THREE, runs) == []
+
+
+def test_a_variance_in_the_row_of_another_component_is_no_reason_to_judge_that_one(rng: np.random.Generator) -> None:
+    """Yaw moves and has no variance, roll has one and does not move: not --axes x,y,roll, which is conservative."""
+    error, P = np.zeros((20, 6)), np.zeros((20, 6, 6))
+    error[:, [0, 1, 5]] = rng.normal(size=(20, 3))
+    P[:, [0, 1, 3], [0, 1, 3]] = 1.0
+    track = Track(0, np.arange(20), Places("line {}".format, np.arange(20)), error, P)
+    said = _singular("est", [track], SIX)
+    assert "roll has a variance and no error, yaw has errors and no variance" in said
+    assert "--axes" not in said
+    right = replace(track, covariance=P[:, [0, 1, 2, 5, 4, 3]][:, :, [0, 1, 2, 5, 4, 3]])
+    assert "--axes x,y,yaw" in _singular("est", [right], SIX)
+
+
+@pytest.mark.parametrize("scale", [0.25, 1.0, 4.0])
+@pytest.mark.parametrize(
+    "name", ["quaternions", "blocks", "gtsam", "turned world", "information", "headings in degrees"]
+)
+def test_a_mix_up_is_named_beside_a_wrong_scale(name: str, scale: float, rng: np.random.Generator) -> None:
+    make, mess, words = MIXED[name]
+    runs = [replace(p, covariance=p.covariance * scale) for p in make(rng)]
+    axes = SIX if runs[0].manifold == "spatial" else THREE
+    assert hints("est", axes, runs) == []
+    (said,) = hints("est", axes, [mess(p) for p in runs])
+    assert words in said
+    rest = {0.25: "too large in all components", 4.0: "too small in all components"}.get(scale)
+    assert rest is None or said.endswith(rest)
+
+
+def test_inverse_poses_are_named(rng: np.random.Generator) -> None:
+    inverted = []
+    for p in spatial(rng):
+        turn = Rotation.from_quat(p.estimate[:, 3:]).inv()
+        inverted.append(replace(p, estimate=np.hstack([-turn.apply(p.estimate[:, :3]), turn.as_quat()])))
+    (said,) = hints("est", SIX, inverted)
+    assert "the poses of the estimates are inverse" in said
+
+
+def test_one_slow_log_with_a_constant_covariance_gets_no_hint(rng: np.random.Generator) -> None:
+    """A drift of meters beside 0.001 I: the inverse, 1000 I, is as far off on the other side."""
+    drift = np.cumsum(rng.normal(0.0, 0.3, (300, 3)), axis=0)
+    run = poses(np.arange(300.0), np.zeros((300, 3)), 1e-3 * np.eye(3), drift, "vector", "vector")
+    assert hints("est", ("x", "y", "z"), [run]) == []
+
+
+def test_components_that_are_judged_alone_get_hints(rng: np.random.Generator) -> None:
+    """Blocks in the other order beside components without a variance, which would make the whole singular."""
+    runs = []
+    for p in spatial(rng, plain=True):
+        P = p.covariance[:, SWAP][:, :, SWAP]
+        P[:, 2], P[:, :, 2] = 0.0, 0.0
+        runs.append(replace(p, covariance=P))
+    assert hints("est", SIX, runs) == []
+    (said,) = hints("est", SIX, runs, judged=[0, 1, 3, 4])
+    assert "other order (--covariance-order)" in said
+
+
+def test_cross_terms_that_are_nearly_singular_are_named_with_their_direction(rng: np.random.Generator) -> None:
+    e = rng.normal(size=(400, 3)) * [0.1, 0.2, 0.05]
+    R = np.eye(3)
+    R[0, 1] = R[1, 0] = 1.0 - 1e-7
+    P = R * np.outer([0.1, 0.2, 0.05], [0.1, 0.2, 0.05])
+    (said,) = hints("est", ("x", "y", "z"), [poses(np.arange(400.0), np.zeros_like(e), P, e, "vector", "vector")])
+    assert "nearly singular in the direction +1.00 x -1.00 y" in said or "direction -1.00 x +1.00 y" in said
+
+
+def test_a_unit_quaternion_with_four_variances_is_named(rng: np.random.Generator) -> None:
+    turn = Rotation.random(400, random_state=rng.integers(2**31))
+    true = (turn * Rotation.from_rotvec(0.02 * rng.normal(size=(400, 3)))).as_quat()
+    true *= np.sign((true * turn.as_quat()).sum(axis=1))[:, None]
+    run = poses(np.arange(400.0), turn.as_quat(), 0.01**2 * np.eye(4), true, "vector", "vector")
+    (said,) = hints("est", ("qx", "qy", "qz", "qw"), [run])
+    assert "qx, qy, qz, qw are a unit quaternion (x y z w) with three degrees of freedom" in said
+
+
+def test_blocks_of_an_inertial_state_in_another_order_are_named(rng: np.random.Generator) -> None:
+    runs = []
+    for p in spatial(rng):
+        P = np.zeros((STEPS, 9, 9))
+        P[:, :6, :6], P[:, 6:, 6:] = p.covariance, 0.3**2 * np.eye(3)
+        own, error = rng.normal(size=(STEPS, 3)), 0.3 * rng.normal(size=(STEPS, 3))
+        estimate, truth = np.hstack([p.estimate, own]), np.hstack([p.truth, own + error])
+        runs.append(replace(p, estimate=estimate, truth=truth, covariance=P))
+    axes, order = (*SIX, "vx", "vy", "vz"), [0, 1, 2, 6, 7, 8, 3, 4, 5]
+    assert hints("est", axes, runs) == []
+    (said,) = hints("est", axes, [replace(p, covariance=p.covariance[:, order][:, :, order]) for p in runs])
+    assert said.endswith("in the order p,v,R; add --covariance-order p,v,R")
+
+
+def test_half_angles_are_named_as_one_of_two(rng: np.random.Generator) -> None:
+    runs = [weighed(p, slice(3, 6), 0.5) for p in world.log(rng, "spatial", 20, 50, 0.0)]
+    (said,) = hints("est", SIX, runs)
+    assert "its angles are half angles" in said
+    assert said.endswith("a covariance of a wrong scale looks the same")
+
+
+def test_causes_are_shown_by_print_and_gate(rng: np.random.Generator) -> None:
+    sigma = np.array([0.1, 0.05, 0.02])
+    errors, P = rng.normal(size=(40, 50, 3)) * sigma, np.broadcast_to(np.diag(sigma), (40, 50, 3, 3))
+    verdict = judge(errors, P)
+    (cause,) = verdict.causes
+    assert "standard deviations" in cause
+    assert cause in verdict.reasons
+    assert cause in verdict.notes
+    assert cause in str(verdict)
+    assert cause in verdict._repr_html_()
+    with pytest.raises(AssertionError, match="its diagonal holds standard deviations"):
+        assert_consistent(errors, P)
 
 
 # --- frames -----------------------------------------------------------------------------------------

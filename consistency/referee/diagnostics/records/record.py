@@ -104,6 +104,7 @@ class Record:
     times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
     convention: str = ""  # of the error
     notes: tuple[str, ...] = ()  # notes for the reader: the convention, left-out steps
+    causes: tuple[str, ...] = ()  # probable mix-ups, which the verdict names; they stand in the notes, too
     window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
     independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
     unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked

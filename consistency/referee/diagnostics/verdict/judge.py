@@ -113,7 +113,8 @@ def _beside(verdict: Verdict, r: Record, world: Verdict | None, runs: int | None
     left_out = verdict.left_out_steps
     return replace(
         verdict,
-        reasons=(f"{first}; {r.caption}" if r.caption else first, *rest, *_other_ways(verdict, r)),
+        reasons=(f"{first}; {r.caption}" if r.caption else first, *rest, *r.causes, *_other_ways(verdict, r)),
+        causes=tuple(r.causes),
         convention=r.convention or None,
         align=(r.align or None) if r.convention else None,
         notes=tuple(r.notes),

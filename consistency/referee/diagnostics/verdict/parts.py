@@ -373,6 +373,7 @@ class Verdict:
     accuracy: Accuracy | None = None
     convention: str | None = None  # of the error that is judged, where files or the filter declare one
     notes: tuple[str, ...] = ()  # of whoever read the files
+    causes: tuple[str, ...] = ()  # probable mix-ups; they stand in the reasons and notes, too
     align: str | None = None  # how estimates in files were moved into the world of the truth
     world: Verdict | None = None  # the same runs in the additive error of the world, where the filter has another
     map: MapScore | None = None

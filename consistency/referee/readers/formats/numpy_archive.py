@@ -229,11 +229,13 @@ def _of_arrays(
     axes = _axes(path, arrays, n)
     require_radians(str(path), poses)
     notes = [f"error convention {error_kind}: {PLANAR[error_kind]}"] if error_kind else []
-    notes += hints(path.stem, axes, poses)
+    causes = hints(path.stem, axes, poses)
     if given == "vector":
         remedy = "add --error so2, if these are x, y, heading" if error_kind and n == 3 else "wrap it to [-pi, pi]"
-        notes += turns(path.stem, axes, error, covariances, remedy)
-    return assemble(path.stem, tracks, step_times(path, arrays, steps), axes, str(path), error_kind, notes)
+        causes += turns(path.stem, axes, error, covariances, remedy)
+    t = step_times(path, arrays, steps)
+    record = assemble(path.stem, tracks, t, axes, str(path), error_kind, [*notes, *causes])
+    return replace(record, causes=tuple(causes))
 
 
 def steps_of(of: Path | str, run: int, rows: Indices) -> Places:

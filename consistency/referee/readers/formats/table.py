@@ -170,6 +170,7 @@ def _recording(
     numbers = [int(run) for run in np.unique(runs)]
     members = [np.flatnonzero(runs == run) for run in numbers]
     notes: list[str] = []
+    causes: list[str] = []
     moved, deviations = Aligned(()), None
     of_runs: list[dict[str, Array | None]]
     if truth is None:
@@ -210,7 +211,8 @@ def _recording(
                 from consistency.referee.readers.clock_offset import clocks_and_frames
 
                 shift, clocks, moved = clocks_and_frames(name, moved.runs, r.time_offset, r.align, range(len(axes)))
-            clocks += [*moved.notes, *hints(name, axes, moved.runs, shift)]
+            causes = hints(name, axes, moved.runs, shift)
+            clocks += [*moved.notes, *causes]
         known, notes = matched(name, sheet, truth, samples, key, numbers, members, moved.runs, shift, r.tolerance)
         if relative is not None:
             from consistency.referee.readers.relative_motions import Stretch, relative_recording
@@ -271,6 +273,7 @@ def _recording(
         own_nis, own_dof, own_t = (None if values is None else values[rows] for values in (nis, dof, clock))
         tracks.append(Track(run, column, Places(sheet.place, rows), nis=own_nis, nis_dof=own_dof, t=own_t, **arrays))
     record = assemble(name, tracks, t, axes, str(sheet.path), convention if truth is not None else "", notes)
+    record = replace(record, causes=tuple(causes))
     if truth is None:
         return replace(record, error=None, dof=0)
     return moved.on(each_alone(record) if deviations is not None else record)

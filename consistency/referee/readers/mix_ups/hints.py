@@ -1,16 +1,19 @@
-"""Hints on mix-ups in files with impossible errors: a unit, order, side or frame that makes the covariance fit."""
+"""Hints on mix-ups in files whose errors do not fit: a unit, order, side or frame that makes the covariance fit.
+
+Each cause transforms estimates and covariance (:mod:`consistency.referee.readers.mix_ups.known`). The errors that this
+leaves are judged in the same way for all causes, and a cause is named if they come near.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from consistency.referee.diagnostics.records.validity import Validity, classify
-from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
@@ -18,61 +21,101 @@ from consistency.referee.types import Array
 if TYPE_CHECKING:
     from consistency.referee.readers.mix_ups.known import Guess
 
-MOST = 4000  # estimates that are looked at, of all runs together
+MOST = 1000  # estimates that are looked at, of all runs together
 MOST_RUNS = 200  # that are looked at, evenly over all
-MOST_FITTED = 1000  # of which so many are, where less than a decade is wrong
-WRONG = 1.0  # decades that the NEES is off, from which a mix-up is looked for
+WRONG = 1.0  # decades that the NEES is off, from which on causes are named that look like a bias or a drift
 APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
-RIGHT = 0.4  # decades that it may be off with the mix-up undone
-LEAST_GAIN = float(np.log(1e4))  # log likelihood that a reading gains over simple faults, and as much as it has rivals
+RIGHT = 0.4  # decades that components may differ by with the mix-up undone
+SCALE = 1.0  # decades that all may be off by with the mix-up undone: a filter's own fault beside it
+SAID = 0.2  # decades from which on this is said
+LEAST_GAIN = float(np.log(1e4))  # log likelihood that a cause gains over simple faults, and as much as it has rivals
+ENOUGH = 30.0  # independent estimates that show a scale to be the one that a cause makes
 ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
-ALIKE = 0.01  # decades between guesses of which the likelier is named
 NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
 
+Taken: TypeAlias = Callable[[Poses], tuple[Array, Array]]  # errors (k, n) that are judged, with their covariances
 
-def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 0.0) -> list[str]:
+
+def hints(
+    name: str,
+    axes: Sequence[str],
+    runs: Sequence[Poses],
+    shift: float = 0.0,
+    judged: Sequence[int] | None = None,
+    taken: Taken | None = None,
+) -> list[str]:
     """Hints on a probable mix-up, where the covariance does not fit and one other reading of the files does; or none.
 
-    Where the NEES of a median estimate is off by a decade or more, the guess that brings it nearest to a right one is
-    named. Where it is off by less, a guess is named if all errors then agree with the covariance, and no simple fault
-    of a filter explains as much (:mod:`consistency.referee.readers.mix_ups.hints`).
+    A cause that changes directions or single components is named where no simple fault of a filter explains the errors
+    nearly as well, up to a factor of 10 that all components share. One that only scales is named beside the plain
+    wrong scale.
+
+    Parameters
+    ----------
+    axes : names of the components of the error, ``judged`` are the indices of those that count
+    taken : errors of a run and their covariances, where they are not those of its poses
     """
     if not runs:
         return []
     runs = runs[:: -(-len(runs) // MOST_RUNS)]
-    some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs]
-    if _same(some):
+    some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs] if taken is None else runs
+    if taken is None and _same(some):
         return [
             f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies of "
             "one; give the true poses as the truth"
         ]
-    off = decades(some)
-    limit = np.append(WRONG, np.full(len(off) - 1, APART))
-    worst = int(np.argmax(np.abs(off) / limit))
-    gross = bool(abs(off[worst]) > limit[worst])
-    if gross and (best := _gross(_guesses(some, axes), some)) is not None:
-        return [f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, but about right if {best.text}"]
-    some = [poses.some(max(MOST_FITTED // len(runs), 20)) for poses in some]
-    declared = fit_of(some)
-    if declared is None:
-        return []
-    if not gross and declared.size * declared.fault() < LEAST_GAIN:
-        return []
-    guesses = _guesses(some, axes)
-    best = _fine(guesses, some, declared)
-    if best is None:
-        return []
-    worst = int(np.argmax(np.abs(off)))
-    return [
-        f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, and no single factor explains the errors, but "
-        f"all would be consistent if {best.text}"
-    ]
+    part = list(range(len(axes)) if judged is None else judged)
 
+    def errors_of(p: Poses) -> tuple[Array, Array]:
+        error, P = (p.errors(), p.covariance) if taken is None else taken(p)
+        kept = part if error.shape[1] == len(axes) else list(range(error.shape[1]))  # of a quaternion as a rotation
+        return error[:, kept], P[:, kept][:, :, kept]
 
-def _guesses(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
+    declared = fit_of([errors_of(p) for p in some])
+    if declared is None or declared.size * declared.fault() < LEAST_GAIN:
+        return []
     from consistency.referee.readers.mix_ups.known import guesses_of  # few files need them
 
-    return guesses_of(runs, axes)
+    found = [(guess, fit_of([errors_of(guess.change(p)) for p in some]))
+             for guess in guesses_of(some, axes, part, moving=taken is None)]  # fmt: skip
+    cause = _cause(found, declared)
+    if cause is None:
+        return []
+    off = declared.decades
+    worst = int(np.argmax(np.abs(off)))
+    of = [axes[i] for i in part]
+    return [f"{name}: the NEES{_of(of, worst)} is {_times(off[worst])}, but about right if {cause}"]
+
+
+def _cause(found: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFit) -> str | None:
+    """The likeliest cause in words, if any is confirmed."""
+    off = np.abs(declared.decades)
+    gross = bool(off[0] > WRONG or (off > APART).any())
+    bar, simple = LEAST_GAIN + np.log(max(len(found), 1)), declared.simple()
+    named: list[tuple[float, Guess, ReadingFit]] = []
+    scaled: list[tuple[Guess, ReadingFit]] = []
+    for guess, fit in found:
+        if fit is None or len(fit.w) < NEARLY_ALL * len(declared.w) or not (gross or guess.fine):
+            continue
+        size = min(fit.size, declared.size)
+        gain = size * (fit.near() - simple) if fit.n == declared.n else -np.inf
+        if gain >= bar and fit.right(gross) and _status(fit) <= _status(declared):
+            named.append((gain, guess, fit))
+        elif (gross or guess.exact) and fit.is_shown():
+            scaled.append((guess, fit))
+    first = [each for each in named if not each[1].last]
+    named = first or named
+    if named:
+        most = max(gain for gain, *_ in named)
+        guess, fit = next(
+            (guess, fit) for gain, guess, fit in named if gain >= most - 1.0
+        )  # nearly as likely: the first
+        rest = fit.decades[0]
+        return guess.text + (f"; the NEES is then {_times(rest)} in all components" if abs(rest) > SAID else "")
+    if not scaled:
+        return None
+    guess, fit = scaled[0]
+    return guess.text + "; a covariance of a wrong scale looks the same" * (fit.n == declared.n)
 
 
 def _of(axes: Sequence[str], worst: int) -> str:
@@ -96,39 +139,6 @@ def _same(runs: Sequence[Poses]) -> bool:
     return total >= LEAST and same >= NEARLY_ALL * total
 
 
-def _gross(guesses: Sequence[Guess], some: Sequence[Poses]) -> Guess | None:
-    """The guess with which the NEES of a median estimate is nearest to a right one, if it is near."""
-    left = np.array([np.abs(decades([guess.change(poses) for poses in some])).max() for guess in guesses])
-    first = np.where([guess.last for guess in guesses], np.nan, left)
-    left = first if np.nanmin(first) < RIGHT else left
-    if not np.nanmin(left) < RIGHT:
-        return None
-    return guesses[int(np.flatnonzero(left <= np.nanmin(left) + ALIKE)[0])]
-
-
-def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: ReadingFit) -> Guess | None:
-    """The likeliest guess with which everything is right, where no simple fault is nearly as likely."""
-    guesses = [guess for guess in guesses if guess.fine]
-    bar, simple, found = LEAST_GAIN + np.log(max(len(guesses), 1)), declared.simple(), []
-    errors = np.concatenate([poses.errors() for poses in some])
-    for guess in guesses:
-        read = [guess.change(poses) for poses in some]
-        if any(new.truth is not old.truth for new, old in zip(read, some, strict=True)):
-            continue  # a density of the truth in another unit is no likelier
-        same = all(
-            new.estimate is old.estimate and new.convention == old.convention
-            for new, old in zip(read, some, strict=True)
-        )
-        fit = fit_of(read, errors if same else None)
-        if fit is None or len(fit.w) < len(declared.w) or declared.size * (fit.likelihood - simple) < bar:
-            continue
-        gain = min(fit.size, declared.size) * (fit.likelihood - simple)
-        if gain >= bar and fit.right():
-            found.append((gain, guess))
-    most = max((gain for gain, _ in found), default=0.0)
-    return next((guess for gain, guess in found if gain >= most - 1.0), None)  # nearly as likely: the first
-
-
 def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
     """Components of errors (runs, steps, n) that look like angles: their large errors are whole turns."""
     found = []
@@ -146,26 +156,7 @@ def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remed
     return found
 
 
-def decades(runs: Sequence[Poses]) -> Array:
-    """log10 of the median NEES over that of chi-square, of all n components and of each alone, (1 + n,).
-
-    NaN without any.
-    """
-    n = runs[0].covariance.shape[-1]
-    found = []
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for poses in runs:
-            error, P = poses.errors(), poses.covariance
-            own = np.square(error) / np.diagonal(P, axis1=1, axis2=2)
-            found.append(np.column_stack([np.square(whiten(error, P)).sum(axis=1), own]))
-    nees = np.concatenate(found)
-    nees = nees[np.isfinite(nees).all(axis=1)]
-    if not len(nees):
-        return np.full(1 + n, np.nan)
-    right = distributions.chi2.ppf(0.5, np.append(n, np.ones(n)))
-    return np.asarray(np.log10(np.maximum(np.median(nees, axis=0), 1e-300) / right))
-
-
+BIAS = 6.0  # standard deviations that a filter is off by without a mix-up
 FACTOR = 6.0  # by which a wrong filter's covariance is off without a mix-up: the table of benchmarks/hints.py has 4
 ODD = 1e-3  # chance that errors with the stated covariance are not taken for such
 GROUPS = {3: ([0, 1],), 6: ([0, 1, 2], [3, 4, 5])}  # position and attitude, of poses
@@ -191,6 +182,13 @@ class ReadingFit:
         return np.concatenate(self.whitened)
 
     @cached_property
+    def decades(self) -> Array:
+        """log10 of the median NEES over that of chi-square, of all n components and of each alone, (1 + n,)."""
+        nees = np.median(np.column_stack([np.square(self.w).sum(axis=1), np.square(self.own)]), axis=0)
+        right = distributions.chi2.ppf(0.5, np.append(self.n, np.ones(self.n)))
+        return np.asarray(np.log10(np.maximum(nees, 1e-300) / right))
+
+    @cached_property
     def likelihood(self) -> float:
         """Mean log likelihood of an estimate, but for a constant."""
         return -0.5 * (float(np.square(self.w).sum(axis=1).mean()) + self.log_det)
@@ -213,17 +211,34 @@ class ReadingFit:
             size = min(size, 2.0 * float(means.mean()) ** 2 * len(means) / (n * float(means.var(ddof=1))))
         return max(float(size), 1.0)
 
-    def right(self) -> bool:
-        n, size = self.n, self.size
-        ratios = np.append(np.square(self.own).mean(axis=0), np.square(self.w).mean())
+    def right(self, roughly: bool) -> bool:
+        """Whether all is right but for a factor that all components share: within decades, or at a rate of ``ODD``."""
+        if roughly:
+            off = self.decades
+            return bool(abs(off[0]) < SCALE and (np.abs(off[1:] - off[0]) < RIGHT).all())
+        n, size, common = self.n, self.size, float(np.square(self.w).mean())
+        w = self.w / np.sqrt(common)
         pairs = np.triu_indices(n, 1)
-        asked = n + 1 + n + len(pairs[0]) + 1
-        scale = np.append(np.full(n, size), n * size) * (ratios - np.log(np.maximum(ratios, 1e-300)) - 1.0)
-        products = (self.w.T @ self.w / len(self.w))[pairs]
-        below = float((np.square(self.w).sum(axis=1) < distributions.chi2.ppf(0.5, n)).mean())
-        normal = np.concatenate([self.w.mean(axis=0), products, [2.0 * below - 1.0]]) * np.sqrt(size)
+        asked = n + n + len(pairs[0]) + 1
+        ratios = np.square(self.own).mean(axis=0) / common
+        scale = size * (ratios - np.log(np.maximum(ratios, 1e-300)) - 1.0)
+        products = (w.T @ w / len(w))[pairs]
+        below = float((np.square(w).sum(axis=1) < distributions.chi2.ppf(0.5, n)).mean())
+        normal = np.concatenate([w.mean(axis=0), products, [2.0 * below - 1.0]]) * np.sqrt(size)
         limit = distributions.chi2.isf(ODD / asked, 1)
         return bool((scale <= limit).all() and (np.square(normal) <= limit).all())
+
+    def is_shown(self) -> bool:
+        """Whether all is right, the common factor too, with enough independent estimates to show it."""
+        ratio = float(np.square(self.w).mean())
+        off = self.n * self.size * (ratio - np.log(max(ratio, 1e-300)) - 1.0)
+        return self.size >= ENOUGH and self.right(False) and bool(off <= distributions.chi2.isf(ODD, 1))
+
+    def near(self) -> float:
+        """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``."""
+        mean = float(np.square(self.w).mean())
+        f = float(np.clip(mean, 10.0**-SCALE, 10.0**SCALE))
+        return self.likelihood + 0.5 * self.n * (mean - mean / f - float(np.log(f)))
 
     def fault(self) -> float:
         """Log likelihood of an estimate that another covariance, the same for all whitened errors, would gain."""
@@ -234,30 +249,41 @@ class ReadingFit:
     def simple(self) -> float:
         """Log likelihood of an estimate with the simple fault that explains the errors best.
 
-        That is a bias, or a factor of at most ``FACTOR`` on the covariance of all components, of one, of position or of
-        attitude.
+        That is any factor on the covariance of all components, with one of at most ``FACTOR`` on that of a single one,
+        of position or of attitude; or a bias of at most ``BIAS`` standard deviations with a factor within ``SCALE``.
         """
         n, w = self.n, self.w
         before = float(np.square(w).sum(axis=1).mean())
         shift = self.root @ self.error.mean(axis=0)
-        best = 0.5 * float((2.0 * w * shift - shift**2).sum(axis=1).mean())
+        part = min(1.0, BIAS / max(float(np.sqrt(np.square(shift).sum(axis=1).mean())), 1e-300))
+        after = before - float((2.0 * part * w * shift - (part * shift) ** 2).sum(axis=1).mean())
+        common = float(np.clip(after / n, 10.0**-SCALE, 10.0**SCALE))
+        best = 0.5 * (before - after / common - n * float(np.log(common)))
         f = np.exp(np.linspace(-np.log(FACTOR), np.log(FACTOR), 61))
-        for group in [list(range(n)), *([j] for j in range(n)), *GROUPS.get(n, ())]:
-            part = (self.root[:, :, group] @ self.error[:, group, None])[..., 0]
+        for group in [*([j] for j in range(n)), *GROUPS.get(n, ())]:
+            own = (self.root[:, :, group] @ self.error[:, group, None])[..., 0]
             a = f**-0.5 - 1.0
-            after = before + 2.0 * a * float((w * part).sum(axis=1).mean()) + a**2 * float((part**2).sum(axis=1).mean())
-            best = max(best, float((0.5 * (before - after - len(group) * np.log(f))).max()))
+            left = before + 2.0 * a * float((w * own).sum(axis=1).mean()) + a**2 * float((own**2).sum(axis=1).mean())
+            of_all = n + n * np.log(np.maximum(left, 1e-300) / n)
+            best = max(best, float((0.5 * (before - of_all - len(group) * np.log(f))).max()))
         return self.likelihood + best
 
 
-def fit_of(runs: Sequence[Poses], errors: Array | None = None) -> ReadingFit | None:
-    """Errors of some runs; None without any that can be whitened.
+def _status(fit: ReadingFit) -> int:
+    """0 where the NEES is shown to be consistent, 1 where it may be, 2 where it is not."""
+    from consistency.referee.diagnostics.records.record import Record
+    from consistency.referee.diagnostics.verdict.verdict import judge_alone
 
-    ``errors`` (K, n) are those of all estimates, where they are known.
-    """
-    errors = np.concatenate([p.errors() for p in runs]) if errors is None else errors
-    P = np.concatenate([p.covariance for p in runs])
-    ends = np.cumsum([len(p.t) for p in runs])[:-1]
+    nees = np.full((len(fit.whitened), max(map(len, fit.whitened))), np.nan)
+    for row, w in zip(nees, fit.whitened, strict=True):
+        row[: len(w)] = np.square(w).sum(axis=1)
+    return {"consistent": 0, "undecided": 1}.get(judge_alone(Record("", nees=nees, dof=fit.n)).status, 2)
+
+
+def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
+    """Errors (k, n) of some runs with their covariances (k, n, n); None without any that can be whitened."""
+    errors, P = (np.concatenate(each) for each in zip(*runs, strict=True))
+    ends = np.cumsum([len(error) for error, _ in runs])[:-1]
     with np.errstate(invalid="ignore"):
         variance = np.diagonal(P, axis1=1, axis2=2)
         good = np.isfinite(errors).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (variance > 0).all(axis=1)

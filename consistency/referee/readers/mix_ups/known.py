@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
+from consistency.referee.geometry.groups import inverse, matrices, vectors
 from consistency.referee.readers.alignment.world_frames import (
     WorldTransform,
     fitted_body,
@@ -27,6 +28,8 @@ from consistency.referee.types import Array
 ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
 DEGREE = np.pi / 180.0
 MILLI = 1e-3
+SINGULAR = 1e-3  # smallest eigenvalue of a correlation from which on a direction is named
+UNIT = 1e-3  # lengths of quaternions differ by less from 1
 ARM = 1e-3  # of the size of the path: shorter lever arms are not named
 TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
 
@@ -43,22 +46,120 @@ class Guess:
     change: Change
     last: bool = False  # named only where nothing else fits: it has a fit of its own for each run
     fine: bool = True  # named where less than a decade is wrong too: no bias and no drift looks like it
+    exact: bool = False  # named by its NEES alone, however little is wrong
 
 
-def guesses_of(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
-    """Possible mix-ups, the likelier first."""
+def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], moving: bool = True) -> list[Guess]:
+    """Possible mix-ups, the likelier first; ``part`` is judged. Worlds and bodies only where poses are ``moving``."""
     kind, convention = runs[0].manifold, runs[0].convention
-    guesses = [
-        Guess("its diagonal holds standard deviations; square them", _squared),
-        Guess("it is an information matrix; invert it", _inverted),
+    n = runs[0].covariance.shape[-1]
+    if kind == "spatial" and n > 6:
+        return list(_blocks(n))
+    scales = [
+        Guess("its diagonal holds standard deviations; square them", _covariance(_squared)),
+        Guess("it is an information matrix; invert it", _covariance(partial(_inverted, part=part))),
+        Guess(
+            "it holds the upper root U of an information matrix U'U; write the inverse of U'U",
+            _covariance(lambda P: _inverted(np.swapaxes(np.triu(P), 1, 2) @ np.triu(P), part)),
+        ),
+        *_singular(runs, axes, part),
     ]
+    if kind == "vector":
+        own = [*scales, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
+        return [*own, *_quaternion_states(runs, axes)] if moving else own
     if kind == "spatial":
-        own = [*_orders(convention), *_quaternions(), *guesses, *_permuted(axes, 3)]
-        return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_positions(3), *_frames(runs), *_bodies(runs)]
-    if kind == "planar":
-        own = [*_sides(convention), *_headings(), *guesses, *_permuted(axes, 3)]
-        return [*own, *_units(2, slice(2, 3)), _mirrored(convention), *_positions(2), *_frames(runs), *_bodies(runs)]
-    return [*guesses, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
+        own = [*_orders(convention), *_quaternions(), *scales, *_permuted(axes, 3), *_units(3, slice(3, 6))]
+        own += [_half_angles(), *_positions(3)]
+    else:
+        own = [*_sides(convention), *_headings(), *scales, *_permuted(axes, 3), *_units(2, slice(2, 3)), *_positions(2)]
+    own.append(Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False))
+    if not moving:
+        return own
+    worlds = [*_ned(convention)] if kind == "spatial" else [_mirrored(convention)]
+    return [*own, *worlds, *_frames(runs), *_bodies(runs)]
+
+
+def _blocks(n: int) -> Iterator[Guess]:
+    """Blocks of three of the covariance of an inertial state in another order; biases at its end, in theirs."""
+    names = ("p", "R", "v", "bg", "ba")[: n // 3]
+    for order in itertools.permutations(range(n // 3)):
+        if list(order) == sorted(order) or {*order[:3]} != {0, 1, 2}:
+            continue
+        text = ",".join(names[order.index(i)] for i in range(n // 3))
+        whole = [3 * block + i for block in order for i in range(3)]
+        yield Guess(f"the blocks of its covariance are in the order {text}; add --covariance-order {text}",
+                    _reordered(None, whole))  # fmt: skip
+
+
+def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> Iterator[Guess]:
+    """Cross terms that make the covariance nearly singular, while each component by itself is right."""
+    P = np.concatenate([p.covariance for p in runs])[:, part][:, :, part]
+    sigma = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        R = np.median(P / sigma[:, :, None] / sigma[:, None, :], axis=0)
+    if len(part) < 2 or not np.isfinite(R).all():
+        return
+    values, vectors = np.linalg.eigh(R)
+    if values[0] > SINGULAR:
+        return
+    v = vectors[:, 0] / vectors[np.argmax(np.abs(vectors[:, 0])), 0]
+    direction = " ".join(f"{c:+.2f} {axes[i]}" for c, i in zip(v, part, strict=True) if abs(c) > 0.1)
+    words = f"its cross terms are left out: it is nearly singular in the direction {direction} (in standard deviations)"
+    yield Guess(
+        f"{words}; look for lost digits or a correlation of 1",
+        _covariance(lambda P: _diagonal(P) * np.eye(P.shape[-1])),
+    )
+
+
+def _diagonal(P: Array) -> Array:
+    return np.diagonal(P, axis1=1, axis2=2)[:, :, None]
+
+
+def _half_angles() -> Guess:
+    """The vector part of a small quaternion is half its rotation vector."""
+    words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
+    return Guess(words, lambda p: _weighed(p, slice(3, 6), 2.0), exact=True)
+
+
+def _inverse(p: Poses) -> Poses:
+    finite = np.isfinite(p.estimate).all(axis=1)
+    estimate = p.estimate.copy()
+    if finite.any():
+        estimate[finite] = vectors(inverse(matrices(p.estimate[finite])))
+    return replace(p, estimate=estimate)
+
+
+def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
+    """Four components of a state that are a unit quaternion, which has three degrees of freedom."""
+    for first in range(len(axes) - 3):
+        four = slice(first, first + 4)
+        values = np.concatenate([np.concatenate([p.estimate, p.truth])[:, four] for p in runs])
+        values = values[np.isfinite(values).all(axis=1)]
+        if not len(values) or (np.abs(np.linalg.norm(values, axis=1) - 1.0) > UNIT).any():
+            continue
+        for w in (3, 0):
+            order = "w x y z" if w == 0 else "x y z w"
+            words = f"{', '.join(axes[four])} are a unit quaternion ({order}) with three degrees of freedom"
+            yield Guess(f"{words}; give poses, or a rotation vector with its 3 x 3 covariance",
+                        partial(_rotation_vectors, first=first, w=w), exact=True)  # fmt: skip
+
+
+def _rotation_vectors(p: Poses, first: int, w: int) -> Poses:
+    """The state with a rotation vector, of the truth beside the estimate, in place of the quaternion."""
+    order = [first + (i + 1 - (w == 3)) % 4 for i in range(4)]
+    rest = [i for i in range(p.estimate.shape[1]) if not first <= i < first + 4]
+    known = p.known()
+    turn = Rotation.from_quat(p.estimate[known.rows][:, order])
+    small = (turn.inv() * Rotation.from_quat(known.truth[:, order])).as_rotvec()
+    x, y, z, s = turn.as_quat().T
+    G = 2.0 * np.stack([np.stack(row, -1) for row in ((s, z, -y, -x), (-z, s, x, -y), (y, -x, s, -z))], axis=1)
+    J = np.zeros((len(turn), len(rest) + 3, p.estimate.shape[1]))
+    J[:, range(len(rest)), rest] = 1.0
+    J[:, len(rest) :, order] = G
+    P = J @ p.covariance[known.rows] @ np.swapaxes(J, 1, 2)
+    truth = np.hstack([known.truth[:, rest], small])
+    estimate = np.hstack([p.estimate[known.rows][:, rest], np.zeros_like(small)])
+    return replace(p._of(known.rows), estimate=estimate, covariance=P, true_t=p.t[known.rows], truth=truth)
 
 
 def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator[Guess]:
@@ -178,9 +279,12 @@ def _headings() -> Iterator[Guess]:
     degrees = np.array([1.0, 1.0, DEGREE])
     remedy = "; multiply them by pi / 180"
     for of, names in OF.items():
-        yield Guess(f"the headings of {of} are in degrees{remedy}", partial(_scaled, names, degrees))
+        change = partial(_scaled, names, degrees)
+        yield Guess(f"the headings of {of} are in degrees{remedy}", change, fine="truth" not in names)
     both = "the headings of both files and their variances are in degrees"
-    yield Guess(f"{both}{remedy}", lambda p: _weighed(_scaled(OF["both files"], degrees, p), slice(2, 3), DEGREE))
+    yield Guess(
+        f"{both}{remedy}", lambda p: _weighed(_scaled(OF["both files"], degrees, p), slice(2, 3), DEGREE), fine=False
+    )
 
 
 def _scaled(names: Sequence[str], factors: Array, p: Poses) -> Poses:
@@ -211,7 +315,12 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
         lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),
     )
     for of in ("the truth", "the estimates"):
-        yield Guess(f"the positions of {of} are in millimetres; divide them by 1000", _changed(OF[of], shrunk))
+        words = f"the positions of {of} are in millimetres; divide them by 1000"
+        yield Guess(words, _changed(OF[of], shrunk), fine=of != "the truth")
+
+
+def _covariance(function: Callable[[Array], Array]) -> Change:
+    return lambda p: replace(p, covariance=function(p.covariance))
 
 
 def _weighed(p: Poses, part: slice, factor: float) -> Poses:
@@ -220,16 +329,16 @@ def _weighed(p: Poses, part: slice, factor: float) -> Poses:
     return replace(p, covariance=p.covariance * scale[:, None] * scale)
 
 
-def _squared(p: Poses) -> Poses:
-    n = p.covariance.shape[-1]
-    return replace(p, covariance=np.square(np.diagonal(p.covariance, axis1=1, axis2=2))[:, :, None] * np.eye(n))
+def _squared(P: Array) -> Array:
+    return np.square(_diagonal(P)) * np.eye(P.shape[-1])
 
 
-def _inverted(p: Poses) -> Poses:
-    P = np.full_like(p.covariance, np.nan)
-    regular = np.abs(np.linalg.det(p.covariance)) > 0
-    P[regular] = np.linalg.inv(p.covariance[regular])
-    return replace(p, covariance=P)
+def _inverted(P: Array, part: list[int]) -> Array:
+    """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
+    out, block = np.full_like(P, np.nan), P[:, part][:, :, part]
+    regular = np.flatnonzero(np.abs(np.linalg.det(block)) > 0)
+    out[np.ix_(regular, np.array(part), np.array(part))] = np.linalg.inv(block[regular])
+    return out
 
 
 # --- frames -----------------------------------------------------------------------------------------

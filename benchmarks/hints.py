@@ -131,8 +131,8 @@ def run_of(rng: np.random.Generator, kind: str, convention: str, e: Array, P: Ar
         manifold = "vector"
         own = np.cumsum(rng.normal(size=(steps, n)), axis=0)
         truth = own + e
-    place = Places("line {}".format, np.arange(steps))
-    return Poses(place, t, own, P, np.ones(steps, bool), t, truth, manifold, convention, 0.01)  # type: ignore[arg-type]
+    rows = Places("line {}".format, np.arange(steps))
+    return Poses(rows, t, own, P, np.ones(steps, bool), t, truth, manifold, convention, 0.01)  # type: ignore[arg-type]
 
 
 def honest(rng: np.random.Generator, number: int) -> tuple[str, list[str]]:
@@ -270,7 +270,8 @@ def heading_degrees(p: Poses) -> Poses:
 
 def unlike(rng: np.random.Generator, kind: str) -> Array:
     """Standard deviations of which those of a block differ by up to a factor of 30, as along and across the way."""
-    return sizes(rng, kind) * np.exp(rng.uniform(-1.0, 1.0, len(AXES[kind])) * 0.5 * np.log(30.0))
+    factors = np.exp(rng.uniform(-1.0, 1.0, len(AXES[kind])) * 0.5 * np.log(30.0))
+    return np.asarray(sizes(rng, kind) * factors)
 
 
 # kind of mix-up: variants of kind of state, true convention, sizes, mix-up, words of the hint

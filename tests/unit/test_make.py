@@ -49,4 +49,5 @@ def test_a_python_without_venv_is_told_in_one_line(checkout: Path) -> None:
     assert done.returncode == 2
     assert "false cannot make a virtual environment" in done.stderr.splitlines()[0]
     assert "apt install python3-venv" in done.stderr.splitlines()[0]
+    assert "-m venv" not in done.stdout
     assert not (checkout / ".venv").exists()

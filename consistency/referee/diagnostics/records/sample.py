@@ -36,7 +36,7 @@ class Errors:
         assert self.record.error is not None
         return self.record.error
 
-    @property
+    @cached_property
     def covariance(self) -> Symmetric:
         """(N, T, n, n)."""
         assert self.record.covariance is not None

@@ -12,6 +12,7 @@ from consistency.referee.types import Array
 
 LARGE = 40  # components from which on LAPACK, matrix by matrix, is faster than all matrices entry by entry
 NUMBERS = 2**22  # of matrices that are factored in one call
+AT_ONCE = 8 * NUMBERS  # of matrices that are copied whole from their entries
 FEW = 7  # components that NumPy adds one after the other; sums over so short an axis are slow
 
 
@@ -51,6 +52,8 @@ def _whiten_large(e: Array, covariance: Array | Symmetric) -> Array:
     rows, P = e.reshape(*(e.shape[:-1] or (1,)), n), covariance
     if P.shape[:-1] != rows.shape:
         P = np.broadcast_to(np.asarray(P, float), (*rows.shape, n))
+    elif rows.size * n <= AT_ONCE:
+        P = np.asarray(P, float)  # indexing entry by entry is slow
     out = np.full(rows.shape, np.nan)
     for here in blocks(out.size // n, n * n, NUMBERS):
         index = np.unravel_index(np.arange(out.size // n)[here], rows.shape[:-1])

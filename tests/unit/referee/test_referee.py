@@ -23,6 +23,8 @@ from statsmodels.stats.diagnostic import acorr_ljungbox
 
 import consistency as cs
 from consistency.referee.diagnostics import (
+    Evidence,
+    Settings,
     answers,
     coverage_interval,
     gate_runs,
@@ -42,6 +44,7 @@ from consistency.referee.diagnostics import (
     whiten,
     whiteness,
 )
+from consistency.referee.diagnostics import judge as judge_record
 from consistency.referee.diagnostics.questions.outliers import beyond_stated, outliers
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.types import Array
@@ -305,9 +308,9 @@ def test_outliers_of_a_conservative_filter_are_outliers_for_the_stated_covarianc
     settings = Settings(false_alarm=1e-3, allow="conservative")
     nees = float(np.square(w).sum(axis=-1).max())
     assert beyond_stated(w) == pytest.approx(min(1.0, 2500 * stats.chi2.sf(nees, 3)))
-    assert "outliers" not in judge(Evidence("f", error=w, covariance=covariance), settings).faults
+    assert "outliers" not in judge_record(Evidence("f", error=w, covariance=covariance), settings).faults
     w[3, 7, 0] = 12.0
-    assert "outliers" in judge(Evidence("f", error=w, covariance=covariance), settings).faults
+    assert "outliers" in judge_record(Evidence("f", error=w, covariance=covariance), settings).faults
 
 
 def test_whiteness_needs_more_innovations_of_more_components(fresh: np.random.Generator) -> None:

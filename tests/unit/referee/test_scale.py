@@ -444,8 +444,9 @@ def test_no_advice_where_there_is_none() -> None:
 def test_what_may_be_conservative_is_far_from_the_end() -> None:
     """One-sided, a ratio of .7 is farther from 1.5 than one of 1; it is no fault, and takes fewer runs to show."""
     z, means = stats.norm.ppf, means_of(np.random.default_rng(28), 40)
+    nu = scale_test(0.7 * means / means.mean(), 3, 1, gaussian=False).effective_dof
     result = equivalence(0.7 * means / means.mean(), 3, 1, Settings(allow="conservative", power=0.999))
-    assert result.runs == int(np.ceil(2 / 3 * (2 * z(0.999) / np.log(1.5 / 0.7)) ** 2))
+    assert result.runs == int(np.ceil(2 / nu * (2 * z(0.999) / np.log(1.5 / 0.7)) ** 2))
 
 
 # --- by betting, and of innovations -----------------------------------------------------------------------

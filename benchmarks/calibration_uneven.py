@@ -23,7 +23,7 @@ from consistency.referee.types import Array
 
 GATES, PILOTS, DRAWS = 2000, 400, 3000
 QUICK_GATES, QUICK_PILOTS, QUICK_DRAWS = 40, 30, 100
-STEPS = 4  # of a run, all alike
+ALIKE, WHITE_STEPS = 4, 50  # steps of a run
 ALLOWED, CLEAR = "conservative allowed, false alarm", "uneven runs, wrong all-clear"
 PLANNED, WHITE = "plan --like, power", "many components, whiteness"
 
@@ -85,7 +85,7 @@ PLANS = {
 INNOVATIONS = {3: 20, 15: 30, 30: 60}  # components, and runs of 20 steps: the fewest that are judged
 
 ABOUT = {
-    **{world: f"{about}; one error in all steps, n = 3" for world, (_, _, about) in CONSERVATIVE.items()},
+    **{world: f"{about}; independent steps, n = 3" for world, (_, _, about) in CONSERVATIVE.items()},
     **{
         _world: f"{about}; one error in all steps of a run, n = {n}"
         for world, (_, about) in UNEVEN.items() for n in (3, 1) for _world in (f"{world}, n = {n}",)
@@ -103,10 +103,13 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
     return [*_allowed(quick, seed), *_cleared(quick, seed), *_planned(quick, seed), *_white(quick, seed)]
 
 
-def verdict_of(rng: np.random.Generator, squares: Squares, runs: int, n: int, settings: Settings) -> Verdict:
-    """On runs that each have one error in all steps and a ratio of their own."""
-    error = np.sqrt(squares(rng, runs))[:, None, None] * rng.standard_normal((runs, 1, n))
-    error = np.repeat(error, STEPS, axis=1)
+def verdict_of(rng: np.random.Generator, squares: Array, n: int, settings: Settings, white: bool = False) -> Verdict:
+    """On runs of these ratios, whose steps are independent or all alike."""
+    runs = len(squares)
+    steps = WHITE_STEPS if white else 1
+    error = np.sqrt(squares)[:, None, None] * rng.standard_normal((runs, steps, n))
+    if not white:
+        error = np.repeat(error, ALIKE, axis=1)
     return judge(Evidence("uneven", error, shared(np.eye(n), error)), settings)
 
 
@@ -114,7 +117,7 @@ def _allowed(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
     gates, settings = QUICK_GATES if quick else GATES, Settings(FALSE_ALARM, DETECT, POWER, allow="conservative")
     for k, (world, (runs, squares, _)) in enumerate(CONSERVATIVE.items()):
         rng = np.random.default_rng((seed, 111, k))
-        found = sum(bool(verdict_of(rng, squares, runs, 3, settings).faults) for _ in range(gates))
+        found = sum(bool(verdict_of(rng, squares(rng, runs), 3, settings, True).faults) for _ in range(gates))
         yield row(world, ALLOWED, 1.0, runs, FALSE_ALARM, "<=", gates, found)
 
 
@@ -124,7 +127,7 @@ def _cleared(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
         for n in (3,) if quick else (3, 1):
             for runs in (102,) if quick else (50, 102):
                 rng = np.random.default_rng((seed, 112, k, n, runs))
-                found = sum(verdict_of(rng, squares, runs, n, settings).consistent for _ in range(gates))
+                found = sum(verdict_of(rng, squares(rng, runs), n, settings).consistent for _ in range(gates))
                 stated = CLEARED.get((world, n, runs), round(1.0 - POWER, 3))
                 yield row(f"{world}, n = {n}", CLEAR, DETECT, runs, stated, "<=", gates, found)
 

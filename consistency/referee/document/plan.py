@@ -10,7 +10,7 @@ from consistency.referee.diagnostics.words.sentences import percent
 def plan_lines(planned: dict[str, Any]) -> list[str]:
     """Runs that a verdict takes, a line for each thing to be shown.
 
-    A pilot tells how much its runs spread, and not how skewed they are: its number has its power where runs are alike.
+    A pilot tells how much its runs spread, and not how skewed they are: its power is that of axes and runs that are alike.
     """
     p = planned
     side = "small" if p["detect"] > 1.0 else "large"
@@ -28,6 +28,6 @@ def plan_lines(planned: dict[str, Any]) -> list[str]:
     return lines + [
         f"{like['runs']} runs do where steps depend on each other as those of {name} in {like['pilot_runs']} pilot "
         f"runs: a run is worth {like['effective_dof']:.3g} degrees of freedom or more, {p['dof']} in the worst case; "
-        f"that is for runs that are alike, and uneven ones (slow errors in some alone, say) may need {p['runs']}"
+        f"where some axes or some runs alone are slow, it may take up to {p['runs']}"
         for name, like in p.get("like", {}).items()
     ]

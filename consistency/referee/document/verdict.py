@@ -284,7 +284,7 @@ def _overview(verdicts: Mapping[str, Verdict]) -> Table:
 
 
 def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
-    """What the errors are, where filters have some of their own; the maps, what guards rejected, and the rate of all."""
+    """What the errors are, where filters have some of their own; maps, what guards rejected, the rate of all."""
     lines = []
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))

@@ -252,7 +252,7 @@ def test_heads_of_a_comparison_and_lines_of_a_plan() -> None:
     assert "too large by x2 " in plan_lines(PLAN | {"detect": 0.5})[0]
     like = plan_lines(PLAN | {"like": {"kf": {"runs": 7, "pilot_runs": 40, "effective_dof": 12.0}}})[-1]
     assert like.startswith("7 runs do where steps depend on each other as those of kf")
-    assert like.endswith("that is for runs that are alike, and uneven ones (slow errors in some alone, say) may need 9")
+    assert like.endswith("where some axes or some runs alone are slow, it may take up to 9")
 
 
 def test_the_rate_of_several_filters_is_said() -> None:

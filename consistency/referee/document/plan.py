@@ -8,7 +8,10 @@ from consistency.referee.diagnostics.words.sentences import percent
 
 
 def plan_lines(planned: dict[str, Any]) -> list[str]:
-    """Runs that a verdict takes, a line for each thing to be shown."""
+    """Runs that a verdict takes, a line for each thing to be shown.
+
+    A pilot tells how much its runs spread, and not how skewed they are: its power is that of axes and runs that are alike.
+    """
     p = planned
     side = "small" if p["detect"] > 1.0 else "large"
     factor = p["detect"] if p["detect"] > 1.0 else 1.0 / p["detect"]
@@ -24,6 +27,7 @@ def plan_lines(planned: dict[str, Any]) -> list[str]:
     )
     return lines + [
         f"{like['runs']} runs do where steps depend on each other as those of {name} in {like['pilot_runs']} pilot "
-        f"runs: a run is worth {like['effective_dof']:.3g} degrees of freedom or more, {p['dof']} in the worst case"
+        f"runs: a run is worth {like['effective_dof']:.3g} degrees of freedom or more, {p['dof']} in the worst case; "
+        f"where some axes or some runs alone are slow, it may take up to {p['runs']}"
         for name, like in p.get("like", {}).items()
     ]

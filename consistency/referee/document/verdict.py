@@ -284,7 +284,7 @@ def _overview(verdicts: Mapping[str, Verdict]) -> Table:
 
 
 def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
-    """What the errors are, where filters have some of their own; then the maps, and what guards rejected."""
+    """What the errors are, where filters have some of their own; maps, what guards rejected, the rate of all."""
     lines = []
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
@@ -300,4 +300,8 @@ def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
         from consistency.referee.document.guard import rejection_text
 
         lines += [f"{name} rejected {rejection_text(score)}" for name, score in guarded.items()]
+    if len(verdicts) > 1:
+        rates = [v.settings.false_alarm for v in verdicts.values()]
+        each, some = f"{max(rates):g}", f"{min(1.0, sum(rates)):.2g}"
+        lines.append(f"false alarm {each} holds for each filter; for all {len(rates)} together it is at most {some}")
     return lines

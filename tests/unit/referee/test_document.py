@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from consistency.referee.diagnostics import Comparison, Evidence, Interval, MapScore, judge
+from consistency.referee.diagnostics import Comparison, Evidence, Interval, MapScore, Verdict, judge
 from consistency.referee.diagnostics.comparison import Difference
 from consistency.referee.diagnostics.verdict.answers import ABOUT, ALONE
 from consistency.referee.diagnostics.verdict.parts import JointScore, RejectionScore
@@ -250,6 +250,24 @@ def test_heads_of_a_comparison_and_lines_of_a_plan() -> None:
     assert lost[1] == "3 runs, none of them lost, show that at most 5 % of all are"
     assert len(plan_lines(PLAN)) == 2
     assert "too large by x2 " in plan_lines(PLAN | {"detect": 0.5})[0]
+    like = plan_lines(PLAN | {"like": {"kf": {"runs": 7, "pilot_runs": 40, "effective_dof": 12.0}}})[-1]
+    assert like.startswith("7 runs do where steps depend on each other as those of kf")
+    assert like.endswith("where some axes or some runs alone are slow, it may take up to 9")
+
+
+def test_the_rate_of_several_filters_is_said() -> None:
+    """Each filter has the rate; that of the call is at most their sum, and never above 1."""
+    v = verdict_of(1.0)
+    assert _rate_line({"a": v}) is None
+    named = dict.fromkeys("abc", v)
+    assert v.settings.false_alarm == 0.05
+    assert _rate_line(named) == "false alarm 0.05 holds for each filter; for all 3 together it is at most 0.15"
+    assert str(_rate_line({str(k): v for k in range(30)})).endswith("for all 30 together it is at most 1")
+
+
+def _rate_line(verdicts: dict[str, Verdict]) -> str | None:
+    lines = [b.text for b in document(verdicts, reasons=False).opening if isinstance(b, Text)]
+    return next((line for line in lines if line.startswith("false alarm")), None)
 
 
 def test_a_fault_of_one_question_alone_has_its_sentence() -> None:

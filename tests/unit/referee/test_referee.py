@@ -23,6 +23,8 @@ from statsmodels.stats.diagnostic import acorr_ljungbox
 
 import consistency as cs
 from consistency.referee.diagnostics import (
+    Evidence,
+    Settings,
     answers,
     coverage_interval,
     gate_runs,
@@ -42,7 +44,8 @@ from consistency.referee.diagnostics import (
     whiten,
     whiteness,
 )
-from consistency.referee.diagnostics.questions.outliers import outliers
+from consistency.referee.diagnostics import judge as judge_record
+from consistency.referee.diagnostics.questions.outliers import beyond_stated, outliers
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.types import Array
 
@@ -296,6 +299,25 @@ def test_mean_shape_by_hand(fresh: np.random.Generator) -> None:
 
 
 # --- tails ---------------------------------------------------------------------------------------------
+
+
+def test_outliers_of_a_conservative_filter_are_outliers_for_the_stated_covariance(fresh: np.random.Generator) -> None:
+    """P right in a fifth of the runs and 4 times too large in the others; one false alarm in 1,000."""
+    w = fresh.standard_normal((50, 50, 3)) * np.where(np.arange(50) % 5 == 0, 1.0, 0.5)[:, None, None]
+    covariance = np.broadcast_to(np.eye(3), (50, 50, 3, 3))
+    settings = Settings(false_alarm=1e-3, allow="conservative")
+    nees = float(np.square(w).sum(axis=-1).max())
+    assert beyond_stated(w) == pytest.approx(min(1.0, 2500 * stats.chi2.sf(nees, 3)))
+    assert "outliers" not in judge_record(Evidence("f", error=w, covariance=covariance), settings).faults
+    w[3, 7, 0] = 12.0
+    assert "outliers" in judge_record(Evidence("f", error=w, covariance=covariance), settings).faults
+
+
+def test_whiteness_needs_more_innovations_of_more_components(fresh: np.random.Generator) -> None:
+    for m, fewest in ((1, 400), (10, 400), (30, 1200)):
+        u, S = fresh.standard_normal((fewest // 20, 20, m)), np.eye(m)
+        assert np.isfinite(whiteness(u, np.broadcast_to(S, (*u.shape, m))).p_value)
+        assert np.isnan(whiteness(u[1:], np.broadcast_to(S, (*u[1:].shape, m))).p_value)
 
 
 def test_outliers_by_hand(fresh: np.random.Generator) -> None:

@@ -33,6 +33,9 @@ def equivalence(
     that of Y factor finds them too large; both at ``1 - power`` (Schuirmann 1987). A ratio at either end, or beyond,
     is called equivalent with that probability at most.
 
+    The covariance may be right in some runs and wrong in others, which then differ more than Gaussian errors of one
+    covariance: the effective degrees of freedom of a run may be fewer than ``dof``.
+
     Parameters
     ----------
     means : (runs,), mean NEES of each run over ``dof``
@@ -44,12 +47,12 @@ def equivalence(
     """
     factor = settings.factor if factor is None else factor
     top, bottom = (share + (1.0 - share) * factor) * (1.0 - unseen), share + (1.0 - share) / factor
-    below = scale_test(means / top, dof, steps).below if top > 0 else 1.0
-    above = scale_test(means / bottom, dof, steps).above
+    below = scale_test(means / top, dof, steps, gaussian=False).below if top > 0 else 1.0
+    above = scale_test(means / bottom, dof, steps, gaussian=False).above
     runs = None
     if top > 1.0:
         nearer = min(top, 1.0 / bottom) if share and not settings.one_sided else top
-        runs = deciding_runs(scale_test(means, dof, steps), nearer, settings, low_is_fault)
+        runs = deciding_runs(scale_test(means, dof, steps, gaussian=False), nearer, settings, low_is_fault)
     return equivalent(below, above, factor, settings, runs)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.questions.bias import Moments, moments
 from consistency.referee.diagnostics.records.large_arrays import blocks
+from consistency.referee.diagnostics.records.whitening import squared_length
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
 
@@ -55,6 +56,18 @@ def outliers(whitened: Array, known: Moments | None = None) -> Outlier:
     share = min(float(of_step[worst]) * n_runs / (n_runs - 1.0) ** 2, 1.0 - 1e-12)
     left_out = share / (1.0 - share) * n_runs * (n_runs - 2.0) / (n_runs - 1.0)  # without the run itself
     return Outlier(p_value, int(rows[worst]), int(usable[worst]), float(np.sqrt(left_out)))
+
+
+def beyond_stated(whitened: Array) -> float:
+    """Bonferroni's p value of the largest NEES of all runs and steps, (runs, steps, n), by the stated covariance.
+
+    It is valid for a covariance that is too large as well: chi-square exceeds such a NEES in distribution.
+    """
+    nees = squared_length(whitened)
+    count = int(np.isfinite(nees).sum())
+    if not count:
+        return float("nan")
+    return min(1.0, count * float(distributions.chi2.sf(np.nanmax(nees), whitened.shape[-1])))
 
 
 def _distances(gap: Array, precision: Array) -> Array:

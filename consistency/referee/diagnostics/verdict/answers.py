@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.questions.band import Band, simultaneous_band
 from consistency.referee.diagnostics.questions.bias import Moments, hotelling, moments, t_squared
-from consistency.referee.diagnostics.questions.outliers import Outlier, outliers
+from consistency.referee.diagnostics.questions.outliers import Outlier, beyond_stated, outliers
 from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test
 from consistency.referee.diagnostics.questions.shape import Largest, largest_direction, mean_shape, sphericity
 from consistency.referee.diagnostics.records.sample import Sample
@@ -129,6 +129,8 @@ def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: fl
         bias_step = _bias(w, in_steps, p)
         outlier = outliers(w, in_steps)
         p["outliers"] = outlier.p_value
+        if settings.one_sided:  # runs may be conservative to different degrees: an outlier must be one for P, too
+            p["outliers"] = float(np.maximum(outlier.p_value, beyond_stated(w)))
         if settings.one_sided:
             largest = largest_direction(w)
             p[DIRECTION] = largest.p_value

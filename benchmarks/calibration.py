@@ -52,6 +52,7 @@ MODULES = (
     "calibration_windows",
     "calibration_truth",
     "calibration_pieces",
+    "calibration_spread",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

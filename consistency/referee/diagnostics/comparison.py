@@ -227,7 +227,10 @@ def _ratio(name: str, a: Array, b: Array, power: float, paired: bool, confidence
     if not (mean_a > 0 and mean_b > 0):
         return Difference(name, mean_a**power, mean_b**power, float("nan"), float("nan"), float("nan"))
     error, freedom = _error(power * a / mean_a, power * b / mean_b, paired)
-    log, half = power * np.log(mean_a / mean_b), _half(error, freedom, confidence) * float(np.exp(0.5 * margin(freedom)))
+    log, half = (
+        power * np.log(mean_a / mean_b),
+        _half(error, freedom, confidence) * float(np.exp(0.5 * margin(freedom))),
+    )
     low, ratio, high = (float(np.exp(x)) for x in (log - half, log, log + half))
     return Difference(name, mean_a**power, mean_b**power, ratio, low, high)
 

@@ -619,3 +619,10 @@ def test_power_of_fractional_degrees_of_freedom() -> None:
     assert low < middle < high
     assert required_runs(8.0, 1.2) < required_runs(7.5, 1.2) < required_runs(7.0, 1.2)
     assert middle == pytest.approx(chi_square_power(50 * 7.5, 1.2, 0.025))
+
+
+def test_one_degree_of_freedom_needs_no_bound() -> None:
+    means = gamma_means(np.random.default_rng(8), 40, 30.0, 0.8)
+    test = scale_test(means, 1, 2000)
+    assert test.effective_dof == pytest.approx(oracle(means, 1, 2000).nu, rel=2e-6)
+    assert test.effective_dof > 1.0

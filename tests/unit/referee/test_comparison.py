@@ -64,6 +64,18 @@ def test_a_coverage_in_which_no_run_differs_has_an_interval() -> None:
     assert (d.low, d.high) == (pytest.approx(0.025 ** (1 / 21)), 1.0)
 
 
+@pytest.mark.parametrize("largest", [1.0, 0.2])
+def test_runs_that_are_missing_may_differ_as_much_as_those_that_are_not(largest: float) -> None:
+    """One of 21 runs differs by ``largest``: Student's t alone would give 2.1 / 21 of that, and miss too often."""
+    nees, inside = gamma(np.random.default_rng(6), 21, 2.0), np.ones((21, 1))
+    less = inside - largest * (np.arange(21) == 4)[:, None]
+    missing = largest * (1 - 0.025 ** (1 / 21))
+    a, b = (RunSummary(np.arange(21), 1, nees, nees[:, None], covered) for covered in (less, inside))
+    for first, second, gap in ((a, b, -largest / 21), (b, a, largest / 21)):
+        d = compare(first, second).differences[2]
+        assert (d.difference, d.low, d.high) == pytest.approx((gap, gap - missing, gap + missing))
+
+
 @pytest.mark.parametrize(("of_a", "of_b"), [(4.0, 1.0), (0.25, 1.0), (4.0, 0.5)])
 def test_farther_from_consistent_is_worse_on_either_side(of_a: float, of_b: float) -> None:
     """Missed with probability below 1e-6: the distance is at least 7 standard errors."""

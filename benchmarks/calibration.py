@@ -53,6 +53,7 @@ MODULES = (
     "calibration_truth",
     "calibration_pieces",
     "calibration_uneven",
+    "calibration_spread",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

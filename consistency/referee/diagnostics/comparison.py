@@ -227,7 +227,8 @@ def _ratio(name: str, a: Array, b: Array, power: float, paired: bool, confidence
     if not (mean_a > 0 and mean_b > 0):
         return Difference(name, mean_a**power, mean_b**power, float("nan"), float("nan"), float("nan"))
     error, freedom = _error(power * a / mean_a, power * b / mean_b, paired)
-    log, half = power * np.log(mean_a / mean_b), _half(error, freedom, confidence)
+    log = power * np.log(mean_a / mean_b)
+    half = _half(error, freedom, confidence) * np.exp(0.5 * margin(freedom))
     low, ratio, high = (float(np.exp(x)) for x in (log - half, log, log + half))
     return Difference(name, mean_a**power, mean_b**power, ratio, low, high)
 
@@ -235,7 +236,9 @@ def _ratio(name: str, a: Array, b: Array, power: float, paired: bool, confidence
 def _share(name: str, a: Array, b: Array, paired: bool, confidence: float) -> Difference:
     error, freedom = _error(a, b, paired)
     gap, half = float(a.mean() - b.mean()), _half(error, freedom, confidence)
-    return Difference(name, float(a.mean()), float(b.mean()), gap, gap - half, gap + half)
+    missing = 1.0 - (0.5 * (1.0 - confidence)) ** (1.0 / min(len(a), len(b)))  # a share of runs that may not be drawn
+    half = max(half, missing * (max(np.ptp(a), np.ptp(b)) or 1.0))  # and may differ as much as those that are
+    return Difference(name, float(a.mean()), float(b.mean()), gap, max(gap - half, -1.0), min(gap + half, 1.0))
 
 
 def _error(a: Array, b: Array, paired: bool) -> tuple[float, float]:

@@ -49,8 +49,31 @@ def test_paired_ratio_is_the_t_interval_of_the_influence() -> None:
     a, b = gamma(rng, 30, 2.0), gamma(rng, 30, 1.0)
     d = compare(of_runs(a), of_runs(b)).differences[0]
     z = a / a.mean() - b / b.mean()
-    half = stats.t.ppf(0.975, 29) * z.std(ddof=1) / np.sqrt(30)
+    half = stats.t.ppf(0.975, 29) * z.std(ddof=1) / np.sqrt(30) * np.exp(0.5 * np.sqrt(2 / 29))  # to the safe side
     np.testing.assert_allclose([d.low, d.high], np.exp(np.log(a.mean() / b.mean()) + np.array([-half, half])))
+
+
+def test_a_coverage_in_which_no_run_differs_has_an_interval() -> None:
+    """A share of runs of 1 - .025^(1/21) is missing among 21 runs with probability 2.5 %; never beyond [-1, 1]."""
+    nees, inside = gamma(np.random.default_rng(6), 21, 2.0), np.ones((21, 1))
+    a = RunSummary(np.arange(21), 1, nees, nees[:, None], inside)
+    d = compare(a, a).differences[2]
+    assert (d.difference, d.low, d.high) == (0.0, pytest.approx(-(1 - 0.025 ** (1 / 21))), pytest.approx(-d.low))
+    opposite = RunSummary(np.arange(21), 1, nees, nees[:, None], 0.0 * inside)
+    d = compare(a, opposite).differences[2]
+    assert (d.low, d.high) == (pytest.approx(0.025 ** (1 / 21)), 1.0)
+
+
+@pytest.mark.parametrize("largest", [1.0, 0.2])
+def test_runs_that_are_missing_may_differ_as_much_as_those_that_are_not(largest: float) -> None:
+    """One of 21 runs differs by ``largest``: Student's t alone would give 2.1 / 21 of that, and miss too often."""
+    nees, inside = gamma(np.random.default_rng(6), 21, 2.0), np.ones((21, 1))
+    less = inside - largest * (np.arange(21) == 4)[:, None]
+    missing = largest * (1 - 0.025 ** (1 / 21))
+    a, b = (RunSummary(np.arange(21), 1, nees, nees[:, None], covered) for covered in (less, inside))
+    for first, second, gap in ((a, b, -largest / 21), (b, a, largest / 21)):
+        d = compare(first, second).differences[2]
+        assert (d.difference, d.low, d.high) == pytest.approx((gap, gap - missing, gap + missing))
 
 
 @pytest.mark.parametrize(("of_a", "of_b"), [(4.0, 1.0), (0.25, 1.0), (4.0, 0.5)])

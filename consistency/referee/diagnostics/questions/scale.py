@@ -18,7 +18,9 @@ from consistency.referee.types import Array, Indices
 FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete
 LARGE = 1e6  # shape of a Gamma distribution beyond which its information is 1/2 and rounding would rule
 LEAST = 4.0  # degrees of freedom of Student's t in an interval: with fewer it says nothing at all
+SKEWNESS = 0.4  # of the bound on it, that the spread is adjusted by: holds the rates of docs/referee.md
 REACH = 4.0  # standard errors that chance may carry the mean, where nu is moved to a mean of 1
+ITERATIONS = 5  # of the upper end of an interval and the spread there
 UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
 NOTHING = (float("nan"), float("nan"))
 
@@ -61,7 +63,9 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
     independent. Two estimates are taken, each one standard error to the safe side, and the smaller counts:
 
     - from the coefficient of variation, nu = 2 / CV^2 less its first-order bias. The jackknife over runs gives its
-      variance and its change with the mean; where that lowers nu, its value at a mean of 1 is used;
+      variance and its change with the mean; where that lowers nu, its value at a mean of 1 is used.
+      Where the mean is below 1, the skewness may be larger than that of a Gamma distribution of this spread, see
+      :func:`_at_most_skewness`;
     - from the likelihood of a Gamma distribution of shape a = nu / 2, log a - digamma(a) = log mean Y - mean log Y
       (Fisher 1922), which small values enter as strongly as large ones.
 
@@ -84,6 +88,7 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
     if runs >= FEW and (steps > 1 or not gaussian) and means.min() > 0:
         by_spread, left_out = _log_nu_of_means(means)
         by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / runs)
+        by_spread = _at_most_skewness(by_spread, ratio, dof)
         by_likelihood, error = _log_nu_of_gamma(means)
         safe = by_spread - float(np.sqrt(variance)), float(by_likelihood - error)
         log_nu = min(*safe, float(np.log(dof * steps)))
@@ -166,7 +171,11 @@ def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -
         return Interval(ratio, ratio, ratio)
     z, k = float(distributions.t.isf(tail, spread)), len(means) * nu
     low, high = (float(distributions.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
-    return Interval(ratio, ratio * k / low, ratio * k / max(high, 1e-300))
+    upper = ratio * k / max(high, 1e-300)
+    for _ in range(ITERATIONS if len(means) >= FEW and nu > dof else 0):  # the spread of means whose ratio is upper
+        skewed = len(means) * max(float(dof), float(np.exp(_at_most_skewness(np.log(nu), ratio / upper, dof))))
+        upper = ratio * skewed / max(float(distributions.chi2.ppf(special.ndtr(-z), skewed)), 1e-300)
+    return Interval(ratio, ratio * k / low, upper)
 
 
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:
@@ -214,6 +223,21 @@ def _at_mean_one(log_nu: float, left_out: Array, means: Array, floor: float) -> 
     reach = REACH * np.sqrt(of_mean)  # no farther than chance carries the mean
     variance = max(_jackknife(left_out, left_out) - slope * both, floor)
     return log_nu + min(-slope * float(np.clip(np.log(means.mean()), -reach, reach)), 0.0), variance
+
+
+def _at_most_skewness(log_nu: float, ratio: float, dof: int) -> float:
+    """log nu at a mean of 1, where ``ratio`` below 1 was seen and some runs may have errors that do not change.
+
+    A run mean is a sum of chi-squares whose weights are 1 / dof at most, so that its third cumulant is at most 4 / dof
+    times its variance v, also where runs differ. The log of the observed variance thus falls by up to 4 / (dof v) for
+    each unit by which the mean falls. With ``SKEWNESS`` of that, v log(v / observed) = change. One degree of freedom
+    needs no adjustment: the Gamma distribution is as skewed.
+    """
+    change = SKEWNESS * 4.0 / dof * (1.0 - ratio)
+    if dof == 1 or not change > 0.0:
+        return log_nu
+    observed = max(2.0 * ratio**2 * float(np.exp(-log_nu)), 1e-300)
+    return min(log_nu, float(np.log(2.0 * special.lambertw(change / observed).real / change)))
 
 
 def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:

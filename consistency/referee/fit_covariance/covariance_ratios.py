@@ -11,8 +11,8 @@ from scipy import stats
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.white_noise import BLOCKS, ENOUGH, Noise, fit_noise
-from consistency.referee.fit_covariance.windows import Windows
+from consistency.referee.fit_covariance.white_noise import Noise, fit_noise
+from consistency.referee.fit_covariance.windows import BLOCKS, ENOUGH, Windows
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array, Indices
 
@@ -77,7 +77,7 @@ class Judged:
 
 
 def folds_of(
-    drives: Sequence[Drive], windows: Windows, held_out: str | None, correct: bool
+    drives: Sequence[Drive], windows: Windows, held_out: str | None, correct: bool, jitter: Array | float = 0.0
 ) -> tuple[Noise, list[Fold]]:
     """The fit that is handed out, and those that are judged.
 
@@ -97,10 +97,10 @@ def folds_of(
         ends = [windows.last[windows.drive == i] for i in every]
         middle = np.array([int(each[(len(each) - 1) // 2]) if len(each) else 0 for each in ends])  # rows at half time
         early = windows.of(windows.last <= middle[windows.drive])
-        return fit_noise(windows, correct), [Fold(fit_noise(early, correct), every, middle)]
+        return fit_noise(windows, correct, jitter), [Fold(fit_noise(early, correct, jitter), every, middle)]
     if held_out is None:
-        fits = [fit_noise(windows.of(windows.drive != i), correct) for i in np.unique(windows.drive)]
-        return fit_noise(windows, correct), [
+        fits = [fit_noise(windows.of(windows.drive != i), correct, jitter) for i in np.unique(windows.drive)]
+        return fit_noise(windows, correct, jitter), [
             Fold(fit, np.array([i]), none) for i, fit in zip(np.unique(windows.drive), fits, strict=True)
         ]
     names = [name.strip() for name in held_out.split(",")]
@@ -111,7 +111,7 @@ def folds_of(
     rest = ~np.isin(windows.drive, judged)
     if not rest.any() or rest.all():
         raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if not rest.any() else 'judge'}")
-    noise = fit_noise(windows.of(rest), correct)
+    noise = fit_noise(windows.of(rest), correct, jitter)
     return noise, [Fold(noise, judged, none)]
 
 

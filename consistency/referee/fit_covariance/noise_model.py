@@ -20,8 +20,8 @@ from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.motions import record_of, stretches_of
 from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
 from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_sound
-from consistency.referee.fit_covariance.white_noise import ENOUGH, Noise, intervals, with_jitter
-from consistency.referee.fit_covariance.windows import PIECES, Windows, span_of, windows_at, windows_of
+from consistency.referee.fit_covariance.white_noise import Noise, fit_noise, intervals, jitter_of
+from consistency.referee.fit_covariance.windows import ENOUGH, PIECES, Windows, span_of, windows_at, windows_of
 from consistency.referee.geometry.groups import matrices
 from consistency.referee.readers.relative_motions import Stretch
 from consistency.referee.types import Array
@@ -155,10 +155,9 @@ def fit_covariance(
         raise InputError(f"--cautious {cautious:g}: must be a probability between 0.5 and 1, such as 0.9")
     windows = windows_of(drives, over, planar)
     require_sound(drives, windows, planar, correct)
-    noise, folds = folds_of(drives, windows, held_out, correct)
-    noise = with_jitter(noise, drives, windows, planar)
+    jitter = jitter_of(fit_noise(windows, correct), drives, windows, planar)
+    noise, folds = folds_of(drives, windows, held_out, correct, jitter)
     growth, lasting = growth_of(drives, windows, planar, noise.mean), persistent(noise, windows)
-    folds = [replace(fold, noise=replace(fold.noise, floor=noise.floor)) for fold in folds]
     is_half = held_out == HALF or (held_out is None and len(drives) == 1)
     if cautious is not None:
         factor = caution(judged_by(folds, windows, len(drives), not is_half).whole, cautious)

@@ -15,8 +15,16 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.systematic_errors import Mean, carriers, fit_mean, none_of
-from consistency.referee.fit_covariance.windows import Windows, turns, ways, windows_at
+from consistency.referee.fit_covariance.systematic_errors import (
+    NEIGHBOURS,
+    Mean,
+    MeanFit,
+    carriers,
+    choose_mean,
+    none_of,
+    sum_of_neighbours,
+)
+from consistency.referee.fit_covariance.windows import Windows, blocks_of, turns, ways, windows_at
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
@@ -26,21 +34,20 @@ SHORTER = (8.0, 4.0, 2.0, 1.0)  # parts of the span, whose errors tell jitter of
 
 @dataclass(frozen=True)
 class Noise:
-    """Cov e = sum over pieces of A diag(per_m |way| + per_rad |turn|) A', raised to the floor; n axes."""
+    """Cov e = sum over pieces of A diag(per_m |way| + per_rad |turn|) A', and the floor; n axes."""
 
     axes: tuple[str, ...]
     mean: Mean
     per_m: Array  # (n,), m^2/m and rad^2/m
     per_rad: Array  # (n,), m^2/rad and rad^2/rad
-    floor: Array  # (n,), m^2 and rad^2: no motion has a smaller variance
+    floor: Array  # (n,), m^2 and rad^2: what both ends of a motion add
     factor: float = 1.0  # on all covariances, where caution asks for more than the fit
+    mean_fit: MeanFit | None = None  # None where nothing is corrected
 
     def covariance(self, pieces: Array) -> Array:
         """Covariances (W, n, n) of Log(D^-1 M), of corrected motions in pieces (W, P, d + 1, d + 1)."""
         theta = np.concatenate([self.per_m, self.per_rad])
-        C = np.tensordot(theta, terms_of(pieces), (0, 1))
-        own = np.diagonal(C, axis1=1, axis2=2)
-        return np.asarray(self.factor * (C + np.maximum(self.floor - own, 0.0)[:, :, None] * np.eye(len(self.axes))))
+        return np.asarray(self.factor * (np.tensordot(theta, terms_of(pieces), (0, 1)) + np.diag(self.floor)))
 
     def nees(self, windows: Windows) -> tuple[Array, Array]:
         """NEES over dof (W,), and of each axis alone (W, n), of windows whose motions are not corrected yet."""
@@ -49,8 +56,12 @@ class Noise:
         return nees_of(error, C) / error.shape[1], error**2 / np.diagonal(C, axis1=1, axis2=2)
 
 
-def fit_noise(windows: Windows, correct: bool = True) -> Noise:
+def fit_noise(windows: Windows, correct: bool = True, jitter: Array | float = 0.0) -> Noise:
     """Mean and noise of windows, each given the other in turn.
+
+    Parameters
+    ----------
+    jitter : (n,), variance that both ends of a motion add, of :func:`jitter_of`
 
     Raises
     ------
@@ -63,18 +74,36 @@ def fit_noise(windows: Windows, correct: bool = True) -> Noise:
             f"--span {windows.span.option}: {len(windows.drive)} windows are too few to fit {least} variances; take a "
             "shorter span or longer drives: 50 windows in 5 drives make a verdict possible"
         )
-    mean = fit_mean(windows) if correct else none_of(windows)
-    theta = None
+    found, theta = choose_mean(windows) if correct else None, None
+    mean = none_of(windows) if found is None else found.whole
     for left in reversed(range(ROUNDS if correct else 1)):
         now = mean.applied(windows)
-        error, F = now.errors, terms_of(now.pieces)
-        floor = least_of(error)
+        error, F = now.errors, fitted_terms(now, found)
+        floor = np.maximum(least_of(error), jitter)
         theta = fit_terms(error, F, floor, theta)
-        if left:
-            mean = fit_mean(windows, np.diag(floor) + np.tensordot(theta, F, (0, 1)), mean)
+        if left and found:
+            C = np.diag(floor) + np.tensordot(theta, F, (0, 1))
+            found = choose_mean(windows, C, mean)
+            mean = found.whole if left > 1 else found.mean
     assert theta is not None
     n = len(windows.axes)
-    return Noise(windows.axes, mean, theta[:n], theta[n:], floor)
+    return Noise(windows.axes, mean, theta[:n], theta[n:], floor, mean_fit=found)
+
+
+def fitted_terms(windows: Windows, mean: MeanFit | None) -> Array:
+    """Terms (W, 2 n, n, n) that variances are fitted to, of windows whose motions are corrected.
+
+    Where the odometry's noise is in its turns, an error is large where its own noise makes |turn| large. So those of the
+    neighbouring windows stand for them.
+    """
+    F, n = terms_of(windows.pieces), len(windows.axes)
+    if mean is None or mean.instruments != NEIGHBOURS:
+        return F
+    number = sum_of_neighbours(windows, *2 * [np.ones(len(F))])
+    other = sum_of_neighbours(windows, F[:, n:], F[:, n:])[number > 0] / number[number > 0, None, None, None]
+    F[:, n:] = other.mean(axis=0)
+    F[number > 0, n:] = other
+    return F
 
 
 def least_of(error: Array) -> Array:
@@ -95,8 +124,8 @@ def least_of(error: Array) -> Array:
     return out
 
 
-def with_jitter(noise: Noise, drives: Sequence[Drive], windows: Windows, planar: bool) -> Noise:
-    """The noise with a floor at what both ends of a motion add to its error, where shorter windows show it.
+def jitter_of(noise: Noise, drives: Sequence[Drive], windows: Windows, planar: bool) -> Array:
+    """Variance that both ends of a motion add to its error, (n,), where shorter windows show it; 0 otherwise.
 
     The mean square error of windows of several lengths is what the noise says, times a factor, and a constant.
     """
@@ -112,8 +141,8 @@ def with_jitter(noise: Noise, drives: Sequence[Drive], windows: Windows, planar:
         squares.append((now.errors**2).mean(axis=0))
         stated.append(np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0))
     if len(squares) < 3:
-        return noise
-    return replace(noise, floor=np.maximum(noise.floor, _constants(np.array(squares), np.array(stated))))
+        return np.zeros(len(noise.axes))
+    return _constants(np.array(squares), np.array(stated))
 
 
 def _constants(squares: Array, stated: Array) -> Array:
@@ -129,7 +158,7 @@ def _constants(squares: Array, stated: Array) -> Array:
 def intervals(noise: Noise, windows: Windows) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
     """Intervals of the variances a metre and a radian, from the jackknife over drives or blocks of windows."""
     now = noise.mean.applied(windows)
-    error, F, floor = now.errors, terms_of(now.pieces), least_of(now.errors)
+    error, F, floor = now.errors, fitted_terms(now, noise.mean_fit), noise.floor
     theta = np.concatenate([noise.per_m, noise.per_rad])
     whole: Indices = np.arange(len(error))
     left = []
@@ -142,8 +171,6 @@ def intervals(noise: Noise, windows: Windows) -> tuple[tuple[Interval, ...], tup
 
 
 STEPS, CLOSE = 100, 1e-7  # of scoring; gain of the log likelihood of a window at which it ends
-BLOCKS = 20  # of windows, where drives are too few for the jackknife
-ENOUGH = 5  # drives for which they are the blocks
 
 
 def terms_of(pieces: Array) -> Array:
@@ -229,14 +256,6 @@ def _nonnegative(H: Array, g: Array) -> Array:
     values, vectors = np.linalg.eigh(scaled)
     root = np.sqrt(np.maximum(values, 1e-9))
     return np.asarray(optimize.nnls(root[:, None] * vectors.T, (vectors.T @ (g / scale)) / root)[0] / scale)
-
-
-def blocks_of(drive: Indices) -> list[Indices]:
-    """Windows (W,) in blocks for the jackknife: drives where they are enough, otherwise consecutive windows."""
-    names = np.unique(drive)
-    if len(names) >= ENOUGH:
-        return [np.flatnonzero(drive == name) for name in names]
-    return [part for part in np.array_split(np.arange(len(drive)), min(BLOCKS, len(drive))) if len(part)]
 
 
 def interval_of(value: float, left_out: Sequence[float]) -> Interval:

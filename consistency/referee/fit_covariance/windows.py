@@ -17,6 +17,8 @@ from consistency.referee.types import Array, Indices
 PIECES = 20  # of a window: sums over them are independent of the rate of the file, and as good as integrals
 STILL = 0.1  # of the span: a window with less motion says nothing about the span
 JUMP = (12.0, 3.0)  # medians of the errors of its drive's pieces, and windows, that a piece exceeds in a jump
+BLOCKS = 20  # of windows, where drives are too few for the jackknife
+ENOUGH = 5  # drives for which they are the blocks
 PLANE, SPACE = ("x", "y", "yaw"), ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -30,6 +32,7 @@ class Windows:
     last: Indices  # (W,)
     pieces: Array  # (W, P, d + 1, d + 1), motions
     true: Array  # (W, d + 1, d + 1), of the whole window
+    true_pieces: Array  # (W, P, d + 1, d + 1)
     long: int = 0  # windows left out because rows or truth are missing
     still: int = 0  # left out, with hardly any motion
     jumps: int = 0  # left out, with a jump
@@ -58,7 +61,7 @@ class Windows:
         return self.jumps / max(len(self.drive) + self.jumps, 1)
 
     def of(self, keep: Indices | Array) -> Windows:
-        names = ("drive", "first", "last", "pieces", "true")
+        names = ("drive", "first", "last", "pieces", "true", "true_pieces")
         return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
 
@@ -106,8 +109,8 @@ def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) ->
     if not parts:
         assert refused is not None
         raise refused
-    index, first, last, pieces, true, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
-    found = Windows(span, index, first, last, pieces, true, long)
+    index, first, last, pieces, true, true_pieces, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    found = Windows(span, index, first, last, pieces, true, true_pieces, long)
     moved, jumped = _moves(found), _jumps(errors, found)
     found = replace(found, still=int((~moved).sum()), jumps=int((moved & jumped).sum()))
     if not (moved & ~jumped).any():
@@ -125,8 +128,8 @@ def windows_at(drives: Sequence[Drive], windows: Windows, size: float, planar: b
 
 def _pieces(
     number: int, drive: Drive, first: Indices, last: Indices, planar: bool
-) -> tuple[Indices, Indices, Indices, Array, Array, Array]:
-    """Windows of one drive: index, rows, pieces (W, P, ...), true motions, and the errors of pieces (W, P, n)."""
+) -> tuple[Indices, Indices, Indices, Array, Array, Array, Array]:
+    """Windows of one drive: index, rows, pieces (W, P, ...), true motions and pieces, and errors of pieces (W, P, n)."""
     share = np.linspace(0.0, 1.0, PIECES + 1)
     ends = np.rint(first[:, None] + share * (last - first)[:, None]).astype(np.int64)
     T, true = drive.estimate, drive.truth
@@ -136,7 +139,7 @@ def _pieces(
         D, M, whole = (in_plane(each) for each in (D, M, whole))
     error = log((inverse(D) @ M).reshape(-1, *D.shape[-2:])).reshape(*D.shape[:2], -1)
     error[ends[:, 1:] == ends[:, :-1]] = np.nan
-    return np.full(len(first), number), first, last, D, whole, error
+    return np.full(len(first), number), first, last, D, whole, M, error
 
 
 def in_plane(T: Array) -> Array:
@@ -194,3 +197,11 @@ def _jumps(errors: Array, of: Windows) -> Array:
             limit = max(JUMP[0] * float(np.nanmedian(pieces[rows])), JUMP[1] * float(np.median(windows[rows])))
             out[rows] |= (np.nan_to_num(pieces[rows]) > limit).any(axis=1) & (limit > 0)
     return out
+
+
+def blocks_of(drive: Indices, enough: int = ENOUGH) -> list[Indices]:
+    """Windows (W,) in blocks for the jackknife: drives where they are enough, otherwise consecutive windows."""
+    names = np.unique(drive)
+    if len(names) >= enough:
+        return [np.flatnonzero(drive == name) for name in names]
+    return [part for part in np.array_split(np.arange(len(drive)), min(BLOCKS, len(drive))) if len(part)]

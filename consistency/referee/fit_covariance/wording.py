@@ -14,8 +14,7 @@ from consistency.referee.document.blocks import Cell, Column, Document, Quantity
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Ratio
 from consistency.referee.fit_covariance.noise_model import NoiseModel
 from consistency.referee.fit_covariance.persistence import SHARED, Second
-from consistency.referee.fit_covariance.white_noise import ENOUGH
-from consistency.referee.fit_covariance.windows import span_of
+from consistency.referee.fit_covariance.windows import ENOUGH, span_of
 
 RATIO = ("value", "low", "high", "spread", "drives", "windows", "status")  # of a ratio, as programs have it
 MARK = {"consistent": "", "undecided": " ?", "overconfident": " overconfident", "conservative": " conservative"}

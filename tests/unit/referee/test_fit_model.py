@@ -29,7 +29,7 @@ from consistency.referee.fit_covariance.white_noise import (
     interval_of,
     nees_of,
     terms_of,
-    with_jitter,
+    jitter_of,
 )
 from consistency.referee.fit_covariance.windows import Windows, in_plane, span_of, windows_of
 from consistency.referee.fit_covariance.wording import lines, sentence
@@ -234,7 +234,7 @@ def test_jitter_of_both_ends_is_the_floor(rng: np.random.Generator) -> None:
     quiet, shaky = (drives(rng, 3, World(offset=offset)) for offset in (0.0, 0.05))
     for made, low, high in ((quiet, 0.0, 1e-3), (shaky, 2.5e-3, 1e-2)):
         w = windows_of(made, span_of("10m"))
-        assert low <= with_jitter(fit_noise(w), made, w, False).floor[0] <= high
+        assert low <= jitter_of(fit_noise(w), made, w, False)[0] <= high
 
 
 # --- folds and ratios -----------------------------------------------------------------------------------------

@@ -139,7 +139,8 @@ class Estimate(NamedTuple):
 def moments_of(windows: Windows, mean: Mean, instruments: str, covariance: Array | None = None) -> Moments:
     now = mean.applied(windows)
     error, design = now.errors, design_of(now.pieces)
-    P = np.diag(np.maximum((error**2).mean(axis=0), 1e-300))[None] if covariance is None else covariance
+    square = (error**2).mean(axis=0)
+    P = np.diag(np.maximum(square, 1e-12 * square.max() + 1e-100))[None] if covariance is None else covariance
     Z = design
     if instruments == BACKWARD:
         Z = design_of(windows.true_pieces)
@@ -169,7 +170,7 @@ def _estimate(windows: Windows, near: Mean, moments: Moments, free: Array | None
     scatter[free] = _solved(A.sum(axis=0), np.stack([left[block].sum(axis=0) for block in blocks], axis=1))
     k = max(len(blocks), 2)
     error = np.sqrt((scatter**2).sum(axis=1) * k / (k - 1))
-    reach = np.maximum(float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1)) * error, 1e-300)
+    reach = np.maximum(float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1)) * error, 1e-12)
     drift = start[SCALES:] * (1 + step[1]) + step[SCALES:] * near.way
     value = np.where(free, np.append(start[:SCALES] * (1 + step[:SCALES]), drift), none)
     mean = Mean(float(value[0]), float(value[1]), tuple(value[SCALES:].tolist()))

@@ -29,6 +29,7 @@ from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
 ROUNDS = 3  # of mean and noise in turn
+SHOWN = 3.0  # standard errors from which there is jitter
 SHORTER = (8.0, 4.0, 2.0, 1.0)  # parts of the span, whose errors tell jitter of both ends from noise of the way
 
 
@@ -129,7 +130,7 @@ def jitter_of(noise: Noise, drives: Sequence[Drive], windows: Windows, planar: b
 
     The mean square error of windows of several lengths is what the noise says, times a factor, and a constant.
     """
-    squares, stated = [], []
+    squares, stated, counts = [], [], []
     for part in SHORTER:
         size = windows.span.size / part
         if windows.span.unit == "step":
@@ -140,18 +141,25 @@ def jitter_of(noise: Noise, drives: Sequence[Drive], windows: Windows, planar: b
         now = noise.mean.applied(some)
         squares.append((now.errors**2).mean(axis=0))
         stated.append(np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0))
+        counts.append(len(some.drive))
     if len(squares) < 3:
         return np.zeros(len(noise.axes))
-    return _constants(np.array(squares), np.array(stated))
+    return _constants(np.array(squares), np.array(stated), np.array(counts))
 
 
-def _constants(squares: Array, stated: Array) -> Array:
-    """J >= 0 (n,) of squares (k, n) = factor stated + J, with the weight that squares deserve; 0 where it is none."""
+def _constants(squares: Array, stated: Array, counts: Array) -> Array:
+    """J >= 0 (n,) of squares (k, n) = factor stated + J, by weighted least squares; 0 where none is shown.
+
+    A mean square of W windows has a relative variance of 2 / W.
+    """
     out = np.zeros(squares.shape[1])
     for axis, (q, c) in enumerate(zip(squares.T, stated.T, strict=True)):
-        X = np.column_stack([c, np.ones(len(c))]) / np.maximum(q, 1e-300)[:, None]
-        slope, constant = np.linalg.lstsq(X, np.ones(len(q)), rcond=None)[0]
-        out[axis] = max(constant, 0.0) if slope > 0 else 0.0
+        weight = np.sqrt(counts / 2.0)
+        X = np.column_stack([c, np.ones(len(c))]) * (weight / np.maximum(q, 1e-100))[:, None]
+        size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+        slope, constant = np.linalg.lstsq(X / size, weight, rcond=None)[0] / size
+        error = np.sqrt(np.linalg.pinv((X / size).T @ (X / size))[1, 1]) / size[1]
+        out[axis] = constant if slope > 0 and constant > SHOWN * error else 0.0
     return out
 
 

@@ -14,6 +14,7 @@ from consistency.referee.document.blocks import Cell, Column, Document, Quantity
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Ratio
 from consistency.referee.fit_covariance.noise_model import NoiseModel
 from consistency.referee.fit_covariance.persistence import SHARED, Second
+from consistency.referee.fit_covariance.systematic_errors import NEIGHBOURS, STRONG, Mean, MeanFit
 from consistency.referee.fit_covariance.windows import ENOUGH, span_of
 
 RATIO = ("value", "low", "high", "spread", "drives", "windows", "status")  # of a ratio, as programs have it
@@ -89,12 +90,42 @@ def document(model: NoiseModel) -> Document:
 
 def correction(model: NoiseModel) -> str:
     """What is corrected before the covariance holds; empty where nothing is."""
-    m = model.noise.mean
-    if m.way == m.turn == 1.0 and not any(m.drift):
+    mean, fit = model.noise.mean, model.noise.mean_fit
+    if fit is None or not fit.free.any():
         return ""
-    drift = ", ".join(f"{each:+.3g}" for each in m.drift)
-    of = "heading" if len(m.drift) == 1 else "roll, pitch, yaw"
-    return f"correct first: way x{m.way:.4g}, turn x{m.turn:.4g}, {of} {drift} rad/m"
+    shown = [f"way x{mean.way:.4g}", f"turn x{mean.turn:.4g}"]
+    shown += [f"{name} {each:+.3g} rad/m" for name, each in zip(_drifts(mean), mean.drift, strict=True)]
+    return f"correct first: {', '.join(np.array(shown)[fit.free])}"
+
+
+def _drifts(mean: Mean) -> tuple[str, ...]:
+    return ("heading",) if len(mean.drift) == 1 else ("roll", "pitch", "yaw")
+
+
+def _of_mean(fit: MeanFit) -> list[str]:
+    """What is not corrected, and whether the scale of turns depends on whose noise it is."""
+    names = [f"{each} x" for each in ("way", "turn")] + [f"{each} " for each in _drifts(fit.mean)]
+    left = [
+        f"{name}[{short(low)}, {short(high)}]"
+        for name, low, high, is_free in zip(names, fit.low, fit.high, fit.free, strict=True)
+        if not is_free
+    ]
+    found = [f"not corrected, as the interval holds none: {', '.join(left)}"] if left else []
+    forward, backward = (f"x{short(each)}" for each in fit.turns)
+    sides = f"{forward} if the robot's motion errs about the odometry, {backward} if the odometry errs about the motion"
+    if fit.instruments == NEIGHBOURS:
+        text = f"the scale of turns is that by the motion of neighbouring windows (F {short(fit.strength)}), not {sides}"
+        if fit.turns[1] > fit.high[1]:
+            text += "; the true side errs, too, as of slip, or of a truth that drifts or jitters: --second tells which"
+        found.append(text)
+    elif fit.is_open:
+        why = "neighbouring windows tell less than these"
+        if fit.strength < STRONG:
+            why = f"neighbouring windows are weak instruments (F {short(fit.strength)}, below {STRONG:g})"
+        elif fit.lasts:
+            why = "errors outlast a window, so that neighbouring windows are no instruments"
+        found.append(f"whose noise it is cannot be told: the scale of turns is {sides}; {why}")
+    return found
 
 
 def _table(model: NoiseModel) -> Table:
@@ -146,6 +177,8 @@ def lines(model: NoiseModel) -> list[str]:
         )
     if model.second is not None:
         out.append(_of_second(model.second, model.noise.axes))
+    if model.noise.mean_fit is not None:
+        out += _of_mean(model.noise.mean_fit)
     out += model.warnings
     out.append(
         f"analyse counts each judged motion as a run, though those of a drive depend: {model.verdict.reasons[0]}"
@@ -177,7 +210,7 @@ def data(model: NoiseModel) -> dict[str, Any]:
     found: dict[str, Any] = plain({
         "name": model.name, "status": model.status, "sentence": sentence(model), "span": model.span, "axes": n.axes,
         "fitted_drives": model.fitted_drives, "judged_drives": model.judged_drives, "held_out": model.held_out,
-        "counts": dict(model.counts), "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": m.drift},
+        "counts": dict(model.counts), "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": m.drift, **_evidence(n.mean_fit)},
         "noise": {
             "variance_per_m": n.per_m, "variance_per_rad": n.per_rad, "floor": n.floor, "factor": n.factor,
             "per_m_interval": model.per_m, "per_rad_interval": model.per_rad,
@@ -187,3 +220,13 @@ def data(model: NoiseModel) -> dict[str, Any]:
         "second_size": None if second is None else second.size, "spans": spans, "referee": flat(model.verdict),
     })  # fmt: skip
     return found
+
+
+def _evidence(fit: MeanFit | None) -> dict[str, Any]:
+    """Intervals of the scale of the way, of turns, and of the drift, and what they rest on."""
+    if fit is None:
+        return {}
+    return {
+        "low": fit.low, "high": fit.high, "corrected": fit.free, "instruments": fit.instruments,
+        "turn_by_estimated_and_true_motion": fit.turns, "instruments_f": fit.strength, "is_open": fit.is_open,
+    }  # fmt: skip

@@ -23,7 +23,6 @@ from consistency.referee.fit_covariance.persistence import TERMS, Lasting
 from consistency.referee.fit_covariance.refusals import Growth, body_turn, growth_of, revisits
 from consistency.referee.fit_covariance.systematic_errors import Mean, carriers, design_of, fit_mean
 from consistency.referee.fit_covariance.white_noise import (
-    blocks_of,
     fit_noise,
     fit_terms,
     interval_of,
@@ -31,7 +30,7 @@ from consistency.referee.fit_covariance.white_noise import (
     terms_of,
     jitter_of,
 )
-from consistency.referee.fit_covariance.windows import Windows, in_plane, span_of, windows_of
+from consistency.referee.fit_covariance.windows import Windows, blocks_of, in_plane, span_of, windows_of
 from consistency.referee.fit_covariance.wording import lines, sentence
 from consistency.referee.geometry.groups import composed, inverse, log, vectors
 from consistency.referee.types import Array
@@ -323,7 +322,7 @@ def test_covariance_of_a_motion_is_that_of_its_steps(rng: np.random.Generator) -
     C = model.covariance(np.repeat(step[None], 20, 0))
     np.testing.assert_allclose(model.covariance(motion), C, rtol=1e-9)
     n = model.noise
-    assert C[2, 2] == pytest.approx(10 * n.per_m[2] + 0.8 * n.per_rad[2])
+    assert C[2, 2] == pytest.approx(10 * n.per_m[2] + 0.8 * n.per_rad[2] + n.floor[2])
     still = model.covariance([0.0, 0.0, 0.0])
     np.testing.assert_allclose(still, np.diag(n.floor))
     assert (n.floor > 0).all()

@@ -18,7 +18,7 @@ ROUNDS = 2  # of Gauss and Newton from nothing; from a mean that is nearly right
 WEAK = 1e-6  # of the largest singular value, below which a direction is not determined and stays 0
 FORWARD, BACKWARD, NEIGHBOURS = "estimated motion", "true motion", "neighbouring windows"  # instruments
 SCALES = 2  # coefficients before those of the drift
-GAP = 4  # pieces of a neighbouring window that are left out
+GAP = 2  # pieces of a neighbouring window that are left out
 STRONG = 10.0  # first-stage F from which instruments are not weak (Staiger & Stock 1997, Econometrica 65)
 OPEN = 0.02  # between scales of turns that are fitted in both directions, from which it is said that they differ
 SURE = 3.0  # standard errors from which errors of neighbouring windows correlate: 0.3 % of right drives
@@ -84,7 +84,7 @@ def fit_mean(windows: Windows, covariance: Array | None = None, start: Mean | No
     """
     mean = none_of(windows) if start is None else start
     for _ in range(ROUNDS if start is None else 1):
-        mean = _estimate(windows, mean, moments_of(windows, mean, FORWARD, covariance)).mean
+        mean = _estimate(windows, mean, moments_of(windows, mean, covariance, FORWARD)[0]).mean
     return mean
 
 
@@ -98,7 +98,8 @@ def choose_mean(windows: Windows, covariance: Array | None = None, start: Mean |
     are independent; it is used where its intervals are the narrower ones.
     """
     near = fit_mean(windows, covariance) if start is None else start
-    moments = {each: moments_of(windows, near, each, covariance) for each in (FORWARD, BACKWARD, NEIGHBOURS)}
+    kinds = (FORWARD, BACKWARD, NEIGHBOURS)
+    moments = dict(zip(kinds, moments_of(windows, near, covariance, *kinds), strict=True))
     none = none_of(windows).values
     free, whole = np.ones(len(none), bool), None
     forward, backward, other = (_estimate(windows, near, each, free) for each in moments.values())
@@ -136,20 +137,23 @@ class Estimate(NamedTuple):
     high: Array
 
 
-def moments_of(windows: Windows, mean: Mean, instruments: str, covariance: Array | None = None) -> Moments:
+def moments_of(windows: Windows, mean: Mean, covariance: Array | None, *instruments: str) -> list[Moments]:
+    """Moments with each kind of instruments, at a mean."""
     now = mean.applied(windows)
     error, design = now.errors, design_of(now.pieces)
     square = (error**2).mean(axis=0)
     P = np.diag(np.maximum(square, 1e-12 * square.max() + 1e-100))[None] if covariance is None else covariance
-    Z = design
-    if instruments == BACKWARD:
-        Z = design_of(windows.true_pieces)
-    elif instruments == NEIGHBOURS:
-        Z = _of_neighbours(now)
     whiten = np.linalg.inv(np.linalg.cholesky(P))
-    Z, X, y = whiten @ Z, whiten @ design, whiten @ error[..., None]
-    back = np.swapaxes(Z, -1, -2)
-    return Moments(back @ X, (back @ y)[..., 0], Z, X)
+    X, y, found = whiten @ design, whiten @ error[..., None], []
+    for each in instruments:
+        Z = X
+        if each == BACKWARD:
+            Z = whiten @ design_of(windows.true_pieces)
+        elif each == NEIGHBOURS:
+            Z = whiten @ _of_neighbours(now)
+        back = np.swapaxes(Z, -1, -2)
+        found.append(Moments(back @ X, (back @ y)[..., 0], Z, X))
+    return found
 
 
 def _estimate(windows: Windows, near: Mean, moments: Moments, free: Array | None = None) -> Estimate:

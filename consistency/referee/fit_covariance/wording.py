@@ -104,17 +104,17 @@ def _drifts(mean: Mean) -> tuple[str, ...]:
 
 def _of_mean(fit: MeanFit) -> list[str]:
     """What is not corrected, and whether the scale of turns depends on whose noise it is."""
-    names = [f"{each} x" for each in ("way", "turn")] + [f"{each} " for each in _drifts(fit.mean)]
-    left = [
-        f"{name}[{short(low)}, {short(high)}]"
-        for name, low, high, is_free in zip(names, fit.low, fit.high, fit.free, strict=True)
-        if not is_free
-    ]
+    names = ["way x", "turn x", *(f"{each} " for each in _drifts(fit.mean))]
+    units = ["", "", *[" rad/m"] * len(fit.mean.drift)]
+    parts = zip(names, fit.low, fit.high, units, fit.free, strict=True)
+    left = [f"{name}[{low:.3g}, {high:.3g}]{unit}" for name, low, high, unit, is_free in parts if not is_free]
     found = [f"not corrected, as the interval holds none: {', '.join(left)}"] if left else []
     forward, backward = (f"x{short(each)}" for each in fit.turns)
     sides = f"{forward} if the robot's motion errs about the odometry, {backward} if the odometry errs about the motion"
     if fit.instruments == NEIGHBOURS:
-        text = f"the scale of turns is that by the motion of neighbouring windows (F {short(fit.strength)}), not {sides}"
+        text = (
+            f"the scale of turns is that by the motion of neighbouring windows (F {short(fit.strength)}), not {sides}"
+        )
         if fit.turns[1] > fit.high[1]:
             text += "; the true side errs, too, as of slip, or of a truth that drifts or jitters: --second tells which"
         found.append(text)

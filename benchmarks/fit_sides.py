@@ -29,7 +29,8 @@ from consistency.referee.fit_covariance.windows import span_of, windows_at, wind
 from consistency.referee.geometry.groups import composed, matrices
 from consistency.referee.types import Array
 
-STEP, LENGTH, DRIVES = 0.05, 120.0, 10  # m, m
+STEP, LENGTH = 0.05, 120.0  # m
+DRIVES = {False: 10, True: 5}  # in the plane and in space, where a scale is that of three turns
 LASTS = 2.0  # m that a turn lasts for
 SIGMA = (0.02, 0.01, 0.03)  # of x, y and yaw after 1 m, in m and rad; roll and pitch, and their turns, have 0.3 of it
 JITTER = 0.5  # variance of a turn's jitter over that of its noise, over 1 m
@@ -101,7 +102,7 @@ def drive(rng: np.random.Generator, side: Side, name: str) -> Drive:
 
 
 def drives(rng: np.random.Generator, side: Side) -> list[Drive]:
-    return [drive(rng, side, f"drive {i + 1}") for i in range(DRIVES)]
+    return [drive(rng, side, f"drive {i + 1}") for i in range(DRIVES[side.in_space])]
 
 
 def fitted(rng: np.random.Generator, side: Side) -> tuple[MeanFit, float]:
@@ -113,7 +114,8 @@ def fitted(rng: np.random.Generator, side: Side) -> tuple[MeanFit, float]:
     assert judged is not None
     assert noise.mean_fit is not None
     nees = noise.nees(judged)[0]
-    return noise.mean_fit, float(np.exp(np.mean([np.log(nees[judged.drive == i].mean()) for i in range(DRIVES)])))
+    means = [nees[judged.drive == i].mean() for i in range(len(others))]
+    return noise.mean_fit, float(np.exp(np.log(means).mean()))
 
 
 def cells() -> Iterator[Side]:
@@ -149,9 +151,8 @@ def side_rows(draws: int, seed: int, only: str = "") -> bool:
 def drift_rows(draws: int, seed: int, only: str) -> bool:
     """Print how often it is said that a truth that drifts leaves the scale open; whether it is in most draws."""
     held = True
-    print(
-        f"\na truth that drifts, {draws} draws\n| space or plane | noise of | truth | snr | scale | said |\n|{'---|' * 6}"
-    )
+    head = "space or plane | noise of | truth | snr | scale | said"
+    print(f"\na truth that drifts, {draws} draws\n| {head} |\n|{'---|' * 6}")
     for number, (space, odometry, snr) in enumerate(product((False, True), (True, False), (10, 1))):
         side = Side(snr, odometry, space, drifts=True)
         if only not in str(side):

@@ -84,7 +84,7 @@ def fit_mean(windows: Windows, covariance: Array | None = None, start: Mean | No
     """
     mean = none_of(windows) if start is None else start
     for _ in range(ROUNDS if start is None else 1):
-        mean = _estimate(windows, mean, moments_of(windows, mean, covariance, FORWARD)[0]).mean
+        mean = _estimate(windows, mean, moments_of(windows, mean, covariance, FORWARD)[0])[0]
     return mean
 
 
@@ -101,23 +101,22 @@ def choose_mean(windows: Windows, covariance: Array | None = None, start: Mean |
     kinds = (FORWARD, BACKWARD, NEIGHBOURS)
     moments = dict(zip(kinds, moments_of(windows, near, covariance, *kinds), strict=True))
     none = none_of(windows).values
-    free, whole = np.ones(len(none), bool), None
-    forward, backward, other = (_estimate(windows, near, each, free) for each in moments.values())
-    low, high = np.minimum(forward.low, backward.low), np.maximum(forward.high, backward.high)
-    strength, lasts = _strength(moments[NEIGHBOURS]), _lasts(other.mean.applied(windows))
-    gain = np.log((high - low) / (other.high - other.low))[:SCALES].sum()
-    used = (NEIGHBOURS,) if strength >= STRONG and not lasts and gain > 0 else (FORWARD, BACKWARD)
+    free = np.ones(len(none), bool)
+    found = {each: _estimate(windows, near, moments[each], free) for each in kinds}
+    lows, highs = (np.array([found[each][k] for each in kinds]) for k in (1, 2))
+    strength, lasts = _strength(moments[NEIGHBOURS]), _lasts(found[NEIGHBOURS][0].applied(windows))
+    gain = np.log((highs[:2].max(axis=0) - lows[:2].min(axis=0)) / (highs[2] - lows[2]))[:SCALES].sum()
+    used = kinds[2:] if strength >= STRONG and not lasts and gain > 0 else kinds[:2]
+    whole, turns = found[used[0]][0], (found[FORWARD][0].turn, found[BACKWARD][0].turn)
+    low, high = none, none
     while True:
-        estimates = [_estimate(windows, near, moments[each], free) for each in used]
-        low = np.where(free, np.min([each.low for each in estimates], axis=0), low)
-        high = np.where(free, np.max([each.high for each in estimates], axis=0), high)
-        whole = whole or estimates[0].mean
-        inside = np.where(free, np.minimum(high - none, none - low) / (high - low), -1.0)
+        means, lows, highs = zip(*(_estimate(windows, near, moments[each], free) for each in used), strict=True)
+        low, high = np.where(free, np.min(lows, axis=0), low), np.where(free, np.max(highs, axis=0), high)
+        inside = np.where(free, np.minimum(high - none, none - low), -1.0) / (high - low)
         if not inside.max() >= 0:
             break
         free[np.argmax(inside)] = False  # one at a time, as the others change with it
-    turns = forward.mean.turn, backward.mean.turn
-    return MeanFit(estimates[0].mean, whole, low, high, free, used[0], turns, strength, lasts)
+    return MeanFit(means[0], whole, low, high, free, used[0], turns, strength, lasts)
 
 
 class Moments(NamedTuple):
@@ -127,14 +126,6 @@ class Moments(NamedTuple):
     b: Array
     Z: Array
     X: Array
-
-
-class Estimate(NamedTuple):
-    """A mean with the interval of its coefficients, (p,)."""
-
-    mean: Mean
-    low: Array
-    high: Array
 
 
 def moments_of(windows: Windows, mean: Mean, covariance: Array | None, *instruments: str) -> list[Moments]:
@@ -156,8 +147,8 @@ def moments_of(windows: Windows, mean: Mean, covariance: Array | None, *instrume
     return found
 
 
-def _estimate(windows: Windows, near: Mean, moments: Moments, free: Array | None = None) -> Estimate:
-    """A step of Gauss and Newton, with intervals from the scatter of what it leaves, between drives or blocks.
+def _estimate(windows: Windows, near: Mean, moments: Moments, free: Array | None = None) -> tuple[Mean, Array, Array]:
+    """The mean after a step of Gauss and Newton, and intervals (p,) from the scatter between blocks of what it leaves.
 
     Parameters
     ----------
@@ -178,7 +169,7 @@ def _estimate(windows: Windows, near: Mean, moments: Moments, free: Array | None
     drift = start[SCALES:] * (1 + step[1]) + step[SCALES:] * near.way
     value = np.where(free, np.append(start[:SCALES] * (1 + step[:SCALES]), drift), none)
     mean = Mean(float(value[0]), float(value[1]), tuple(value[SCALES:].tolist()))
-    return Estimate(mean, value - reach, value + reach)
+    return mean, value - reach, value + reach
 
 
 def _of_neighbours(windows: Windows) -> Array:
@@ -204,7 +195,7 @@ def _solved(A: Array, b: Array) -> Array:
 
 
 def _strength(moments: Moments) -> float:
-    """First-stage F, the smallest of all coefficients: how well each instrument, beside the others, predicts the motion.
+    """First-stage F, the smallest of all coefficients: how well an instrument, beside the others, predicts the motion.
 
     Robust to unequal variances of windows (White 1980).
     """
@@ -223,12 +214,12 @@ def _lasts(corrected: Windows) -> bool:
     """Whether rotation errors of windows one or two apart correlate positively; jitter of their ends does not."""
     error = corrected.errors[:, corrected.d :]
     error = error / np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-300)
+    found = []
     for lag in (1, 2):
         pairs = corrected.drive[lag:] == corrected.drive[:-lag]
         product = (error[lag:] * error[:-lag]).sum(axis=1)[pairs]
-        if product.sum() > SURE * np.sqrt((product**2).sum()):
-            return True
-    return False
+        found.append(product.sum() > SURE * np.sqrt((product**2).sum()))
+    return any(found)
 
 
 def none_of(windows: Windows) -> Mean:

@@ -6,7 +6,7 @@ The variances are fitted to the errors of windows by maximum likelihood.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize, stats
@@ -94,7 +94,7 @@ def fit_noise(windows: Windows, correct: bool = True, jitter: Array | float = 0.
 def fitted_terms(windows: Windows, mean: MeanFit | None) -> Array:
     """Terms (W, 2 n, n, n) that variances are fitted to, of windows whose motions are corrected.
 
-    Where the odometry's noise is in its turns, an error is large where its own noise makes |turn| large. So those of the
+    Where turns are measured with noise, an error is large where its own noise makes |turn| large, so that the turns of
     neighbouring windows stand for them.
     """
     F, n = terms_of(windows.pieces), len(windows.axes)

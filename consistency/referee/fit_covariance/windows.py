@@ -129,7 +129,7 @@ def windows_at(drives: Sequence[Drive], windows: Windows, size: float, planar: b
 def _pieces(
     number: int, drive: Drive, first: Indices, last: Indices, planar: bool
 ) -> tuple[Indices, Indices, Indices, Array, Array, Array, Array]:
-    """Windows of one drive: index, rows, pieces (W, P, ...), true motions and pieces, and errors of pieces (W, P, n)."""
+    """Windows of one drive: index, rows, pieces (W, P, ...), true motions and pieces, errors of pieces (W, P, n)."""
     share = np.linspace(0.0, 1.0, PIECES + 1)
     ends = np.rint(first[:, None] + share * (last - first)[:, None]).astype(np.int64)
     T, true = drive.estimate, drive.truth

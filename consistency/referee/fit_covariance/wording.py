@@ -18,6 +18,7 @@ from consistency.referee.fit_covariance.systematic_errors import NEIGHBOURS, STR
 from consistency.referee.fit_covariance.windows import ENOUGH, span_of
 
 RATIO = ("value", "low", "high", "spread", "drives", "windows", "status")  # of a ratio, as programs have it
+EVIDENCE = ("low", "high", "free", "instruments", "turns", "strength", "lasts", "is_open")  # of a mean, the same
 MARK = {"consistent": "", "undecided": " ?", "overconfident": " overconfident", "conservative": " conservative"}
 
 
@@ -105,9 +106,8 @@ def _drifts(mean: Mean) -> tuple[str, ...]:
 def _of_mean(fit: MeanFit) -> list[str]:
     """What is not corrected, and whether the scale of turns depends on whose noise it is."""
     names = ["way x", "turn x", *(f"{each} " for each in _drifts(fit.mean))]
-    units = ["", "", *[" rad/m"] * len(fit.mean.drift)]
-    parts = zip(names, fit.low, fit.high, units, fit.free, strict=True)
-    left = [f"{name}[{low:.3g}, {high:.3g}]{unit}" for name, low, high, unit, is_free in parts if not is_free]
+    parts = zip(names, fit.low, fit.high, fit.free, strict=True)
+    left = [f"{name}[{low:.3g}, {high:.3g}]" for name, low, high, is_free in parts if not is_free]
     found = [f"not corrected, as the interval holds none: {', '.join(left)}"] if left else []
     forward, backward = (f"x{short(each)}" for each in fit.turns)
     sides = f"{forward} if the robot's motion errs about the odometry, {backward} if the odometry errs about the motion"
@@ -207,10 +207,11 @@ def data(model: NoiseModel) -> dict[str, Any]:
         }
         for each in model.spans
     ]
+    evidence = {key: getattr(n.mean_fit, key) for key in EVIDENCE if n.mean_fit is not None}
     found: dict[str, Any] = plain({
         "name": model.name, "status": model.status, "sentence": sentence(model), "span": model.span, "axes": n.axes,
         "fitted_drives": model.fitted_drives, "judged_drives": model.judged_drives, "held_out": model.held_out,
-        "counts": dict(model.counts), "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": m.drift, **_evidence(n.mean_fit)},
+        "counts": dict(model.counts), "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": m.drift, **evidence},
         "noise": {
             "variance_per_m": n.per_m, "variance_per_rad": n.per_rad, "floor": n.floor, "factor": n.factor,
             "per_m_interval": model.per_m, "per_rad_interval": model.per_rad,
@@ -220,13 +221,3 @@ def data(model: NoiseModel) -> dict[str, Any]:
         "second_size": None if second is None else second.size, "spans": spans, "referee": flat(model.verdict),
     })  # fmt: skip
     return found
-
-
-def _evidence(fit: MeanFit | None) -> dict[str, Any]:
-    """Intervals of the scale of the way, of turns, and of the drift, and what they rest on."""
-    if fit is None:
-        return {}
-    return {
-        "low": fit.low, "high": fit.high, "corrected": fit.free, "instruments": fit.instruments,
-        "turn_by_estimated_and_true_motion": fit.turns, "instruments_f": fit.strength, "is_open": fit.is_open,
-    }  # fmt: skip

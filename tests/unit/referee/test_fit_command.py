@@ -231,7 +231,8 @@ def test_the_command_on_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str
     out, err = consistency(capsys, *words, "--out", tmp_path / "noise")
     assert err == ""
     assert out.startswith("wheels: at 10 m ")
-    for each in ("not corrected, as the interval holds none: way x[", "held-out 10 m", "a new drive: ", "analyse counts each judged motion"):
+    left = "not corrected, as the interval holds none: way x["
+    for each in (left, "held-out 10 m", "a new drive: ", "analyse counts each judged motion"):
         assert each in out
     names = {path.name for path in (tmp_path / "noise").iterdir()}
     assert names == {

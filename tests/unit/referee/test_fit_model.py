@@ -26,9 +26,9 @@ from consistency.referee.fit_covariance.white_noise import (
     fit_noise,
     fit_terms,
     interval_of,
+    jitter_of,
     nees_of,
     terms_of,
-    jitter_of,
 )
 from consistency.referee.fit_covariance.windows import Windows, blocks_of, in_plane, span_of, windows_of
 from consistency.referee.fit_covariance.wording import lines, sentence

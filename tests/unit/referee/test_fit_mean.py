@@ -59,9 +59,8 @@ def test_the_scale_is_found_on_whichever_side_the_noise_is(of_odometry: bool, in
 
 def test_neighbours_are_those_of_the_same_drive_without_a_gap() -> None:
     w = cut(Side(3), 1).of(np.arange(5))
-    w = replace(
-        w, drive=np.array([0, 0, 0, 1, 1]), first=np.array([0, 20, 40, 0, 21]), last=np.array([20, 40, 60, 20, 41])
-    )
+    first, last = np.array([0, 20, 40, 60, 81]), np.array([20, 40, 60, 80, 101])
+    w = replace(w, drive=np.array([0, 0, 0, 1, 1]), first=first, last=last)
     out = sum_of_neighbours(w, np.arange(1.0, 6), 10 * np.arange(1.0, 6))
     assert out.tolist() == [20.0, 31.0, 2.0, 0.0, 0.0]
 
@@ -154,6 +153,21 @@ def test_motion_that_lasts_for_less_than_a_window_is_a_weak_instrument() -> None
     assert found.instruments == FORWARD
     assert found.is_open
     assert found.turns == pytest.approx((0.5, 1.0), abs=0.25)
+
+
+def test_weak_instruments_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    w = cut(Side(3, in_space=False), 4)
+    assert choose_mean(w).instruments == NEIGHBOURS
+    monkeypatch.setattr(errors_, "STRONG", 1e9)
+    assert choose_mean(w).instruments == FORWARD
+
+
+def test_roads_without_turns_leave_turns_as_they_are() -> None:
+    """Estimated turns are noise alone: least squares is near 0, and the range holds 1."""
+    found = choose_mean(cut(Side(0.0), 10))
+    assert found.mean.turn == 1.0
+    assert abs(found.turns[0]) < 0.2
+    assert found.low[1] < 1.0 < found.high[1]
 
 
 def test_strength_is_the_first_stage_f() -> None:

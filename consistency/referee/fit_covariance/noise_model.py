@@ -262,4 +262,6 @@ def _spans(
 
 
 def error_windows(model: NoiseModel, judged: Judged) -> Windows:
-    return model.noise.mean.applied(windows_of(model.drives, span_of(judged.span), model.is_planar))
+    found = windows_at(model.drives, model.windows, span_of(judged.span).size, model.is_planar)
+    assert found is not None
+    return model.noise.mean.applied(found)

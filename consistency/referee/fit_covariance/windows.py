@@ -82,12 +82,13 @@ def span_of(text: str | float) -> Relative:
     return replace(span, flag="--span")
 
 
-def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) -> Windows:
+def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> Windows:
     """The windows of all drives; drives in which none fits have none.
 
     Parameters
     ----------
     planar : x, y and yaw alone of motions in space
+    pieces : of a window
 
     Raises
     ------
@@ -105,12 +106,12 @@ def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) ->
             continue
         long += skipped
         first, last = np.searchsorted(rows, first), np.searchsorted(rows, last)
-        parts.append(_pieces(number, drive, first, last, planar))
+        parts.append(_pieces(number, drive, first, last, planar, pieces))
     if not parts:
         assert refused is not None
         raise refused
-    index, first, last, pieces, true, true_pieces, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
-    found = Windows(span, index, first, last, pieces, true, true_pieces, long)
+    index, first, last, motions, true, true_pieces, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    found = Windows(span, index, first, last, motions, true, true_pieces, long)
     moved, jumped = _moves(found), _jumps(errors, found)
     found = replace(found, still=int((~moved).sum()), jumps=int((moved & jumped).sum()))
     if not (moved & ~jumped).any():
@@ -119,18 +120,22 @@ def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) ->
 
 
 def windows_at(drives: Sequence[Drive], windows: Windows, size: float, planar: bool) -> Windows | None:
-    """The windows of all drives over a span of another size; None where none fits."""
+    """The windows of all drives over a span of another size, in pieces of the same size; None where none fits.
+
+    Turns of another size would hold another share of the noise.
+    """
+    pieces = max(round(PIECES * size / windows.span.size), 1)
     try:
-        return windows_of(drives, replace(windows.span, size=size), planar)
+        return windows_of(drives, replace(windows.span, size=size), planar, pieces)
     except InputError:
         return None
 
 
 def _pieces(
-    number: int, drive: Drive, first: Indices, last: Indices, planar: bool
+    number: int, drive: Drive, first: Indices, last: Indices, planar: bool, pieces: int
 ) -> tuple[Indices, Indices, Indices, Array, Array, Array, Array]:
     """Windows of one drive: index, rows, pieces (W, P, ...), true motions and pieces, errors of pieces (W, P, n)."""
-    share = np.linspace(0.0, 1.0, PIECES + 1)
+    share = np.linspace(0.0, 1.0, pieces + 1)
     ends = np.rint(first[:, None] + share * (last - first)[:, None]).astype(np.int64)
     T, true = drive.estimate, drive.truth
     D, M = (inverse(each[ends[:, :-1]]) @ each[ends[:, 1:]] for each in (T, true))

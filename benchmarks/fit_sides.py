@@ -144,7 +144,7 @@ def side_rows(draws: int, seed: int, only: str = "") -> bool:
         print(f"| {side} | {covered}/{draws} | {made}/{draws} | {scale:.3f} | {ratio:.2f} |", flush=True)
     if total:
         print(f"| all | | | | | {inside}/{total} | | | |")
-        held &= inside >= POOLED * total
+        held &= inside >= POOLED * total or bool(only)
     return held & drift_rows(draws, seed, only)
 
 

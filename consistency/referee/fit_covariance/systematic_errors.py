@@ -190,7 +190,7 @@ def sum_of_neighbours(windows: Windows, before: Array, after: Array) -> Array:
 
 def _solved(A: Array, b: Array) -> Array:
     """x of A x = b, (p, p) and (p,) or (p, k); 0 in directions that are not determined."""
-    size = np.sqrt(np.maximum(np.abs(np.diag(A)), 1e-300))
+    size: Array = np.sqrt(np.maximum(np.abs(np.diag(A)), 1e-300))
     return np.asarray((np.linalg.lstsq(A / np.outer(size, size), (b.T / size).T, rcond=WEAK**2)[0].T / size).T)
 
 

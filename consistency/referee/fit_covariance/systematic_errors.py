@@ -110,8 +110,8 @@ def choose_mean(windows: Windows, covariance: Array | None = None, start: Mean |
     whole, turns = found[used[0]][0], (found[FORWARD][0].turn, found[BACKWARD][0].turn)
     low, high = none, none
     while True:
-        means, lows, highs = zip(*(_estimate(windows, near, moments[each], free) for each in used), strict=True)
-        low, high = np.where(free, np.min(lows, axis=0), low), np.where(free, np.max(highs, axis=0), high)
+        means, least, most = zip(*(_estimate(windows, near, moments[each], free) for each in used), strict=True)
+        low, high = np.where(free, np.min(least, axis=0), low), np.where(free, np.max(most, axis=0), high)
         inside = np.where(free, np.minimum(high - none, none - low), -1.0) / (high - low)
         if not inside.max() >= 0:
             break
@@ -204,7 +204,7 @@ def _strength(moments: Moments) -> float:
         others = np.delete(Z, j, axis=-1).reshape(-1, Z.shape[-1] - 1)
         x, z = (each[..., j].ravel() for each in (X, Z))
         x, z = (each - others @ np.linalg.lstsq(others, each, rcond=WEAK)[0] for each in (x, z))
-        slope = (z @ x) / max(z @ z, 1e-300)
+        slope = float(z @ x) / max(float(z @ z), 1e-300)
         scatter = (z * (x - slope * z)).reshape(len(X), -1).sum(axis=1)
         found.append(abs(z @ x) / max(np.sqrt((scatter**2).sum()), 1e-300))
     return float(min(min(found), 1e100) ** 2)

@@ -71,13 +71,17 @@ class Judged:
 
     @property
     def status(self) -> str:
-        """That of the whole; inconsistent where that is right and an axis is not."""
-        found = {axis.status for axis in self.axes} & {"overconfident", "conservative"}
-        return "inconsistent" if found and self.whole.status == "consistent" else self.whole.status
+        """That of the whole; where that is consistent, inconsistent or undecided if an axis is not."""
+        if self.whole.status != "consistent":
+            return self.whole.status
+        found = {axis.status for axis in self.axes if axis.drives}  # an axis without any error tells nothing
+        if found & {"overconfident", "conservative"}:
+            return "inconsistent"
+        return "undecided" if "undecided" in found else "consistent"
 
 
 def folds_of(
-    drives: Sequence[Drive], windows: Windows, held_out: str | None, correct: bool
+    drives: Sequence[Drive], windows: Windows, held_out: str | None, correct: bool | str
 ) -> tuple[Noise, list[Fold]]:
     """The fit that is handed out, and those that are judged.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.fit_covariance.windows import Windows, rests, turns, ways
+from consistency.referee.fit_covariance.windows import Windows, lengthened, rests, turns, ways
 from consistency.referee.geometry.groups import adjoint, inverse
 from consistency.referee.types import Array
 
@@ -22,10 +22,11 @@ class Mean:
     way: float = 1.0  # true over estimated length
     turn: float = 1.0  # true over estimated rotation
     drift: tuple[float, ...] = (0.0,)  # rad a m, about the axes of the body: (1,), or (3,) in space
+    slip: float = 0.0  # m a rad, that each turn adds to the estimated way before all else
 
     def corrected(self, pieces: Array) -> Array:
         """Motions (W, P, d + 1, d + 1) with this mean taken out."""
-        d = pieces.shape[-1] - 1
+        d, pieces = pieces.shape[-1] - 1, lengthened(pieces, self.slip)
         way, out = ways(pieces), np.array(pieces)
         angle = self.turn * turns(pieces) + way[..., None] * np.asarray(self.drift)
         out[..., :d, d] *= self.way

@@ -15,8 +15,9 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.slip import BY_TURN, fit_slip
 from consistency.referee.fit_covariance.systematic_errors import Mean, carriers, fit_mean, none_of
-from consistency.referee.fit_covariance.windows import Windows, turns, ways, windows_at
+from consistency.referee.fit_covariance.windows import Windows, lengthened, turns, ways, windows_at
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
@@ -49,8 +50,8 @@ class Noise:
         return nees_of(error, C) / error.shape[1], error**2 / np.diagonal(C, axis1=1, axis2=2)
 
 
-def fit_noise(windows: Windows, correct: bool = True) -> Noise:
-    """Mean and noise of windows, each given the other in turn.
+def fit_noise(windows: Windows, correct: bool | str = True) -> Noise:
+    """Mean and noise of windows, each given the other in turn; the mean is of BY_TURN, too, if this is ``correct``.
 
     Raises
     ------
@@ -63,6 +64,10 @@ def fit_noise(windows: Windows, correct: bool = True) -> Noise:
             f"--span {windows.span.option}: {len(windows.drive)} windows are too few to fit {least} variances; take a "
             "shorter span or longer drives: 50 windows in 5 drives make a verdict possible"
         )
+    if correct == BY_TURN:
+        slip = fit_slip(windows)
+        noise = fit_noise(replace(windows, pieces=lengthened(windows.pieces, slip)))
+        return replace(noise, mean=replace(noise.mean, slip=slip))
     mean = fit_mean(windows) if correct else none_of(windows)
     theta = None
     for left in reversed(range(ROUNDS if correct else 1)):

@@ -139,6 +139,16 @@ def _pieces(
     return np.full(len(first), number), first, last, D, whole, error
 
 
+def true_pieces(drives: Sequence[Drive], windows: Windows, planar: bool) -> Array:
+    """True motions of the pieces of each window, (W, P, d + 1, d + 1)."""
+    out = np.empty_like(windows.pieces)
+    for number in np.unique(windows.drive):
+        own = windows.drive == number
+        drive = replace(drives[number], estimate=drives[number].truth)
+        out[own] = _pieces(number, drive, windows.first[own], windows.last[own], planar)[3]
+    return out
+
+
 def in_plane(T: Array) -> Array:
     """Motions in space (..., 4, 4) as x, y and yaw, (..., 3, 3); yaw is the direction of the x axis."""
     out = np.zeros((*T.shape[:-2], 3, 3))
@@ -173,6 +183,14 @@ def turns(pieces: Array) -> Array:
     flat = pieces[..., :3, :3].reshape(-1, 3, 3)
     vectors = Rotation.from_matrix(flat).as_rotvec() if len(flat) else np.empty((0, 3))
     return np.asarray(vectors.reshape(*pieces.shape[:2], 3))
+
+
+def lengthened(pieces: Array, slip: float) -> Array:
+    """Motions whose way is longer by ``slip`` for each radian of their turn; none goes backwards by this."""
+    out, d, way = np.array(pieces), pieces.shape[-1] - 1, ways(pieces)
+    turn = np.linalg.norm(turns(pieces), axis=-1)
+    out[..., :d, d] *= np.maximum(1.0 + slip * turn / np.where(way > 0, way, np.inf), 0.0)[..., None]
+    return out
 
 
 def _moves(of: Windows) -> Array:

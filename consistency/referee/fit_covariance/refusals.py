@@ -57,7 +57,8 @@ def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, corre
     if windows.cut > CUT:
         raise InputError(
             f"--span {span}: {100 * windows.cut:.0f} % of the windows have a jump, more than {100 * CUT:.0f} %: a "
-            "model without them is none of this odometry; mend the jumps, or state them as failures of the odometry"
+            "model without them is none of this odometry; if the clocks of estimates and truth differ, give their "
+            "--time-offset S, or 'estimate'; otherwise mend the jumps, or state them as failures of the odometry"
         )
     angle, share, chance = body_turn(windows)
     if share > TURNED and chance < RARE:

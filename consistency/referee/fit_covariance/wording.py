@@ -165,6 +165,11 @@ def lines(model: NoiseModel) -> list[str]:
         out.append(
             f"cautious: all covariances are raised x{model.noise.factor:.3g}, so that a new drive seldom has more"
         )
+    if model.drives[0].shift:
+        out.append(
+            f"clocks: {model.drives[0].shift:.3g} s are added to the timestamps of the estimates, for which the motions "
+            "agree best"
+        )
     if model.second is not None:
         out.append(_of_second(model.second, model.noise.axes))
     out += model.warnings

@@ -20,7 +20,7 @@ from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.mean_by_motion import ByMotion, mean_by_motion
 from consistency.referee.fit_covariance.motions import record_of, stretches_of
 from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
-from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_sound
+from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_poses, require_sound
 from consistency.referee.fit_covariance.slip import BY_TURN
 from consistency.referee.fit_covariance.white_noise import ENOUGH, Noise, intervals, with_jitter
 from consistency.referee.fit_covariance.windows import PIECES, Windows, span_of, windows_at, windows_of
@@ -166,6 +166,7 @@ def fit_covariance(
         raise InputError(f"--cautious {cautious:g}: must be a probability between 0.5 and 1, such as 0.9")
     if by_turn and not correct:
         raise InputError("--by-turn is a correction; leave --no-correct out")
+    require_poses(drives)
     windows = windows_of(drives, over, planar)
     require_sound(drives, windows, planar, correct)
     noise, folds = folds_of(drives, windows, held_out, BY_TURN if by_turn else correct)

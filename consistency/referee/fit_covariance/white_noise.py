@@ -95,7 +95,10 @@ def least_of(error: Array) -> Array:
     out = np.empty(error.shape[1])
     for part, what in kinds:
         if not square[part].max() > 1e-20:
-            raise InputError(f"estimate and truth have the same {what}; there is no error to fit")
+            raise InputError(
+                f"estimate and truth have the same {what}; there is no error to fit: give those that the odometry "
+                "estimates itself"
+            )
         out[part] = LEAST * square[part].max()
     return out
 

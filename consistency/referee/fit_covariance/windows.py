@@ -17,6 +17,7 @@ from consistency.referee.types import Array, Indices
 PIECES = 20  # of a window: sums over them are independent of the rate of the file, and as good as integrals
 STILL = 0.1  # of the span: a window with less motion says nothing about the span
 JUMP = (12.0, 3.0)  # medians of the errors of its drive's pieces, and windows, that a piece exceeds in a jump
+ROUNDED = 1e-4  # rad, of rotation errors that neither jump nor grow: a file with four digits has them
 PLANE, SPACE = ("x", "y", "yaw"), ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -205,10 +206,11 @@ def _moves(of: Windows) -> Array:
 def _jumps(errors: Array, of: Windows) -> Array:
     """Which windows have a piece whose error (W, P, n), of position or rotation, is a jump in its drive, (W,)."""
     out, whole = np.zeros(len(errors), bool), of.errors
-    for part in (slice(0, of.d), slice(of.d, None)):
+    for part, least in ((slice(0, of.d), 0.0), (slice(of.d, None), ROUNDED)):
         pieces, windows = (np.linalg.norm(each[..., part], axis=-1) for each in (errors, whole))
         for drive in np.unique(of.drive):
             rows = of.drive == drive
-            limit = max(JUMP[0] * float(np.nanmedian(pieces[rows])), JUMP[1] * float(np.median(windows[rows])))
+            medians = float(np.nanmedian(pieces[rows])), float(np.median(windows[rows]))
+            limit = max(JUMP[0] * medians[0], JUMP[1] * medians[1], least)
             out[rows] |= (np.nan_to_num(pieces[rows]) > limit).any(axis=1) & (limit > 0)
     return out

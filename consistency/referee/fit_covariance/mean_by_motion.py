@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -20,6 +20,7 @@ LEAST = 0.1  # share of the variance of an axis over the span, as with a turn of
 BINS = 3  # of windows that turn, or go, least, more and most
 VARIES = 1.5  # largest over smallest mean way of a bin, from which windows are compared by their way
 BLOCKS = 40  # of consecutive windows, whose errors may depend on each other
+UNTOLD = 0.01  # share of the squared effect of a scale, below which a bin does not tell it
 SCALES = ("the scale of the way", "the scale of turns")
 
 
@@ -37,9 +38,13 @@ class ByMotion:
     p_value: float
     gain: float  # share of squared errors of positions that a way by turn takes out where it is not fitted; 0 if none may
 
+    @property
+    def is_found(self) -> bool:
+        return self.p_value <= SURE and self.share >= LEAST
 
-def mean_by_motion(noise: Noise, windows: Windows, drives: Sequence[Drive], planar: bool) -> ByMotion | None:
-    """The dependence that is found, that of the smallest p-value; None where there is none.
+
+def mean_by_motion(noise: Noise, windows: Windows, drives: Sequence[Drive], planar: bool) -> ByMotion:
+    """The dependence with the smallest p-value, which is times the number of questions.
 
     Windows are divided once by the estimated and once by the true motion, and both must show it: the noise of a motion
     is itself a mean error in windows that are chosen by it.
@@ -54,24 +59,25 @@ def mean_by_motion(noise: Noise, windows: Windows, drives: Sequence[Drive], plan
         if by == "way" and most < VARIES * least:
             continue
         for scale in range(len(SCALES)):
-            p = max(dependence(now, pieces, of, scale) for pieces, of in zip(both, bins, strict=True))
+            p = max(p_value_of(now, pieces, of, scale) for pieces, of in zip(both, bins, strict=True))
             found.append((p, by, scale, sizes[0], bins[0]))
     p, by, scale, size, of = min(found, key=lambda each: each[0])
     values, error = _by_bin(now, of, scale)
     shares = (error**2).mean(axis=0) / np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0)
     axis = int(np.argmax(shares))
-    if len(found) * p > SURE or shares[axis] < LEAST:
-        return None
     reach = max(float(np.abs(error[of == k, axis]).mean()) for k in np.unique(of))
     of_all = noise.mean.turn if scale else noise.mean.way
     edges = tuple(float(size[of == k].min()) for k in range(1, BINS) if (of == k).any())
-    return ByMotion(
+    dependence = ByMotion(
         SCALES[scale], by, tuple((of_all * (1.0 + values)).tolist()), edges, now.axes[axis], float(shares[axis]), reach,
-        len(found) * p, held_out_gain(windows, blocks_of(windows.drive)) if (by, scale) == ("turn", 0) else 0.0,
+        min(len(found) * p, 1.0), 0.0,
     )  # fmt: skip
+    if dependence.is_found and (by, scale) == ("turn", 0):
+        return replace(dependence, gain=held_out_gain(windows, blocks_of(windows.drive)))
+    return dependence
 
 
-def dependence(windows: Windows, pieces: Array, bins: Indices, scale: int) -> float:
+def p_value_of(windows: Windows, pieces: Array, bins: Indices, scale: int) -> float:
     """p-value of one scale in all bins, by a score test; errors are of ``windows``, and motions ``pieces``.
 
     Each drive has constants of its own. The scores of blocks of windows, in all bins but the first, are compared with
@@ -103,9 +109,11 @@ def dependence(windows: Windows, pieces: Array, bins: Indices, scale: int) -> fl
 
 
 def _by_bin(windows: Windows, bins: Indices, scale: int) -> tuple[Array, Array]:
-    """What a scale is more in each bin, (BINS,), and the mean errors that this makes, (W, n)."""
+    """What a scale is more in each bin, (BINS,), and the mean errors that this makes, (W, n); 0 where nothing tells."""
     error, X = windows.errors, design_of(windows.pieces)
     Z = X[:, :, [scale]] * (bins[:, None] == np.arange(BINS))[:, None, :]
+    squares = (Z**2).sum(axis=(0, 1))
+    Z = Z * (squares > UNTOLD * squares.sum())
     weight = 1.0 / np.sqrt(np.maximum((error**2).mean(axis=0), 1e-300))[:, None]
     design = (np.concatenate([Z, np.delete(X, scale, axis=-1)], axis=-1) * weight).reshape(error.size, -1)
     values = np.linalg.lstsq(design, (error * weight[:, 0]).ravel(), rcond=None)[0][:BINS]

@@ -52,7 +52,7 @@ class NoiseModel:
     growth: Growth  # of the squared rotation error over the span
     warnings: tuple[str, ...]
     lasting: tuple[Lasting, ...]  # errors that differ between drives
-    by_motion: ByMotion | None  # a mean error that depends on the motion
+    by_motion: ByMotion | None  # whether the mean depends on the motion; None where it is left in
     second: Second | None  # errors of the second estimator
     drives: tuple[Drive, ...] = field(repr=False)
     windows: Windows = field(repr=False)
@@ -69,7 +69,7 @@ class NoiseModel:
         """consistent, overconfident, conservative, inconsistent or undecided."""
         is_of_truth = self.second is not None and bool(self.second.is_shared.any())
         doubted = is_of_truth or any(each.decides for each in self.lasting)
-        return decided(self.spans[0].status, doubted, self.by_motion is not None)
+        return decided(self.spans[0].status, doubted, self.by_motion is not None and self.by_motion.is_found)
 
     @property
     def stretches(self) -> list[tuple[str, Stretch]]:

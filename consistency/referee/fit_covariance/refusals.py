@@ -109,6 +109,14 @@ def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, corre
             "model without them is none of this odometry; if the clocks of estimates and truth differ, give their "
             "--time-offset S, or 'estimate'; otherwise mend the jumps, or state them as failures of the odometry"
         )
+    growth = growth_of(drives, windows, planar, none_of(windows))  # a map leaves no mean to correct
+    rounding = float(np.sqrt((windows.errors[:, windows.d :] ** 2).sum(axis=1).mean()))
+    if growth.shrinks and rounding < ROUNDED:
+        raise InputError(
+            f"rotations of estimate and truth differ by {rounding:.2g} rad, as by rounding, and not by more over longer "
+            "spans: one was taken from the other, so that there is no error of rotations to fit; give those that the "
+            "odometry estimates itself"
+        )
     angle, share, chance = body_turn(windows)
     if share > TURNED and chance < RARE:
         raise InputError(
@@ -122,17 +130,9 @@ def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, corre
             f"the true way is {scale:.3g} times the estimated one: the scale is not metric, as of a single camera; "
             "fit after the scale is known (stereo, inertial, wheels), or state it by a scale state"
         )
-    growth = growth_of(drives, windows, planar, none_of(windows))  # a map leaves no mean to correct
     revisit, chance = revisits(drives, windows)
     returns = revisit < 1.0 and chance < RARE
     if growth.shrinks or returns:
-        rounding = float(np.sqrt((windows.errors[:, windows.d :] ** 2).sum(axis=1).mean()))
-        if rounding < ROUNDED:
-            raise InputError(
-                f"rotations of estimate and truth differ by {rounding:.2g} rad, as by rounding, and not by more over "
-                "longer spans: one was taken from the other, so that there is no error of rotations to fit; give those "
-                "that the odometry estimates itself"
-            )
         shown = (
             f"the squared rotation error grows with the span to the power of {growth.power:.2g} (1 is white noise)"
             if growth.shrinks

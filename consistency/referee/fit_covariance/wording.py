@@ -70,7 +70,7 @@ def _why(model: NoiseModel) -> str:
         parts.append(", ".join(found))
     if open_axes and r.status == "consistent":
         parts.append(f"undecided: {', '.join(open_axes)}")
-    if model.by_motion is not None:
+    if model.by_motion is not None and model.by_motion.is_found:
         parts.append(dependence(model.by_motion, bool(model.noise.mean.slip)))
     return "".join(f"; {part}" for part in parts)
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize
 
-from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import inverse, log, matrices
 from consistency.referee.readers.clock_offset import MOST, REACH
@@ -17,43 +15,17 @@ from consistency.referee.types import Array
 
 LONG = 1.0  # s, of the motions that are compared
 KEPT = 0.9  # of the squared errors, the smallest: jumps decide nothing
-PARTS = 5  # drives that show how far the offset is known; fewer ones are cut into as many parts
-UNSURE = 0.1  # s, half the interval of an offset that is not used
-GRID = np.concatenate([-np.geomspace(0.004, REACH, 12)[::-1], [0.0], np.geomspace(0.004, REACH, 12)])
-
-
-class Motions(NamedTuple):
-    """Estimated motions (k, d + 1, d + 1) between times (k,), s, beside the samples of the truth."""
-
-    begin: Array
-    end: Array
-    motions: Array
-    poses: Poses
-
-    def of(self, rows: Array) -> Motions:
-        return Motions(self.begin[rows], self.end[rows], self.motions[rows], self.poses)
-
-    def squares(self, shift: float) -> Array:
-        """Squared errors (k, 2) of positions and rotations with the truth ``shift`` s later; NaN where it is not known."""
-        ends, p = [], self.poses
-        for t in (self.begin, self.end):
-            known = truth_at(t + shift, p.true_t, p.truth, p.manifold, p.max_dt)
-            T = np.full(self.motions.shape, np.nan)
-            T[known.rows] = matrices(known.truth)
-            ends.append(T)
-        out = np.full((len(self.begin), 2), np.nan)
-        fine = np.isfinite(ends[0] + ends[1]).all(axis=(1, 2))
-        error = log(inverse(self.motions[fine]) @ inverse(ends[0][fine]) @ ends[1][fine])
-        d = self.motions.shape[-1] - 1
-        out[fine] = np.column_stack([(error[:, part] ** 2).sum(axis=1) for part in (slice(0, d), slice(d, None))])
-        return out
+PARTS = 5  # drives that show how well the offset is known; fewer ones are cut into as many parts
+UNSURE = 0.1  # s, standard error of an offset that is not used
+STEPS = np.geomspace(0.004, REACH, 12)
+GRID = np.concatenate([-STEPS[::-1], [0.0], STEPS])
 
 
 def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     """Time to add to the timestamps of the estimates, s, one for all drives.
 
-    The offset minimises the squared errors of motions over a second, of positions times rotations, so that no scale of
-    either decides; the largest are left out. Its interval is that of Student for the offsets of drives or their parts.
+    The offset minimises the squared errors of motions over ``LONG`` s, of positions times rotations, so that no scale
+    of either decides.
 
     Parameters
     ----------
@@ -64,13 +36,16 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     InputError
         The motions do not tell it.
     """
-    found = [_motions(poses, T, MOST // len(drives)) for poses, T in drives]
-    each = -(-PARTS // len(found))
-    parts = [m.of(rows) for m in found for rows in np.array_split(np.arange(len(m.begin)), each) if len(rows)]
-    values = np.array([_best([part]) for part in parts])
-    k, value = len(values), _best(found) if found else np.nan
-    reach = float(stats.t.isf(0.5 * (1 - CONFIDENCE), k - 1) * values.std(ddof=1) / np.sqrt(k)) if k > 1 else np.inf
-    if not reach <= UNSURE:
+    parts = []
+    for poses, T in drives:
+        last = np.searchsorted(poses.t, poses.t + LONG)
+        first = np.flatnonzero(last < len(poses.t))
+        some = first[:: max(len(first) * len(drives) // MOST, 1)]
+        for rows in np.array_split(some, -(-PARTS // len(drives))):
+            parts.append((poses, poses.t[[rows, last[rows]]], inverse(T[rows]) @ T[last[rows]]))
+    values = [_best([part]) for part in parts if len(part[2])]
+    value = _best(parts) if len(values) > 1 else np.nan
+    if not np.isfinite(value) or not np.std(values, ddof=1) < UNSURE * np.sqrt(len(values)):
         raise InputError(
             "--time-offset estimate: the motions do not tell it, because nothing moves unevenly, or the offset is more "
             f"than {REACH:g} s; give seconds"
@@ -78,27 +53,32 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     return value
 
 
-def _motions(poses: Poses, T: Array, most: int) -> Motions:
-    """Motions over ``LONG`` s, at most ``most``, evenly chosen."""
-    end = np.searchsorted(poses.t, poses.t + LONG)
-    begin = np.flatnonzero(end < len(poses.t))
-    begin = begin[np.unique(np.linspace(0, len(begin) - 1, min(most, len(begin))).astype(int))]
-    end = end[begin]
-    return Motions(poses.t[begin], poses.t[end], inverse(T[begin]) @ T[end], poses)
-
-
-def _best(motions: Sequence[Motions]) -> float:
-    """The offset of the smallest error; NaN where none is smaller than others, or it is at the end of what is tried."""
+def _best(parts: Sequence[tuple[Poses, Array, Array]]) -> float:
+    """The offset with the smallest errors; NaN where that is at an end of ``GRID``, or no offset is better."""
 
     def size(shift: float) -> float:
-        squares = np.sort(np.concatenate([each.squares(shift) for each in motions]), axis=0)  # NaN last
-        known = int(np.isfinite(squares[:, 0]).sum())
-        return float(np.log(np.maximum(squares[: max(int(KEPT * known), 1)].mean(axis=0), 1e-300)).sum())
+        squares = np.sort(np.concatenate([_squares(*part, shift) for part in parts]), axis=0)
+        return float(np.log(squares[: max(int(KEPT * len(squares)), 1)].mean(axis=0) + 1e-300).sum())
 
     sizes = np.array([size(shift) for shift in GRID])
-    best = int(np.argmin(np.where(np.isfinite(sizes), sizes, np.inf)))
-    if best in (0, len(GRID) - 1) or not np.ptp(sizes[np.isfinite(sizes)]) > 1e-6:
+    best = int(np.nanargmin(np.append(sizes, np.inf)))
+    if best in (0, len(GRID) - 1, len(GRID)) or not np.nanmax(sizes) - sizes[best] > 1e-6:
         return float("nan")
-    bounds = GRID[best - 1], GRID[best + 1]
-    found = optimize.minimize_scalar(size, bounds=bounds, method="bounded", options={"xatol": 1e-4})
+    found = optimize.minimize_scalar(
+        size, bounds=(GRID[best - 1], GRID[best + 1]), method="bounded", options={"xatol": 1e-4}
+    )
     return float(found.x if found.fun < sizes[best] else GRID[best])
+
+
+def _squares(p: Poses, t: Array, motions: Array, shift: float) -> Array:
+    """Squared errors (k, 2) of positions and rotations, with the truth ``shift`` s later, where it is known.
+
+    The motions (K, d + 1, d + 1) are between times (2, K).
+    """
+    ends = np.full((2, *motions.shape), np.nan)
+    for T, times in zip(ends, t + shift, strict=True):
+        known = truth_at(times, p.true_t, p.truth, p.manifold, p.max_dt)
+        T[known.rows] = matrices(known.truth)
+    fine, d = np.isfinite(ends).all(axis=(0, 2, 3)), motions.shape[-1] - 1
+    error = log(inverse(motions[fine]) @ inverse(ends[0, fine]) @ ends[1, fine])
+    return np.column_stack([(error[:, :d] ** 2).sum(axis=1), (error[:, d:] ** 2).sum(axis=1)])

@@ -131,9 +131,7 @@ def judged_by(folds: Sequence[Fold], windows: Windows, drives: int, general: boo
     for i in np.unique(drive):
         by_drive[i] = values[drive == i].mean(axis=0)
     n = values.shape[1] - 1
-    ratios = [
-        ratio_of(by_drive[:, k], values[:, k], general, counts * (1 if k else n)) for k in range(values.shape[1])
-    ]
+    ratios = [ratio_of(by_drive[:, k], values[:, k], general, counts * (1 if k else n)) for k in range(values.shape[1])]
     return Judged(windows.span.option, ratios[0], tuple(ratios[1:]), by_drive)
 
 

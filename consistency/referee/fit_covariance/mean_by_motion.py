@@ -1,4 +1,4 @@
-"""Whether a scale of the mean error depends on how far a window turns, or goes, and the way that a turn adds."""
+"""Whether a scale of the mean error depends on how far a window turns, or goes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from consistency.referee.fit_covariance.windows import Windows, true_pieces, tur
 from consistency.referee.types import Array, Indices
 
 SURE = 0.01  # chance to find a dependence where there is none, all questions together
-LEAST = 0.1  # share of the variance of an axis over the span, as with a turn of the body that is refused
+LEAST = 0.1  # share of the variance of an axis over the span that it makes, as a turn of the body that is refused
 BINS = 3  # of windows that turn, or go, least, more and most
 VARIES = 1.5  # largest over smallest mean way of a bin, from which windows are compared by their way
 BLOCKS = 40  # of consecutive windows, whose errors may depend on each other
@@ -36,7 +36,7 @@ class ByMotion:
     share: float  # of the stated variance of this axis
     reach: float  # largest mean error of this axis in a bin, m or rad
     p_value: float
-    gain: float  # share of squared errors of positions that a way by turn takes out where it is not fitted; 0 if none may
+    gain: float = 0.0  # share of squared errors of positions that a way by turn takes out where it is not fitted
 
     @property
     def is_found(self) -> bool:
@@ -50,27 +50,23 @@ def mean_by_motion(noise: Noise, windows: Windows, drives: Sequence[Drive], plan
     is itself a mean error in windows that are chosen by it.
     """
     now = noise.mean.applied(windows)
-    both = now.pieces, true_pieces(drives, windows, planar)
-    found = []
-    for by, size_of in (("turn", _turned), ("way", _gone)):
-        sizes = [size_of(pieces) for pieces in both]
-        bins = [_bins(size) for size in sizes]
-        least, *_, most = (sizes[1][bins[1] == k].mean() if (bins[1] == k).any() else 0.0 for k in range(BINS))
-        if by == "way" and most < VARIES * least:
-            continue
-        for scale in range(len(SCALES)):
-            p = max(p_value_of(now, pieces, of, scale) for pieces, of in zip(both, bins, strict=True))
-            found.append((p, by, scale, sizes[0], bins[0]))
+    both, found = (now.pieces, true_pieces(drives, windows, planar)), []
+    for by in ("turn", "way"):
+        sizes = [_size(pieces, by) for pieces in both]
+        bins = [np.searchsorted(np.quantile(size, np.arange(1, BINS) / BINS), size, side="right") for size in sizes]
+        least, most = (np.quantile(sizes[1], at) for at in (0.5 / BINS, 1.0 - 0.5 / BINS))
+        if by == "turn" or most >= VARIES * least:
+            for scale in range(len(SCALES)):
+                p = max(p_value_of(now, pieces, of, scale) for pieces, of in zip(both, bins, strict=True))
+                found.append((p, by, scale, sizes[0], bins[0]))
     p, by, scale, size, of = min(found, key=lambda each: each[0])
     values, error = _by_bin(now, of, scale)
     shares = (error**2).mean(axis=0) / np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0)
-    axis = int(np.argmax(shares))
-    reach = max(float(np.abs(error[of == k, axis]).mean()) for k in np.unique(of))
-    of_all = noise.mean.turn if scale else noise.mean.way
-    edges = tuple(float(size[of == k].min()) for k in range(1, BINS) if (of == k).any())
+    axis, there = int(np.argmax(shares)), np.unique(of)
     dependence = ByMotion(
-        SCALES[scale], by, tuple((of_all * (1.0 + values)).tolist()), edges, now.axes[axis], float(shares[axis]), reach,
-        min(len(found) * p, 1.0), 0.0,
+        SCALES[scale], by, tuple(((noise.mean.way, noise.mean.turn)[scale] * (1.0 + values[there])).tolist()),
+        tuple(float(size[of == k].min()) for k in there[1:]), now.axes[axis], float(shares[axis]),
+        max(float(np.abs(error[of == k, axis]).mean()) for k in there), min(len(found) * p, 1.0),
     )  # fmt: skip
     if dependence.is_found and (by, scale) == ("turn", 0):
         return replace(dependence, gain=held_out_gain(windows, blocks_of(windows.drive)))
@@ -83,25 +79,21 @@ def p_value_of(windows: Windows, pieces: Array, bins: Indices, scale: int) -> fl
     Each drive has constants of its own. The scores of blocks of windows, in all bins but the first, are compared with
     their scatter (Hotelling 1931).
     """
-    error, X = windows.errors, design_of(pieces)
-    Z = X[:, :, [scale]] * (bins[:, None] == np.arange(1, BINS))[:, None, :]
-    weight = 1.0 / np.sqrt(np.maximum((error**2).mean(axis=0), 1e-300))[:, None]
-    scores, lost = [], 0
-    blocks = max(round(BLOCKS / len(np.unique(windows.drive))), 1)
-    for drive in np.unique(windows.drive):
-        rows = windows.drive == drive
-        n = int(rows.sum())
-        own, rest = (each[rows] * weight for each in (X, np.concatenate([Z, error[..., None]], axis=-1)))
-        own, rest = own.reshape(-1, own.shape[-1]), rest.reshape(-1, rest.shape[-1])
-        rest = rest - own @ np.linalg.lstsq(own, rest, rcond=None)[0]
-        products = (rest[:, :-1] * rest[:, -1:]).reshape(n, -1, BINS - 1).sum(axis=1)
-        scores += [part.sum(axis=0) for part in np.array_split(products, min(blocks, n))]
-        lost += own.shape[-1]
-    S = np.array(scores)
+    X, names = design_of(pieces), np.unique(windows.drive)
+    y, own, Z = _weighted(windows, X, X[:, :, [scale]] * (bins[:, None] == np.arange(1, BINS))[:, None, :])
+    scores = []
+    for name in names:
+        rows = np.flatnonzero(windows.drive == name)
+        both, mean = np.concatenate([Z[rows], y[rows]], axis=-1).reshape(-1, BINS), own[rows].reshape(-1, X.shape[-1])
+        both = both - mean @ np.linalg.lstsq(mean, both, rcond=None)[0]
+        products = (both[:, :-1] * both[:, -1:]).reshape(len(rows), -1, BINS - 1).sum(axis=1)
+        parts = min(max(round(BLOCKS / len(names)), 1), len(rows))
+        scores += [part.sum(axis=0) for part in np.array_split(products, parts)]
+    S, lost = np.array(scores), X.shape[-1] * len(names)
     G, q = S.shape
-    scatter = np.atleast_2d(np.cov(S.T)) * error.size / max(error.size - lost, 1)
+    scatter = np.atleast_2d(np.cov(S.T)) * y.size / max(y.size - lost, 1)
     size = np.sqrt(np.diag(scatter))
-    if G <= q or not (size > 0).all():
+    if q >= G or not (size > 0).all():
         return 1.0
     t = S.mean(axis=0) / size
     T2 = G * float(t @ np.linalg.pinv(scatter / np.outer(size, size), rcond=1e-9) @ t)
@@ -110,26 +102,22 @@ def p_value_of(windows: Windows, pieces: Array, bins: Indices, scale: int) -> fl
 
 def _by_bin(windows: Windows, bins: Indices, scale: int) -> tuple[Array, Array]:
     """What a scale is more in each bin, (BINS,), and the mean errors that this makes, (W, n); 0 where nothing tells."""
-    error, X = windows.errors, design_of(windows.pieces)
+    X = design_of(windows.pieces)
     Z = X[:, :, [scale]] * (bins[:, None] == np.arange(BINS))[:, None, :]
     squares = (Z**2).sum(axis=(0, 1))
     Z = Z * (squares > UNTOLD * squares.sum())
-    weight = 1.0 / np.sqrt(np.maximum((error**2).mean(axis=0), 1e-300))[:, None]
-    design = (np.concatenate([Z, np.delete(X, scale, axis=-1)], axis=-1) * weight).reshape(error.size, -1)
-    values = np.linalg.lstsq(design, (error * weight[:, 0]).ravel(), rcond=None)[0][:BINS]
+    y, design = _weighted(windows, np.concatenate([Z, np.delete(X, scale, axis=-1)], axis=-1))
+    values = np.linalg.lstsq(design.reshape(y.size, -1), y.ravel(), rcond=None)[0][:BINS]
     return values, Z @ values
 
 
-def _bins(size: Array) -> Indices:
-    """Bins of equal numbers of windows, (W,)."""
-    return np.asarray(np.searchsorted(np.quantile(size, np.arange(1, BINS) / BINS), size, side="right"))
+def _weighted(windows: Windows, *designs: Array) -> list[Array]:
+    """Errors (W, n, 1) and their derivatives (W, n, p), in units of the root mean square of each axis."""
+    error = windows.errors[..., None]
+    return [each / np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-150) for each in (error, *designs)]
 
 
-def _turned(pieces: Array) -> Array:
-    """Sum of the angles of the pieces of each window, (W,), rad."""
-    return np.asarray(np.linalg.norm(turns(pieces), axis=-1).sum(axis=1))
-
-
-def _gone(pieces: Array) -> Array:
-    """Way of each window, (W,), m."""
-    return np.asarray(ways(pieces).sum(axis=1))
+def _size(pieces: Array, by: str) -> Array:
+    """Sum of the angles of the pieces of each window, rad, or of their ways, m: (W,)."""
+    each = np.linalg.norm(turns(pieces), axis=-1) if by == "turn" else ways(pieces)
+    return np.asarray(each.sum(axis=1))

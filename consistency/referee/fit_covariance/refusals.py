@@ -48,13 +48,7 @@ class Growth:
 
 
 def require_poses(drives: Sequence[Drive]) -> None:
-    """Refuse what is not a pose in both: increments, and one orientation in every row beside one that turns.
-
-    Raises
-    ------
-    InputError
-        Estimates or truth of a drive are not poses; says which, and what they seem to be.
-    """
+    """Refuse estimates or a truth that are no poses, but increments, or positions with placeholders of orientations."""
     for drive in drives:
         names = ("estimates", "truth")
         both = drive.estimate, drive.truth
@@ -65,11 +59,10 @@ def require_poses(drives: Sequence[Drive]) -> None:
                     "placeholder, as with positions alone; motions are compared in the body's frame, so give "
                     f"{name} with orientations"
                 )
-            if _are_increments(T, other, drive.d):
+            if _are_increments(T, other):
                 remedy = "give --motions" if name == "estimates" else "compound them to poses"
                 raise InputError(
-                    f"{drive.name}: rows of the {name} seem to be motions since the row before, not poses: they are as "
-                    f"long as the steps of the {names[name == 'estimates']}; {remedy}"
+                    f"{drive.name}: rows of the {name} seem to be motions since the row before, not poses; {remedy}"
                 )
 
 
@@ -84,14 +77,13 @@ def _are_placeholders(T: Array, other: Array) -> bool:
     return bool(in_body - in_world > FOLLOWS * np.linalg.norm(steps, axis=1).sum())
 
 
-def _are_increments(T: Array, other: Array, d: int) -> bool:
-    """Whether positions of T have the size of the steps of another, in most rows that move, and their own steps do not."""
-    sizes = np.linalg.norm(T[1:, :d, d], axis=1)
-    own, steps = (np.linalg.norm(np.diff(each[:, :d, d], axis=0), axis=1) for each in (T, other))
+def _are_increments(T: Array, other: Array) -> bool:
+    """Whether positions have the size of the steps of another, in most rows that move, and their own steps do not."""
+    sizes = np.linalg.norm(T[1:, :-1, -1], axis=1)
+    own, steps = (np.linalg.norm(np.diff(each[:, :-1, -1], axis=0), axis=1) for each in (T, other))
     moves = steps > STILL * np.median(steps)
-    if not moves.any() or own.sum() > steps.sum() / SCALE:
-        return False
-    return bool(np.mean((sizes[moves] < SCALE * steps[moves]) & (sizes[moves] > steps[moves] / SCALE)) > 0.5)
+    alike = (sizes < SCALE * steps) & (sizes > steps / SCALE) & moves
+    return bool(alike.sum() > 0.5 * moves.sum() and own.sum() < steps.sum() / SCALE)
 
 
 def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, correct: bool) -> None:
@@ -113,9 +105,9 @@ def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, corre
     rounding = float(np.sqrt((windows.errors[:, windows.d :] ** 2).sum(axis=1).mean()))
     if growth.shrinks and rounding < ROUNDED:
         raise InputError(
-            f"rotations of estimate and truth differ by {rounding:.2g} rad, as by rounding, and not by more over longer "
-            "spans: one was taken from the other, so that there is no error of rotations to fit; give those that the "
-            "odometry estimates itself"
+            f"rotations of estimate and truth differ by {rounding:.2g} rad, as by rounding, and not by more over "
+            "longer spans: one was taken from the other, so that there is no error of rotations to fit; give those "
+            "that the odometry estimates itself"
         )
     angle, share, chance = body_turn(windows)
     if share > TURNED and chance < RARE:

@@ -23,12 +23,11 @@ def fit_slip(windows: Windows) -> float:
         mean = fit_mean(longer)
         now = mean.applied(longer)
         error, effect = now.errors, effect_of(now.pieces)
-        weight = 1.0 / np.sqrt(np.maximum((error**2).mean(axis=0), 1e-300))
-        X = (design_of(now.pieces) * weight[:, None]).reshape(error.size, -1)
-        both = np.column_stack([(each * weight).ravel() for each in (effect, error)])
-        before = float(both[:, 0] @ both[:, 0])
+        both = np.concatenate([design_of(now.pieces), effect[..., None], error[..., None]], axis=-1)
+        both = (both / np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-150)[:, None]).reshape(error.size, -1)
+        X, both = both[:, :-2], both[:, -2:]
         effect, error = (both - X @ np.linalg.lstsq(X, both, rcond=None)[0]).T
-        if not effect @ effect > APART * before:
+        if not effect @ effect > APART * both[:, 0] @ both[:, 0]:
             return 0.0
         slip += float(effect @ error / (effect @ effect)) / mean.way
     return slip

@@ -81,15 +81,14 @@ def dependence(found: ByMotion, is_corrected: bool) -> str:
     *rest, last = [f"x{value:.3g}" for value in found.values]
     bins = [f"{value} for {what} up to {edge:.2g} {unit}" for value, edge in zip(rest, found.edges, strict=True)]
     size = f"{found.reach:.2g} {'m' if found.axis in 'xyz' else 'rad'}"
-    remedy = f"state that spread in the covariance (add the square of {size} to the variance of {found.axis})"
-    if found.gain > 0 and not is_corrected:
-        remedy = (
-            f"correct the way by the turn with --by-turn, which takes {found.gain:.0%} of the squared error of positions "
-            f"out of motions that it is not fitted to, or {remedy}"
-        )
+    offer = (
+        f"correct the way by the turn with --by-turn, which takes {found.gain:.0%} of the squared error of positions "
+        "out of motions that it is not fitted to, or " * (found.gain > 0 and not is_corrected)
+    )
     return (
         f"{found.scale} depends on the {found.by}: {', '.join(bins)}, {last} beyond; that is {found.share:.0%} of the "
-        f"variance of {found.axis}: {remedy}"
+        f"variance of {found.axis}: {offer}state that spread in the covariance (add the square of {size} to the "
+        f"variance of {found.axis})"
     )
 
 
@@ -167,8 +166,8 @@ def lines(model: NoiseModel) -> list[str]:
         )
     if model.drives[0].shift:
         out.append(
-            f"clocks: {model.drives[0].shift:.3g} s are added to the timestamps of the estimates, for which the motions "
-            "agree best"
+            f"clocks: {model.drives[0].shift:.3g} s are added to the timestamps of the estimates, for which the "
+            "motions agree best"
         )
     if model.second is not None:
         out.append(_of_second(model.second, model.noise.axes))
@@ -203,7 +202,8 @@ def data(model: NoiseModel) -> dict[str, Any]:
     found: dict[str, Any] = plain({
         "name": model.name, "status": model.status, "sentence": sentence(model), "span": model.span, "axes": n.axes,
         "fitted_drives": model.fitted_drives, "judged_drives": model.judged_drives, "held_out": model.held_out,
-        "counts": dict(model.counts), "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": m.drift, "slip_m_per_rad": m.slip},
+        "counts": dict(model.counts),
+        "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": m.drift, "slip_m_per_rad": m.slip},
         "noise": {
             "variance_per_m": n.per_m, "variance_per_rad": n.per_rad, "floor": n.floor, "factor": n.factor,
             "per_m_interval": model.per_m, "per_rad_interval": model.per_rad,

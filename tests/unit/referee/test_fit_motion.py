@@ -227,7 +227,7 @@ def test_the_mean_of_logarithms_of_few_degrees_of_freedom(rng: np.random.Generat
     assert abs(np.mean(logs)) < 4 * np.std(logs) / np.sqrt(4000)
 
 
-# --- clocks ------------------------------------------------------------------------------------------------------------
+# --- clocks ---------------------------------------------------------------------------------------------
 
 
 def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> list[tuple[Poses, Array]]:
@@ -318,7 +318,7 @@ def test_increments_and_placeholders_are_named(world: World, rng: np.random.Gene
 def test_what_moves_without_turning_is_no_placeholder(rng: np.random.Generator) -> None:
     """A straight road with estimates that drift by a radian, and a vehicle that moves sideways as it likes."""
     steps = np.tile([0.5, 0.0, 0.0], (600, 1))
-    drifting = steps + [0.0, 0.0, 1e-3]
+    drifting = steps + np.array([0.0, 0.0, 1e-3])
     straight, drifted = (composed(matrices_of(each)) for each in (steps, drifting))
     sideways = np.column_stack([np.cumsum(rng.normal(size=(600, 2)), axis=0), np.zeros(600)])
     turning = sideways + [0.0, 0.0, 1.0] * np.linspace(0, 1, 600)[:, None]
@@ -339,7 +339,7 @@ def test_rotations_equal_to_rounding_are_no_closed_loops(size: float, rng: np.ra
         E, M = vectors(drive.estimate), vectors(drive.truth)
         E[:, 2] = size * np.round((M[:, 2] + 0.3 * size) / size)
         made.append(drive_of(drive.name, E, M, drive.t))
-    with pytest.raises(InputError, match="rotations of estimate and truth differ by .* as by rounding"):
+    with pytest.raises(InputError, match=r"rotations of estimate and truth differ by .* as by rounding"):
         cs.fit_covariance(made, SPAN)
     assert windows_of(made, span_of(SPAN)).jumps == 0
     assert size < ROUNDED

@@ -262,8 +262,8 @@ CASES = (
     Case("jitter 5 cm", World(offset=0.05)),
     Case("right, 10 drives of 250 m", World(), 10, length=250.0),
     Case("right in space, 10 drives of 250 m", ROADS[2][1], 10, length=250.0),
-    Case("way by turn, -0.2 m a rad", World(slip=-0.2)),
-    Case("way by turn, corrected", World(slip=-0.2), correct=BY_TURN),
+    Case("way by turn, -0.4 m a rad", World(slip=-0.4)),
+    Case("way by turn, corrected", World(slip=-0.4), correct=BY_TURN),
     Case("one drive, halves", World(), 1),
     Case("loops closed", World(closed=True)),
     Case("one camera, x2.2", World(metric=2.2)),
@@ -337,7 +337,7 @@ BY_MOTION = (  # name, world, drives, span, whether the mean depends on the moti
     ("constants of their own, in space", replace(ROADS[2][1], **OWN_CONSTANTS), 5, SPAN, False),
     ("turns as large as their noise", World((4e-4, 2e-4, 4e-3), winds=True, **OWN_CONSTANTS), 5, SPAN, False),
     ("heading remembers", World(memory=50.0, coloured=2e-3), 5, SPAN, False),
-    ("way by turn, -0.2 m a rad", World(slip=-0.2, **OWN_CONSTANTS), 5, SPAN, True),
+    ("way by turn, -0.4 m a rad", World(slip=-0.4, **OWN_CONSTANTS), 5, SPAN, True),
 )
 
 

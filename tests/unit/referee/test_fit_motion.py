@@ -98,6 +98,10 @@ def test_a_straight_drive_tells_no_slip(rng: np.random.Generator) -> None:
 def test_slip_that_helps_nothing_gains_nothing(rng: np.random.Generator) -> None:
     w = windows_of(drives(rng, 5, length=300.0), span_of(SPAN))
     assert held_out_gain(w, blocks_of(w.drive)) < 0.05
+    quiet = World((1e-10, 1e-10, 1e-12), (1e-12,) * 3, slip=0.1)
+    opposite = [*drives(rng, 1, quiet, 300.0), *drives(rng, 1, replace(quiet, slip=-0.1), 300.0)]
+    w = windows_of(opposite, span_of(SPAN))
+    assert held_out_gain(w, [np.flatnonzero(w.drive == i) for i in range(2)]) < 0.0
 
 
 def test_a_way_by_turn_is_found_named_and_corrected(rng: np.random.Generator) -> None:
@@ -205,6 +209,9 @@ def test_an_undecided_axis_makes_it_undecided_and_is_named(rng: np.random.Genera
     unknown = Ratio(*(float("nan"),) * 4, drives=0, windows=250)  # an axis without any error
     assert replace(judged, axes=(RIGHT, unknown, RIGHT)).status == "consistent"
     model = cs.fit_covariance(drives(rng, 5, length=300.0), SPAN)
+    by_drive, counts = model.spans[0].by_drive, np.bincount(model.windows.drive)
+    for axis, ratio, dof in ((3, model.spans[0].axes[2], counts), (0, model.spans[0].whole, 3 * counts)):
+        assert ratio.value == pytest.approx(ratio_of(by_drive[:, axis], np.ones(3), True, dof).value)
     shown = replace(model, spans=(judged, *model.spans[1:]), lasting=(), by_motion=None)
     assert shown.status == "undecided"
     assert sentence(shown).endswith("; undecided: yaw")

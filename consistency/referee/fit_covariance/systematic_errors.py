@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.fit_covariance.windows import BLOCKS, Windows, blocks_of, rests, turns, ways
+from consistency.referee.fit_covariance.windows import BLOCKS, Windows, blocks_of, lengthened, rests, turns, ways
 from consistency.referee.geometry.groups import adjoint, inverse
 from consistency.referee.types import Array
 
@@ -31,6 +31,7 @@ class Mean:
     way: float = 1.0  # true over estimated length
     turn: float = 1.0  # true over estimated rotation
     drift: tuple[float, ...] = (0.0,)  # rad a m, about the axes of the body: (1,), or (3,) in space
+    slip: float = 0.0  # m a rad, that each turn adds to the estimated way before all else
 
     @property
     def values(self) -> Array:
@@ -39,7 +40,7 @@ class Mean:
 
     def corrected(self, pieces: Array) -> Array:
         """Motions (W, P, d + 1, d + 1) with this mean taken out."""
-        d = pieces.shape[-1] - 1
+        d, pieces = pieces.shape[-1] - 1, lengthened(pieces, self.slip)
         way, out = ways(pieces), np.array(pieces)
         angle = self.turn * turns(pieces) + way[..., None] * np.asarray(self.drift)
         out[..., :d, d] *= self.way

@@ -6,7 +6,7 @@ The variances are fitted to the errors of windows by maximum likelihood.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import optimize, stats
@@ -15,6 +15,7 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.slip import BY_TURN, fit_slip
 from consistency.referee.fit_covariance.systematic_errors import (
     NEIGHBOURS,
     Mean,
@@ -24,7 +25,7 @@ from consistency.referee.fit_covariance.systematic_errors import (
     none_of,
     sum_of_neighbours,
 )
-from consistency.referee.fit_covariance.windows import Windows, blocks_of, turns, ways, windows_at
+from consistency.referee.fit_covariance.windows import Windows, blocks_of, lengthened, turns, ways, windows_at
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
@@ -57,8 +58,8 @@ class Noise:
         return nees_of(error, C) / error.shape[1], error**2 / np.diagonal(C, axis1=1, axis2=2)
 
 
-def fit_noise(windows: Windows, correct: bool = True, jitter: Array | float = 0.0) -> Noise:
-    """Mean and noise of windows, each given the other in turn.
+def fit_noise(windows: Windows, correct: bool | str = True, jitter: Array | float = 0.0) -> Noise:
+    """Mean and noise of windows, each given the other in turn; the mean is of BY_TURN, too, if this is ``correct``.
 
     Parameters
     ----------
@@ -75,6 +76,10 @@ def fit_noise(windows: Windows, correct: bool = True, jitter: Array | float = 0.
             f"--span {windows.span.option}: {len(windows.drive)} windows are too few to fit {least} variances; take a "
             "shorter span or longer drives: 50 windows in 5 drives make a verdict possible"
         )
+    if correct == BY_TURN:
+        slip = fit_slip(windows)
+        noise = fit_noise(replace(windows, pieces=lengthened(windows.pieces, slip)), True, jitter)
+        return replace(noise, mean=replace(noise.mean, slip=slip))
     found, theta = choose_mean(windows) if correct else None, None
     mean = none_of(windows) if found is None else found.whole
     for left in reversed(range(ROUNDS if correct else 1)):
@@ -120,7 +125,10 @@ def least_of(error: Array) -> Array:
     out = np.empty(error.shape[1])
     for part, what in kinds:
         if not square[part].max() > 1e-20:
-            raise InputError(f"estimate and truth have the same {what}; there is no error to fit")
+            raise InputError(
+                f"estimate and truth have the same {what}; there is no error to fit: give those that the odometry "
+                "estimates itself"
+            )
         out[part] = LEAST * square[part].max()
     return out
 

@@ -19,6 +19,7 @@ STILL = 0.1  # of the span: a window with less motion says nothing about the spa
 JUMP = (12.0, 3.0)  # medians of the errors of its drive's pieces, and windows, that a piece exceeds in a jump
 BLOCKS = 20  # of windows, where drives are too few for the jackknife
 ENOUGH = 5  # drives for which they are the blocks
+ROUNDED = 1e-4  # rad, of rotation errors that neither jump nor grow: a file with four digits has them
 PLANE, SPACE = ("x", "y", "yaw"), ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -183,6 +184,14 @@ def turns(pieces: Array) -> Array:
     return np.asarray(vectors.reshape(*pieces.shape[:2], 3))
 
 
+def lengthened(pieces: Array, slip: float) -> Array:
+    """Motions whose way is longer by ``slip`` for each radian of their turn; none goes backwards by this."""
+    out, d, way = np.array(pieces), pieces.shape[-1] - 1, ways(pieces)
+    turn = np.linalg.norm(turns(pieces), axis=-1)
+    out[..., :d, d] *= np.maximum(1.0 + slip * turn / np.where(way > 0, way, np.inf), 0.0)[..., None]
+    return out
+
+
 def _moves(of: Windows) -> Array:
     """Which windows have motion, (W,): on the way, for a span in m; in way or turn, compared with others, otherwise."""
     way = ways(of.pieces).sum(axis=1)
@@ -195,11 +204,12 @@ def _moves(of: Windows) -> Array:
 def _jumps(errors: Array, of: Windows) -> Array:
     """Which windows have a piece whose error (W, P, n), of position or rotation, is a jump in its drive, (W,)."""
     out, whole = np.zeros(len(errors), bool), of.errors
-    for part in (slice(0, of.d), slice(of.d, None)):
+    for part, least in ((slice(0, of.d), 0.0), (slice(of.d, None), ROUNDED)):
         pieces, windows = (np.linalg.norm(each[..., part], axis=-1) for each in (errors, whole))
         for drive in np.unique(of.drive):
             rows = of.drive == drive
-            limit = max(JUMP[0] * float(np.nanmedian(pieces[rows])), JUMP[1] * float(np.median(windows[rows])))
+            medians = float(np.nanmedian(pieces[rows])), float(np.median(windows[rows]))
+            limit = max(JUMP[0] * medians[0], JUMP[1] * medians[1], least)
             out[rows] |= (np.nan_to_num(pieces[rows]) > limit).any(axis=1) & (limit > 0)
     return out
 

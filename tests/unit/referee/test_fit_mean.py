@@ -284,4 +284,4 @@ def test_programs_have_the_evidence(model: cs.NoiseModel) -> None:
     assert mean["instruments"] == fit.instruments
     plain = cs.fit_covariance(model.drives, "10m", correct=False)
     assert plain.noise.mean_fit is None
-    assert set(data(plain)["mean"]) == {"way", "turn", "drift_rad_per_m"}
+    assert set(data(plain)["mean"]) == {"way", "turn", "drift_rad_per_m", "slip_m_per_rad"}

@@ -333,7 +333,7 @@ def increasing(lines: Lines) -> Lines:
 
     def what(row: int) -> str:
         of = "is there twice" if t[row] == t[row - 1] else "is less than the one before"
-        return f"timestamp {t[row]:.10g} {of}; they must increase, so leave the row out"
+        return f"timestamp {float(t[row])} {of}; they must increase, so leave the row out"
 
     refuse(np.append(False, np.diff(t) <= 0), lines.place, what)
     return lines

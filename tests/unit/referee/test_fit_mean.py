@@ -272,6 +272,9 @@ def test_sentences_of_the_mean(model: cs.NoiseModel) -> None:
     assert "the scale of turns is that by the motion of neighbouring windows (F 50.0), not x0.80" in used
     assert "--second tells which" in used
     assert "--second" not in said(model, instruments=NEIGHBOURS, turns=(0.8, 0.97))
+    slip = "correct first: -0.1 m of way a rad of turn"
+    assert said(model, mean=Mean(1.0, 0.95, (0.0,), -0.1)).startswith(f"{slip}, then turn x0.95\n")
+    assert said(model, mean=Mean(slip=-0.1), free=np.array([False] * 3)).startswith(f"{slip}\n")
     none = said(model, free=np.array([False] * 3), mean=none_of(model.windows))
     assert none.startswith("\n")
 

@@ -88,6 +88,17 @@ def test_a_known_slip_is_recovered_and_corrected(rng: np.random.Generator) -> No
     assert turns(corrected)[0, 0, 0] == pytest.approx(0.9 * -0.5 + 0.1 * 0.9)
 
 
+def test_a_slip_keeps_the_floor_and_the_evidence(rng: np.random.Generator) -> None:
+    w = windows_of(drives(rng, 2, World(slip=-0.2), 300.0), span_of(SPAN))
+    noise = fit_noise(w, BY_TURN, np.array([1.0, 2.0, 3.0]))
+    assert noise.floor.tolist() == [1.0, 2.0, 3.0]
+    alone = fit_noise(replace(w, pieces=lengthened(w.pieces, noise.mean.slip)), True, noise.floor)
+    assert noise.mean_fit is not None
+    assert alone.mean_fit is not None
+    np.testing.assert_array_equal(noise.mean_fit.low, alone.mean_fit.low)
+    assert replace(noise.mean, slip=0.0) == alone.mean
+
+
 def test_a_straight_drive_tells_no_slip(rng: np.random.Generator) -> None:
     steps = np.tile([0.5, 0.0, 0.0], (1200, 1))
     noisy = steps + rng.normal(size=steps.shape) * [0.02, 0.0, 0.0]
@@ -120,7 +131,7 @@ def test_a_way_by_turn_is_found_named_and_corrected(rng: np.random.Generator) ->
     assert after.by_motion is not None
     assert not after.by_motion.is_found
     assert after.noise.mean.slip == pytest.approx(-0.2, abs=0.05)
-    assert " m of way a rad of turn, then way x" in correction(after)
+    assert f"correct first: {after.noise.mean.slip:+.3g} m of way a rad of turn" in correction(after)
     assert f"slip_m_per_rad = {after.noise.mean.slip!r}" in toml(after)
     assert after.noise.per_rad[0] < before.noise.per_rad[0] or after.noise.per_m[0] < before.noise.per_m[0]
     already = replace(before, noise=replace(before.noise, mean=after.noise.mean))
@@ -153,6 +164,18 @@ def test_a_scale_that_depends_on_the_turn_has_its_values(scale: int, rng: np.ran
     assert found.is_found
     np.testing.assert_allclose(found.values, (1.0, 1.1, 1.2), atol=0.015)  # a straight third tells no scale of turns
     np.testing.assert_allclose(found.edges, np.quantile(size, [1 / 3, 2 / 3]), rtol=0.3)
+
+
+@pytest.mark.parametrize("scale", [0, 1])
+def test_a_scale_of_all_windows_that_is_not_corrected_is_no_spread(scale: int, rng: np.random.Generator) -> None:
+    """A tenth of the way is 15 sigma, which would be a share of 200; noise alone makes 0.02 of it on average."""
+    w = windows_of(drives(rng, 5, World(), 400.0), span_of(SPAN))
+    e = w.errors + 0.1 * design_of(w.pieces)[:, :, scale]
+    found = mean_by_motion(replace(fit_noise(w), mean=Mean()), replace(w, true=w.motions @ spatial.exp(e)))
+    assert found.share < 0.2
+    assert not found.is_found  # fails in 1 %
+    of = SCALES.index(found.scale)
+    assert found.values[-1] == pytest.approx(1.1 if of == scale else 1.0, abs=0.02)
 
 
 def test_a_scale_that_depends_on_the_way(rng: np.random.Generator) -> None:

@@ -16,7 +16,7 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -28,9 +28,11 @@ from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive, drive_of
+from consistency.referee.fit_covariance.mean_by_motion import mean_by_motion
 from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.persistence import doubts, persistent
 from consistency.referee.fit_covariance.refusals import growth_of, require_sound
+from consistency.referee.fit_covariance.slip import BY_TURN
 from consistency.referee.fit_covariance.white_noise import fit_noise, intervals, terms_of
 from consistency.referee.fit_covariance.windows import PLANE, SPACE, Windows, span_of, windows_of
 from consistency.referee.geometry.groups import composed, matrices, vectors
@@ -55,6 +57,9 @@ class World:
     times: float = 1.0  # factor on both
     winds: bool = False  # the road
     scale: float = 0.0  # sd of the scale of the way between drives
+    turn: float = 0.0  # sd of the scale of turns between drives
+    drift: float = 0.0  # rad/m, sd of the drift of the heading between drives
+    slip: float = 0.0  # m a rad, of the true way less the estimated one
     spread: float = 0.0  # sd of the logarithm of the variance between drives
     memory: float = 0.0  # m, over which an additional error of the heading rate decays
     coloured: float = 0.0  # rad/m, its sd
@@ -106,7 +111,8 @@ def matrices_of(motions: Array) -> Array:
 def drive(rng: np.random.Generator, world: World = World(), name: str = "drive", length: float = LENGTH) -> Drive:
     """One drive, whose estimate errs at the end of each step."""
     true = steps_of(rng, length, world)
-    turn = np.linalg.norm(true[:, -3:] if true.shape[1] == 6 else true[:, -1:], axis=1, keepdims=True)
+    angles = slice(3, None) if true.shape[1] == 6 else slice(2, None)
+    turn = np.linalg.norm(true[:, angles], axis=1, keepdims=True)
     variance = world.times * (STEP * np.array(world.per_m) + turn * np.array(world.per_rad))
     factor = np.exp(0.5 * world.spread * rng.normal())
     error = factor * np.sqrt(variance) * rng.normal(size=true.shape)
@@ -123,6 +129,12 @@ def drive(rng: np.random.Generator, world: World = World(), name: str = "drive",
     start = np.eye(motions.shape[-1])[None]
     truth = composed(np.concatenate([start, motions]))
     motions[:, 0, -1] *= (1.0 + world.scale * rng.normal()) / world.metric
+    if world.turn or world.drift or world.slip:
+        turned = np.array(true)
+        turned[:, angles] *= 1.0 + world.turn * rng.normal()
+        turned[:, -1] += STEP * world.drift * rng.normal()
+        motions[:, :-1, :-1] = matrices_of(turned)[:, :-1, :-1]
+        motions[:, 0, -1] -= world.slip * turn[:, 0]
     T = composed(np.concatenate([start, motions @ matrices_of(error)]))
     if world.closed:
         T = truth @ matrices_of(np.sqrt(10 * np.array(PER_M)) * rng.normal(size=(len(truth), 3)))
@@ -228,6 +240,8 @@ class Case:
     fitted: int = 5
     judged: int = 0
     times: float = 1.0  # variance of the judged drives over that of the fitted ones
+    length: float = SHORT  # m
+    correct: bool | str = True
 
     @property
     def later(self) -> World:
@@ -246,6 +260,10 @@ CASES = (
     Case("heading remembers 50 m", World(memory=50.0, coloured=2e-3)),
     Case("two jumps a drive", World(jumps=2)),
     Case("jitter 5 cm", World(offset=0.05)),
+    Case("right, 10 drives of 250 m", World(), 10, length=250.0),
+    Case("right in space, 10 drives of 250 m", ROADS[2][1], 10, length=250.0),
+    Case("way by turn, -0.4 m a rad", World(slip=-0.4)),
+    Case("way by turn, corrected", World(slip=-0.4), correct=BY_TURN),
     Case("one drive, halves", World(), 1),
     Case("loops closed", World(closed=True)),
     Case("one camera, x2.2", World(metric=2.2)),
@@ -258,18 +276,19 @@ def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, flo
 
     The parts of :func:`consistency.fit_covariance` that decide, without those that describe.
     """
-    made = drives(rng, case.fitted, case.world, SHORT)
-    judged = [drive(rng, case.later, f"judged {i}", SHORT) for i in range(case.judged)]
+    made = drives(rng, case.fitted, case.world, case.length)
+    judged = [drive(rng, case.later, f"judged {i}", case.length) for i in range(case.judged)]
     names, every = ",".join(each.name for each in judged) or None, [*made, *judged]
     try:
         windows = windows_of(every, span_of(SPAN))
         require_sound(every, windows, False, True)
-        noise, folds = folds_of(every, windows, names, True)
+        noise, folds = folds_of(every, windows, names, case.correct)
     except InputError as error:
         return "refused", np.nan, str(error)
     lasting = persistent(noise, windows)
+    depends = mean_by_motion(noise, windows).is_found
     status = decided(
-        judged_by(folds, windows, len(every), case.fitted > 1).status, any(each.decides for each in lasting)
+        judged_by(folds, windows, len(every), case.fitted > 1).status, any(each.decides for each in lasting), depends
     )
     growth = growth_of(every, windows, False, noise.mean)
     warnings = doubts(noise, windows, growth, lasting)
@@ -304,6 +323,44 @@ def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
     return held
 
 
+# --- a mean that depends on the motion -------------------------------------------------------------------
+
+OWN_CONSTANTS: dict[str, Any] = {"scale": 0.02, "turn": 0.02, "drift": 1e-3}
+ALLOWED, FOUND = 0.05, 0.90  # share of right drives with a dependence that is found, and of wrong ones at least
+BY_MOTION = (  # name, world, drives, span, whether the mean depends on the motion
+    ("right", World(), 5, SPAN, False),
+    ("constants of their own", World(**OWN_CONSTANTS), 5, SPAN, False),
+    ("constants of their own, winding", replace(ROADS[1][1], **OWN_CONSTANTS), 5, SPAN, False),
+    ("constants of their own, 10 s", World(**OWN_CONSTANTS), 5, "10s", False),
+    ("constants of their own, 12 drives", World(**OWN_CONSTANTS), 12, SPAN, False),
+    ("constants of their own, one drive", World(**OWN_CONSTANTS), 1, SPAN, False),
+    ("constants of their own, in space", replace(ROADS[2][1], **OWN_CONSTANTS), 5, SPAN, False),
+    ("turns as large as their noise", World((4e-4, 2e-4, 4e-3), winds=True, **OWN_CONSTANTS), 5, SPAN, False),
+    ("heading remembers", World(memory=50.0, coloured=2e-3), 5, SPAN, False),
+    ("way by turn, -0.4 m a rad", World(slip=-0.4, **OWN_CONSTANTS), 5, SPAN, True),
+)
+
+
+def motion_rows(draws: int, seed: int, tests: int, only: str) -> bool:
+    """Print how often a mean error is said to depend on the motion; whether as often as allowed."""
+    held = True
+    print(f"\nmean by motion, {draws} draws of drives of {SHORT:g} m")
+    print("| drives | found | p below 0.05 | p below 0.01 |\n|---|---|---|---|")
+    for number, (name, world, count, span, is_there) in enumerate(BY_MOTION):
+        if only not in f"mean by motion, {name}":
+            continue
+        rng, found = np.random.default_rng([seed, 500 + number]), []
+        for _ in range(draws):
+            made = drives(rng, count, world, SHORT)
+            windows = windows_of(made, span_of(span))
+            found.append(mean_by_motion(fit_noise(windows), windows))
+        hits, p = sum(each.is_found for each in found), np.array([each.p_value for each in found])
+        low, high = binomial_interval(hits, draws, 1.0 - 2 * SURE / tests)
+        held &= bool(high >= FOUND if is_there else low <= ALLOWED)
+        print(f"| {name} | {hits / draws:.3f} | {(p < 0.05).mean():.3f} | {(p < 0.01).mean():.3f} |", flush=True)
+    return held
+
+
 def main() -> int:
     arguments = options_of(
         __doc__,
@@ -311,11 +368,12 @@ def main() -> int:
         seed=(0, None),
         only=("", "rows with this in their names; the numbers are the same"),
     )
-    draws, seed, only, tests = arguments.draws, arguments.seed, arguments.only, len(CASES) + ROWS
+    draws, seed, only, tests = arguments.draws, arguments.seed, arguments.only, len(CASES) + ROWS + len(BY_MOTION)
     roads = any(only in f"known noise, {road}{number} drives" for road, _ in ROADS for number in (1, 10))
     held = recovery_rows(draws, seed, tests, only) if roads else True
     if any(only in case.name for case in CASES):
         held &= verdict_rows(draws, seed, tests, only)
+    held &= motion_rows(draws, seed, tests, only)
     print("\nall promises hold" if held else "\na promise is broken")
     return 0 if held else 1
 

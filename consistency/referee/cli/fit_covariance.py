@@ -44,6 +44,9 @@ def fit_covariance(
     no_correct: Annotated[
         bool, typer.Option("--no-correct", help="Leave mean errors of scale and heading in.")
     ] = False,
+    by_turn: Annotated[
+        bool, typer.Option("--by-turn", help="Correct a way that each turn adds, too, as of wheels that slip.")
+    ] = False,
     cautious: Annotated[
         float | None,
         typer.Option(
@@ -70,8 +73,8 @@ def fit_covariance(
     drives = read_drives(path, reading=replace(files, motions=motions or None))
     other = None if second is None else read_drives(second, reading=files)
     model = fit(
-        drives, span, held_out=held_out, axes=axes, correct=not no_correct, cautious=cautious, second=other,
-        name=path.stem,
+        drives, span, held_out=held_out, axes=axes, correct=not no_correct, by_turn=by_turn, cautious=cautious,
+        second=other, name=path.stem,
     )  # fmt: skip
     written: list[Path] = []
     if out is not None:

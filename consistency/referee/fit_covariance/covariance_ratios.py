@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.white_noise import BLOCKS, ENOUGH, Noise, fit_noise
-from consistency.referee.fit_covariance.windows import Windows
+from consistency.referee.fit_covariance.white_noise import Noise, fit_noise
+from consistency.referee.fit_covariance.windows import BLOCKS, ENOUGH, Windows
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array, Indices
 
@@ -71,13 +71,17 @@ class Judged:
 
     @property
     def status(self) -> str:
-        """That of the whole; inconsistent where that is right and an axis is not."""
-        found = {axis.status for axis in self.axes} & {"overconfident", "conservative"}
-        return "inconsistent" if found and self.whole.status == "consistent" else self.whole.status
+        """That of the whole; where that is consistent, inconsistent or undecided if an axis is not."""
+        if self.whole.status != "consistent":
+            return self.whole.status
+        found = {axis.status for axis in self.axes if axis.drives}  # an axis without any error tells nothing
+        if found & {"overconfident", "conservative"}:
+            return "inconsistent"
+        return "undecided" if "undecided" in found else "consistent"
 
 
 def folds_of(
-    drives: Sequence[Drive], windows: Windows, held_out: str | None, correct: bool
+    drives: Sequence[Drive], windows: Windows, held_out: str | None, correct: bool | str, jitter: Array | float = 0.0
 ) -> tuple[Noise, list[Fold]]:
     """The fit that is handed out, and those that are judged.
 
@@ -97,10 +101,10 @@ def folds_of(
         ends = [windows.last[windows.drive == i] for i in every]
         middle = np.array([int(each[(len(each) - 1) // 2]) if len(each) else 0 for each in ends])  # rows at half time
         early = windows.of(windows.last <= middle[windows.drive])
-        return fit_noise(windows, correct), [Fold(fit_noise(early, correct), every, middle)]
+        return fit_noise(windows, correct, jitter), [Fold(fit_noise(early, correct, jitter), every, middle)]
     if held_out is None:
-        fits = [fit_noise(windows.of(windows.drive != i), correct) for i in np.unique(windows.drive)]
-        return fit_noise(windows, correct), [
+        fits = [fit_noise(windows.of(windows.drive != i), correct, jitter) for i in np.unique(windows.drive)]
+        return fit_noise(windows, correct, jitter), [
             Fold(fit, np.array([i]), none) for i, fit in zip(np.unique(windows.drive), fits, strict=True)
         ]
     names = [name.strip() for name in held_out.split(",")]
@@ -111,7 +115,7 @@ def folds_of(
     rest = ~np.isin(windows.drive, judged)
     if not rest.any() or rest.all():
         raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if not rest.any() else 'judge'}")
-    noise = fit_noise(windows.of(rest), correct)
+    noise = fit_noise(windows.of(rest), correct, jitter)
     return noise, [Fold(noise, judged, none)]
 
 
@@ -123,22 +127,29 @@ def judged_by(folds: Sequence[Fold], windows: Windows, drives: int, general: boo
         whole, axes = fold.noise.nees(some)
         parts.append((some.drive, np.column_stack([whole, axes])))
     drive, values = (np.concatenate(each) for each in zip(*parts, strict=True))
-    by_drive = np.full((drives, values.shape[1]), np.nan)
+    by_drive, counts = np.full((drives, values.shape[1]), np.nan), np.bincount(drive, minlength=drives)
     for i in np.unique(drive):
         by_drive[i] = values[drive == i].mean(axis=0)
-    ratios = [ratio_of(by_drive[:, k], values[:, k], general) for k in range(values.shape[1])]
+    n = values.shape[1] - 1
+    ratios = [ratio_of(by_drive[:, k], values[:, k], general, counts * (1 if k else n)) for k in range(values.shape[1])]
     return Judged(windows.span.option, ratios[0], tuple(ratios[1:]), by_drive)
 
 
-def ratio_of(by_drive: Array, values: Array, general: bool = True) -> Ratio:
+def ratio_of(by_drive: Array, values: Array, general: bool = True, dof: Array | None = None) -> Ratio:
     """Geometric mean of the ratios of drives, (drives,), with Student's interval of its logarithm.
 
+    The logarithm of a mean square with few degrees of freedom, ``dof`` (drives,), is too small on average, by what a
+    chi-square has (Bartlett & Kendall 1946, "The statistical analysis of variance-heterogeneity and the logarithmic
+    transformation", J. R. Statist. Soc. Suppl. 8).
     A single drive has an interval from the means of consecutive windows, of ``values`` (W,), which holds for it alone.
     """
-    known = by_drive[np.isfinite(by_drive) & (by_drive > 0)]
+    there = np.isfinite(by_drive) & (by_drive > 0)
+    known = by_drive[there]
     tail = 0.5 * (1.0 - CONFIDENCE)
     if len(known) > 1:
         logs = np.log(known)
+        if dof is not None:
+            logs += np.log(0.5 * dof[there]) - special.digamma(0.5 * dof[there])
         spread = float(logs.std(ddof=1))
         reach = float(stats.t.isf(tail, len(logs) - 1)) * spread / np.sqrt(len(logs))
         center = float(logs.mean())

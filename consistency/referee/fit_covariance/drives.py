@@ -10,6 +10,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import function_at
+from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.geometry.groups import composed, matrices
 from consistency.referee.readers.file_kinds import (
     ARCHIVES,
@@ -39,6 +40,7 @@ class Drive:
     row: Indices  # (N,), of the estimates: neighbours differ by 1 where none is left out
     estimate: Array  # (N, d + 1, d + 1), poses in any world
     truth: Array  # (N, d + 1, d + 1)
+    shift: float = 0.0  # s, that was estimated and added to its times
 
     @property
     def d(self) -> int:
@@ -68,9 +70,13 @@ def read_drives(
     path = Path(estimates)
     if not path.exists():
         raise InputError(f"{path}: no such file")
-    if r.time_offset == "estimate":
-        raise InputError("--time-offset estimate: needs poses in one world; give seconds")
-    return [_drive(each, r) for each in _poses(path, r)]
+    if r.time_offset not in (None, "estimate") and not isinstance(r.time_offset, (int, float)):
+        raise InputError(f"--time-offset {r.time_offset}: must be a number of seconds, or 'estimate'")
+    found = [(each, _matrices(each, r)) for each in _poses(path, r)]
+    if r.time_offset != "estimate":
+        return [_drive(each, T, float(r.time_offset or 0.0)) for each, T in found]
+    shift = clock_offset([(each.poses, T) for each, T in found])
+    return [replace(_drive(each, T, shift), shift=shift) for each, T in found]
 
 
 def drive_of(
@@ -126,18 +132,22 @@ def _of_folder(folder: Path, r: Reading) -> Iterator[NamedPoses]:
             yield NamedPoses(stem if name == path.stem else f"{stem}, {name}", poses, clock)
 
 
-def _drive(read: NamedPoses, r: Reading) -> Drive:
-    name, poses, clock = read
-    finite = np.isfinite(poses.estimate).all(axis=1)
+def _matrices(read: NamedPoses, r: Reading) -> Array:
+    """Estimated poses, (N, d + 1, d + 1)."""
+    finite = np.isfinite(read.poses.estimate).all(axis=1)
     what = "the pose is not finite; end the drive before it, or leave the row out"
-    refuse(~finite, poses.place.__getitem__, what)
-    t = poses.t + r.shift
+    refuse(~finite, read.poses.place.__getitem__, what)
+    T = matrices(read.poses.estimate)
+    return composed(T) if r.motions else T
+
+
+def _drive(read: NamedPoses, T: Array, shift: float) -> Drive:
+    name, poses, clock = read
+    t = poses.t + shift
     known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
     if len(known.rows) < 2:
         raise InputError(
             f"{name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t is "
             f"{t[0]:.15g} to {t[-1]:.15g}, but {poses.true_t[0]:.15g} to {poses.true_t[-1]:.15g} in the truth"
         )
-    T = matrices(poses.estimate)
-    T = composed(T) if r.motions else T
-    return Drive(name, clock[known.rows] + r.shift, known.rows, T[known.rows], matrices(known.truth))
+    return Drive(name, clock[known.rows] + shift, known.rows, T[known.rows], matrices(known.truth))

@@ -17,11 +17,13 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Fold, Judged, Ratio, folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.mean_by_motion import ByMotion, mean_by_motion
 from consistency.referee.fit_covariance.motions import record_of, stretches_of
 from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
-from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_sound
-from consistency.referee.fit_covariance.white_noise import ENOUGH, Noise, intervals, with_jitter
-from consistency.referee.fit_covariance.windows import PIECES, Windows, span_of, windows_at, windows_of
+from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_poses, require_sound
+from consistency.referee.fit_covariance.slip import BY_TURN
+from consistency.referee.fit_covariance.white_noise import Noise, fit_noise, intervals, jitter_of
+from consistency.referee.fit_covariance.windows import ENOUGH, PIECES, Windows, span_of, windows_at, windows_of
 from consistency.referee.geometry.groups import matrices
 from consistency.referee.readers.relative_motions import Stretch
 from consistency.referee.types import Array
@@ -50,6 +52,7 @@ class NoiseModel:
     growth: Growth  # of the squared rotation error over the span
     warnings: tuple[str, ...]
     lasting: tuple[Lasting, ...]  # errors that differ between drives
+    by_motion: ByMotion | None  # whether the mean depends on the motion; None where it is left in
     second: Second | None  # errors of the second estimator
     drives: tuple[Drive, ...] = field(repr=False)
     windows: Windows = field(repr=False)
@@ -65,7 +68,8 @@ class NoiseModel:
     def status(self) -> str:
         """consistent, overconfident, conservative, inconsistent or undecided."""
         is_of_truth = self.second is not None and bool(self.second.is_shared.any())
-        return decided(self.spans[0].status, is_of_truth or any(each.decides for each in self.lasting))
+        doubted = is_of_truth or any(each.decides for each in self.lasting)
+        return decided(self.spans[0].status, doubted, self.by_motion is not None and self.by_motion.is_found)
 
     @property
     def stretches(self) -> list[tuple[str, Stretch]]:
@@ -106,12 +110,17 @@ class NoiseModel:
         return f"<NoiseModel {self.name}: {_shown('wording', 'sentence', self)}>"
 
 
-def decided(status: str, doubted: bool) -> str:
+def decided(status: str, doubted: bool, depends: bool) -> str:
     """A status at the span: nothing is consistent whose errors are the truth's, or last for a whole drive.
 
-    Such an error has one value a drive, so that a fit to few drives, and its judgement, rest on as few values.
+    Such an error has one value a drive, so that a fit to few drives, and its judgement, rest on as few values. Where
+    the mean ``depends`` on the motion, a covariance that is right on average is wrong for each motion.
     """
-    return "undecided" if doubted and status == "consistent" else status
+    if status != "consistent":
+        return status
+    if depends:
+        return "inconsistent"
+    return "undecided" if doubted else status
 
 
 def _shown(module: str, function: str, *arguments: Any) -> Any:
@@ -126,6 +135,7 @@ def fit_covariance(
     held_out: str | None = None,
     axes: int | None = None,
     correct: bool = True,
+    by_turn: bool = False,
     cautious: float | None = None,
     second: Sequence[Drive] | None = None,
     name: str = "odometry",
@@ -140,6 +150,7 @@ def fit_covariance(
         judged by a fit to the first halves; None: each drive is judged by a fit to all others, or halves of one
     axes : 3 (x, y, yaw) or 6; None is that of the poses
     correct : take the mean of scale and heading out first
+    by_turn : take out a way that each turn adds, too, as of wheels that slip
     cautious : probability, such as 0.9, that a new drive has no larger covariance than the one stated: raises all
     second : another estimator's poses on the same drives, to tell errors of the truth
     name : of the odometry, in sentences
@@ -153,12 +164,15 @@ def fit_covariance(
     planar = _is_planar(drives, axes)
     if cautious is not None and not 0.5 < cautious < 1.0:
         raise InputError(f"--cautious {cautious:g}: must be a probability between 0.5 and 1, such as 0.9")
+    if by_turn and not correct:
+        raise InputError("--by-turn is a correction; leave --no-correct out")
+    require_poses(drives)
     windows = windows_of(drives, over, planar)
     require_sound(drives, windows, planar, correct)
-    noise, folds = folds_of(drives, windows, held_out, correct)
-    noise = with_jitter(noise, drives, windows, planar)
+    correction = BY_TURN if by_turn else correct
+    jitter = jitter_of(fit_noise(windows, correction), drives, windows, planar)
+    noise, folds = folds_of(drives, windows, held_out, correction, jitter)
     growth, lasting = growth_of(drives, windows, planar, noise.mean), persistent(noise, windows)
-    folds = [replace(fold, noise=replace(fold.noise, floor=noise.floor)) for fold in folds]
     is_half = held_out == HALF or (held_out is None and len(drives) == 1)
     if cautious is not None:
         factor = caution(judged_by(folds, windows, len(drives), not is_half).whole, cautious)
@@ -179,6 +193,7 @@ def fit_covariance(
             "windows": len(windows.drive), "long": windows.long, "still": windows.still, "jumps": windows.jumps,
         },
         growth=growth, warnings=tuple(doubts(noise, windows, growth, lasting)), lasting=lasting,
+        by_motion=mean_by_motion(noise, windows) if correct else None,
         second=None if second is None else errors_of_second(noise, windows, drives, second),
         drives=tuple(drives), windows=windows, folds=tuple(folds), is_planar=planar,
     )  # fmt: skip
@@ -263,4 +278,6 @@ def _spans(
 
 
 def error_windows(model: NoiseModel, judged: Judged) -> Windows:
-    return model.noise.mean.applied(windows_of(model.drives, span_of(judged.span), model.is_planar))
+    found = windows_at(model.drives, model.windows, span_of(judged.span).size, model.is_planar)
+    assert found is not None
+    return model.noise.mean.applied(found)

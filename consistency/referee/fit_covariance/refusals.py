@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, none_of
-from consistency.referee.fit_covariance.windows import Windows, windows_at
+from consistency.referee.fit_covariance.windows import ROUNDED, STILL, Windows, windows_at
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.types import Array
 
@@ -23,6 +23,8 @@ SHRINKING = 0.5  # power of the span that the squared rotation error grows with;
 PERSISTENT = 1.4  # the same, from which errors last longer than a window
 ERRORS = 3.0  # standard errors that the power must be from 1, too
 LONGER = (1, 2, 3, 5, 8, 12, 20, 30, 50)  # multiples of the span
+CONSTANT = 1e-6  # of a rotation matrix, by which placeholders differ at most
+FOLLOWS = 0.1  # of the way: steps agree by as much more in the body than in the world where the path turns with it
 FEW = 8  # windows that a mean square needs
 FAR, NEAR = 20, 1  # spans between two passes of a place, along the way at least and in space at most
 RARE = 0.002  # chance that white noise shows as much of a turned body, or as little between passes
@@ -45,6 +47,45 @@ class Growth:
         return self.power > PERSISTENT and self.power - ERRORS * self.error > 1.0
 
 
+def require_poses(drives: Sequence[Drive]) -> None:
+    """Refuse estimates or a truth that are no poses, but increments, or positions with placeholders of orientations."""
+    for drive in drives:
+        names = ("estimates", "truth")
+        both = drive.estimate, drive.truth
+        for name, T, other in zip(names, both, reversed(both), strict=True):
+            if _are_placeholders(T, other):
+                raise InputError(
+                    f"{drive.name}: all rows of the {name} have one orientation, though the path turns: it is a "
+                    "placeholder, as with positions alone; motions are compared in the body's frame, so give "
+                    f"{name} with orientations"
+                )
+            if _are_increments(T, other):
+                remedy = "give --motions" if name == "estimates" else "compound them to poses"
+                raise InputError(
+                    f"{drive.name}: rows of the {name} seem to be motions since the row before, not poses; {remedy}"
+                )
+
+
+def _are_placeholders(T: Array, other: Array) -> bool:
+    """Whether orientations are one constant, though those of another follow a path that turns."""
+    d = T.shape[-1] - 1
+    if np.abs(T[:, :d, :d] - T[0, :d, :d]).max() > CONSTANT:
+        return False
+    steps = np.diff(other[:, :d, d], axis=0)[..., None]
+    along = np.swapaxes(other[:-1, :d, :d], -1, -2) @ steps
+    in_world, in_body = (np.linalg.norm(each.sum(axis=0)) for each in (steps, along))
+    return bool(in_body - in_world > FOLLOWS * np.linalg.norm(steps, axis=1).sum())
+
+
+def _are_increments(T: Array, other: Array) -> bool:
+    """Whether positions have the size of the steps of another, in most rows that move, and their own steps do not."""
+    sizes = np.linalg.norm(T[1:, :-1, -1], axis=1)
+    own, steps = (np.linalg.norm(np.diff(each[:, :-1, -1], axis=0), axis=1) for each in (T, other))
+    moves = steps > STILL * np.median(steps)
+    alike = (sizes < SCALE * steps) & (sizes > steps / SCALE) & moves
+    return bool(alike.sum() > 0.5 * moves.sum() and own.sum() < steps.sum() / SCALE)
+
+
 def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, correct: bool) -> None:
     """Refuse drives that no white noise describes.
 
@@ -57,7 +98,16 @@ def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, corre
     if windows.cut > CUT:
         raise InputError(
             f"--span {span}: {100 * windows.cut:.0f} % of the windows have a jump, more than {100 * CUT:.0f} %: a "
-            "model without them is none of this odometry; mend the jumps, or state them as failures of the odometry"
+            "model without them is none of this odometry; if the clocks of estimates and truth differ, give their "
+            "--time-offset S, or 'estimate'; otherwise mend the jumps, or state them as failures of the odometry"
+        )
+    growth = growth_of(drives, windows, planar, none_of(windows))  # a map leaves no mean to correct
+    rounding = float(np.sqrt((windows.errors[:, windows.d :] ** 2).sum(axis=1).mean()))
+    if growth.shrinks and rounding < ROUNDED:
+        raise InputError(
+            f"rotations of estimate and truth differ by {rounding:.2g} rad, as by rounding, and not by more over "
+            "longer spans: one was taken from the other, so that there is no error of rotations to fit; give those "
+            "that the odometry estimates itself"
         )
     angle, share, chance = body_turn(windows)
     if share > TURNED and chance < RARE:
@@ -72,7 +122,6 @@ def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, corre
             f"the true way is {scale:.3g} times the estimated one: the scale is not metric, as of a single camera; "
             "fit after the scale is known (stereo, inertial, wheels), or state it by a scale state"
         )
-    growth = growth_of(drives, windows, planar, none_of(windows))  # a map leaves no mean to correct
     revisit, chance = revisits(drives, windows)
     returns = revisit < 1.0 and chance < RARE
     if growth.shrinks or returns:

@@ -15,32 +15,41 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.systematic_errors import Mean, carriers, fit_mean, none_of
-from consistency.referee.fit_covariance.windows import Windows, turns, ways, windows_at
+from consistency.referee.fit_covariance.slip import BY_TURN, fit_slip
+from consistency.referee.fit_covariance.systematic_errors import (
+    NEIGHBOURS,
+    Mean,
+    MeanFit,
+    carriers,
+    choose_mean,
+    none_of,
+    sum_of_neighbours,
+)
+from consistency.referee.fit_covariance.windows import Windows, blocks_of, lengthened, turns, ways, windows_at
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
 ROUNDS = 3  # of mean and noise in turn
+SHOWN = 3.0  # standard errors from which there is jitter
 SHORTER = (8.0, 4.0, 2.0, 1.0)  # parts of the span, whose errors tell jitter of both ends from noise of the way
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Cov e = sum over pieces of A diag(per_m |way| + per_rad |turn|) A', raised to the floor; n axes."""
+    """Cov e = sum over pieces of A diag(per_m |way| + per_rad |turn|) A', and the floor; n axes."""
 
     axes: tuple[str, ...]
     mean: Mean
     per_m: Array  # (n,), m^2/m and rad^2/m
     per_rad: Array  # (n,), m^2/rad and rad^2/rad
-    floor: Array  # (n,), m^2 and rad^2: no motion has a smaller variance
+    floor: Array  # (n,), m^2 and rad^2: what both ends of a motion add
     factor: float = 1.0  # on all covariances, where caution asks for more than the fit
+    mean_fit: MeanFit | None = None  # None where nothing is corrected
 
     def covariance(self, pieces: Array) -> Array:
         """Covariances (W, n, n) of Log(D^-1 M), of corrected motions in pieces (W, P, d + 1, d + 1)."""
         theta = np.concatenate([self.per_m, self.per_rad])
-        C = np.tensordot(theta, terms_of(pieces), (0, 1))
-        own = np.diagonal(C, axis1=1, axis2=2)
-        return np.asarray(self.factor * (C + np.maximum(self.floor - own, 0.0)[:, :, None] * np.eye(len(self.axes))))
+        return np.asarray(self.factor * (np.tensordot(theta, terms_of(pieces), (0, 1)) + np.diag(self.floor)))
 
     def nees(self, windows: Windows) -> tuple[Array, Array]:
         """NEES over dof (W,), and of each axis alone (W, n), of windows whose motions are not corrected yet."""
@@ -49,8 +58,12 @@ class Noise:
         return nees_of(error, C) / error.shape[1], error**2 / np.diagonal(C, axis1=1, axis2=2)
 
 
-def fit_noise(windows: Windows, correct: bool = True) -> Noise:
-    """Mean and noise of windows, each given the other in turn.
+def fit_noise(windows: Windows, correct: bool | str = True, jitter: Array | float = 0.0) -> Noise:
+    """Mean and noise of windows, each given the other in turn; the mean is of BY_TURN, too, if this is ``correct``.
+
+    Parameters
+    ----------
+    jitter : (n,), variance that both ends of a motion add, of :func:`jitter_of`
 
     Raises
     ------
@@ -63,18 +76,40 @@ def fit_noise(windows: Windows, correct: bool = True) -> Noise:
             f"--span {windows.span.option}: {len(windows.drive)} windows are too few to fit {least} variances; take a "
             "shorter span or longer drives: 50 windows in 5 drives make a verdict possible"
         )
-    mean = fit_mean(windows) if correct else none_of(windows)
-    theta = None
+    if correct == BY_TURN:
+        slip = fit_slip(windows)
+        noise = fit_noise(replace(windows, pieces=lengthened(windows.pieces, slip)), True, jitter)
+        return replace(noise, mean=replace(noise.mean, slip=slip))
+    found, theta = choose_mean(windows) if correct else None, None
+    mean = none_of(windows) if found is None else found.whole
     for left in reversed(range(ROUNDS if correct else 1)):
         now = mean.applied(windows)
-        error, F = now.errors, terms_of(now.pieces)
-        floor = least_of(error)
+        error, F = now.errors, fitted_terms(now, found)
+        floor = np.maximum(least_of(error), jitter)
         theta = fit_terms(error, F, floor, theta)
-        if left:
-            mean = fit_mean(windows, np.diag(floor) + np.tensordot(theta, F, (0, 1)), mean)
+        if left and found:
+            C = np.diag(floor) + np.tensordot(theta, F, (0, 1))
+            found = choose_mean(windows, C, mean)
+            mean = found.whole if left > 1 else found.mean
     assert theta is not None
     n = len(windows.axes)
-    return Noise(windows.axes, mean, theta[:n], theta[n:], floor)
+    return Noise(windows.axes, mean, theta[:n], theta[n:], floor, mean_fit=found)
+
+
+def fitted_terms(windows: Windows, mean: MeanFit | None) -> Array:
+    """Terms (W, 2 n, n, n) that variances are fitted to, of windows whose motions are corrected.
+
+    Where turns are measured with noise, an error is large where its own noise makes |turn| large, so that the turns of
+    neighbouring windows stand for them.
+    """
+    F, n = terms_of(windows.pieces), len(windows.axes)
+    if mean is None or mean.instruments != NEIGHBOURS:
+        return F
+    number = sum_of_neighbours(windows, *2 * [np.ones(len(F))])
+    other = sum_of_neighbours(windows, F[:, n:], F[:, n:])[number > 0] / number[number > 0, None, None, None]
+    F[:, n:] = other.mean(axis=0)
+    F[number > 0, n:] = other
+    return F
 
 
 def least_of(error: Array) -> Array:
@@ -90,17 +125,20 @@ def least_of(error: Array) -> Array:
     out = np.empty(error.shape[1])
     for part, what in kinds:
         if not square[part].max() > 1e-20:
-            raise InputError(f"estimate and truth have the same {what}; there is no error to fit")
+            raise InputError(
+                f"estimate and truth have the same {what}; there is no error to fit: give those that the odometry "
+                "estimates itself"
+            )
         out[part] = LEAST * square[part].max()
     return out
 
 
-def with_jitter(noise: Noise, drives: Sequence[Drive], windows: Windows, planar: bool) -> Noise:
-    """The noise with a floor at what both ends of a motion add to its error, where shorter windows show it.
+def jitter_of(noise: Noise, drives: Sequence[Drive], windows: Windows, planar: bool) -> Array:
+    """Variance that both ends of a motion add to its error, (n,), where shorter windows show it; 0 otherwise.
 
     The mean square error of windows of several lengths is what the noise says, times a factor, and a constant.
     """
-    squares, stated = [], []
+    squares, stated, counts = [], [], []
     for part in SHORTER:
         size = windows.span.size / part
         if windows.span.unit == "step":
@@ -111,25 +149,32 @@ def with_jitter(noise: Noise, drives: Sequence[Drive], windows: Windows, planar:
         now = noise.mean.applied(some)
         squares.append((now.errors**2).mean(axis=0))
         stated.append(np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0))
+        counts.append(len(some.drive))
     if len(squares) < 3:
-        return noise
-    return replace(noise, floor=np.maximum(noise.floor, _constants(np.array(squares), np.array(stated))))
+        return np.zeros(len(noise.axes))
+    return _constants(np.array(squares), np.array(stated), np.array(counts))
 
 
-def _constants(squares: Array, stated: Array) -> Array:
-    """J >= 0 (n,) of squares (k, n) = factor stated + J, with the weight that squares deserve; 0 where it is none."""
+def _constants(squares: Array, stated: Array, counts: Array) -> Array:
+    """J >= 0 (n,) of squares (k, n) = factor stated + J, by weighted least squares; 0 where none is shown.
+
+    A mean square of W windows has a relative variance of 2 / W.
+    """
     out = np.zeros(squares.shape[1])
     for axis, (q, c) in enumerate(zip(squares.T, stated.T, strict=True)):
-        X = np.column_stack([c, np.ones(len(c))]) / np.maximum(q, 1e-300)[:, None]
-        slope, constant = np.linalg.lstsq(X, np.ones(len(q)), rcond=None)[0]
-        out[axis] = max(constant, 0.0) if slope > 0 else 0.0
+        weight = np.sqrt(counts / 2.0)
+        X = np.column_stack([c, np.ones(len(c))]) * (weight / np.maximum(q, 1e-100))[:, None]
+        size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+        slope, constant = np.linalg.lstsq(X / size, weight, rcond=None)[0] / size
+        error = np.sqrt(np.linalg.pinv((X / size).T @ (X / size))[1, 1]) / size[1]
+        out[axis] = constant if slope > 0 and constant > SHOWN * error else 0.0
     return out
 
 
 def intervals(noise: Noise, windows: Windows) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
     """Intervals of the variances a metre and a radian, from the jackknife over drives or blocks of windows."""
     now = noise.mean.applied(windows)
-    error, F, floor = now.errors, terms_of(now.pieces), least_of(now.errors)
+    error, F, floor = now.errors, fitted_terms(now, noise.mean_fit), noise.floor
     theta = np.concatenate([noise.per_m, noise.per_rad])
     whole: Indices = np.arange(len(error))
     left = []
@@ -142,8 +187,6 @@ def intervals(noise: Noise, windows: Windows) -> tuple[tuple[Interval, ...], tup
 
 
 STEPS, CLOSE = 100, 1e-7  # of scoring; gain of the log likelihood of a window at which it ends
-BLOCKS = 20  # of windows, where drives are too few for the jackknife
-ENOUGH = 5  # drives for which they are the blocks
 
 
 def terms_of(pieces: Array) -> Array:
@@ -229,14 +272,6 @@ def _nonnegative(H: Array, g: Array) -> Array:
     values, vectors = np.linalg.eigh(scaled)
     root = np.sqrt(np.maximum(values, 1e-9))
     return np.asarray(optimize.nnls(root[:, None] * vectors.T, (vectors.T @ (g / scale)) / root)[0] / scale)
-
-
-def blocks_of(drive: Indices) -> list[Indices]:
-    """Windows (W,) in blocks for the jackknife: drives where they are enough, otherwise consecutive windows."""
-    names = np.unique(drive)
-    if len(names) >= ENOUGH:
-        return [np.flatnonzero(drive == name) for name in names]
-    return [part for part in np.array_split(np.arange(len(drive)), min(BLOCKS, len(drive))) if len(part)]
 
 
 def interval_of(value: float, left_out: Sequence[float]) -> Interval:

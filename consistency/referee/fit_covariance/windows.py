@@ -17,6 +17,9 @@ from consistency.referee.types import Array, Indices
 PIECES = 20  # of a window: sums over them are independent of the rate of the file, and as good as integrals
 STILL = 0.1  # of the span: a window with less motion says nothing about the span
 JUMP = (12.0, 3.0)  # medians of the errors of its drive's pieces, and windows, that a piece exceeds in a jump
+BLOCKS = 20  # of windows, where drives are too few for the jackknife
+ENOUGH = 5  # drives for which they are the blocks
+ROUNDED = 1e-4  # rad, of rotation errors that neither jump nor grow: a file with four digits has them
 PLANE, SPACE = ("x", "y", "yaw"), ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -30,6 +33,7 @@ class Windows:
     last: Indices  # (W,)
     pieces: Array  # (W, P, d + 1, d + 1), motions
     true: Array  # (W, d + 1, d + 1), of the whole window
+    true_pieces: Array  # (W, P, d + 1, d + 1)
     long: int = 0  # windows left out because rows or truth are missing
     still: int = 0  # left out, with hardly any motion
     jumps: int = 0  # left out, with a jump
@@ -58,7 +62,7 @@ class Windows:
         return self.jumps / max(len(self.drive) + self.jumps, 1)
 
     def of(self, keep: Indices | Array) -> Windows:
-        names = ("drive", "first", "last", "pieces", "true")
+        names = ("drive", "first", "last", "pieces", "true", "true_pieces")
         return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
 
@@ -79,12 +83,13 @@ def span_of(text: str | float) -> Relative:
     return replace(span, flag="--span")
 
 
-def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) -> Windows:
+def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> Windows:
     """The windows of all drives; drives in which none fits have none.
 
     Parameters
     ----------
     planar : x, y and yaw alone of motions in space
+    pieces : of a window
 
     Raises
     ------
@@ -102,12 +107,12 @@ def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) ->
             continue
         long += skipped
         first, last = np.searchsorted(rows, first), np.searchsorted(rows, last)
-        parts.append(_pieces(number, drive, first, last, planar))
+        parts.append(_pieces(number, drive, first, last, planar, pieces))
     if not parts:
         assert refused is not None
         raise refused
-    index, first, last, pieces, true, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
-    found = Windows(span, index, first, last, pieces, true, long)
+    index, first, last, motions, true, true_pieces, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    found = Windows(span, index, first, last, motions, true, true_pieces, long)
     moved, jumped = _moves(found), _jumps(errors, found)
     found = replace(found, still=int((~moved).sum()), jumps=int((moved & jumped).sum()))
     if not (moved & ~jumped).any():
@@ -116,18 +121,22 @@ def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False) ->
 
 
 def windows_at(drives: Sequence[Drive], windows: Windows, size: float, planar: bool) -> Windows | None:
-    """The windows of all drives over a span of another size; None where none fits."""
+    """The windows of all drives over a span of another size, in pieces of the same size; None where none fits.
+
+    Turns of another size would hold another share of the noise.
+    """
+    pieces = max(round(PIECES * size / windows.span.size), 1)
     try:
-        return windows_of(drives, replace(windows.span, size=size), planar)
+        return windows_of(drives, replace(windows.span, size=size), planar, pieces)
     except InputError:
         return None
 
 
 def _pieces(
-    number: int, drive: Drive, first: Indices, last: Indices, planar: bool
-) -> tuple[Indices, Indices, Indices, Array, Array, Array]:
-    """Windows of one drive: index, rows, pieces (W, P, ...), true motions, and the errors of pieces (W, P, n)."""
-    share = np.linspace(0.0, 1.0, PIECES + 1)
+    number: int, drive: Drive, first: Indices, last: Indices, planar: bool, pieces: int
+) -> tuple[Indices, Indices, Indices, Array, Array, Array, Array]:
+    """Windows of one drive: index, rows, pieces (W, P, ...), true motions and pieces, errors of pieces (W, P, n)."""
+    share = np.linspace(0.0, 1.0, pieces + 1)
     ends = np.rint(first[:, None] + share * (last - first)[:, None]).astype(np.int64)
     T, true = drive.estimate, drive.truth
     D, M = (inverse(each[ends[:, :-1]]) @ each[ends[:, 1:]] for each in (T, true))
@@ -136,7 +145,7 @@ def _pieces(
         D, M, whole = (in_plane(each) for each in (D, M, whole))
     error = log((inverse(D) @ M).reshape(-1, *D.shape[-2:])).reshape(*D.shape[:2], -1)
     error[ends[:, 1:] == ends[:, :-1]] = np.nan
-    return np.full(len(first), number), first, last, D, whole, error
+    return np.full(len(first), number), first, last, D, whole, M, error
 
 
 def in_plane(T: Array) -> Array:
@@ -175,6 +184,14 @@ def turns(pieces: Array) -> Array:
     return np.asarray(vectors.reshape(*pieces.shape[:2], 3))
 
 
+def lengthened(pieces: Array, slip: float) -> Array:
+    """Motions whose way is longer by ``slip`` for each radian of their turn; none goes backwards by this."""
+    out, d, way = np.array(pieces), pieces.shape[-1] - 1, ways(pieces)
+    turn = np.linalg.norm(turns(pieces), axis=-1)
+    out[..., :d, d] *= np.maximum(1.0 + slip * turn / np.where(way > 0, way, np.inf), 0.0)[..., None]
+    return out
+
+
 def _moves(of: Windows) -> Array:
     """Which windows have motion, (W,): on the way, for a span in m; in way or turn, compared with others, otherwise."""
     way = ways(of.pieces).sum(axis=1)
@@ -187,10 +204,19 @@ def _moves(of: Windows) -> Array:
 def _jumps(errors: Array, of: Windows) -> Array:
     """Which windows have a piece whose error (W, P, n), of position or rotation, is a jump in its drive, (W,)."""
     out, whole = np.zeros(len(errors), bool), of.errors
-    for part in (slice(0, of.d), slice(of.d, None)):
+    for part, least in ((slice(0, of.d), 0.0), (slice(of.d, None), ROUNDED)):
         pieces, windows = (np.linalg.norm(each[..., part], axis=-1) for each in (errors, whole))
         for drive in np.unique(of.drive):
             rows = of.drive == drive
-            limit = max(JUMP[0] * float(np.nanmedian(pieces[rows])), JUMP[1] * float(np.median(windows[rows])))
+            medians = float(np.nanmedian(pieces[rows])), float(np.median(windows[rows]))
+            limit = max(JUMP[0] * medians[0], JUMP[1] * medians[1], least)
             out[rows] |= (np.nan_to_num(pieces[rows]) > limit).any(axis=1) & (limit > 0)
     return out
+
+
+def blocks_of(drive: Indices, enough: int = ENOUGH) -> list[Indices]:
+    """Windows (W,) in blocks for the jackknife: drives where they are enough, otherwise consecutive windows."""
+    names = np.unique(drive)
+    if len(names) >= enough:
+        return [np.flatnonzero(drive == name) for name in names]
+    return [part for part in np.array_split(np.arange(len(drive)), min(BLOCKS, len(drive))) if len(part)]

@@ -12,12 +12,14 @@ from consistency.referee.diagnostics.verdict.as_dictionary import flat, plain
 from consistency.referee.diagnostics.words.sentences import plural, short
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Ratio
+from consistency.referee.fit_covariance.mean_by_motion import ByMotion
 from consistency.referee.fit_covariance.noise_model import NoiseModel
 from consistency.referee.fit_covariance.persistence import SHARED, Second
-from consistency.referee.fit_covariance.white_noise import ENOUGH
-from consistency.referee.fit_covariance.windows import span_of
+from consistency.referee.fit_covariance.systematic_errors import NEIGHBOURS, STRONG, Mean, MeanFit
+from consistency.referee.fit_covariance.windows import ENOUGH, span_of
 
 RATIO = ("value", "low", "high", "spread", "drives", "windows", "status")  # of a ratio, as programs have it
+EVIDENCE = ("low", "high", "free", "instruments", "turns", "strength", "lasts", "is_open")  # of a mean, the same
 MARK = {"consistent": "", "undecided": " ?", "overconfident": " overconfident", "conservative": " conservative"}
 
 
@@ -62,16 +64,33 @@ def _why(model: NoiseModel) -> str:
             "drives may have another covariance"
             for each in model.lasting if each.decides
         ]  # fmt: skip
-    open_axes = [a for a, axis in zip(model.noise.axes, model.spans[0].axes, strict=True) if axis.status == "undecided"]
-    found = [
-        f"{a} {axis.status}" for a, axis in zip(model.noise.axes, model.spans[0].axes, strict=True)
-        if axis.status in ("overconfident", "conservative")
-    ]  # fmt: skip
+    axes = list(zip(model.noise.axes, model.spans[0].axes, strict=True))
+    open_axes = [a for a, axis in axes if axis.status == "undecided" and axis.drives]
+    found = [f"{a} {axis.status}" for a, axis in axes if axis.status in ("overconfident", "conservative")]
     if found:
         parts.append(", ".join(found))
-    if open_axes and model.status == "consistent":
+    if open_axes and r.status == "consistent":
         parts.append(f"undecided: {', '.join(open_axes)}")
+    if model.by_motion is not None and model.by_motion.is_found:
+        parts.append(dependence(model.by_motion, bool(model.noise.mean.slip)))
     return "".join(f"; {part}" for part in parts)
+
+
+def dependence(found: ByMotion, is_corrected: bool) -> str:
+    """A mean error that depends on the motion, and what to do about it."""
+    unit, what = ("rad", "turns") if found.by == "turn" else ("m", "ways")
+    *rest, last = [f"x{value:.3g}" for value in found.values]
+    bins = [f"{value} for {what} up to {edge:.2g} {unit}" for value, edge in zip(rest, found.edges, strict=True)]
+    size = f"{found.reach:.2g} {'m' if found.axis in 'xyz' else 'rad'}"
+    offer = (
+        f"correct the way by the turn with --by-turn, which takes {found.gain:.0%} of the squared error of positions "
+        "out of motions that it is not fitted to, or " * (found.gain > 0 and not is_corrected)
+    )
+    return (
+        f"{found.scale} depends on the {found.by}: {', '.join(bins)}, {last} beyond; that is {found.share:.0%} of the "
+        f"variance of {found.axis}: {offer}state that spread in the covariance (add the square of {size} to the "
+        f"variance of {found.axis})"
+    )
 
 
 def document(model: NoiseModel) -> Document:
@@ -90,12 +109,42 @@ def document(model: NoiseModel) -> Document:
 
 def correction(model: NoiseModel) -> str:
     """What is corrected before the covariance holds; empty where nothing is."""
-    m = model.noise.mean
-    if m.way == m.turn == 1.0 and not any(m.drift):
+    mean, fit = model.noise.mean, model.noise.mean_fit
+    if fit is None or not (fit.free.any() or mean.slip):
         return ""
-    drift = ", ".join(f"{each:+.3g}" for each in m.drift)
-    of = "heading" if len(m.drift) == 1 else "roll, pitch, yaw"
-    return f"correct first: way x{m.way:.4g}, turn x{m.turn:.4g}, {of} {drift} rad/m"
+    shown = [f"way x{mean.way:.4g}", f"turn x{mean.turn:.4g}"]
+    shown += [f"{name} {each:+.3g} rad/m" for name, each in zip(_drifts(mean), mean.drift, strict=True)]
+    parts = [f"{mean.slip:+.3g} m of way a rad of turn"] * (mean.slip != 0.0) + [", ".join(np.array(shown)[fit.free])]
+    return f"correct first: {', then '.join(part for part in parts if part)}"
+
+
+def _drifts(mean: Mean) -> tuple[str, ...]:
+    return ("heading",) if len(mean.drift) == 1 else ("roll", "pitch", "yaw")
+
+
+def _of_mean(fit: MeanFit) -> list[str]:
+    """What is not corrected, and whether the scale of turns depends on whose noise it is."""
+    names = ["way x", "turn x", *(f"{each} " for each in _drifts(fit.mean))]
+    parts = zip(names, fit.low, fit.high, fit.free, strict=True)
+    left = [f"{name}[{low:.3g}, {high:.3g}]" for name, low, high, is_free in parts if not is_free]
+    found = [f"not corrected, as the interval holds none: {', '.join(left)}"] if left else []
+    forward, backward = (f"x{short(each)}" for each in fit.turns)
+    sides = f"{forward} if the robot's motion errs about the odometry, {backward} if the odometry errs about the motion"
+    if fit.instruments == NEIGHBOURS:
+        text = (
+            f"the scale of turns is that by the motion of neighbouring windows (F {short(fit.strength)}), not {sides}"
+        )
+        if fit.turns[1] > fit.high[1]:
+            text += "; the true side errs, too, as of slip, or of a truth that drifts or jitters: --second tells which"
+        found.append(text)
+    elif fit.is_open:
+        why = "neighbouring windows tell less than these"
+        if fit.strength < STRONG:
+            why = f"neighbouring windows are weak instruments (F {short(fit.strength)}, below {STRONG:g})"
+        elif fit.lasts:
+            why = "errors outlast a window, so that neighbouring windows are no instruments"
+        found.append(f"whose noise it is cannot be told: the scale of turns is {sides}; {why}")
+    return found
 
 
 def _table(model: NoiseModel) -> Table:
@@ -145,8 +194,15 @@ def lines(model: NoiseModel) -> list[str]:
         out.append(
             f"cautious: all covariances are raised x{model.noise.factor:.3g}, so that a new drive seldom has more"
         )
+    if model.drives[0].shift:
+        out.append(
+            f"clocks: {model.drives[0].shift:.3g} s are added to the timestamps of the estimates, for which the "
+            "motions agree best"
+        )
     if model.second is not None:
         out.append(_of_second(model.second, model.noise.axes))
+    if model.noise.mean_fit is not None:
+        out += _of_mean(model.noise.mean_fit)
     out += model.warnings
     out.append(
         f"analyse counts each judged motion as a run, though those of a drive depend: {model.verdict.reasons[0]}"
@@ -175,14 +231,17 @@ def data(model: NoiseModel) -> dict[str, Any]:
         }
         for each in model.spans
     ]
+    evidence = {key: getattr(n.mean_fit, key) for key in EVIDENCE if n.mean_fit is not None}
     found: dict[str, Any] = plain({
         "name": model.name, "status": model.status, "sentence": sentence(model), "span": model.span, "axes": n.axes,
         "fitted_drives": model.fitted_drives, "judged_drives": model.judged_drives, "held_out": model.held_out,
-        "counts": dict(model.counts), "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": m.drift},
+        "counts": dict(model.counts),
+        "mean": {"way": m.way, "turn": m.turn, "drift_rad_per_m": m.drift, "slip_m_per_rad": m.slip, **evidence},
         "noise": {
             "variance_per_m": n.per_m, "variance_per_rad": n.per_rad, "floor": n.floor, "factor": n.factor,
             "per_m_interval": model.per_m, "per_rad_interval": model.per_rad,
         },
+        "by_motion": None if model.by_motion is None else vars(model.by_motion),
         "growth": model.growth.power, "warnings": model.warnings,
         "second_correlation": None if second is None else second.correlation,
         "second_size": None if second is None else second.size, "spans": spans, "referee": flat(model.verdict),

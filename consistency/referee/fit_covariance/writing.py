@@ -51,8 +51,8 @@ def toml(model: NoiseModel) -> str:
     numbers = {key: value for key, value in data(model).items() if key not in ("referee", "spans")}
     tables = {key: numbers.pop(key) for key in ("mean", "noise", "counts")}
     lines = [
-        "# Cov Log(D^-1 M) = factor * (sum over steps of A diag(variance_per_m |way| + variance_per_rad |turn|) A',",
-        "# raised to the floor); D is the estimated motion after the correction of [mean], M the true one, and A",
+        "# Cov Log(D^-1 M) = factor * (sum over steps of A diag(variance_per_m |way| + variance_per_rad |turn|) A'",
+        "# + diag(floor)); D is the estimated motion after the correction of [mean], M the true one, and A",
         "# carries a step's error to the end of the motion. Shown for motions over the span, and for no others.",
         *_pairs(numbers),
     ]
@@ -75,6 +75,8 @@ def _toml(value: Any) -> str:
         return "[" + ", ".join("nan" if each is None else _toml(each) for each in value) + "]"
     if isinstance(value, dict):
         return "{ " + ", ".join(_pairs(value)) + " }"
+    if isinstance(value, bool):
+        return str(value).lower()
     return repr(value) if isinstance(value, (int, float)) else str(value)
 
 
@@ -84,7 +86,7 @@ def robot_localization(model: NoiseModel) -> str:
     per_m, per_rad = n.factor * n.per_m, n.factor * n.per_rad
     rest = n.factor * n.floor / seconds(model)
     rows = [
-        f"    covariance[{7 * place}] = max({per_m[i]:.17g} * abs(v) + {per_rad[i]:.17g} * abs(w), {rest[i]:.17g}) / dt"
+        f"    covariance[{7 * place}] = ({per_m[i]:.17g} * abs(v) + {per_rad[i]:.17g} * abs(w) + {rest[i]:.17g}) / dt"
         f"  # {axis}"
         for i, (axis, place) in enumerate(zip(n.axes, places, strict=True))
     ]
@@ -141,7 +143,7 @@ def covariance(delta: gtsam.{kind}) -> np.ndarray:
     for k in range(PIECES + 1):
         A = gtsam.{kind}.Expmap(-k * xi).AdjointMap()
         S += (0.5 if k in (0, PIECES) else 1.0) * A @ Q @ A.T
-    return S + np.diag(np.maximum(FLOOR - np.diag(S), 0.0))
+    return S + np.diag(FLOOR)
 
 
 def noise(delta: gtsam.{kind}) -> gtsam.noiseModel.Gaussian:

@@ -231,7 +231,8 @@ def test_the_command_on_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str
     out, err = consistency(capsys, *words, "--out", tmp_path / "noise")
     assert err == ""
     assert out.startswith("wheels: at 10 m ")
-    for each in ("correct first: way x", "held-out 10 m", "a new drive: ", "analyse counts each judged motion"):
+    left = "not corrected, as the interval holds none: way x["
+    for each in (left, "held-out 10 m", "a new drive: ", "analyse counts each judged motion"):
         assert each in out
     names = {path.name for path in (tmp_path / "noise").iterdir()}
     assert names == {
@@ -329,7 +330,8 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ((estimates, *good, "--held-out", "run 7"), "run 7"),
         ((estimates, *good, "--cautious", "0.9"), "--cautious"),
         ((estimates, *good, "--fail-on", "wrong"), "--fail-on"),
-        ((estimates, *good, "--time-offset", "estimate"), "seconds"),
+        ((estimates, *good, "--time-offset", "fast"), "seconds"),
+        ((estimates, *good, "--no-correct", "--by-turn"), "--by-turn"),
         ((estimates, *good, "--out", str(tmp_path / "full")), "exists already"),
         ((estimates, *good, "--second", str(tmp_path / "none.csv")), "no such file"),
         ((estimates, *good, "--overwrite"), "--overwrite"),

@@ -23,15 +23,14 @@ from consistency.referee.fit_covariance.persistence import TERMS, Lasting
 from consistency.referee.fit_covariance.refusals import Growth, body_turn, growth_of, revisits
 from consistency.referee.fit_covariance.systematic_errors import Mean, carriers, design_of, fit_mean
 from consistency.referee.fit_covariance.white_noise import (
-    blocks_of,
     fit_noise,
     fit_terms,
     interval_of,
+    jitter_of,
     nees_of,
     terms_of,
-    with_jitter,
 )
-from consistency.referee.fit_covariance.windows import Windows, in_plane, span_of, windows_of
+from consistency.referee.fit_covariance.windows import Windows, blocks_of, in_plane, span_of, windows_of
 from consistency.referee.fit_covariance.wording import lines, sentence
 from consistency.referee.geometry.groups import composed, inverse, log, vectors
 from consistency.referee.types import Array
@@ -234,7 +233,7 @@ def test_jitter_of_both_ends_is_the_floor(rng: np.random.Generator) -> None:
     quiet, shaky = (drives(rng, 3, World(offset=offset)) for offset in (0.0, 0.05))
     for made, low, high in ((quiet, 0.0, 1e-3), (shaky, 2.5e-3, 1e-2)):
         w = windows_of(made, span_of("10m"))
-        assert low <= with_jitter(fit_noise(w), made, w, False).floor[0] <= high
+        assert low <= jitter_of(fit_noise(w), made, w, False)[0] <= high
 
 
 # --- folds and ratios -----------------------------------------------------------------------------------------
@@ -323,7 +322,7 @@ def test_covariance_of_a_motion_is_that_of_its_steps(rng: np.random.Generator) -
     C = model.covariance(np.repeat(step[None], 20, 0))
     np.testing.assert_allclose(model.covariance(motion), C, rtol=1e-9)
     n = model.noise
-    assert C[2, 2] == pytest.approx(10 * n.per_m[2] + 0.8 * n.per_rad[2])
+    assert C[2, 2] == pytest.approx(10 * n.per_m[2] + 0.8 * n.per_rad[2] + n.floor[2])
     still = model.covariance([0.0, 0.0, 0.0])
     np.testing.assert_allclose(still, np.diag(n.floor))
     assert (n.floor > 0).all()

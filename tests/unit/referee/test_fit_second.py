@@ -69,6 +69,6 @@ def test_wheels_and_sightings_of_five_robots_share_no_error(tmp_path: Path, caps
     out, err = consistency(capsys, *words, "--second", sights)
     assert err == ""
     said = json.loads(out)
-    assert said["status"] == "consistent"
+    assert said["status"] == "inconsistent"
     np.testing.assert_allclose(said["second_correlation"], [-0.03, -0.47, 0.28], atol=0.05)
     np.testing.assert_allclose(said["second_size"], [3.1, 5.2, 0.83], rtol=0.1)

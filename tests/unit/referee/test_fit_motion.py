@@ -1,0 +1,381 @@
+"""Means that depend on the motion, clocks that differ, and inputs that are no poses, on drives with known errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import relative_poses as spatial
+from fit_covariance import OWN_CONSTANTS, World, drives, matrices_of
+
+import consistency as cs
+from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.clocks import clock_offset
+from consistency.referee.fit_covariance.covariance_ratios import Judged, Ratio, ratio_of
+from consistency.referee.fit_covariance.drives import Drive, drive_of
+from consistency.referee.fit_covariance.mean_by_motion import SCALES, mean_by_motion, p_value_of
+from consistency.referee.fit_covariance.noise_model import decided
+from consistency.referee.fit_covariance.refusals import require_poses
+from consistency.referee.fit_covariance.slip import BY_TURN, effect_of, fit_slip, held_out_gain
+from consistency.referee.fit_covariance.systematic_errors import Mean, design_of
+from consistency.referee.fit_covariance.white_noise import fit_noise
+from consistency.referee.fit_covariance.windows import (
+    ROUNDED,
+    blocks_of,
+    lengthened,
+    span_of,
+    turns,
+    ways,
+    windows_of,
+)
+from consistency.referee.fit_covariance.wording import correction, lines, sentence
+from consistency.referee.fit_covariance.writing import toml
+from consistency.referee.geometry.groups import composed, inverse, vectors
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.types import Array
+
+SPAN = "10m"
+RIGHT = Ratio(1.0, 0.8, 1.25, 0.1, 10, 250)
+OPEN = replace(RIGHT, low=0.56, high=1.95)
+SPACE = ((4e-4, 2e-4, 3e-4, 2e-6, 3e-6, 4e-6), (4e-4, 1e-4, 2e-4, 1e-5, 1e-5, 2e-5))
+
+
+def paced(rng: np.random.Generator, noise: float, number: int = 5) -> list[Drive]:
+    """Drives that go by 0.2 or 1 m a step, for 20 steps each, with noise (sd, m) of the way of each step."""
+    found = []
+    for i in range(number):
+        true = np.zeros((1000, 3))
+        true[:, 0] = np.repeat(rng.choice([0.2, 0.6, 1.0], 50), 20)
+        true[:, 2] = 0.05 * np.sin(0.1 * np.arange(1000) + i)
+        error = np.column_stack([noise * rng.normal(size=1000), 1e-3 * rng.normal(size=(1000, 2))])
+        T, M = (composed(np.concatenate([np.eye(3)[None], matrices_of(each)])) for each in (true + error, true))
+        found.append(Drive(f"drive {i}", np.arange(1001.0), np.arange(1001), T, M))
+    return found
+
+
+# --- a way by turn ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("world", [World(), World(*SPACE)], ids=["plane", "space"])
+def test_effect_of_a_slip_is_its_derivative(world: World, rng: np.random.Generator) -> None:
+    w = windows_of(drives(rng, 1, world, 300.0), span_of(SPAN))
+    w = replace(w, true=w.motions)
+    less, more = (replace(w, pieces=lengthened(w.pieces, slip)).errors for slip in (-1e-6, 1e-6))
+    np.testing.assert_allclose((less - more) / 2e-6, effect_of(w.pieces), atol=1e-6)
+    longer = lengthened(w.pieces, 0.1)
+    np.testing.assert_allclose(ways(longer), ways(w.pieces) + 0.1 * np.linalg.norm(turns(w.pieces), axis=-1))
+    np.testing.assert_allclose(turns(longer), turns(w.pieces))
+    assert ways(lengthened(w.pieces, -1e3)).min() == 0.0
+
+
+def test_a_known_slip_is_recovered_and_corrected(rng: np.random.Generator) -> None:
+    """With hardly any noise: the corrected motion is the true one."""
+    quiet = World((1e-10, 1e-10, 1e-12), (1e-12,) * 3, slip=-0.1)
+    w = windows_of(drives(rng, 2, quiet, 400.0), span_of(SPAN))
+    assert fit_slip(w) == pytest.approx(-0.1, rel=1e-3)
+    noise = fit_noise(w, BY_TURN)
+    assert noise.mean.slip == pytest.approx(-0.1, rel=1e-3)
+    assert noise.mean.way == pytest.approx(1.0, abs=1e-3)
+    assert np.abs(noise.mean.applied(w).errors).max() < 1e-3
+    assert np.abs(fit_noise(w).mean.applied(w).errors).max() > 0.02
+    assert held_out_gain(w, blocks_of(w.drive)) > 0.99
+    piece = matrices_of(np.array([[1.0, 0.0, -0.5]]))[None]
+    corrected = Mean(2.0, 0.9, (0.1,), slip=-0.2).corrected(piece)
+    assert ways(corrected)[0, 0] == pytest.approx(2.0 * (1.0 - 0.2 * 0.5))
+    assert turns(corrected)[0, 0, 0] == pytest.approx(0.9 * -0.5 + 0.1 * 0.9)
+
+
+def test_a_slip_keeps_the_floor_and_the_evidence(rng: np.random.Generator) -> None:
+    w = windows_of(drives(rng, 2, World(slip=-0.2), 300.0), span_of(SPAN))
+    noise = fit_noise(w, BY_TURN, np.array([1.0, 2.0, 3.0]))
+    assert noise.floor.tolist() == [1.0, 2.0, 3.0]
+    alone = fit_noise(replace(w, pieces=lengthened(w.pieces, noise.mean.slip)), True, noise.floor)
+    assert noise.mean_fit is not None
+    assert alone.mean_fit is not None
+    np.testing.assert_array_equal(noise.mean_fit.low, alone.mean_fit.low)
+    assert replace(noise.mean, slip=0.0) == alone.mean
+
+
+def test_a_straight_drive_tells_no_slip(rng: np.random.Generator) -> None:
+    steps = np.tile([0.5, 0.0, 0.0], (1200, 1))
+    noisy = steps + rng.normal(size=steps.shape) * [0.02, 0.0, 0.0]
+    T, M = (composed(matrices_of(each)) for each in (noisy, steps))
+    assert fit_slip(windows_of([Drive("a", np.arange(1200.0), np.arange(1200), T, M)], span_of(SPAN))) == 0.0
+
+
+def test_slip_that_helps_nothing_gains_nothing(rng: np.random.Generator) -> None:
+    w = windows_of(drives(rng, 5, length=300.0), span_of(SPAN))
+    assert held_out_gain(w, blocks_of(w.drive)) < 0.05
+    quiet = World((1e-10, 1e-10, 1e-12), (1e-12,) * 3, slip=0.1)
+    opposite = [*drives(rng, 1, quiet, 300.0), *drives(rng, 1, replace(quiet, slip=-0.1), 300.0)]
+    w = windows_of(opposite, span_of(SPAN))
+    assert held_out_gain(w, [np.flatnonzero(w.drive == i) for i in range(2)]) < 0.0
+
+
+def test_a_way_by_turn_is_found_named_and_corrected(rng: np.random.Generator) -> None:
+    """The right value is -0.2 m a radian; its standard error over 200 windows is about 0.01."""
+    made = drives(rng, 5, World(slip=-0.2, **OWN_CONSTANTS | {"scale": 0.0}), 400.0)
+    before, after = cs.fit_covariance(made, SPAN), cs.fit_covariance(made, SPAN, by_turn=True)
+    found = before.by_motion
+    assert found is not None
+    assert (found.is_found, found.scale, found.by, found.axis) == (True, SCALES[0], "turn", "x")
+    assert found.values[0] == pytest.approx(1.0, abs=0.005)  # straight roads have no slip
+    assert found.values[-1] < found.values[0] - 0.005
+    assert found.gain > 0.1
+    assert before.status in ("inconsistent", "overconfident", "undecided")
+    assert "the scale of the way depends on the turn: x1" in sentence(before)
+    assert "correct the way by the turn with --by-turn" in sentence(before)
+    assert after.by_motion is not None
+    assert not after.by_motion.is_found
+    assert after.noise.mean.slip == pytest.approx(-0.2, abs=0.05)
+    assert f"correct first: {after.noise.mean.slip:+.3g} m of way a rad of turn" in correction(after)
+    assert f"slip_m_per_rad = {after.noise.mean.slip!r}" in toml(after)
+    assert after.noise.per_rad[0] < before.noise.per_rad[0] or after.noise.per_m[0] < before.noise.per_m[0]
+    already = replace(before, noise=replace(before.noise, mean=after.noise.mean))
+    assert "--by-turn" not in sentence(already)
+    assert f"(add the square of {found.reach:.2g} m to the variance of x)" in sentence(already)
+    right = replace(before.spans[0], whole=RIGHT, axes=(RIGHT,) * 3)
+    shown = replace(before, spans=(right, *before.spans[1:]), lasting=())
+    assert shown.status == "inconsistent"
+    assert replace(shown, by_motion=None).status == "consistent"
+    assert replace(shown, by_motion=replace(found, share=0.09)).status == "consistent"
+    assert cs.fit_covariance(made, SPAN, correct=False).by_motion is None
+    with pytest.raises(InputError, match="--by-turn is a correction"):
+        cs.fit_covariance(made, SPAN, correct=False, by_turn=True)
+
+
+# --- the question -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [0, 1])
+def test_a_scale_that_depends_on_the_turn_has_its_values(scale: int, rng: np.random.Generator) -> None:
+    """Planted in thirds of the windows: x1, x1.1 and x1.2 of either scale."""
+    made = drives(rng, 4, World((1e-6, 1e-6, 1e-8), (1e-9,) * 3), 500.0)
+    w = windows_of(made, span_of(SPAN))
+    size = np.linalg.norm(turns(w.pieces), axis=-1).sum(axis=1)
+    thirds = np.searchsorted(np.quantile(size, [1 / 3, 2 / 3]), size, side="right")
+    e = w.errors + 0.1 * thirds[:, None] * design_of(w.pieces)[:, :, scale]
+    noise = replace(fit_noise(w), mean=Mean())
+    found = mean_by_motion(noise, replace(w, true=w.motions @ spatial.exp(e)))
+    assert (found.scale, found.by) == (SCALES[scale], "turn")
+    assert found.is_found
+    np.testing.assert_allclose(found.values, (1.0, 1.1, 1.2), atol=0.015)  # a straight third tells no scale of turns
+    np.testing.assert_allclose(found.edges, np.quantile(size, [1 / 3, 2 / 3]), rtol=0.3)
+
+
+@pytest.mark.parametrize("scale", [0, 1])
+def test_a_scale_of_all_windows_that_is_not_corrected_is_no_spread(scale: int, rng: np.random.Generator) -> None:
+    """A tenth of the way is 15 sigma, which would be a share of 200; noise alone makes 0.02 of it on average."""
+    w = windows_of(drives(rng, 5, World(), 400.0), span_of(SPAN))
+    e = w.errors + 0.1 * design_of(w.pieces)[:, :, scale]
+    found = mean_by_motion(replace(fit_noise(w), mean=Mean()), replace(w, true=w.motions @ spatial.exp(e)))
+    assert found.share < 0.2
+    assert not found.is_found  # fails in 1 %
+    of = SCALES.index(found.scale)
+    assert found.values[-1] == pytest.approx(1.1 if of == scale else 1.0, abs=0.02)
+
+
+def test_a_scale_that_depends_on_the_way(rng: np.random.Generator) -> None:
+    """Over seconds, with three speeds: x1 at the lowest and x1.1 at the highest."""
+    made = paced(rng, 0.01)
+    w = windows_of(made, span_of("20s"))
+    fast = ways(w.pieces).sum(axis=1) > 15.0
+    e = w.errors + 0.1 * fast[:, None] * design_of(w.pieces)[:, :, 0]
+    found = mean_by_motion(replace(fit_noise(w), mean=Mean()), replace(w, true=w.motions @ spatial.exp(e)))
+    assert (found.is_found, found.scale, found.by, found.gain) == (True, SCALES[0], "way", 0.0)
+    assert found.values[0] == pytest.approx(1.0, abs=0.02)
+    assert found.values[-1] == pytest.approx(1.1, abs=0.02)
+
+
+def test_noise_of_the_way_by_which_windows_are_divided_is_not_a_dependence(rng: np.random.Generator) -> None:
+    """By the estimated way, a window that errs forward is a longer one; by the true way it is not."""
+    made = paced(rng, 1.0)
+    w = windows_of(made, span_of("20s"))
+    noise = fit_noise(w)
+    now = noise.mean.applied(w)
+    size = ways(now.pieces).sum(axis=1)
+    thirds = np.searchsorted(np.quantile(size, [1 / 3, 2 / 3]), size, side="right")
+    assert p_value_of(now, now.pieces, thirds, 0) < 1e-3
+    assert not mean_by_motion(noise, w).is_found
+
+
+def test_constants_of_each_drive_are_no_dependence() -> None:
+    """Each is found with a chance of 1 % at most: 3 of 10 are with one of 1e-4."""
+    found = 0
+    for seed in range(10):
+        made = drives(np.random.default_rng([7, seed]), 4, World(scale=0.05, turn=0.05, drift=2e-3), 300.0)
+        w = windows_of(made, span_of(SPAN))
+        found += mean_by_motion(fit_noise(w), w).p_value < 0.01
+    assert found < 3
+
+
+def test_pieces_of_the_true_motion(rng: np.random.Generator) -> None:
+    made = drives(rng, 2, length=200.0)
+    w = windows_of(made, span_of(SPAN)).of(np.arange(0, 38, 3))
+    np.testing.assert_allclose(replace(w, pieces=w.true_pieces).errors, 0.0, atol=1e-9)
+
+
+# --- statuses ---------------------------------------------------------------------------------------------------------
+
+
+def test_an_undecided_axis_makes_it_undecided_and_is_named(rng: np.random.Generator) -> None:
+    axes = (RIGHT, RIGHT, OPEN)
+    assert OPEN.status == "undecided"
+    judged = Judged(SPAN, RIGHT, axes, np.ones((1, 4)))
+    assert judged.status == "undecided"
+    assert replace(judged, axes=(RIGHT, replace(RIGHT, low=1.2, high=1.6), OPEN)).status == "inconsistent"
+    assert replace(judged, whole=replace(RIGHT, low=1.2, high=1.6)).status == "overconfident"
+    unknown = Ratio(*(float("nan"),) * 4, drives=0, windows=250)  # an axis without any error
+    assert replace(judged, axes=(RIGHT, unknown, RIGHT)).status == "consistent"
+    model = cs.fit_covariance(drives(rng, 5, length=300.0), SPAN)
+    by_drive, counts = model.spans[0].by_drive, np.bincount(model.windows.drive)
+    for axis, ratio, dof in ((3, model.spans[0].axes[2], counts), (0, model.spans[0].whole, 3 * counts)):
+        assert ratio.value == pytest.approx(ratio_of(by_drive[:, axis], np.ones(3), True, dof).value)
+    shown = replace(model, spans=(judged, *model.spans[1:]), lasting=(), by_motion=None)
+    assert shown.status == "undecided"
+    assert sentence(shown).endswith("; undecided: yaw")
+
+
+def test_what_decides_beside_the_ratio() -> None:
+    assert decided("consistent", False, False) == "consistent"
+    assert decided("consistent", True, False) == "undecided"
+    assert decided("consistent", True, True) == "inconsistent"
+    assert decided("conservative", True, True) == "conservative"
+
+
+def test_the_mean_of_logarithms_of_few_degrees_of_freedom(rng: np.random.Generator) -> None:
+    """-psi(k / 2) + log(k / 2) is 0.0405 for 25, and right on average: 4 standard errors of 4,000 ratios are 0.006."""
+    values = np.array([1.0, 1.1, 0.9])
+    few = ratio_of(values, np.ones(3), True, np.array([25.0, 25.0, 25.0]))
+    assert np.log(few.value / ratio_of(values, np.ones(3)).value) == pytest.approx(0.04053, abs=1e-5)
+    draws = rng.chisquare(4, (4000, 10)) / 4
+    logs = [np.log(ratio_of(each, each, True, np.full(10, 4)).value) for each in draws]
+    assert abs(np.mean(logs)) < 4 * np.std(logs) / np.sqrt(4000)
+
+
+# --- clocks ---------------------------------------------------------------------------------------------
+
+
+def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> list[tuple[Poses, Array]]:
+    """Poses whose timestamps are ``late`` s early, in a world of their own, of a vehicle that does not move evenly."""
+    found = []
+    for drive in drives(rng, number, world, 150.0):
+        t = np.cumsum(0.4 + 0.3 * np.sin(0.3 * np.arange(len(drive.t))))
+        place = matrices_of(np.full((1, 3 if drive.d == 2 else 6), 0.7))
+        E, M = vectors(place @ drive.estimate), vectors(drive.truth)
+        poses = Poses.bare(None, t - late, E, t, M, "planar" if drive.d == 2 else "spatial", 0.02)  # type: ignore[arg-type]
+        found.append((poses, place @ drive.estimate))
+    return found
+
+
+@pytest.mark.parametrize(("late", "number"), [(0.2, 3), (-0.35, 1)])
+@pytest.mark.parametrize("world", [World(jumps=2), World(*SPACE)], ids=["plane", "space"])
+def test_an_offset_of_clocks_is_found_from_motions(
+    late: float, number: int, world: World, rng: np.random.Generator
+) -> None:
+    made = uneven(rng, late, world, number)
+    wide = [(replace(poses, max_dt=0.5), T) for poses, T in made]
+    assert clock_offset(wide) == pytest.approx(late, abs=0.02)
+
+
+def test_an_offset_that_nothing_tells_is_refused() -> None:
+    M = np.column_stack([np.arange(300.0), np.zeros((300, 2))])
+    poses = Poses.bare(None, np.arange(300.0), M, np.arange(300.0), M, "planar", 0.5)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="--time-offset estimate: the motions do not tell it"):
+        clock_offset([(poses, matrices_of(M))])
+
+
+def test_the_command_reads_an_offset_that_is_estimated(tmp_path: Path, rng: np.random.Generator) -> None:
+    for name in ("est", "truth"):
+        (tmp_path / name).mkdir()
+    for i, (poses, _) in enumerate(uneven(rng, 0.2, World(), 3)):
+        for name, t, rows in (("est", poses.t, poses.estimate), ("truth", poses.true_t, poses.truth)):
+            table = np.column_stack([t, rows])
+            np.savetxt(tmp_path / name / f"{i}.csv", table, delimiter=",", header="t,x,y,heading", comments="")
+    given = Reading(truth=tmp_path / "truth", time_offset="estimate", max_dt=0.5)
+    found = cs.read_drives(tmp_path / "est", reading=given)
+    assert found[0].shift == pytest.approx(0.2, abs=0.02)
+    fixed = cs.read_drives(tmp_path / "est", reading=replace(given, time_offset=found[0].shift))
+    np.testing.assert_array_equal(found[2].t, fixed[2].t)
+    np.testing.assert_array_equal(found[2].truth, fixed[2].truth)
+    assert fixed[0].shift == 0.0
+    model = cs.fit_covariance(found, SPAN)
+    assert f"clocks: {found[0].shift:.3g} s are added to the timestamps" in "\n".join(lines(model))
+    assert "clocks" not in "\n".join(lines(replace(model, drives=tuple(fixed))))
+    with pytest.raises(InputError, match="--time-offset fast: must be a number of seconds, or 'estimate'"):
+        cs.read_drives(tmp_path / "est", reading=replace(given, time_offset="fast"))
+    whole = [cs.read_drives(tmp_path / "est", reading=replace(given, time_offset=one))[0].t[0] for one in (1, 1.0)]
+    assert whole[0] == whole[1]
+
+
+def test_jumps_name_the_offset_of_clocks(rng: np.random.Generator) -> None:
+    with pytest.raises(InputError, match=r"have a jump.*clocks of estimates and truth differ.*--time-offset"):
+        cs.fit_covariance(drives(rng, 2, World(jumps=8)), SPAN)
+
+
+# --- no poses ---------------------------------------------------------------------------------------------------------
+
+
+def increments(T: Array) -> Array:
+    return np.concatenate([np.eye(T.shape[-1])[None], inverse(T[:-1]) @ T[1:]])
+
+
+def unturned(T: Array) -> Array:
+    out = np.array(T)
+    out[:, :-1, :-1] = np.eye(T.shape[-1] - 1)
+    return out
+
+
+@pytest.mark.parametrize("world", [World(), World(*SPACE)], ids=["plane", "space"])
+def test_increments_and_placeholders_are_named(world: World, rng: np.random.Generator) -> None:
+    drive = drives(rng, 1, world, 300.0)[0]
+    require_poses([drive])
+    cases = (
+        ({"estimate": increments(drive.estimate)}, r"estimates seem to be motions.*give --motions"),
+        ({"truth": increments(drive.truth)}, r"truth seem to be motions.*compound them"),
+        ({"estimate": unturned(drive.estimate)}, r"rows of the estimates have one orientation.*placeholder"),
+        ({"truth": unturned(drive.truth)}, r"rows of the truth have one orientation.*give truth with"),
+    )
+    for parts, words in cases:
+        with pytest.raises(InputError, match=words):
+            cs.fit_covariance([drive, replace(drive, **parts)], SPAN)
+
+
+def test_what_moves_without_turning_is_no_placeholder(rng: np.random.Generator) -> None:
+    """A straight road with estimates that drift by a radian, and a vehicle that moves sideways as it likes."""
+    steps = np.tile([0.5, 0.0, 0.0], (600, 1))
+    drifting = steps + np.array([0.0, 0.0, 1e-3])
+    straight, drifted = (composed(matrices_of(each)) for each in (steps, drifting))
+    sideways = np.column_stack([np.cumsum(rng.normal(size=(600, 2)), axis=0), np.zeros(600)])
+    turning = sideways + [0.0, 0.0, 1.0] * np.linspace(0, 1, 600)[:, None]
+    for T, M in ((drifted, straight), (matrices_of(turning), matrices_of(sideways))):
+        require_poses([Drive("a", np.arange(600.0), np.arange(600), T, M)])
+
+
+def test_a_scale_that_is_not_metric_is_not_taken_for_increments(rng: np.random.Generator) -> None:
+    with pytest.raises(InputError, match="not metric"):
+        cs.fit_covariance(drives(rng, 2, World(metric=2.2)), SPAN)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-9, 1e-5])
+def test_rotations_equal_to_rounding_are_no_closed_loops(size: float, rng: np.random.Generator) -> None:
+    """Headings of the truth, rounded to a step of ``size``; positions err as they did."""
+    made = []
+    for drive in drives(rng, 3, length=500.0):
+        E, M = vectors(drive.estimate), vectors(drive.truth)
+        E[:, 2] = size * np.round((M[:, 2] + 0.3 * size) / size)
+        made.append(drive_of(drive.name, E, M, drive.t))
+    with pytest.raises(InputError, match=r"rotations of estimate and truth differ by .* as by rounding"):
+        cs.fit_covariance(made, SPAN)
+    assert windows_of(made, span_of(SPAN)).jumps == 0
+    assert size < ROUNDED
+
+
+def test_timestamps_in_messages_are_not_rounded(tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text("".join(f"1326030980.{k} {k} 0 0 0 0 0 1\n" for k in (51, 53, 53, 55)))
+    with pytest.raises(InputError, match=r"line 3: timestamp 1326030980\.53 is there twice"):
+        cs.read_drives(path, path)

@@ -431,6 +431,8 @@ def test_a_mean_of_unlike_runs_at_the_end_is_seldom_called_equivalent() -> None:
     draws = rng.chisquare(6, (300, 102)) / 6 * np.where(rng.random((300, 102)) < 0.1, 6.0, 1.0)
     shown = sum(equivalence(means, 6, 50, Settings()).shown for means in draws)
     assert shown <= stats.binom.isf(SURE, 300, 0.05)
+    low = rng.chisquare(6, (300, 102)) / 6 * np.exp(rng.standard_normal((300, 102)) - 0.5) / 1.5
+    assert sum(equivalence(means, 6, 50, Settings()).shown for means in low) <= stats.binom.isf(SURE, 300, 0.05)
 
 
 def test_nothing_is_shown_of_nothing() -> None:

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from calibration_cases import DETECT, MOST, POWER, QUICK_FAILURE, Case, cases, quick_cases, quick_confidence
 from calibration_gates import DOF, SEED, STEPS, Draw, Gate, joined
-from calibration_rows import CONFIDENCE, Row, document, kept, merged, write_docs
+from calibration_rows import CONFIDENCE, Row, document, kept, merged, percentage, write_docs
 from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
 from script_options import options_of
 
@@ -306,7 +306,7 @@ def said(row: Row) -> str:
     runs = f"{row.runs} runs" if row.looks == 1 else f"{row.mean_runs:.0f} runs, 95 %: {row.late_runs:.0f}"
     return (
         f"{row.question:<28} {row.world:<24} x{row.ratio:<5.3g} {runs:<20} "
-        f"{row.bound} {100 * row.stated:g} %: {100 * row.share:.1f} % of {row.gates}"
+        f"{row.bound} {100 * row.stated:g} %: {percentage(row)} of {row.gates}"
     )
 
 

@@ -13,6 +13,7 @@ from calibration_worlds import HEAVY, LOGS, WORLDS
 from scipy import stats
 
 CONFIDENCE = 0.99  # with which a row is said to break its promise
+SMALL = 1e-3  # stated rate, below which a share is shown with four digits of a percentage
 MARKS = ("<!-- calibration: begin -->", "<!-- calibration: end -->")
 
 QUESTIONS = {
@@ -127,7 +128,12 @@ def _promise(row: Row) -> str:
 def _measured(row: Row) -> str:
     """Share; of gates that end when they are decided also the mean number of runs and its 95 % quantile."""
     taken = "" if row.looks else f" ({row.mean_runs:.0f}, {row.late_runs:.0f})"
-    return f"{100 * row.share:.1f} %{taken}"
+    return f"{percentage(row)}{taken}"
+
+
+def percentage(row: Row) -> str:
+    """The share, with more digits where the stated rate is small."""
+    return f"{100 * row.share:.{1 if row.stated >= SMALL or row.stated == 0 else 4}f} %"
 
 
 def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:

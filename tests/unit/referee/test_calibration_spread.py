@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import calibration
 import calibration_spread as spread
 import numpy as np
@@ -42,6 +44,12 @@ def test_errors_of_gates_have_the_same_run_means() -> None:
     assert (constant[:, 0] == constant[:, 1]).all()
     assert not constant[:, 2:].any()
     assert 60 < constant[:, 0].sum() < 140  # 5.6 standard errors
+
+
+def test_small_rates_are_shown_with_their_digits() -> None:
+    row = calibration.Row("w", spread.QUESTION, 1.0, 50, 1, 5e-4, "<=", 100_000, 21)
+    assert calibration.said(row).endswith("<= 0.05 %: 0.0210 % of 100000")
+    assert calibration.said(replace(row, stated=0.05)).endswith("<= 5 %: 0.0 % of 100000")
 
 
 def test_every_row_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:

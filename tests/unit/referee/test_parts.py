@@ -14,7 +14,7 @@ from draws import independent
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.diagnostics import Record, Settings, gate_runs, judge
+from consistency.referee.diagnostics import Record, Settings, gate_runs, judge, ratio_interval
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.gating.session import needed_at
@@ -187,3 +187,16 @@ def test_two_estimators_that_state_deviations(rng: np.random.Generator) -> None:
     assert not assert_not_worse(error, None, error, **whole).worse  # the same matrices: no chance in it
     with pytest.raises(ValueError, match="the errors have 2 and 3 components"):
         assert_not_worse(error[..., :2], None, error, deviations_a=right[..., :2], deviations_b=right)
+
+
+@pytest.mark.parametrize(
+    ("parts", "least"), [(((0,), (1,), (2,), (3,)), 1), (((0, 1), (2, 3)), 2), (((0,), (1, 2, 3)), 1)]
+)
+def test_the_interval_of_the_whole_allows_for_parts_whose_errors_are_the_same(
+    rng: np.random.Generator, parts: tuple[tuple[int, ...], ...], least: int
+) -> None:
+    """With fewer than 20 runs: the mean NEES then has the degrees of freedom of the smallest part."""
+    error = independent(rng, 8, 5, 4)
+    verdict = judge(Record("f", error, diagonal(np.ones(error.shape)), dof=4, axes=tuple("wxyz"), parts=parts))
+    expected = ratio_interval(np.square(error).mean(axis=(1, 2)), least)
+    np.testing.assert_allclose(verdict.scale.inflation, expected)

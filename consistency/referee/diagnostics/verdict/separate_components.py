@@ -9,6 +9,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.questions.equivalence import worst
 from consistency.referee.diagnostics.questions.lost_runs import lost_of
+from consistency.referee.diagnostics.questions.scale import FEW, ratio_interval, run_means
 from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.sample import names_of
@@ -73,17 +74,21 @@ def _by_holm(records: Mapping[str, Record], settings: Settings) -> dict[str, Ver
 
 def _with_parts(whole: Verdict, parts: Mapping[str, Verdict], record: Record, settings: Settings) -> Verdict:
     """The whole with what is known of it whatever the correlations, and the answers of its parts."""
-    scale, scales = whole.scale, [part.scale for part in parts.values() if part.scale is not None]
-    if scale is not None:
-        nothing = (float("nan"), float("nan"))
-        scale = replace(
-            scale, band=np.full_like(scale.band, np.nan), accepted=nothing, share_inside=float("nan"), within=None,
-            detectable=max(s.detectable for s in scales), equivalence=worst([s.equivalence for s in scales]),
-        )  # fmt: skip
     assert record.error is not None
     assert record.covariance is not None
     nees = squared_length(whiten(record.error, record.covariance)) / record.error.shape[-1]
     nees[~np.isfinite(nees if record.nees is None else record.nees)] = np.nan
+    scale, scales = whole.scale, [part.scale for part in parts.values() if part.scale is not None]
+    if scale is not None:
+        nothing = (float("nan"), float("nan"))
+        means, counts = run_means(nees)
+        if counts.astype(bool).sum() < FEW:  # the errors of all parts may be the same
+            interval = ratio_interval(means[counts > 0], min(map(len, record.parts)))
+            scale = replace(scale, inflation=interval)
+        scale = replace(
+            scale, band=np.full_like(scale.band, np.nan), accepted=nothing, share_inside=float("nan"), within=None,
+            detectable=max(s.detectable for s in scales), equivalence=worst([s.equivalence for s in scales]),
+        )  # fmt: skip
     lost = lost_of(record, nees, 1, settings)  # a mean of chi-square(1), however they depend on each other
     innovations = parts[INNOVATIONS].innovations if INNOVATIONS in parts else whole.innovations
     accuracy = whole.accuracy and replace(whole.accuracy, nci=float("nan"), inclination=float("nan"))

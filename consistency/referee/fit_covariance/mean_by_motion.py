@@ -62,7 +62,7 @@ def mean_by_motion(noise: Noise, windows: Windows) -> ByMotion:
     shares = (error**2).mean(axis=0) / np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0)
     axis, there = int(np.argmax(shares)), np.unique(of)
     dependence = ByMotion(
-        SCALES[scale], by, tuple(((noise.mean.way, noise.mean.turn)[scale] * (1.0 + values[there])).tolist()),
+        SCALES[scale], by, tuple((noise.mean.values[scale] * (1.0 + values[there])).tolist()),
         tuple(float(size[of == k].min()) for k in there[1:]), now.axes[axis], float(shares[axis]),
         max(float(np.abs(error[of == k, axis]).mean()) for k in there), min(len(found) * p, 1.0),
     )  # fmt: skip

@@ -7,7 +7,7 @@ from dataclasses import replace
 import fit_sides as sides
 import numpy as np
 import pytest
-from fit_covariance import drives
+from fit_covariance import World, drives
 from fit_sides import Side
 from scipy import stats
 
@@ -26,7 +26,14 @@ from consistency.referee.fit_covariance.systematic_errors import (
     none_of,
     sum_of_neighbours,
 )
-from consistency.referee.fit_covariance.white_noise import Noise, _constants, fitted_terms, terms_of
+from consistency.referee.fit_covariance.white_noise import (
+    Noise,
+    _constants,
+    fit_noise,
+    fitted_terms,
+    jitter_of,
+    terms_of,
+)
 from consistency.referee.fit_covariance.windows import Windows, span_of, windows_of
 from consistency.referee.fit_covariance.wording import correction, data, lines
 
@@ -236,6 +243,15 @@ def test_jitter_of_the_truth_is_not_noise_of_the_way() -> None:
     """The ratio at 20 spans, where jitter does not grow: 0.6 if it is taken for noise, 1 but for 10 % if it is not."""
     _, ratio = sides.fitted(np.random.default_rng(2), Side(3, False, jitters=True))
     assert 0.75 < ratio < 1.3
+
+
+def test_every_fit_that_is_judged_has_the_jitter(rng: np.random.Generator) -> None:
+    made = drives(rng, 3, World(offset=0.1), 300.0)
+    model = cs.fit_covariance(made, "10m")
+    jitter = jitter_of(fit_noise(model.windows), made, model.windows, False)
+    assert jitter[0] > 0.005  # of 0.02
+    for noise in (model.noise, *(fold.noise for fold in model.folds)):
+        assert (noise.floor >= jitter).all()
 
 
 def test_a_ratio_over_twenty_spans_with_noise_of_the_odometry() -> None:

@@ -229,15 +229,6 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     unused = none if still.all() else none | idle
     left = ",".join(axis for axis, no in zip(axes, unused, strict=True) if not no)
     advice = f"judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
-    errors = [np.abs(t.error) for t in tracks if t.error is not None]
-    idle = (np.concatenate(errors) <= ROUNDED.zero).all(axis=0) if errors else none
-    if (idle & ~none).any() and (none & ~idle).any():
-        still, moving = (", ".join(a for a, is_it in zip(axes, those, strict=True) if is_it)
-                         for those in (idle & ~none, none & ~idle))  # fmt: skip
-        advice = (
-            f"{still} has a variance and no error, {moving} has errors and no variance: the rows of the covariance "
-            f"seem to be in another order; write them as {', '.join(axes)}"
-        )
     if not none.any():
         advice = "write only the states that the filter estimates by themselves"
     return f"{file}: the covariance is singular in every step{of}; {advice}"

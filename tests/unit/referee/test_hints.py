@@ -376,7 +376,7 @@ def test_a_variance_in_the_row_of_another_component_is_no_reason_to_judge_that_o
     P[:, [0, 1, 3], [0, 1, 3]] = 1.0
     track = Track(0, np.arange(20), Places("line {}".format, np.arange(20)), error, P)
     said = _singular("est", [track], SIX)
-    assert "roll has a variance and no error, yaw has errors and no variance" in said
+    assert "yaw has errors without a variance, and roll a variance without errors" in said
     assert "--axes" not in said
     right = replace(track, covariance=P[:, [0, 1, 2, 5, 4, 3]][:, :, [0, 1, 2, 5, 4, 3]])
     assert "--axes x,y,yaw" in _singular("est", [right], SIX)

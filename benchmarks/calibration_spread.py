@@ -182,7 +182,8 @@ def _at_most_skewness(log_nu: Array, ratio: Array, dof: int) -> Array:
     if dof == 1 or not len(low):
         return log_nu
     observed = 2.0 * ratio[low] ** 2 * np.exp(-log_nu[low])
-    bound = np.log(2.0 * special.lambertw(change[low] / observed).real / change[low])
+    lambertw: Any = special.lambertw  # its stubs know no array of this kind
+    bound = np.log(2.0 * lambertw(change[low] / observed).real / change[low])
     log_nu[low] = np.minimum(log_nu[low], bound)
     return log_nu
 

@@ -189,10 +189,10 @@ def _at_most_skewness(log_nu: Array, ratio: Array, dof: int) -> Array:
 
 
 def _left_out_mean(means: Array) -> Array:
-    return (means.sum(axis=1, keepdims=True) - means) / (means.shape[1] - 1)
+    return np.asarray((means.sum(axis=1, keepdims=True) - means) / (means.shape[1] - 1))
 
 
 def _jackknife(a: Array, b: Array) -> Array:
     runs = a.shape[1]
     a, b = (x - x.mean(axis=1, keepdims=True) for x in (a, b))
-    return (runs - 1) / runs * (a * b).sum(axis=1)
+    return np.asarray((runs - 1) / runs * (a * b).sum(axis=1))

@@ -80,7 +80,7 @@ def some_slow(share: float, dof: int, slow: int) -> Callable[[np.random.Generato
     return means
 
 
-# A pilot of 40 runs tells how much run means spread and not how skewed they are, or holds no slow run at all: where some
+# A pilot of 40 runs tells how much run means spread, and not how skewed they are, or holds no slow run. Where some
 # axes or runs alone are slow, the rates that are reached.
 PLANS = {
     "plan, fully dependent": Pilot(3, some_slow(1.0, 3, 3), "one error in all steps of a run, n = 3"),

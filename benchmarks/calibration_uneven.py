@@ -49,7 +49,13 @@ UNEVEN = {
 }
 # Rates that are reached where those of 1 - POWER are not: of 50 runs, none is wrong in 8 % of the studies if 5 % of all
 # runs are, and one or two in another 46 %; no test of the runs alone tells these from even ones.
-CLEARED = {("5 % x11", 3, 50): 0.15, ("5 % x11", 3, 102): 0.07, ("5 % x11", 1, 102): 0.13, ("10 % x6", 1, 102): 0.08}
+CLEARED = {
+    ("10 % x6", 3, 50): 0.09,
+    ("5 % x11", 3, 50): 0.15,
+    ("5 % x11", 3, 102): 0.07,
+    ("5 % x11", 1, 102): 0.13,
+    ("10 % x6", 1, 102): 0.08,
+}
 PILOT_RUNS, LONG, SLIGHT = 40, 200, 1.2
 
 
@@ -74,13 +80,13 @@ def some_slow(share: float, dof: int, slow: int) -> Callable[[np.random.Generato
     return means
 
 
-# A pilot of 40 runs tells how much run means spread and not how skewed they are, or holds no slow run at all: where some
+# A pilot of 40 runs tells how much run means spread, and not how skewed they are, or holds no slow run. Where some
 # axes or runs alone are slow, the rates that are reached.
 PLANS = {
     "plan, fully dependent": Pilot(3, some_slow(1.0, 3, 3), "one error in all steps of a run, n = 3"),
     "plan, one axis slow": Pilot(6, some_slow(1.0, 6, 1), "one of six axes has one error in all steps", 0.9, 0.45),
-    "plan, axis slow in 30 %": Pilot(6, some_slow(0.3, 6, 1), "one of six axes slow in 30 % of the runs", 0.9, 0.5),
-    "plan, axis slow in 10 %": Pilot(6, some_slow(0.1, 6, 1), "one of six axes slow in 10 % of the runs", 0.72, 0.7),
+    "plan, axis slow in 30 %": Pilot(6, some_slow(0.3, 6, 1), "one of six axes slow in 30 % of the runs", 0.9, 0.47),
+    "plan, axis slow in 10 %": Pilot(6, some_slow(0.1, 6, 1), "one of six axes slow in 10 % of the runs", 0.72, 0.65),
     "plan, 5 % slow": Pilot(3, some_slow(0.05, 3, 3), "one error in all steps in 5 % of the runs, n = 3", 0.52, 0.6),
 }
 INNOVATIONS = {3: 20, 15: 30, 30: 60}  # components, and runs of 20 steps: the fewest that are judged

@@ -10,7 +10,7 @@ from consistency.referee.diagnostics.words.sentences import percent
 def plan_lines(planned: dict[str, Any]) -> list[str]:
     """Runs that a verdict takes, a line for each thing to be shown.
 
-    A pilot tells how much its runs spread, and not how skewed they are: its power is that of axes and runs that are alike.
+    A pilot tells how much its runs spread, and not how skewed they are: its power is that of axes and runs alike.
     """
     p = planned
     side = "small" if p["detect"] > 1.0 else "large"

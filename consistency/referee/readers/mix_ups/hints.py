@@ -66,18 +66,25 @@ def hints(
         ]
     part = list(range(len(axes)) if judged is None else judged)
 
-    def errors_of(p: Poses) -> tuple[Array, Array]:
+    def errors_of(p: Poses, old: Poses | None = None, known: Array | None = None) -> tuple[Array, Array]:
+        """Errors of a run with their covariances; ``known`` are those of ``old``, before a cause was undone."""
+        if old is not None and known is not None and _same_poses(p, old):
+            return known, p.covariance[:, part][:, :, part]
         error, P = (p.errors(), p.covariance) if taken is None else taken(p)
         kept = part if error.shape[1] == len(axes) else list(range(error.shape[1]))  # of a quaternion as a rotation
         return error[:, kept], P[:, kept][:, :, kept]
 
-    declared = fit_of([errors_of(p) for p in some])
+    before = [errors_of(p) for p in some]
+    declared = fit_of(before)
     if declared is None or declared.size * declared.fault() < LEAST_GAIN:
         return []
     from consistency.referee.readers.mix_ups.known import guesses_of  # few files need them
 
-    found = [(guess, fit_of([errors_of(guess.change(p)) for p in some]))
-             for guess in guesses_of(some, axes, part, moving=taken is None)]  # fmt: skip
+    found = [
+        (guess, fit_of([errors_of(guess.change(p), p, e if taken is None else None)
+                        for p, (e, _) in zip(some, before, strict=True)]))
+        for guess in guesses_of(some, axes, part, moving=taken is None)
+    ]  # fmt: skip
     cause = _cause(found, declared)
     if cause is None:
         return []
@@ -85,6 +92,10 @@ def hints(
     worst = int(np.argmax(np.abs(off)))
     of = [axes[i] for i in part]
     return [f"{name}: the NEES{_of(of, worst)} is {_times(off[worst])}, but about right if {cause}"]
+
+
+def _same_poses(p: Poses, old: Poses) -> bool:
+    return p.estimate is old.estimate and p.truth is old.truth and p.convention == old.convention
 
 
 def _cause(found: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFit) -> str | None:
@@ -97,8 +108,8 @@ def _cause(found: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFi
     for guess, fit in found:
         if fit is None or len(fit.w) < NEARLY_ALL * len(declared.w) or not (gross or guess.fine):
             continue
-        size = min(fit.size, declared.size)
-        gain = size * (fit.near() - simple) if fit.n == declared.n else -np.inf
+        nearer = fit.near() - simple if fit.n == declared.n else -np.inf
+        gain = min(fit.size, declared.size) * nearer if nearer > 0 else -np.inf
         if gain >= bar and fit.right(gross) and _status(fit) <= _status(declared):
             named.append((gain, guess, fit))
         elif (gross or guess.exact) and fit.is_shown():

@@ -281,10 +281,10 @@ def _headings() -> Iterator[Guess]:
     for of, names in OF.items():
         change = partial(_scaled, names, degrees)
         yield Guess(f"the headings of {of} are in degrees{remedy}", change, fine="truth" not in names)
-    both = "the headings of both files and their variances are in degrees"
-    yield Guess(
-        f"{both}{remedy}", lambda p: _weighed(_scaled(OF["both files"], degrees, p), slice(2, 3), DEGREE), fine=False
-    )
+    for of in ("both files", "the estimates"):
+        change = partial(_scaled, OF[of], degrees)
+        words = f"the headings of {of} and their variances are in degrees{remedy}"
+        yield Guess(words, lambda p, change=change: _weighed(change(p), slice(2, 3), DEGREE), fine=False)  # type: ignore[misc]
 
 
 def _scaled(names: Sequence[str], factors: Array, p: Poses) -> Poses:

@@ -23,7 +23,8 @@ FOUND_BY = {
     0.67: {"AR(.95)": 32},
 }
 BET_BY = {"AR(.95)": 75, "AR(.99)": 230, "fully dependent": 380}  # runs with which the e-process finds x1.2
-SHOWN = {"AR(.95)": 0.95, "AR(.99)": 0.95, "linear-gaussian": 0.95, "fully dependent": 0.82}  # of right filters
+# of right filters; those below 0.95 are what is reached, since a wrong all-clear is refused where runs differ
+SHOWN = {"AR(.95)": 0.95, "AR(.99)": 0.93, "linear-gaussian": 0.9, "fully dependent": 0.82}
 
 
 @dataclass(frozen=True)

@@ -264,7 +264,7 @@ PREPARE: dict[str, list[Callable[[Path], None]]] = {
     "docs/files.md": [inline],
     "docs/files.md TUM trajectories": [trajectories],
     "docs/files.md Another world frame: `--align`": [trajectories],
-    "docs/files.md Tables: .csv and .parquet": [planar],
+    "docs/files.md Tables: .csv, .parquet and .jsonl": [planar],
     "docs/files.md Without the first steps: `--skip`": [started],
     "docs/files.md OpenVINS": [openvins],
     "docs/files.md Poses with velocity and biases": [moving],

@@ -129,17 +129,17 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
 def test_the_kind_of_files_of_the_document_is_read(copy: Path) -> None:
     """One file and a row; what is refused of it is refused, and what is broken is said."""
     module, row = code("Add a kind of files")
-    (copy / "consistency/referee/readers/formats/json_lines.py").write_text(module, encoding="utf-8")
+    (copy / "consistency/referee/readers/formats/run_lines.py").write_text(module, encoding="utf-8")
     last = ")  # fmt: skip\nSUFFIXES"
     changed(copy / "consistency/referee/readers/file_kinds.py", last, f"    {row.strip()},\n{last}")
     lines = [f'{{"errors": [[{run}], [{run}]], "covariances": [[[1]], [[1]]]}}' for run in (3, 7)]
-    (copy / "est.jsonl").write_text("\n".join(lines), encoding="utf-8")
-    (copy / "bad.jsonl").write_text("\n".join([*lines, "{}"]), encoding="utf-8")
+    (copy / "est.runs").write_text("\n".join(lines), encoding="utf-8")
+    (copy / "bad.runs").write_text("\n".join([*lines, "{}"]), encoding="utf-8")
     call = "from consistency.referee.cli import main\nmain({})"
-    assert "overconfident  29.00" in python(copy, call.format(["analyse", "est.jsonl"])).stdout
-    refused = python(copy, call.format(["analyse", "est.jsonl", "--truth", "truth.csv"])).stderr
-    assert "--truth: does not go with est.jsonl" in refused
-    assert "each line must be an object" in python(copy, call.format(["analyse", "bad.jsonl"])).stderr
+    assert "overconfident  29.00" in python(copy, call.format(["analyse", "est.runs"])).stdout
+    refused = python(copy, call.format(["analyse", "est.runs", "--truth", "truth.csv"])).stderr
+    assert "--truth: does not go with est.runs" in refused
+    assert "each line must be an object" in python(copy, call.format(["analyse", "bad.runs"])).stderr
 
 
 def test_a_default_stands_once(copy: Path) -> None:

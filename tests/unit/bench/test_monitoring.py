@@ -141,7 +141,7 @@ def test_refused_files(tmp_path: Path) -> None:
     wide = pd.DataFrame({f"c{k}": [1.0] for k in range(20)})
     for name, data, said in (
         ("a.csv", wide.assign(nis=1.0), "'nis_dof' is missing"),
-        ("b.txt", table(), r"unknown kind of file; known are .csv, .parquet, .pq, .npz"),
+        ("b.txt", table(), r"unknown kind of file; known are .csv, .parquet, .pq, .jsonl, .ndjson, .npz"),
     ):
         data.to_csv(tmp_path / name, index=False)
         with pytest.raises(InputError, match=said):

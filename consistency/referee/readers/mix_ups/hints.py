@@ -6,10 +6,10 @@ leaves are judged in the same way for all causes, and a cause is named if they c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,8 +33,6 @@ ENOUGH = 30.0  # independent estimates that show a scale to be the one that a ca
 ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
 NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
 
-Taken: TypeAlias = Callable[[Poses], tuple[Array, Array]]  # errors (k, n) that are judged, with their covariances
-
 
 def hints(
     name: str,
@@ -42,7 +40,6 @@ def hints(
     runs: Sequence[Poses],
     shift: float = 0.0,
     judged: Sequence[int] | None = None,
-    taken: Taken | None = None,
 ) -> list[str]:
     """Hints on a probable mix-up, where the covariance does not fit and one other reading of the files does; or none.
 
@@ -53,13 +50,12 @@ def hints(
     Parameters
     ----------
     axes : names of the components of the error, ``judged`` are the indices of those that count
-    taken : errors of a run and their covariances, where they are not those of its poses
     """
     if not runs:
         return []
     runs = runs[:: -(-len(runs) // MOST_RUNS)]
-    some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs] if taken is None else runs
-    if taken is None and _same(some):
+    some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs]
+    if _same(some):
         return [
             f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies of "
             "one; give the true poses as the truth"
@@ -70,7 +66,7 @@ def hints(
         """Errors of a run with their covariances; ``known`` are those of ``old``, before a cause was undone."""
         if old is not None and known is not None and _same_poses(p, old):
             return known, p.covariance[:, part][:, :, part]
-        error, P = (p.errors(), p.covariance) if taken is None else taken(p)
+        error, P = p.errors(), p.covariance
         kept = part if error.shape[1] == len(axes) else list(range(error.shape[1]))  # of a quaternion as a rotation
         return error[:, kept], P[:, kept][:, :, kept]
 
@@ -81,9 +77,9 @@ def hints(
     from consistency.referee.readers.mix_ups.known import guesses_of  # few files need them
 
     found = [
-        (guess, fit_of([errors_of(guess.change(p), p, e if taken is None else None)
+        (guess, fit_of([errors_of(guess.change(p), p, e)
                         for p, (e, _) in zip(some, before, strict=True)]))
-        for guess in guesses_of(some, axes, part, moving=taken is None)
+        for guess in guesses_of(some, axes, part)
     ]  # fmt: skip
     cause = _cause(found, declared)
     if cause is None:

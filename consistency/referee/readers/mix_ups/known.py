@@ -49,8 +49,8 @@ class Guess:
     exact: bool = False  # named by its NEES alone, however little is wrong
 
 
-def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], moving: bool = True) -> list[Guess]:
-    """Possible mix-ups, the likelier first; ``part`` is judged. Worlds and bodies only where poses are ``moving``."""
+def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> list[Guess]:
+    """Possible mix-ups, the likelier first; ``part`` is judged."""
     kind, convention = runs[0].manifold, runs[0].convention
     n = runs[0].covariance.shape[-1]
     if kind == "spatial" and n > 6:
@@ -66,15 +66,13 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], movi
     ]
     if kind == "vector":
         own = [*scales, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
-        return [*own, *_quaternion_states(runs, axes)] if moving else own
+        return [*own, *_quaternion_states(runs, axes)]
     if kind == "spatial":
         own = [*_orders(convention), *_quaternions(), *scales, *_permuted(axes, 3), *_units(3, slice(3, 6))]
         own += [_half_angles(), *_positions(3)]
     else:
         own = [*_sides(convention), *_headings(), *scales, *_permuted(axes, 3), *_units(2, slice(2, 3)), *_positions(2)]
     own.append(Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False))
-    if not moving:
-        return own
     worlds = [*_ned(convention)] if kind == "spatial" else [_mirrored(convention)]
     return [*own, *worlds, *_frames(runs), *_bodies(runs)]
 

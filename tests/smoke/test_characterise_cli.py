@@ -15,7 +15,7 @@ import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.scenario import Belief, PicturedSensor, read_table
 from consistency.bench.store.log import SensorFile, read_log
-from consistency.referee.cli.app import main
+from consistency.commands.app import main
 from consistency.stereo.characterising.characterise import characterise
 from consistency.stereo.characterising.residuals import Residuals
 from consistency.stereo.characterising.sensor_text import believed, sensor_text

@@ -196,7 +196,7 @@ FORBIDDEN = [
     ("referee.diagnostics", "from matplotlib.axes import Axes"),
     ("referee.diagnostics", "from consistency.bench.scenario import Belief"),
     ("referee.diagnostics", "from consistency.referee.readers.read_files import read_recordings"),
-    ("referee.cli.judging", "def f():\n    from consistency.bench.store.results import open_results"),
+    ("commands.judging", "def f():\n    from consistency.bench.store.results import open_results"),
     ("referee.readers.formats.ros_bag", "import consistency.stereo.visual_odometry"),
     ("bench.runs.montecarlo", "from consistency.bench.pages import write_reports"),
     ("bench.runs.montecarlo", "import matplotlib.pyplot as plt"),
@@ -328,7 +328,7 @@ def test_a_new_session_lists_the_public_names(package: str) -> None:
 
 
 def test_the_help_loads_nothing_heavy() -> None:
-    modules_ = loaded("from consistency.referee.cli.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
+    modules_ = loaded("from consistency.commands.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
     assert "typer" in modules_
     assert not modules_ & {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "bokeh"}
 

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 import consistency
 from consistency import testing
+from consistency.commands.registry import COMMANDS
 from consistency.referee import diagnostics
-from consistency.referee.cli.commands import COMMANDS
 from consistency.stereo import visual_odometry
 
 DOCS = Path(__file__).parents[2] / "docs"

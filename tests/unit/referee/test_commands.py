@@ -20,9 +20,9 @@ from documents import parsed
 import consistency as cs
 from consistency.bench import filters
 from consistency.bench.sweeps.plan import load_sweep
+from consistency.commands.app import app
+from consistency.commands.registry import COMMANDS
 from consistency.referee import extras
-from consistency.referee.cli.app import app
-from consistency.referee.cli.commands import COMMANDS
 from consistency.referee.extras import EXTRAS, MissingPackageError, explained, missing, packages, remedy, require
 from consistency.referee.shipped import summaries
 
@@ -247,16 +247,16 @@ def test_arguments_that_need_the_bench(
 def test_only_the_called_command_is_loaded() -> None:
     code = """
 import sys
-from consistency.referee.cli import main
+from consistency.commands import main
 try:
     main(["plan", "--dof", "3", "--json"])
 except SystemExit as end:
     print(end.code)
-print(*sorted(name for name in sys.modules if name.startswith("consistency.referee.cli.")))
+print(*sorted(name for name in sys.modules if name.startswith("consistency.commands.")))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     names = ["app", "commands", "judging", "options"]
-    assert done.stdout.splitlines()[-2:] == ["None", " ".join(f"consistency.referee.cli.{name}" for name in names)]
+    assert done.stdout.splitlines()[-2:] == ["None", " ".join(f"consistency.commands.{name}" for name in names)]
 
 
 def test_a_command_is_a_row_and_a_function() -> None:
@@ -336,7 +336,7 @@ def test_help_of_no_command_is_refused(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_help_imports_nothing_that_checks_values() -> None:
-    code = "import sys; sys.argv[1:] = ['run', '-h']; from consistency.referee.cli.app import _show_help; \
+    code = "import sys; sys.argv[1:] = ['run', '-h']; from consistency.commands.app import _show_help; \
 _show_help(None) or sys.exit(3); sys.exit('pydantic' in sys.modules or 'numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 

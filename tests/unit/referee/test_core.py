@@ -50,7 +50,7 @@ def said(folder: Path, code: str) -> str:
 
 def test_commands_on_files(folder: Path) -> None:
     code = """
-from consistency.referee.cli import main
+from consistency.commands import main
 
 def run(*words):
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
@@ -71,7 +71,7 @@ print("runs" in run("plan", "--dof", "3"))
 def test_a_verdict_loads_what_it_needs(folder: Path) -> None:
     """Not readers of other files, nor questions that are not asked."""
     code = """
-from consistency.referee.cli import main
+from consistency.commands import main
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
     main(["analyse", "est.csv", "--truth", "truth.csv"])
@@ -117,7 +117,7 @@ except InputError as error:
 
 
 REPORT = """
-from consistency.referee.cli import main
+from consistency.commands import main
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as err:
     try:

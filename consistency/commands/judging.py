@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import (
+from consistency.commands.shared_options import (
     DETECT_HELP,
     ESTIMATES,
     LOST_HELP,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import ESTIMATES, AsJson, reads_files, require_word, require_written, show
+from consistency.commands.shared_options import ESTIMATES, AsJson, reads_files, require_word, require_written, show
 from consistency.referee.readers.options import Reading
 
 KEPT = ("truth", "max_dt", "time_offset", "topic", "truth_topic", "body")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import AsJson, given, require_word, show, tell
+from consistency.commands.shared_options import AsJson, given, require_word, show, tell
 from consistency.referee.defaults import GATE_FALSE_ALARM
 from consistency.referee.errors import InputError
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import (
+from consistency.commands.shared_options import (
     AsJson,
     FalseAlarm,
     Judged,

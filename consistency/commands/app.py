@@ -10,7 +10,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from consistency.referee.cli.commands import HELP, CommandGroup
+from consistency.commands.registry import HELP, CommandGroup
 from consistency.referee.errors import InputError
 from consistency.referee.extras import explained
 

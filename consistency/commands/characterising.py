@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import AsJson
+from consistency.commands.shared_options import AsJson
 from consistency.referee.extras import require
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 
-from consistency.referee.cli.options import AsJson
+from consistency.commands.shared_options import AsJson
 from consistency.referee.extras import missing, remedy
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import Out, Overwrite, given
+from consistency.commands.shared_options import Out, Overwrite, given
 
 
 def frontend(

@@ -14,7 +14,7 @@ from consistency.referee.diagnostics import Comparison, Record, Settings, Verdic
 from consistency.referee.diagnostics.comparison import FEWEST
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.gating.comparing import Sides, of_arrays, of_filters
-from consistency.referee.gating.input_checks import checked, of_results, planned_dof, shares
+from consistency.referee.gating.input_checks import checked, planned_dof, record_of_filter, shares
 from consistency.referee.gating.watch import (
     DEFAULTS,
     Entry,
@@ -27,8 +27,11 @@ from consistency.referee.gating.watch import (
 )
 
 if TYPE_CHECKING:
+    from consistency.bench.store.results import Results, StoredResults
     from consistency.referee.verdicts.baselines import Baseline
-    from consistency.referee.verdicts.sources import Results
+    from consistency.referee.verdicts.sources import Source
+
+    BenchResults = Results | StoredResults
 
 
 class ConsistencyError(AssertionError):
@@ -51,7 +54,7 @@ class InsufficientTrials(ValueError):
 
 
 def assert_consistent(
-    errors: ArrayLike | Results | None = None,
+    errors: ArrayLike | BenchResults | None = None,
     covariances: ArrayLike | None = None,
     *,
     deviations: ArrayLike | None = None,
@@ -133,7 +136,7 @@ def assert_consistent(
     }  # fmt: skip
     if filter is not None or hasattr(errors, "estimates"):
         _refuse(arrays, "results bring their own")
-        record = of_results(cast("Results", errors), filter, name, skip)
+        record = record_of_filter(_source(errors), filter, name, skip)
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
@@ -159,7 +162,7 @@ def assert_consistent(
 
 
 def assert_not_worse(
-    errors_a: ArrayLike | Results | None = None,
+    errors_a: ArrayLike | BenchResults | None = None,
     covariances_a: ArrayLike | None = None,
     errors_b: ArrayLike | None = None,
     covariances_b: ArrayLike | None = None,
@@ -168,7 +171,7 @@ def assert_not_worse(
     deviations_b: ArrayLike | None = None,
     filter: str | None = None,
     than: str | None = None,
-    reference: Results | Baseline | str | Path | None = None,
+    reference: BenchResults | Baseline | str | Path | None = None,
     nees_a: ArrayLike | None = None,
     nees_b: ArrayLike | None = None,
     dof: int | None = None,
@@ -218,7 +221,7 @@ def assert_not_worse(
     }  # fmt: skip
     if filter is not None or hasattr(errors_a, "estimates"):
         _refuse(arrays, "results bring their own; the reference is named by than and reference")
-        sides = of_filters(cast("Results", errors_a), filter, than, reference, name, skip)
+        sides = of_filters(_source(errors_a), filter, than, _baseline(reference, skip), name, skip)
     else:
         if than is not None or reference is not None:
             raise ValueError("than and reference need results in place of errors_a")
@@ -361,6 +364,29 @@ def _summary(look: _Look) -> dict[str, Any]:
         "subset": v.subset, "faults": v.faults,
     })  # fmt: skip
     return summary | rest
+
+
+def _source(results: Any) -> Source:
+    """Results of the bench as a source of records."""
+    if not hasattr(results, "batches"):
+        raise ValueError("filter names one in the results of consistency.run_trials; give those in place of errors")
+    from consistency.bench.runs.results_to_records import results_source
+
+    return results_source(results)
+
+
+def _baseline(reference: BenchResults | Baseline | str | Path | None, skip: int | str | None) -> Baseline | None:
+    """Reference of a comparison: a baseline, its file, or results of the bench in memory or in a folder."""
+    from consistency.referee.verdicts.baselines import Baseline, baseline, read_baseline
+
+    if reference is None or isinstance(reference, Baseline):
+        return reference
+    if isinstance(reference, str | Path) and not Path(reference).is_dir():
+        return read_baseline(Path(reference), skip)
+    from consistency.bench.runs.results_to_records import results_source
+
+    name = str(reference) if isinstance(reference, str | Path) else "results"
+    return baseline(results_source(reference), name, skip)
 
 
 def _refuse(arrays: Mapping[str, Any], why: str) -> None:

@@ -22,7 +22,9 @@ from consistency.referee.diagnostics import Evidence, Verdict, judge
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import (
+from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion, diagonal
+from consistency.stereo.visual_odometry.shared import SHARED, fit_shared, sensitivities
+from consistency.vision import (
     RelativePose,
     StereoRig,
     refine_reprojection,
@@ -31,8 +33,6 @@ from consistency.stereo.visual_odometry import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion, diagonal
-from consistency.stereo.visual_odometry.shared import SHARED, fit_shared, sensitivities
 
 if TYPE_CHECKING:
     import front_end_data as data

@@ -21,7 +21,6 @@ from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, joined
-from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand
 from consistency.stereo.rendered_images.stages import (
     KnownDisparity,
     KnownProjection,
@@ -29,6 +28,7 @@ from consistency.stereo.rendered_images.stages import (
     Spread,
     TrackResidual,
 )
+from consistency.stereo.rendered_images.stops import Stops, pose_at, stand
 from consistency.stereo.visual_odometry.features import opencv
 
 drives = sibling(__file__, "image_drives")

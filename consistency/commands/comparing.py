@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +22,12 @@ from consistency.commands.shared_options import (
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics import Record
+    from consistency.referee.diagnostics.records.skipping import Skip as FirstSteps
+    from consistency.referee.verdicts.baselines import Baseline
+    from consistency.referee.verdicts.sources import Source
 
 
 @reads_files
@@ -43,7 +49,7 @@ def compare(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'worse': exit 1 if the first is.")] = None,
 ) -> None:
     """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
-    from consistency.referee.verdicts.baselines import baseline, is_baseline, read_baseline
+    from consistency.referee.verdicts.baselines import is_baseline
     from consistency.referee.verdicts.compare_sources import compare_filters, compare_with, document
     from consistency.referee.verdicts.options import skip_asked
 
@@ -60,10 +66,7 @@ def compare(
             f"--covariance: would be read with {path} and with {other}; keep one of them with 'consistency baseline'"
         )
     read = {each: read_files(each, files) for each in estimates}
-    new, *old = (
-        baseline(read[each], str(each), first, files.truth) if each in read else read_baseline(each, first)
-        for each in sides
-    )
+    new, *old = (_summaries(each, read.get(each), first, files.truth) for each in sides)
     if old:
         compared = compare_with(new, old[0], filters or [], false_alarm)
     else:
@@ -72,6 +75,19 @@ def compare(
     show(document(compared), as_json)
     if fail_on and any(each.worse for each in compared):
         raise typer.Exit(1)
+
+
+def _summaries(path: Path, recordings: list[Record] | None, first: FirstSteps | None, truth: Path | None) -> Baseline:
+    """Return a row for each run of estimates, of a folder of results, or of a file of 'baseline'."""
+    from consistency.referee.verdicts.baselines import baseline, read_baseline
+
+    if recordings is not None:
+        return baseline(recordings, str(path), first, truth)
+    if path.is_dir():
+        from consistency.bench.runs.results_to_records import results_source
+
+        return baseline(results_source(path), str(path), first)
+    return read_baseline(path, first)
 
 
 @reads_files
@@ -83,10 +99,17 @@ def baseline(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Keep what a later 'compare' needs of results, one row a run."""
-    from consistency.referee.verdicts.baselines import baseline as summarised
+    from consistency.referee.verdicts.baselines import baseline as summarise
     from consistency.referee.verdicts.baselines import write_baseline
 
-    recordings = read_files(path, files) if are_files(path, files) else None
-    write_baseline(summarised(path if recordings is None else recordings, str(path), skip, files.truth), out, overwrite)
-    tell_notes(recordings or [])
+    recordings: list[Record] = []
+    source: Source | list[Record]
+    if are_files(path, files):
+        source = recordings = read_files(path, files)
+    else:
+        from consistency.bench.runs.results_to_records import results_source
+
+        source = results_source(path)
+    write_baseline(summarise(source, str(path), skip, files.truth), out, overwrite)
+    tell_notes(recordings)
     print(f"baseline in {out}; next: consistency compare NEW {out}")

@@ -30,7 +30,7 @@ from consistency.commands.shared_options import (
 )
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
-from consistency.referee.extras import missing, outside, remedy
+from consistency.referee.extras import missing, remedy
 from consistency.referee.readers.options import Reading
 
 
@@ -80,7 +80,6 @@ def analyse(
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.options import settings_of, skip_asked
     from consistency.referee.verdicts.sources import analyse as judge
-    from consistency.referee.verdicts.sources import source_of
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -108,7 +107,9 @@ def analyse(
             except InputError as error:
                 refused = error
     else:
-        results = source_of(path)
+        from consistency.bench.runs.results_to_records import results_source
+
+        results = results_source(path)
         if report is not None and not is_file:
             raise InputError(f"--report: is for files of another estimator; for {path} use 'consistency report {path}'")
         if innovations is not None:
@@ -166,7 +167,9 @@ def report(
         write_file_pages(recordings, judge(recordings), *targets, path.name)
         tell_notes(recordings)
     else:
-        outside("report")(path, *targets, overwrite)
+        from consistency.bench.pages import write_reports
+
+        write_reports(path, *targets, overwrite)
     for target in targets:
         if target is not None:
             print(target)
@@ -206,10 +209,14 @@ def plan(
         raise InputError(f"--filter: name the filter to plan for in {scenario}")
     pilots = None
     if like is not None:
-        pilots = outside("pilot")(like, filters)
+        from consistency.bench.runs.sequential import pilots_in
+
+        pilots = pilots_in(like, filters)
     elif scenario is not None:
         plan_runs(dof, detect, false_alarm, power, allow, lost=lost)  # refuse before the work
-        pilots = outside("pilot runs")(scenario, filters, pilot_runs, seed)
+        from consistency.bench.runs.sequential import pilots_in_world
+
+        pilots = pilots_in_world(scenario, filters, pilot_runs, seed)
     planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost)
     if as_json:
         print(json.dumps(planned, indent=2))

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from consistency.commands.shared_options import AsJson, given, require_word, show, tell
 from consistency.referee.defaults import GATE_FALSE_ALARM
 from consistency.referee.errors import InputError
+
+if TYPE_CHECKING:
+    from consistency.referee.readers.formats.innovation_files import NisLog
 
 
 def monitor(
@@ -53,7 +56,7 @@ def monitor(
     from consistency.referee.document.monitor import monitor_document
     from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
     from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash
-    from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch, watch_lines
+    from consistency.referee.verdicts.monitor_sources import make_monitor, watch, watch_lines
 
     require_word("--fail-on", fail_on, "alarm")
     if is_dataflash(Path(path)) and filter_name not in STATED:
@@ -70,7 +73,7 @@ def monitor(
             raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
         watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
     else:
-        log = read_innovations(Path(path), filter_name, run)
+        log = _read_innovations(Path(path), filter_name, run)
         tell(log.notes)
         if plot is not None:
             require_plot(plot, overwrite)
@@ -80,6 +83,17 @@ def monitor(
     show(monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t), as_json)
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
+
+
+def _read_innovations(path: Path, filter_name: str | None, run: int | None) -> NisLog:
+    """Return the innovations of one run in a file, or in a folder of results."""
+    if path.is_dir():
+        from consistency.bench.runs.results_to_records import innovations_of
+
+        return innovations_of(path, filter_name, run)
+    from consistency.referee.verdicts.monitor_sources import read_innovations
+
+    return read_innovations(path, filter_name, run)
 
 
 def _show_ratios(

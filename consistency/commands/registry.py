@@ -1,76 +1,85 @@
 """The table of commands: where each is, which extras it needs, and examples; and the group that loads the called one.
 
-A command is a function of Typer in a module of a root's ``cli``, and a row here.
+A command is a function of Typer in a module of this folder, and a row here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
+from typing import Any, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import CommandInfo
 
-from consistency.referee.extras import function_at, is_installed, remedy, require
+from consistency.referee.extras import is_installed, remedy, require
 
 HELP = ["-h", "--help"]
 
 
 class Row:
-    """A command: module and function, extras needed whatever its arguments are, examples."""
+    """A command: its function, as ``module:name`` in this folder, extras that it always needs, and examples."""
 
     def __init__(self, name: str, target: str, extras: str = "", *examples: str) -> None:
-        self.name, self.target, self.extras, self.examples = name, target, tuple(extras.split()), examples
+        self.name = name
+        self.module, _, self.function_name = target.partition(":")
+        self.extras = tuple(extras.split())
+        self.examples = examples
+
+    def function(self) -> Callable[..., Any]:
+        """Import the module of the command, and return its function."""
+        module = import_module(f"consistency.commands.{self.module}")
+        return cast(Callable[..., Any], getattr(module, self.function_name))
 
 
 # fmt: off
 ROWS = (
     # for any estimator
-    Row("analyse", "commands.judging:analyse", "",
+    Row("analyse", "judging:analyse", "",
         "analyse mine.npz --report look",
         "analyse est.txt --truth truth.txt --covariance P.txt --error so3",
         "analyse est --truth truth --align posyaw",
         "analyse results --skip 2s --fail-on inconsistent"),
-    Row("report", "commands.judging:report", "report",
+    Row("report", "judging:report", "report",
         "report est.txt --truth truth.txt --covariance P.txt",
         "report results"),
-    Row("compare", "commands.comparing:compare", "",
+    Row("compare", "comparing:compare", "",
         "compare new.csv old.csv --truth truth.csv --fail-on worse",
         "compare results --filter ukf-uvd --filter ekf-uvd"),
-    Row("baseline", "commands.comparing:baseline", "", "baseline results --out baseline.json"),
-    Row("plan", "commands.judging:plan", "",
+    Row("baseline", "comparing:baseline", "", "baseline results --out baseline.json"),
+    Row("plan", "judging:plan", "",
         "plan --dof 3 --detect 1.2",
         "plan --like results",
         "plan herath2007-stereo --filter ekf-uvd --detect 1.2"),
-    Row("fit-covariance", "commands.fitting:fit_covariance", "",
+    Row("fit-covariance", "fitting:fit_covariance", "",
         "fit-covariance wheels --truth truth --span 1m --out noise",
         "fit-covariance odometry.csv --truth truth.csv --span 1s --held-out half"),
-    Row("monitor", "commands.monitoring:monitor", "",
+    Row("monitor", "monitoring:monitor", "",
         "monitor innovations.csv --innovations optimal --plot alarm.png",
         "monitor flight.ulg"),
     # the laboratory
-    Row("list", "commands.listing:list_"),
-    Row("simulate", "commands.studies:simulate", "bench", "simulate herath2007-stereo --runs 10 --out log"),
-    Row("frontend", "commands.frontend:frontend", "vision",
+    Row("list", "listing:list_"),
+    Row("simulate", "studies:simulate", "bench", "simulate herath2007-stereo --runs 10 --out log"),
+    Row("frontend", "frontend:frontend", "vision",
         "frontend IMAGES --out drive",
         "frontend IMAGES --calibration stereo.yml --rate 20 --out drive"),
-    Row("run", "commands.studies:run", "bench",
+    Row("run", "studies:run", "bench",
         "run herath2007-stereo --filter ekf-uvd --filter ukf-uvd --out results",
         "run world.toml --filter ekf-uvd --until-decided --out results",
         "run --log log --filter ekf-uvd --out results",
         "run --log log --screen 2,2,1 --filter ekf-uvd --out results"),
-    Row("reproduce", "commands.studies:reproduce", "bench report",
+    Row("reproduce", "studies:reproduce", "bench report",
         "reproduce --out findings",
         "reproduce --only fig3-chain --runs 20 --out findings"),
-    Row("challenge", "commands.searching:challenge", "bench", "challenge ukf-uvd --minutes 5 --out worst.toml"),
-    Row("characterise", "commands.characterising:characterise", "bench",
+    Row("challenge", "searching:challenge", "bench", "challenge ukf-uvd --minutes 5 --out worst.toml"),
+    Row("characterise", "characterising:characterise", "bench",
         "characterise log --out sensor.toml",
         "characterise IMAGES --board 9x6 --square 0.024 --out s.toml"),
-    Row("sweep", "commands.searching:sweep", "bench report",
+    Row("sweep", "searching:sweep", "bench report",
         "sweep regime --out regime",
         "sweep grid.toml --share 1/4 --out cells"),
-    Row("tune", "commands.searching:tune", "bench",
+    Row("tune", "searching:tune", "bench",
         "tune herath2007-optimistic --filter oc-ekf-xyz",
         "tune --log log --filter ekf-uvd"),
 )
@@ -98,7 +107,7 @@ class Loaded(Mapping[str, Any]):
         info = CommandInfo(
             name,
             cls=Command,
-            callback=function_at(row.target),
+            callback=row.function(),
             epilog=epilog if row.examples else None,
         )
         made: Any = typer.main.get_command_from_info(info, pretty_exceptions_short=True, rich_markup_mode=None)

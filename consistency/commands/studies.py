@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
@@ -86,6 +85,7 @@ def run(
     slurm: SlurmOptions = None,
 ) -> None:
     """Put simulated trials, or a recorded log, through filters."""
+    from consistency.bench.runs.analyse_results import analyse
     from consistency.bench.runs.backends.choosing import backend_for, require_scheduler
     from consistency.bench.runs.montecarlo import Interrupted, resolve_filters, run_log, run_trials
     from consistency.bench.runs.sequential import run_until_decided
@@ -95,7 +95,6 @@ def run(
     from consistency.referee.document.verdict import document
     from consistency.referee.show import terminal
     from consistency.referee.system.progress import say
-    from consistency.referee.verdicts.sources import analyse
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
@@ -119,10 +118,10 @@ def run(
                 raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
             recorded = read_log(log)
             if screen is not None:
-                # the bench does not know it
-                screening = import_module("consistency.stereo.visual_odometry.common_motion")
-                recorded = screening.screened_log(recorded, screen)
-                say(screening.screening_line(recorded))
+                from consistency.stereo.visual_odometry.common_motion import screened_log, screening_line
+
+                recorded = screened_log(recorded, screen)
+                say(screening_line(recorded))
             resolve_filters(filters, recorded.belief, recorded.name)
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
                 raise InputError(f"--out {out}: lies in the log; choose another folder")

@@ -125,7 +125,7 @@ def get_filter(name: str) -> Any:
     module, attribute, _ = MODULES[name]
     if (missing := _missing(module)) is not None:
         package, extra = missing
-        raise MissingPackageError(f"filter '{name}' needs {remedy(extra, own=package)}")
+        raise MissingPackageError(f"filter '{name}' needs {remedy(extra, package=package)}")
     return getattr(import_module(f"consistency.bench.filters.{module}"), attribute)
 
 

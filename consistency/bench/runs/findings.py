@@ -16,6 +16,7 @@ import pandas as pd
 from joblib.externals.loky import Future, ProcessPoolExecutor
 
 from consistency.bench.filters import get_filter
+from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
@@ -33,7 +34,6 @@ from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.progress import quiet, say
 from consistency.referee.system.provenance import manifest_of
-from consistency.referee.verdicts.sources import analyse
 
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 WAITING = 30.0  # seconds between lines on a process that is waited for

@@ -39,7 +39,7 @@ from consistency.bench.scenario.truth import (
     UniformLandmarks,
     Waypoints,
 )
-from consistency.referee.shipped import data_folder
+from consistency.bench.shipped import data_folder
 
 __all__ = [
     "PLANAR_SENSORS",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -104,10 +103,14 @@ class NoiseModel:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        return _shown("page", "plot", self, path)
+        from consistency.referee.fit_covariance.page import plot
+
+        return plot(self, path)
 
     def __repr__(self) -> str:
-        return f"<NoiseModel {self.name}: {_shown('wording', 'sentence', self)}>"
+        from consistency.referee.fit_covariance.wording import sentence
+
+        return f"<NoiseModel {self.name}: {sentence(self)}>"
 
 
 def decided(status: str, doubted: bool, depends: bool) -> str:
@@ -121,11 +124,6 @@ def decided(status: str, doubted: bool, depends: bool) -> str:
     if depends:
         return "inconsistent"
     return "undecided" if doubted else status
-
-
-def _shown(module: str, function: str, *arguments: Any) -> Any:
-    """Result of a function that draws or describes, whose module is loaded here."""
-    return getattr(import_module(f"consistency.referee.fit_covariance.{module}"), function)(*arguments)
 
 
 def fit_covariance(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,12 +12,11 @@ from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics import Comparison, Record, RunSummary, compare, summary
 from consistency.referee.diagnostics.comparison import FailedRuns
 from consistency.referee.diagnostics.records.skipping import Skip
-from consistency.referee.gating.input_checks import checked, of_results
+from consistency.referee.gating.input_checks import checked, record_of_filter
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline
-    from consistency.referee.verdicts.sources import Results
-
+    from consistency.referee.verdicts.sources import Source
 
 NONE_FAILED = FailedRuns(0, 0)
 
@@ -93,10 +91,10 @@ def _side(side: str, name: str, arrays: Mapping[str, Any]) -> tuple[Record, RunS
 
 
 def of_filters(
-    results: Results,
+    results: Source,
     filter_name: str | None,
     than: str | None,
-    reference: Results | Baseline | str | Path | None,
+    reference: Baseline | None,
     name: str | None,
     skip: str | float | Skip | None = None,
 ) -> Sides:
@@ -105,24 +103,15 @@ def of_filters(
     Raises
     ------
     ValueError
-        No such filter, nothing to compare with, or a baseline that cannot be read.
+        No such filter, or nothing to compare with.
     """
-    from consistency.referee.verdicts.baselines import Baseline, baseline, read_baseline, require_skip
+    from consistency.referee.verdicts.baselines import baseline, require_skip
 
     if reference is None and than is None:
         raise ValueError("than: name the filter to compare with, or give other results as reference")
-    candidate = of_results(results, filter_name, name, skip=skip)
+    candidate = record_of_filter(results, filter_name, name, skip=skip)
     new = baseline(results, skip=skip)
-    if reference is None:
-        old = new
-    elif isinstance(reference, Baseline):
-        old = require_skip(reference, skip)
-    else:
-        old = (
-            read_baseline(Path(reference), skip)
-            if isinstance(reference, str | Path)
-            else baseline(reference, skip=skip)
-        )
+    old = new if reference is None else require_skip(reference, skip)
     of_a = filter_name or results.filters[0]
     of_b = than or of_a
     if of_b not in old.filters:

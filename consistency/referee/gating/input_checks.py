@@ -15,7 +15,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.numpy_archive import in_memory, masked_steps, record_of_arrays, steps_of
 from consistency.referee.readers.runs_to_record import Track, judged_rows, longest_start, symmetric
 from consistency.referee.types import Array, Failure, Indices
-from consistency.referee.verdicts.sources import Results, source_of
+from consistency.referee.verdicts.sources import Source
 
 
 def checked(
@@ -88,25 +88,23 @@ def shares(record: Record) -> int:
     return len(record.parts) + (record.optimal_gain and record.nis is not None) if record.parts else 1
 
 
-def of_results(
-    results: Results, filter_name: str | None, name: str | None = None, skip: str | float | Skip | None = None
+def record_of_filter(
+    results: Source, filter_name: str | None, name: str | None = None, skip: str | float | Skip | None = None
 ) -> Record:
-    """One filter of the bench's own results, with its failed runs.
+    """Return the record of one filter of the bench's own results, with its failed runs.
 
     Steps whose covariance is rank-deficient are left out, as everywhere in the bench.
 
     Raises
     ------
     ValueError
-        No results, no such filter, or more than one to choose from; ``skip`` leaves nothing.
+        No such filter, or more than one to choose from; ``skip`` leaves nothing.
     """
-    if not hasattr(results, "batches"):
-        raise ValueError("filter names one in the results of consistency.run_trials; give those in place of errors")
     if filter_name is None:
         if len(results.filters) != 1:
             raise ValueError(f"filter: name one of {', '.join(results.filters)}")
         filter_name = results.filters[0]
-    record = source_of(results).record(filter_name).without_first(skip_of(skip))
+    record = results.record(filter_name).without_first(skip_of(skip))
     return replace(record.errors_alone, name=name or filter_name)
 
 

@@ -77,7 +77,7 @@ def characterise_log(folder: Path, grid: tuple[int, int], at_rest: bool = False,
     Raises
     ------
     InputError
-        As :func:`consistency.store.log.read_log`; the sensor measures no disparity; too few data; no truth, and the
+        As :func:`consistency.store.read_log`; the sensor measures no disparity; too few data; no truth, and the
         sensor moves all the time.
     """
     log = read_log(folder)

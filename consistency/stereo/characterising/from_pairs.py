@@ -34,7 +34,7 @@ def characterise_images(folder: Path, options: SourceOptions) -> Characterisatio
     Raises
     ------
     InputError
-        As :func:`consistency.vision.sequence.read_sequence`; too few pairs; neither at rest nor with true poses.
+        As :func:`consistency.vision.read_sequence`; too few pairs; neither at rest nor with true poses.
     """
     sequence = read_sequence(folder, options.calibration, options.format, options.left, options.right)
     rig = sequence.rectification.rig

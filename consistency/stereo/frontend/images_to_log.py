@@ -130,7 +130,7 @@ def write_frontend_log(images: Path, out: Path, options: FrontendOptions, overwr
     Raises
     ------
     InputError
-        As :func:`consistency.vision.sequence.read_sequence` and :func:`consistency.vision.relative_motion`; ``out``
+        As :func:`consistency.vision.read_sequence` and :func:`consistency.vision.relative_motion`; ``out``
         exists; no landmark is left.
     """
     started = time.monotonic()

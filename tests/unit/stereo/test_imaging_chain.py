@@ -24,7 +24,6 @@ from consistency.stereo.rendered_images.chain import (
     joined,
     stage,
 )
-from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand, wall_texture
 from consistency.stereo.rendered_images.render import film
 from consistency.stereo.rendered_images.scene import Layer, Plain, RandomTexture, Scene
 from consistency.stereo.rendered_images.stages import (
@@ -43,6 +42,7 @@ from consistency.stereo.rendered_images.stages import (
     dissimilarity,
     patches,
 )
+from consistency.stereo.rendered_images.stops import Stops, pose_at, stand, wall_texture
 
 pytest.importorskip("cv2")
 

@@ -13,10 +13,10 @@ import consistency as cs
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import posterior
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import RelativePose, StereoRig, refine_reprojection
 from consistency.stereo.visual_odometry.motion import RelativeMotion, diagonal
 from consistency.stereo.visual_odometry.odometry import bridged
 from consistency.stereo.visual_odometry.shared import RIG, SHARED, SharedError, fit_shared, perturbed, sensitivities
+from consistency.vision import RelativePose, StereoRig, refine_reprojection
 
 K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
 ROTATED = Rotation.from_rotvec([0.01, -0.02, 0.005]).as_matrix()

@@ -1,6 +1,6 @@
 """Geometry and conversion of a robot-centred map of inverse ranges, in plain NumPy.
 
-The methods and their sources are in :mod:`consistency.filters.textbook.robocentric`.
+The methods and their sources are in :mod:`consistency.bench.filters.textbook.robocentric`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """State of a robot-centred map, and its steps: landmarks are parked at clones of the pose, and activated again.
 
-The method is in :mod:`consistency.filters.textbook.robocentric`.
+The method is in :mod:`consistency.bench.filters.textbook.robocentric`.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ DISTRIBUTION = "filter-consistency"
 IMPORT_NAMES = {"opencv-python-headless": "cv2", "pyyaml": "yaml", "tomli-w": "tomli_w"}  # where they differ
 PYTHON_OF_BENCH = (3, 11)  # needed by its SciPy, while the core keeps to an older one
 COLLECTIONS = {"all", "dev", "docs"}  # extras that collect others, and that no sentence should name
-REQUIREMENT = re.compile(r"([\w.-]+)(?:>=([\d.]+))?; extra == ['\"]([\w-]+)['\"]")
+REQUIREMENT = re.compile(r"(?P<package>[\w.-]+)(>=(?P<floor>[\d.]+))?; extra == ['\"](?P<extra>[\w-]+)['\"]")
 
 
 class MissingPackageError(InputError, ImportError):
@@ -58,7 +59,7 @@ class Requirement(NamedTuple):
 
 
 def requirements(*extras: str) -> list[Requirement]:
-    """Return what extras bring, in the order of the names; nothing where this package is not installed."""
+    """Return what extras bring, one extra after the other; nothing where this package is not installed."""
     if not extras:
         return []
     from importlib.metadata import PackageNotFoundError, requires
@@ -67,8 +68,12 @@ def requirements(*extras: str) -> list[Requirement]:
         lines = requires(DISTRIBUTION) or []
     except PackageNotFoundError:
         return []
-    parts = [match.groups("") for line in lines if (match := REQUIREMENT.fullmatch(line)) is not None]
-    return list(dict.fromkeys(Requirement(package, floor) for package, floor, extra in parts if extra in extras))
+    brought: dict[str, list[Requirement]] = {extra: [] for extra in extras}
+    for line in lines:
+        match = REQUIREMENT.fullmatch(line)
+        if match is not None and match["extra"] in brought:
+            brought[match["extra"]].append(Requirement(match["package"], match["floor"] or ""))
+    return list(dict.fromkeys(chain.from_iterable(brought.values())))
 
 
 def missing(*extras: str) -> list[str]:

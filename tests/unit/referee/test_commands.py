@@ -72,7 +72,7 @@ def listed(extra: str) -> set[tuple[str, str]]:
 @pytest.mark.parametrize("extra", PROJECT["optional-dependencies"])
 def test_an_extra_brings_what_the_project_lists(extra: str) -> None:
     """Also a check of the installation: one that is stale is mended by ``pip install -e .``."""
-    assert set(requirements(extra)) == listed(extra)
+    assert set(requirements(extra)) == listed(extra), "the installation is stale: pip install -e ."
 
 
 def test_several_extras_bring_each_package_once() -> None:
@@ -175,14 +175,19 @@ def test_the_place_that_it_came_from(
     place.mkdir()
     (place / "pyproject.toml").touch()
 
+    installed = metadata.distribution
+
     class Installed:
+        requires = installed(extras.DISTRIBUTION).requires
+
         def read_text(self, name: str) -> str | None:
             assert name == "direct_url.json"
             return (
                 None if record is None else json.dumps(record).replace("{at}", place.as_uri().removeprefix("file://"))
             )
 
-    monkeypatch.setattr(metadata, "distribution", lambda _: Installed())
+    found = {extras.DISTRIBUTION: Installed()}
+    monkeypatch.setattr(metadata, "distribution", lambda name: found.get(name) or installed(name))
     words = [word.replace("{at}", str(place)) for word in expected]
     assert extras._from_origin(("bench", "plot")) == words
     without(monkeypatch, "bokeh")

@@ -131,7 +131,7 @@ print(status, err.getvalue().splitlines()[-1])
 def test_a_report_without_its_packages(folder: Path) -> None:
     status, _, line = said(folder, REPORT.format(out="look") + LOADED).partition(" ")
     assert status == "1"
-    told = "consistency: the interactive page and the PDF need matplotlib, bokeh, jinja2, typst: pip install "
+    told = "consistency: the interactive page and the PDF need bokeh, jinja2, matplotlib, typst: pip install "
     assert line.startswith(told)
     assert {path.name for path in (folder / "look").iterdir()} == {"manifest.json", "report.html", "verdict.json"}
     page = (folder / "look" / "report.html").read_text("utf-8")

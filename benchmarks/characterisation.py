@@ -26,7 +26,7 @@ from consistency.bench.simulation import World
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.residuals import residuals_of
+from consistency.stereo.characterising.log_residuals import residuals_of
 from consistency.stereo.characterising.sensor_text import believed
 
 SCENARIO = "herath2007-stereo"

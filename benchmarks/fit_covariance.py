@@ -29,12 +29,12 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.mean_by_motion import mean_by_motion
+from consistency.referee.fit_covariance.motion_windows import PLANE, SPACE, Windows, span_of, windows_of
 from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.persistence import doubts, persistent
 from consistency.referee.fit_covariance.refusals import growth_of, require_sound
 from consistency.referee.fit_covariance.slip import BY_TURN
 from consistency.referee.fit_covariance.white_noise import fit_noise, intervals, terms_of
-from consistency.referee.fit_covariance.windows import PLANE, SPACE, Windows, span_of, windows_of
 from consistency.referee.geometry.groups import composed, matrices, vectors
 from consistency.referee.types import Array
 

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from consistency.referee.diagnostics import Comparison, Record, Settings, Verdict, gate_runs, judge
 from consistency.referee.diagnostics.comparison import FEWEST
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.gating.comparing import Sides, of_arrays, of_filters
-from consistency.referee.gating.input_checks import checked, planned_dof, record_of_filter, shares
+from consistency.referee.gating.candidates import Sides, of_arrays, of_filters
+from consistency.referee.gating.checked_arrays import checked, planned_dof, record_of_filter, shares
 from consistency.referee.gating.watch import (
     DEFAULTS,
     Entry,

@@ -20,9 +20,9 @@ with explained_import(__name__):
         PointError,
     )
     from consistency.stereo.visual_odometry.maximum_likelihood import Refined, refine_reprojection, register_weighted
-    from consistency.stereo.visual_odometry.motion import RelativeMotion, relative_motion
     from consistency.stereo.visual_odometry.odometry import trajectory
     from consistency.stereo.visual_odometry.registration import register_horn, register_ransac, register_svd
+    from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, relative_motion
     from consistency.stereo.visual_odometry.relative_pose import RelativePose, compose, invert
     from consistency.stereo.visual_odometry.sequence import read_image, read_sequence
     from consistency.stereo.visual_odometry.shared import SharedError, fit_shared, sensitivities

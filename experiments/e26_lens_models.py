@@ -25,7 +25,7 @@ from consistency.bench.sweeps.rig import read_rig
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.characterising.bias import GRID
+from consistency.stereo.characterising.bias_map import GRID
 from consistency.stereo.characterising.boards import MODELS, find_corners, of_model
 from consistency.stereo.characterising.characterise import Characterisation
 from consistency.stereo.characterising.sensor_text import sensor_text

@@ -13,8 +13,8 @@ from consistency.referee.types import Array
 from consistency.stereo.frontend.dataset_truth import read_truth
 from consistency.stereo.frontend.planar_log import relative
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_opencv
-from consistency.stereo.visual_odometry.motion import RelativeMotion
 from consistency.stereo.visual_odometry.odometry import visual_odometry
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.relative_pose import angular
 from consistency.stereo.visual_odometry.sequence import read_image, read_sequence
 from consistency.vision import RelativePose, StereoRig, relative_motion

@@ -46,9 +46,9 @@ def characterise(
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free
     from consistency.stereo.characterising.from_log import SourceOptions
+    from consistency.stereo.characterising.logs_and_images import CORNERS, NODES, characterise_source, counts
     from consistency.stereo.characterising.sensor_text import as_json as json_of
     from consistency.stereo.characterising.sensor_text import blocks, require_free_file, sensor_text, write_sensor
-    from consistency.stereo.characterising.sources import CORNERS, NODES, characterise_source, counts
     from consistency.stereo.pages import write_sensor_reports
 
     require_free_file(out, overwrite)

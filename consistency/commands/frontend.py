@@ -49,7 +49,7 @@ def frontend(
 ) -> None:
     """Stereo images to a log for filters, and to a trajectory with covariance."""
     from consistency.stereo.frontend import FrontendOptions, write_frontend_log
-    from consistency.stereo.visual_odometry.motion import MotionSettings
+    from consistency.stereo.visual_odometry.relative_motion import MotionSettings
 
     settings = MotionSettings(estimator=estimator, **given(sigma_per_scale=sigma_per_scale))
     options = FrontendOptions(

@@ -17,7 +17,7 @@ from consistency.bench.scenario import Belief, PicturedSensor, read_table
 from consistency.bench.store.log import SensorFile, read_log
 from consistency.commands.app import main
 from consistency.stereo.characterising.characterise import characterise
-from consistency.stereo.characterising.residuals import Residuals
+from consistency.stereo.characterising.log_residuals import Residuals
 from consistency.stereo.characterising.sensor_text import believed, sensor_text
 
 

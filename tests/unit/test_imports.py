@@ -163,7 +163,7 @@ def test_no_two_modules_import_each_other() -> None:
         "consistency.referee.diagnostics.verdict.as_dictionary"
     )
     graph["consistency.referee.fit_covariance.noise_model"] -= {
-        "consistency.referee.fit_covariance.page", "consistency.referee.fit_covariance.wording",
+        "consistency.referee.fit_covariance.page", "consistency.referee.fit_covariance.model_text",
     }  # fmt: skip
     assert acyclic(graph)
     assert not acyclic(

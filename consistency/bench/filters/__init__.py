@@ -119,7 +119,7 @@ def get_filter(name: str) -> Any:
     if name not in MODULES:
         if "," in name:
             raise InputError(f"unknown filter '{name}'; give --filter once for each filter")
-        from consistency.bench.scenario.scenario import unknown
+        from consistency.bench.scenario.truth_and_belief import unknown
 
         raise InputError(unknown("filter", name, list(MODULES)))
     module, attribute, _ = MODULES[name]

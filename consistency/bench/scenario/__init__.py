@@ -6,18 +6,6 @@ observation: the keys of each effect and its ``apply``. Nothing here draws a tri
 """
 
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
-from consistency.bench.scenario.scenario import (
-    Belief,
-    BelievedMotion,
-    GuardSettings,
-    Scenario,
-    SigmaPoints,
-    load_scenario,
-    misbelief,
-    scenario_names,
-    scenario_text,
-    toml_text,
-)
 from consistency.bench.scenario.sensor import (
     BelievedSensor,
     PicturedSensor,
@@ -38,6 +26,18 @@ from consistency.bench.scenario.truth import (
     Truth,
     UniformLandmarks,
     Waypoints,
+)
+from consistency.bench.scenario.truth_and_belief import (
+    Belief,
+    BelievedMotion,
+    GuardSettings,
+    Scenario,
+    SigmaPoints,
+    load_scenario,
+    misbelief,
+    scenario_names,
+    scenario_text,
+    toml_text,
 )
 from consistency.bench.shipped import data_folder
 

@@ -11,8 +11,8 @@ from scipy import special, stats
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.motion_windows import BLOCKS, ENOUGH, Windows
 from consistency.referee.fit_covariance.white_noise import Noise, fit_noise
-from consistency.referee.fit_covariance.windows import BLOCKS, ENOUGH, Windows
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array, Indices
 

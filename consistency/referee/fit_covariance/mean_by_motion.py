@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from consistency.referee.fit_covariance.motion_windows import Windows, blocks_of, turns, ways
 from consistency.referee.fit_covariance.slip import held_out_gain
 from consistency.referee.fit_covariance.systematic_errors import design_of
 from consistency.referee.fit_covariance.white_noise import Noise
-from consistency.referee.fit_covariance.windows import Windows, blocks_of, turns, ways
 from consistency.referee.types import Array, Indices
 
 SURE = 0.01  # chance to find a dependence where there is none, all questions together

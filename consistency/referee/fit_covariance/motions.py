@@ -11,7 +11,7 @@ from consistency.referee.column_names import COVARIANCE
 from consistency.referee.diagnostics import Record
 from consistency.referee.fit_covariance.covariance_ratios import Fold
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.windows import Windows
+from consistency.referee.fit_covariance.motion_windows import Windows
 from consistency.referee.geometry.groups import carried, composed, to_left, vectors
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.relative_motions import Stretch, relative_recording

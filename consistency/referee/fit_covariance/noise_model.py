@@ -17,12 +17,12 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Fold, Judged, Ratio, folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.mean_by_motion import ByMotion, mean_by_motion
+from consistency.referee.fit_covariance.motion_windows import ENOUGH, PIECES, Windows, span_of, windows_at, windows_of
 from consistency.referee.fit_covariance.motions import record_of, stretches_of
 from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
 from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_poses, require_sound
 from consistency.referee.fit_covariance.slip import BY_TURN
 from consistency.referee.fit_covariance.white_noise import Noise, fit_noise, intervals, jitter_of
-from consistency.referee.fit_covariance.windows import ENOUGH, PIECES, Windows, span_of, windows_at, windows_of
 from consistency.referee.geometry.groups import matrices
 from consistency.referee.readers.relative_motions import Stretch
 from consistency.referee.types import Array
@@ -108,7 +108,7 @@ class NoiseModel:
         return plot(self, path)
 
     def __repr__(self) -> str:
-        from consistency.referee.fit_covariance.wording import sentence
+        from consistency.referee.fit_covariance.model_text import sentence
 
         return f"<NoiseModel {self.name}: {sentence(self)}>"
 

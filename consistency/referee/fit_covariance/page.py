@@ -14,10 +14,10 @@ from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, ZERO, solid, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, Span
 from consistency.referee.fit_covariance.covariance_ratios import Judged
+from consistency.referee.fit_covariance.model_text import document
+from consistency.referee.fit_covariance.motion_windows import span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
 from consistency.referee.fit_covariance.white_noise import nees_of
-from consistency.referee.fit_covariance.windows import span_of
-from consistency.referee.fit_covariance.wording import document
 from consistency.referee.pages.write_pages import plotted
 
 SHOWN = 3  # spans with a panel of errors

@@ -11,10 +11,10 @@ from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.motion_windows import ENOUGH, Windows, in_plane
 from consistency.referee.fit_covariance.refusals import Growth
 from consistency.referee.fit_covariance.systematic_errors import design_of
 from consistency.referee.fit_covariance.white_noise import Noise
-from consistency.referee.fit_covariance.windows import ENOUGH, Windows, in_plane
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.readers.relative_motions import BENT
 from consistency.referee.types import Array

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.motion_windows import ROUNDED, STILL, Windows, windows_at
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, none_of
-from consistency.referee.fit_covariance.windows import ROUNDED, STILL, Windows, windows_at
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.types import Array
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from consistency.referee.fit_covariance.motion_windows import Windows, lengthened, turns, ways
 from consistency.referee.fit_covariance.systematic_errors import carriers, design_of, fit_mean
-from consistency.referee.fit_covariance.windows import Windows, lengthened, turns, ways
 from consistency.referee.types import Array
 
 BY_TURN = "by turn"  # a correction with a way by turn

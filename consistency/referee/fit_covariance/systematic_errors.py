@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.fit_covariance.windows import BLOCKS, Windows, blocks_of, lengthened, rests, turns, ways
+from consistency.referee.fit_covariance.motion_windows import BLOCKS, Windows, blocks_of, lengthened, rests, turns, ways
 from consistency.referee.geometry.groups import adjoint, inverse
 from consistency.referee.types import Array
 

@@ -15,6 +15,7 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.motion_windows import Windows, blocks_of, lengthened, turns, ways, windows_at
 from consistency.referee.fit_covariance.slip import BY_TURN, fit_slip
 from consistency.referee.fit_covariance.systematic_errors import (
     NEIGHBOURS,
@@ -25,7 +26,6 @@ from consistency.referee.fit_covariance.systematic_errors import (
     none_of,
     sum_of_neighbours,
 )
-from consistency.referee.fit_covariance.windows import Windows, blocks_of, lengthened, turns, ways, windows_at
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma

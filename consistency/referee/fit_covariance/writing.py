@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.extras import is_installed
+from consistency.referee.fit_covariance.model_text import correction, data, document
+from consistency.referee.fit_covariance.motion_windows import PIECES, ways
 from consistency.referee.fit_covariance.motions import write_motions
 from consistency.referee.fit_covariance.noise_model import NoiseModel
 from consistency.referee.fit_covariance.page import page
-from consistency.referee.fit_covariance.windows import PIECES, ways
-from consistency.referee.fit_covariance.wording import correction, data, document
 from consistency.referee.show import as_html, as_json
 from consistency.referee.system.folders import write_folder
 from consistency.referee.system.provenance import manifest_of

@@ -14,10 +14,10 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
-from consistency.stereo.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
+from consistency.stereo.characterising.bias_map import GRID, BiasEstimate, estimate_bias, grid_of
 from consistency.stereo.characterising.coordinate_fit import Levels, ResidualTails, rate, ratios, tails
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
-from consistency.stereo.characterising.residuals import Residuals, RowSelection, octaves, select
+from consistency.stereo.characterising.log_residuals import Residuals, RowSelection, octaves, select
 
 NAMES = ("u", "v", "d")
 RATE = 0.01  # chance that any interval misses

@@ -12,14 +12,14 @@ from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation
 from consistency.stereo.characterising.from_log import EXACT, FREE, REST, SourceOptions
 from consistency.stereo.characterising.known_poses import characterise_posed
-from consistency.stereo.characterising.residuals import MAD
+from consistency.stereo.characterising.log_residuals import MAD
 from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
 from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
 from consistency.stereo.frontend.planar_log import CAMERA, observations
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.features import is_rectified
-from consistency.stereo.visual_odometry.motion import RelativeMotion
 from consistency.stereo.visual_odometry.odometry import visual_odometry
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
 
 CHOSEN = (

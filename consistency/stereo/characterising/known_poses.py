@@ -20,7 +20,7 @@ from consistency.stereo.characterising.characterise import (
     DisparityNoise,
 )
 from consistency.stereo.characterising.coordinate_fit import LAGS, Levels, rate, ratios, tails
-from consistency.stereo.characterising.residuals import MARGIN, octaves, within_limits
+from consistency.stereo.characterising.log_residuals import MARGIN, octaves, within_limits
 from consistency.stereo.characterising.unknown_landmarks import Fitted, Seen, fit_points, without_gross
 
 FREE = 0.1  # share of a value that the fits must leave for it to tell of the shape of the noise

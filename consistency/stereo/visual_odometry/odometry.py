@@ -13,7 +13,12 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import carried
 from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
-from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion, motion_between, stereo_features
+from consistency.stereo.visual_odometry.relative_motion import (
+    MotionSettings,
+    RelativeMotion,
+    motion_between,
+    stereo_features,
+)
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, angular, cross_matrix
 from consistency.stereo.visual_odometry.sequence import Sequence
 

@@ -18,8 +18,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.maximum_likelihood import refine_reprojection
-from consistency.stereo.visual_odometry.motion import RelativeMotion, diagonal
 from consistency.stereo.visual_odometry.odometry import neighbours
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, diagonal
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, cross_matrix
 
 # What is shared, and the standard deviation of its prior

@@ -25,7 +25,7 @@ from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
 from consistency.referee.diagnostics.verdict.parts import MapScore
 from consistency.referee.document.map import map_text
 from consistency.referee.document.verdict import document
-from consistency.referee.gating.input_checks import record_of_filter
+from consistency.referee.gating.checked_arrays import record_of_filter
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Failure
 from consistency.referee.verdicts.baselines import baseline

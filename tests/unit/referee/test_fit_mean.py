@@ -13,6 +13,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.fit_covariance import systematic_errors as errors_
+from consistency.referee.fit_covariance.model_text import correction, data, lines
+from consistency.referee.fit_covariance.motion_windows import Windows, span_of, windows_of
 from consistency.referee.fit_covariance.systematic_errors import (
     BACKWARD,
     FORWARD,
@@ -34,8 +36,6 @@ from consistency.referee.fit_covariance.white_noise import (
     jitter_of,
     terms_of,
 )
-from consistency.referee.fit_covariance.windows import Windows, span_of, windows_of
-from consistency.referee.fit_covariance.wording import correction, data, lines
 
 FIT = MeanFit(
     Mean(1.0, 0.95, (0.0,)), Mean(1.01, 0.94, (0.001,)), np.array([0.98, 0.9, -0.01]), np.array([1.03, 0.98, 0.012]),

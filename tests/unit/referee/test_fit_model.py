@@ -18,6 +18,8 @@ import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import Ratio, folds_of, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
+from consistency.referee.fit_covariance.model_text import lines, sentence
+from consistency.referee.fit_covariance.motion_windows import Windows, blocks_of, in_plane, span_of, windows_of
 from consistency.referee.fit_covariance.noise_model import caution
 from consistency.referee.fit_covariance.persistence import TERMS, Lasting
 from consistency.referee.fit_covariance.refusals import Growth, body_turn, growth_of, revisits
@@ -30,8 +32,6 @@ from consistency.referee.fit_covariance.white_noise import (
     nees_of,
     terms_of,
 )
-from consistency.referee.fit_covariance.windows import Windows, blocks_of, in_plane, span_of, windows_of
-from consistency.referee.fit_covariance.wording import lines, sentence
 from consistency.referee.geometry.groups import composed, inverse, log, vectors
 from consistency.referee.types import Array
 

@@ -16,12 +16,8 @@ from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.fit_covariance.covariance_ratios import Judged, Ratio, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.mean_by_motion import SCALES, _by_bin, mean_by_motion, p_value_of
-from consistency.referee.fit_covariance.noise_model import decided
-from consistency.referee.fit_covariance.refusals import require_poses
-from consistency.referee.fit_covariance.slip import BY_TURN, effect_of, fit_slip, held_out_gain
-from consistency.referee.fit_covariance.systematic_errors import Mean, design_of
-from consistency.referee.fit_covariance.white_noise import fit_noise
-from consistency.referee.fit_covariance.windows import (
+from consistency.referee.fit_covariance.model_text import correction, lines, sentence
+from consistency.referee.fit_covariance.motion_windows import (
     ROUNDED,
     blocks_of,
     lengthened,
@@ -30,7 +26,11 @@ from consistency.referee.fit_covariance.windows import (
     ways,
     windows_of,
 )
-from consistency.referee.fit_covariance.wording import correction, lines, sentence
+from consistency.referee.fit_covariance.noise_model import decided
+from consistency.referee.fit_covariance.refusals import require_poses
+from consistency.referee.fit_covariance.slip import BY_TURN, effect_of, fit_slip, held_out_gain
+from consistency.referee.fit_covariance.systematic_errors import Mean, design_of
+from consistency.referee.fit_covariance.white_noise import fit_noise
 from consistency.referee.fit_covariance.writing import toml
 from consistency.referee.geometry.groups import composed, inverse, vectors
 from consistency.referee.readers.options import Reading

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.questions.innovations import outliers_of
-from consistency.referee.gating.input_checks import checked
+from consistency.referee.gating.checked_arrays import checked
 from consistency.referee.readers.formats.position_truth import placeholder
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.heading_units import require_radians

@@ -299,7 +299,7 @@ def test_the_command_and_its_report(motion_file: Path, capsys: pytest.CaptureFix
 def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[object], Array]:
     """Motions of a front-end, and true poses (number + 1, 4, 4); errors are of roll, pitch, yaw."""
     from consistency.referee.geometry import rotation
-    from consistency.stereo.visual_odometry.motion import RelativeMotion
+    from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
     from consistency.stereo.visual_odometry.relative_pose import RelativePose
 
     root = np.diag([0.02, 0.01, 0.03, 0.002, 0.004, 0.003]) @ (np.eye(6) + 0.3 * rng.normal(size=(6, 6)))

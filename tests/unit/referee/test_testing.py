@@ -18,7 +18,7 @@ from draws import autoregression
 
 import consistency as cs
 from consistency.referee.diagnostics import gate_runs
-from consistency.referee.gating.input_checks import checked, planned_dof
+from consistency.referee.gating.checked_arrays import checked, planned_dof
 from consistency.referee.types import Array
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 

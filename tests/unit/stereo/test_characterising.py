@@ -17,11 +17,11 @@ from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
-from consistency.stereo.characterising.bias import estimate_bias, grid_of, shrunken
+from consistency.stereo.characterising.bias_map import estimate_bias, grid_of, shrunken
 from consistency.stereo.characterising.characterise import Characterisation, characterise
 from consistency.stereo.characterising.coordinate_fit import Levels, rate, ratios, tails
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Parameters, Rows, fit, regress
-from consistency.stereo.characterising.residuals import Residuals, octaves, residuals_of, select
+from consistency.stereo.characterising.log_residuals import Residuals, octaves, residuals_of, select
 
 LEVEL = 1e-7
 SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=150.0, B=0.09, disparity=(1.0, 32.0), image=(320, 240))

@@ -25,7 +25,7 @@ from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_dri
 from consistency.stereo.frontend.planar_log import plane_of
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
 from consistency.stereo.visual_odometry.cameras.camera_pair import rectify
-from consistency.stereo.visual_odometry.motion import RelativeMotion
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.sequence import read_sequence
 from consistency.vision import RelativePose
 

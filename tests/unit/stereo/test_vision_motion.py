@@ -8,7 +8,13 @@ from rigs import MOTION, RIG
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.motion import ESTIMATORS, MotionSettings, disparities, estimate_motion, usable
+from consistency.stereo.visual_odometry.relative_motion import (
+    ESTIMATORS,
+    MotionSettings,
+    disparities,
+    estimate_motion,
+    usable,
+)
 from consistency.vision import StereoRig, triangulate, triangulation_covariance
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")

@@ -13,8 +13,8 @@ import consistency as cs
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import posterior
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.motion import RelativeMotion, diagonal
 from consistency.stereo.visual_odometry.odometry import bridged
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, diagonal
 from consistency.stereo.visual_odometry.shared import RIG, SHARED, SharedError, fit_shared, perturbed, sensitivities
 from consistency.vision import RelativePose, StereoRig, refine_reprojection
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from consistency.referee.errors import InputError
-from consistency.stereo.characterising.bias import GRID
+from consistency.stereo.characterising.bias_map import GRID
 from consistency.stereo.characterising.from_log import Measured, SourceOptions, characterise_log, is_log
 
 WIDEST = 10.0  # m, of a square of a board; more are millimetres

@@ -12,7 +12,7 @@ from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics import Comparison, Record, RunSummary, compare, summary
 from consistency.referee.diagnostics.comparison import FailedRuns
 from consistency.referee.diagnostics.records.skipping import Skip
-from consistency.referee.gating.input_checks import checked, record_of_filter
+from consistency.referee.gating.checked_arrays import checked, record_of_filter
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline

@@ -13,10 +13,10 @@ from consistency.referee.diagnostics.words.sentences import plural, short
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Ratio
 from consistency.referee.fit_covariance.mean_by_motion import ByMotion
+from consistency.referee.fit_covariance.motion_windows import ENOUGH, span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel
 from consistency.referee.fit_covariance.persistence import SHARED, Second
 from consistency.referee.fit_covariance.systematic_errors import NEIGHBOURS, STRONG, Mean, MeanFit
-from consistency.referee.fit_covariance.windows import ENOUGH, span_of
 
 RATIO = ("value", "low", "high", "spread", "drives", "windows", "status")  # of a ratio, as programs have it
 EVIDENCE = ("low", "high", "free", "instruments", "turns", "strength", "lasts", "is_open")  # of a mean, the same

@@ -14,7 +14,7 @@ from consistency.referee.diagnostics import Comparison, Record, Settings, Verdic
 from consistency.referee.diagnostics.comparison import FEWEST
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.gating.candidates import Sides, of_arrays, of_filters
-from consistency.referee.gating.checked_arrays import checked, planned_dof, record_of_filter, shares
+from consistency.referee.gating.checked_arrays import planned_dof, rate_shares, record_of_checked, record_of_filter
 from consistency.referee.gating.watch import (
     DEFAULTS,
     Entry,
@@ -140,7 +140,7 @@ def assert_consistent(
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
-        record = checked(
+        record = record_of_checked(
             name or "the estimator", cast(ArrayLike, errors), **arrays, subsets=subsets, optimal_gain=optimal_gain,
             skip=skip,
         )  # fmt: skip
@@ -153,7 +153,7 @@ def assert_consistent(
 
     def needed(rate: float) -> int:
         return gate_runs(
-            planned_dof(record), demand.detect, rate / shares(record), demand.power, demand.allow, demand.lost
+            planned_dof(record), demand.detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
         )
 
     result = _settle("assert_consistent", record, demand, look, needed)
@@ -298,7 +298,7 @@ def _settle(
         if result.verdict is None:
             text = few_to_compare(gate, record.name, runs, least, demand)
         else:
-            each = replace(demand, false_alarm=demand.false_alarm / shares(record))
+            each = replace(demand, false_alarm=demand.false_alarm / rate_shares(record))
             text = undecided_text(gate, record.name, result.reasons[0], least, dof, each)
             text += _marker_text(dof, runs)
         raise InsufficientTrials(text, least, runs, result.verdict)
@@ -345,7 +345,7 @@ def _entry(
         gate=gate, name=record.name, outcome=outcome, p_value=plain(result.p_value),
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
         in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
-        runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=shares(record),
+        runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=rate_shares(record),
         detect=demand.detect, power=demand.power, allow=demand.allow, lost=demand.lost,
         late={} if late is None else _summary(late), statistics=statistics, **fields,
     )  # fmt: skip

@@ -11,7 +11,7 @@ from consistency.commands.shared_options import AsJson
 from consistency.referee.extras import require
 
 
-def characterise(
+def characterise_command(
     source: Annotated[
         Path, typer.Argument(metavar="LOG|IMAGES", help="Log folder with truth, or folder of stereo pairs.")
     ],
@@ -46,27 +46,32 @@ def characterise(
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free
     from consistency.stereo.characterising.from_log import SourceOptions
-    from consistency.stereo.characterising.logs_and_images import CORNERS, NODES, characterise_source, counts
+    from consistency.stereo.characterising.logs_and_images import CORNERS, NODES, characterise_source, parse_counts
     from consistency.stereo.characterising.sensor_text import as_json as json_of
-    from consistency.stereo.characterising.sensor_text import blocks, require_free_file, sensor_text, write_sensor
+    from consistency.stereo.characterising.sensor_text import (
+        measured_sensor_toml,
+        require_free_file,
+        sensor_blocks,
+        write_sensor,
+    )
     from consistency.stereo.pages import write_sensor_reports
 
     require_free_file(out, overwrite)
     if report is not None:
         require("--report", "report")
         require_free(report, overwrite, "characterisation", "--report")
-    size = None if board is None else counts(board, "--board", CORNERS)
-    nodes = None if grid is None else counts(grid, "--grid", NODES)
+    size = None if board is None else parse_counts(board, "--board", CORNERS)
+    nodes = None if grid is None else parse_counts(grid, "--grid", NODES)
     options = SourceOptions(
         nodes, at_rest, free_poses, calibration, truth, format, left, right, size, square, distortion, seed
     )
     measured = characterise_source(source, options)
     written = [] if report is None else write_sensor_reports(measured.of, report, json_of(measured.of), overwrite)
-    write_sensor(out, sensor_text(measured.of, measured.others))
+    write_sensor(out, measured_sensor_toml(measured.of, measured.others))
     if as_json:
         print(json_of(measured.of))
         return
-    terminal.show(*blocks(measured.of))
+    terminal.show(*sensor_blocks(measured.of))
     for path in written:
         print(path)
     print(f"sensor in {out}; next: copy it into a log and consistency run --log LOG --filter F")

@@ -13,10 +13,10 @@ from consistency.commands.shared_options import (
     Judged,
     Skip,
     are_files,
+    print_document,
     read_files,
     reads_files,
     require_word,
-    show,
     tell_notes,
 )
 from consistency.referee.defaults import FALSE_ALARM
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @reads_files
-def compare(
+def compare_command(
     path: Judged,
     files: Reading,
     other: Annotated[
@@ -72,7 +72,7 @@ def compare(
     else:
         compared = compare_filters(new, filters or [], false_alarm)
     tell_notes(*read.values())
-    show(document(compared), as_json)
+    print_document(document(compared), as_json)
     if fail_on and any(each.worse for each in compared):
         raise typer.Exit(1)
 
@@ -91,7 +91,7 @@ def _summaries(path: Path, recordings: list[Record] | None, first: FirstSteps | 
 
 
 @reads_files
-def baseline(
+def baseline_command(
     path: Judged,
     out: Annotated[Path, typer.Option("--out", help="JSON file to write; small enough for version control.")],
     files: Reading,

@@ -7,14 +7,21 @@ from typing import Annotated
 
 import typer
 
-from consistency.commands.shared_options import ESTIMATES, AsJson, reads_files, require_word, require_written, show
+from consistency.commands.shared_options import (
+    ESTIMATES,
+    AsJson,
+    print_document,
+    reads_files,
+    require_word,
+    require_written,
+)
 from consistency.referee.readers.options import Reading
 
 KEPT = ("truth", "max_dt", "time_offset", "topic", "truth_topic", "body")
 
 
 @reads_files(only=KEPT)
-def fit_covariance(
+def fit_covariance_command(
     path: Annotated[
         Path,
         typer.Argument(metavar="ESTIMATES", help=f"Poses of an odometry: {ESTIMATES}; a folder has a drive a file."),
@@ -62,7 +69,7 @@ def fit_covariance(
     from dataclasses import replace
 
     from consistency.referee.fit_covariance.drives import read_drives
-    from consistency.referee.fit_covariance.model_text import document
+    from consistency.referee.fit_covariance.model_text import noise_document
     from consistency.referee.fit_covariance.noise_model import fit_covariance as fit
     from consistency.referee.system.folders import require_free
 
@@ -81,6 +88,6 @@ def fit_covariance(
         from consistency.referee.fit_covariance.writing import write_model
 
         written = write_model(model, out, overwrite)
-    show(document(model), as_json, written)
+    print_document(noise_document(model), as_json, written)
     if fail_on and model.status != "consistent":
         raise typer.Exit(1)

@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from consistency.commands.shared_options import Out, Overwrite, given
+from consistency.commands.shared_options import Out, Overwrite, given_options
 
 
-def frontend(
+def frontend_command(
     images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of stereo pairs: KITTI, EuRoC, or plain.")],
     out: Out,
     calibration: Annotated[
@@ -51,10 +51,10 @@ def frontend(
     from consistency.stereo.frontend import FrontendOptions, write_frontend_log
     from consistency.stereo.visual_odometry.relative_motion import MotionSettings
 
-    settings = MotionSettings(estimator=estimator, **given(sigma_per_scale=sigma_per_scale))
+    settings = MotionSettings(estimator=estimator, **given_options(sigma_per_scale=sigma_per_scale))
     options = FrontendOptions(
         calibration, truth, format, left, right, rate, lever=lever, planar=planar, seed=seed, settings=settings,
-        **given(max_landmarks=max_landmarks),
+        **given_options(max_landmarks=max_landmarks),
     )  # fmt: skip
     for line in write_frontend_log(images, out, options, overwrite).lines(out):
         print(line)

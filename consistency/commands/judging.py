@@ -20,12 +20,12 @@ from consistency.commands.shared_options import (
     Seed,
     Skip,
     are_files,
-    given,
+    given_options,
+    print_document,
     read_files,
     reads_files,
     require_word,
     require_written,
-    show,
     tell_notes,
 )
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
@@ -35,7 +35,7 @@ from consistency.referee.readers.options import Reading
 
 
 @reads_files
-def analyse(
+def analyse_command(
     path: Judged,
     files: Reading,
     filters: Annotated[
@@ -83,7 +83,9 @@ def analyse(
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
-    changes = given(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance, lost=lost)
+    changes = given_options(
+        confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance, lost=lost
+    )
     settings, first = settings_of(**changes) if changes else None, skip_asked(skip)
     written: list[Path] = []
     refused: InputError | None = None  # of a report, said below the verdict
@@ -130,7 +132,7 @@ def analyse(
             written = [write_text_file(shown, report, overwrite)]
         except InputError as error:
             refused = error
-    show(shown, as_json, written)
+    print_document(shown, as_json, written)
     is_failed = fail_on is not None and not all(verdict.consistent for verdict in verdicts.values())
     if refused is not None and not is_failed:
         raise refused
@@ -141,7 +143,7 @@ def analyse(
 
 
 @reads_files
-def report(
+def report_command(
     path: Annotated[
         Path, typer.Argument(metavar="PATH", help=f"Folder written by 'run' or 'reproduce', or estimates: {ESTIMATES}.")
     ],
@@ -175,7 +177,7 @@ def report(
             print(target)
 
 
-def plan(
+def plan_command(
     scenario: Annotated[
         str | None, typer.Argument(metavar="[SCENARIO]", help="Run a short pilot of it to learn how steps depend.")
     ] = None,

@@ -9,7 +9,7 @@ from consistency.commands.shared_options import AsJson
 from consistency.referee.extras import missing, remedy
 
 
-def list_(as_json: AsJson = False) -> None:
+def list_command(as_json: AsJson = False) -> None:
     """Scenarios, filters, experiments and sweeps."""
     from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
     from consistency.bench.filters.guard.plain_rules import KINDS

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from consistency.commands.shared_options import AsJson, given, require_word, show, tell
+from consistency.commands.shared_options import AsJson, given_options, print_document, require_word, tell
 from consistency.referee.defaults import GATE_FALSE_ALARM
 from consistency.referee.errors import InputError
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from consistency.referee.readers.formats.innovation_files import NisLog
 
 
-def monitor(
+def monitor_command(
     path: Annotated[
         str,
         typer.Argument(
@@ -60,7 +60,7 @@ def monitor(
 
     require_word("--fail-on", fail_on, "alarm")
     if is_dataflash(Path(path)) and filter_name not in STATED:
-        if refused := given(fail_on=fail_on, gate=gate, mission=mission):
+        if refused := given_options(fail_on=fail_on, gate=gate, mission=mission):
             option = next(iter(refused)).replace("_", "-")
             raise InputError(f"--{option}: {path} holds test ratios, of which nothing is judged, unless --filter names "
                              f"{' or '.join(STATED)}")  # fmt: skip
@@ -68,7 +68,7 @@ def monitor(
         return
     watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
     if path == "-":
-        options = given(filter=filter_name, run=run, plot=plot)
+        options = given_options(filter=filter_name, run=run, plot=plot)
         if options:
             raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
         watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
@@ -80,7 +80,9 @@ def monitor(
         watched = watch(log, watcher)
     if plot is not None:
         write_monitor_plot(plot, watched)
-    show(monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t), as_json)
+    print_document(
+        monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t), as_json
+    )
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
 
@@ -110,4 +112,4 @@ def _show_ratios(
     tell(notes)
     if plot is not None:
         write_monitor_plot(plot, ratios)
-    show(ratios_document(path.stem, ratios), as_json)
+    print_document(ratios_document(path.stem, ratios), as_json)

@@ -25,7 +25,7 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.errors import InputError
 
 
-def sweep(
+def sweep_command(
     source: Annotated[
         str,
         typer.Argument(
@@ -100,7 +100,7 @@ def _share(text: str | None) -> tuple[int, int]:
     return int(part), int(parts)
 
 
-def tune(
+def tune_command(
     filter_name: Annotated[str, typer.Option("--filter", help="Filter name (see 'list').")],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
@@ -166,7 +166,7 @@ def tune(
         raise typer.Exit(1)
 
 
-def challenge(
+def challenge_command(
     filter_name: Annotated[str, typer.Argument(metavar="FILTER", help="Built-in filter (see 'list').")],
     scenario: Annotated[
         str | None,

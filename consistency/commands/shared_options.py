@@ -54,7 +54,7 @@ DETECT_HELP = "ratio of true to stated covariance that must be found"
 SCENARIO = "Built-in name (see 'list') or path of a .toml file."
 
 
-def given(**options: Any) -> dict[str, Any]:
+def given_options(**options: Any) -> dict[str, Any]:
     """Options that were given; the others keep the defaults of what they are handed to."""
     return {name: value for name, value in options.items() if value is not None}
 
@@ -71,7 +71,7 @@ def require_written(overwrite: bool, out: Path | None, option: str) -> None:
         raise InputError(f"--overwrite goes with {option}: nothing else is written")
 
 
-def show(document: Document, as_json: bool, written: Sequence[Path] = ()) -> None:
+def print_document(document: Document, as_json: bool, written: Sequence[Path] = ()) -> None:
     """Print a document for programs, or its opening and the files that were written."""
     if as_json:
         from consistency.referee.show.as_json import render

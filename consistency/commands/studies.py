@@ -21,12 +21,12 @@ from consistency.commands.shared_options import (
     SchedulerWait,
     Seed,
     SlurmOptions,
-    given,
+    given_options,
 )
 from consistency.referee.errors import InputError
 
 
-def simulate(
+def simulate_command(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help=SCENARIO)],
     out: Out,
     runs: Runs = 1,
@@ -43,7 +43,7 @@ def simulate(
     print(f"{count} of {scenario} in {out}; filter them with: consistency run --log {out} --filter F")
 
 
-def run(
+def run_command(
     out: Out,
     filters: Annotated[
         list[str], typer.Option("--filter", metavar="NAME", help="Filter name, or FILTER+gate; again for more.")
@@ -100,7 +100,7 @@ def run(
         raise InputError("give either a SCENARIO or --log DIR")
     if screen is not None and log is None:
         raise InputError("--screen goes with --log: a scenario says which of its observations are spurious")
-    planned = given(max_runs=max_runs, detect=detect, false_alarm=false_alarm, lost=lost)
+    planned = given_options(max_runs=max_runs, detect=detect, false_alarm=false_alarm, lost=lost)
     if planned and not until_decided:
         raise InputError(f"--{next(iter(planned)).replace('_', '-')} goes with --until-decided")
     if until_decided and runs is not None:
@@ -151,7 +151,7 @@ def run(
     print(f"results in {out}; next: consistency report {out}")
 
 
-def reproduce(
+def reproduce_command(
     only: Annotated[
         list[str] | None,
         typer.Option("--only", metavar="NAME", help="Only this finding or experiment; may be repeated."),

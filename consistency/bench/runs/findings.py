@@ -22,7 +22,7 @@ from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.scenario import Scenario, data_folder, load_scenario
-from consistency.bench.store.folder_tables import write_folder
+from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding, outcome
@@ -106,7 +106,7 @@ class Study:
             text = json.dumps([asdict(finding) for finding in findings], indent=2, ensure_ascii=False)
             (folder / "findings.json").write_text(text + "\n", encoding="utf-8")
 
-        write_folder(out, {}, manifest, contents, overwrite)
+        write_tables(out, {}, manifest, contents, overwrite)
 
 
 # --- the scripts -----------------------------------------------------------------------------

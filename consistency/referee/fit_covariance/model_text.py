@@ -93,7 +93,7 @@ def dependence(found: ByMotion, is_corrected: bool) -> str:
     )
 
 
-def document(model: NoiseModel) -> Document:
+def noise_document(model: NoiseModel) -> Document:
     """Sentence, corrections, table over axes and spans, and limits; numbers as data."""
     return Document(
         f"{model.name}: noise of motions over {_text(model.span)}",
@@ -101,7 +101,7 @@ def document(model: NoiseModel) -> Document:
         (),
         (
             Text(f"{model.name}: {sentence(model)}"), *([Text(correction(model))] if correction(model) else []),
-            _table(model), *(Text(line) for line in lines(model)),
+            _table(model), *(Text(line) for line in noise_lines(model)),
         ),
         data(model),
     )  # fmt: skip
@@ -174,7 +174,7 @@ def _cell(ratio: Ratio) -> Cell:
     return f"{short(ratio.value)} [{short(ratio.low)}, {short(ratio.high)}]{MARK[ratio.status]}"
 
 
-def lines(model: NoiseModel) -> list[str]:
+def noise_lines(model: NoiseModel) -> list[str]:
     """Limits of the model, what was left out, and what the referee says of the judged motions."""
     out, r = [], model.ratio
     limit = next((each.span for each in model.spans[1:] if each.whole.status != "consistent"), None)

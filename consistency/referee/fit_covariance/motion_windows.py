@@ -24,7 +24,7 @@ PLANE, SPACE = ("x", "y", "yaw"), ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
-class Windows:
+class DriveWindows:
     """W windows of some drives, in P pieces of estimated motion each; a piece that is the identity is none."""
 
     span: Relative
@@ -61,7 +61,7 @@ class Windows:
     def cut(self) -> float:
         return self.jumps / max(len(self.drive) + self.jumps, 1)
 
-    def of(self, keep: Indices | Array) -> Windows:
+    def of(self, keep: Indices | Array) -> DriveWindows:
         names = ("drive", "first", "last", "pieces", "true", "true_pieces")
         return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
@@ -83,7 +83,7 @@ def span_of(text: str | float) -> Relative:
     return replace(span, flag="--span")
 
 
-def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> Windows:
+def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> DriveWindows:
     """The windows of all drives; drives in which none fits have none.
 
     Parameters
@@ -112,7 +112,7 @@ def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False, pi
         assert refused is not None
         raise refused
     index, first, last, motions, true, true_pieces, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
-    found = Windows(span, index, first, last, motions, true, true_pieces, long)
+    found = DriveWindows(span, index, first, last, motions, true, true_pieces, long)
     moved, jumped = _moves(found), _jumps(errors, found)
     found = replace(found, still=int((~moved).sum()), jumps=int((moved & jumped).sum()))
     if not (moved & ~jumped).any():
@@ -120,14 +120,14 @@ def windows_of(drives: Sequence[Drive], span: Relative, planar: bool = False, pi
     return found.of(moved & ~jumped)
 
 
-def windows_at(drives: Sequence[Drive], windows: Windows, size: float, planar: bool) -> Windows | None:
+def windows_at(drives: Sequence[Drive], windows: DriveWindows, size: float, planar: bool) -> DriveWindows | None:
     """The windows of all drives over a span of another size, in pieces of the same size; None where none fits.
 
     Turns of another size would hold another share of the noise.
     """
     pieces = max(round(PIECES * size / windows.span.size), 1)
     try:
-        return windows_of(drives, replace(windows.span, size=size), planar, pieces)
+        return cut_windows(drives, replace(windows.span, size=size), planar, pieces)
     except InputError:
         return None
 
@@ -175,7 +175,7 @@ def ways(pieces: Array) -> Array:
     return np.asarray(np.linalg.norm(pieces[..., :d, d], axis=-1))
 
 
-def turns(pieces: Array) -> Array:
+def rotation_vectors(pieces: Array) -> Array:
     """Rotation vectors (W, P, 3), or (W, P, 1) in the plane, rad."""
     if pieces.shape[-1] == 3:
         return np.arctan2(pieces[..., 1, 0], pieces[..., 0, 0])[..., None]
@@ -187,21 +187,21 @@ def turns(pieces: Array) -> Array:
 def lengthened(pieces: Array, slip: float) -> Array:
     """Motions whose way is longer by ``slip`` for each radian of their turn; none goes backwards by this."""
     out, d, way = np.array(pieces), pieces.shape[-1] - 1, ways(pieces)
-    turn = np.linalg.norm(turns(pieces), axis=-1)
+    turn = np.linalg.norm(rotation_vectors(pieces), axis=-1)
     out[..., :d, d] *= np.maximum(1.0 + slip * turn / np.where(way > 0, way, np.inf), 0.0)[..., None]
     return out
 
 
-def _moves(of: Windows) -> Array:
+def _moves(of: DriveWindows) -> Array:
     """Which windows have motion, (W,): on the way, for a span in m; in way or turn, compared with others, otherwise."""
     way = ways(of.pieces).sum(axis=1)
     if of.span.unit == "m":
         return np.asarray(way >= STILL * of.span.size)
-    turn = np.linalg.norm(turns(of.pieces), axis=-1).sum(axis=1)
+    turn = np.linalg.norm(rotation_vectors(of.pieces), axis=-1).sum(axis=1)
     return np.asarray((way > STILL * np.median(way)) | (turn > STILL * np.median(turn)))
 
 
-def _jumps(errors: Array, of: Windows) -> Array:
+def _jumps(errors: Array, of: DriveWindows) -> Array:
     """Which windows have a piece whose error (W, P, n), of position or rotation, is a jump in its drive, (W,)."""
     out, whole = np.zeros(len(errors), bool), of.errors
     for part, least in ((slice(0, of.d), 0.0), (slice(of.d, None), ROUNDED)):

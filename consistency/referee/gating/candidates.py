@@ -12,7 +12,7 @@ from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics import Comparison, Record, RunSummary, compare, summary
 from consistency.referee.diagnostics.comparison import FailedRuns
 from consistency.referee.diagnostics.records.skipping import Skip
-from consistency.referee.gating.checked_arrays import checked, record_of_filter
+from consistency.referee.gating.checked_arrays import record_of_checked, record_of_filter
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline
@@ -83,7 +83,7 @@ def of_arrays(name: str, candidate: Mapping[str, Any], reference: Mapping[str, A
 
 def _side(side: str, name: str, arrays: Mapping[str, Any]) -> tuple[Record, RunSummary]:
     try:
-        case = checked(name, **arrays)
+        case = record_of_checked(name, **arrays)
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
     assert case.nees is not None

@@ -18,7 +18,7 @@ from consistency.referee.types import Array, Failure, Indices
 from consistency.referee.verdicts.sources import Source
 
 
-def checked(
+def record_of_checked(
     name: str,
     errors: ArrayLike | None = None,
     covariances: ArrayLike | None = None,
@@ -83,7 +83,7 @@ def planned_dof(record: Record) -> int:
     return max(1, int(record.nis_dof.sum(axis=1).min()))
 
 
-def shares(record: Record) -> int:
+def rate_shares(record: Record) -> int:
     """Parts that divide the false-alarm rate among them; see ``Record.parts``."""
     return len(record.parts) + (record.optimal_gain and record.nis is not None) if record.parts else 1
 

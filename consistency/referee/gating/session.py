@@ -26,7 +26,7 @@ def to_property(entry: Entry) -> tuple[str, str]:
 class Tested:
     nodeid: str
     location: tuple[str, int | None, str]
-    outcome: str = ""
+    outcome_text: str = ""
     expected_to_fail: bool = False
     entries: list[Entry] = field(default_factory=list)
 
@@ -126,7 +126,7 @@ def ending(ledger: Ledger) -> str:
     return text
 
 
-def outcome(e: Entry) -> str:
+def outcome_text(e: Entry) -> str:
     """Also whether the test wanted the gate to fail."""
     return e.outcome + (" (expected)" if wanted(e) else "")
 
@@ -136,7 +136,7 @@ def wanted(e: Entry) -> bool:
     return e.outcome != "passed" and e.test_outcome == "passed"
 
 
-def refusal(path: Path) -> str:
+def path_fault(path: Path) -> str:
     """Why a report cannot be written there, and what to do; '' if it can."""
     if path.suffix.lower() not in FORMATS:
         return f"--consistency-report {path}: must end in {' or '.join(FORMATS)}"

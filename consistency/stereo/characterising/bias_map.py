@@ -74,7 +74,7 @@ def estimate_bias(fits: Sequence[LikelihoodFit], grid: Grid, level: float, rate:
     value, half, believed = (np.full((3, len(known)), fill) for fill in (np.nan, np.nan, 0.0))
     p_value = np.ones(3)
     for k, fit in enumerate(fits):
-        beta, width, C = coordinate_fit.bias(fit, level)
+        beta, width, C = coordinate_fit.bias_coefficients(fit, level)
         value[k, known], half[k, known] = beta[known], width[known]
         if not known.any():
             continue

@@ -47,7 +47,7 @@ def characterise_images(folder: Path, options: SourceOptions) -> Characterisatio
     seen = _seen(rig, motions, R, t)
     free = options.free_poses or options.at_rest
     notes = (*((REST,) if options.at_rest else ()), FREE if free else EXACT, CHOSEN, rows_note(rig, motions))
-    return characterise_posed(seen, sensor_of(rig), str(folder), notes, free)
+    return characterise_posed(seen, uncalibrated_noise_sensor(rig), str(folder), notes, free)
 
 
 def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
@@ -63,7 +63,7 @@ def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
     return read_truth(path, sequence)
 
 
-def sensor_of(rig: StereoRig) -> PicturedSensor:
+def uncalibrated_noise_sensor(rig: StereoRig) -> PicturedSensor:
     """A sensor of which only the calibration is known; its noise is a placeholder."""
     return PicturedSensor(
         model="uvd", sigma=(1.0, 1.0, 1.0), f=float(rig.K_left[0, 0]), B=float(rig.baseline), image=rig.image_size,

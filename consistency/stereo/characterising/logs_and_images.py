@@ -55,7 +55,7 @@ def _of_sequence(source: Path, options: SourceOptions) -> Measured:
     return Measured(characterise_images(source, options), {})
 
 
-def counts(text: str, option: str, least: int) -> tuple[int, int]:
+def parse_counts(text: str, option: str, least: int) -> tuple[int, int]:
     """Two counts of ``KxL``.
 
     Raises

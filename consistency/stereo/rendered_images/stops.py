@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.camera import StereoCamera
-from consistency.stereo.rendered_images.chain import Chain, Tracks, joined
+from consistency.stereo.rendered_images.chain import Chain, Tracks, join_tracks
 from consistency.stereo.rendered_images.render import film
 from consistency.stereo.rendered_images.scene import Blobs, Layer, Painted, RandomTexture, Scene, Texture
 
@@ -61,4 +61,4 @@ def stand(
 
     with ThreadPoolExecutor(workers) as threads:
         parts = list(threads.map(one, stops.distances, rng.spawn(len(stops.distances))))
-    return joined(parts)
+    return join_tracks(parts)

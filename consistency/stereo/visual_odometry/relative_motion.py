@@ -188,7 +188,7 @@ def motion_between(
             f"{names[0]} to {names[1]}: {len(rows)} matches through all four images, at least {FEWEST} are needed; do "
             "the pairs show the same scene, and is the left image the left one?"
         )
-    sigma0, sigma1 = (noise(f, settings.sigma_per_scale)[rows[:, i]] for i, f in enumerate((before, after)))
+    sigma0, sigma1 = (pixel_deviations(f, settings.sigma_per_scale)[rows[:, i]] for i, f in enumerate((before, after)))
     try:
         estimate = estimate_motion(rig, uv0, uv1, sigma0, sigma1, settings, rng)
     except ConsensusError:
@@ -234,7 +234,7 @@ def estimate_motion(
         As :func:`relative_motion`.
     """
     pose, inliers = resect_ransac(rig, uv0, uv1, sigma0, sigma1, gate=settings.gate, rng=rng)
-    S0, S1 = diagonal(sigma0), diagonal(sigma1)
+    S0, S1 = diagonal_covariances(sigma0), diagonal_covariances(sigma1)
     if settings.estimator != "reprojection":
         before, after = triangulate(rig, uv0[inliers]), triangulate(rig, uv1[inliers])
         C_before = triangulation_covariance(rig, uv0[inliers], S0[inliers])
@@ -275,7 +275,7 @@ def pixels(features: StereoFeatures) -> Array:
     return np.column_stack([features.left.uv[left], features.right.uv[right]])
 
 
-def noise(features: StereoFeatures, sigma_per_scale: float) -> Array:
+def pixel_deviations(features: StereoFeatures, sigma_per_scale: float) -> Array:
     """Standard deviations (M, 4) of :func:`pixels`, px: the SIFT scale, sec. 2.3.1, times a calibrated factor."""
     left, right = features.pairs.T
     scale = np.column_stack([features.left.scale[left], features.right.scale[right]])
@@ -307,6 +307,6 @@ def disparities(rig: StereoRig, uv: Array) -> Array:
     return np.asarray(rig.K_left[0, 0] * (left[:, 0] / left[:, 2] - right[:, 0] / right[:, 2]))
 
 
-def diagonal(sigma: Array) -> Array:
+def diagonal_covariances(sigma: Array) -> Array:
     """Covariances (N, k, k) of independent components with standard deviations (N, k)."""
     return np.asarray(sigma[:, :, None] ** 2 * np.eye(sigma.shape[1]))

@@ -17,7 +17,7 @@ from consistency.bench.runs.results_to_records import results_source
 from consistency.referee.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.referee.diagnostics.statistics.log_ratio import Contrast, contrast, margin
 from consistency.referee.gating.session import needed_at
-from consistency.referee.gating.watch import Watch, watching
+from consistency.referee.gating.watch import RunningTest, watching
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
 from consistency.referee.verdicts.compare_sources import Compared, compare_filters, compare_with
@@ -365,7 +365,7 @@ def test_the_end_of_a_session_plans_as_the_gate_did(rng: np.random.Generator) ->
     entries = []
     a, b = together(rng, 400)
     for scale in (1.0, 2.0):
-        with watching(Watch(keep=entries.append)):
+        with watching(RunningTest(keep=entries.append)):
             c = assert_not_worse(nees_a=scale * a[:, None], nees_b=scale * b[:, None], dof=1, false_alarm=1e-9)
         assert needed_at(entries[-1], 1e-9) == entries[-1].needed == c.needed_runs()
         assert needed_at(replace(entries[-1], detect=1.01), 1e-9) == c.needed_runs(1.01)

@@ -19,7 +19,7 @@ import consistency as cs
 from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.geometry.groups import carried, composed, matrices, to_left
+from consistency.referee.geometry.groups import composed, matrices, propagated, to_left
 from consistency.referee.readers.relative_motions import Stretch, windows_of
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
@@ -87,7 +87,7 @@ def test_another_world_of_either_changes_no_number_of_poses(group: str, rng: np.
         turned.append(
             replace(
                 run, estimate=vectors(G @ T), truth=vectors(H @ matrices(run.truth)),
-                covariance=carried(J, run.covariance), cross=cross,
+                covariance=propagated(J, run.covariance), cross=cross,
             )
         )  # fmt: skip
     same(statistics(runs, "1", False), statistics(turned, "1", False))

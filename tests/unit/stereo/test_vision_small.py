@@ -16,7 +16,7 @@ from consistency.stereo.visual_odometry import batch_inverses
 def test_inverses_are_lapacks(m: int, rng: np.random.Generator) -> None:
     root = rng.normal(size=(40, m, m))
     C = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(m)
-    inverse, definite = batch_inverses.inverse(C)
+    inverse, definite = batch_inverses.symmetric_inverses(C)
     assert definite.all()
     assert inverse == pytest.approx(np.linalg.inv(C), rel=1e-8)
 
@@ -28,11 +28,11 @@ def test_what_is_not_positive_definite_is_told(m: int, rng: np.random.Generator)
         values = np.ones(m)
         values[k] = -0.1
         C = np.stack([np.eye(m), turn * values @ turn.T])
-        inverse, definite = batch_inverses.inverse(C)
+        inverse, definite = batch_inverses.symmetric_inverses(C)
         assert definite.tolist() == [True, False]
         assert np.isfinite(inverse).all()
-    assert batch_inverses.inverse(-np.eye(m)[None])[1].tolist() == [False]
-    assert batch_inverses.inverse(np.full((1, m, m), np.nan))[1].tolist() == [False]
+    assert batch_inverses.symmetric_inverses(-np.eye(m)[None])[1].tolist() == [False]
+    assert batch_inverses.symmetric_inverses(np.full((1, m, m), np.nan))[1].tolist() == [False]
 
 
 def test_the_mathematics_needs_no_opencv() -> None:

@@ -10,12 +10,12 @@ from pydantic import Field, ModelWrapValidatorHandler, TypeAdapter, model_valida
 from pydantic_core import PydanticCustomError
 
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Table
+from consistency.bench.scenario.toml_tables import TomlTable
 
 E = TypeVar("E", bound="ListedEffect")
 
 
-class ListedEffect(Table):
+class ListedEffect(TomlTable):
     """An effect that a scenario lists: its fields are the keys of its table.
 
     A subclass gives ``kind`` a value, adds keys of its own and defines :meth:`apply`. Two effects of one kind need
@@ -39,7 +39,7 @@ class ListedEffect(Table):
         """What becomes of ``observations``; ``rng`` is this effect's own in this run."""
 
     @classmethod
-    def kinds(cls) -> list[type[Table]]:
+    def kinds(cls) -> list[type[TomlTable]]:
         return list(EFFECTS.values())
 
     @model_validator(mode="wrap")
@@ -72,7 +72,7 @@ class UvdEffect(ListedEffect):
 EFFECTS: dict[str, type[ListedEffect]] = {}  # by kind
 
 
-def register(effect: type[E]) -> type[E]:
+def register_effect(effect: type[E]) -> type[E]:
     """Decorator that makes the kind of an effect known to scenarios."""
     EFFECTS[effect.model_fields["kind"].default] = effect
     return effect

@@ -100,7 +100,7 @@ def _value(cv2: Any, node: Any) -> Any:
     return node.string() if node.isString() else None
 
 
-def matrix(path: Path, key: str, value: Any) -> Array:
+def read_matrix(path: Path, key: str, value: Any) -> Array:
     """Numbers of one key: a number, a list, an array, or a table with rows, cols and data."""
     shape: tuple[int, ...] | None = None
     try:

@@ -27,11 +27,9 @@ from consistency.referee.gating.watch import (
 )
 
 if TYPE_CHECKING:
-    from consistency.bench.store.results import Results, StoredResults
+    from consistency.bench.store.results import Tables
     from consistency.referee.verdicts.baselines import Baseline
     from consistency.referee.verdicts.sources import Source
-
-    BenchResults = Results | StoredResults
 
 
 class ConsistencyError(AssertionError):
@@ -54,7 +52,7 @@ class InsufficientTrials(ValueError):
 
 
 def assert_consistent(
-    errors: ArrayLike | BenchResults | None = None,
+    errors: ArrayLike | Tables | None = None,
     covariances: ArrayLike | None = None,
     *,
     deviations: ArrayLike | None = None,
@@ -162,7 +160,7 @@ def assert_consistent(
 
 
 def assert_not_worse(
-    errors_a: ArrayLike | BenchResults | None = None,
+    errors_a: ArrayLike | Tables | None = None,
     covariances_a: ArrayLike | None = None,
     errors_b: ArrayLike | None = None,
     covariances_b: ArrayLike | None = None,
@@ -171,7 +169,7 @@ def assert_not_worse(
     deviations_b: ArrayLike | None = None,
     filter: str | None = None,
     than: str | None = None,
-    reference: BenchResults | Baseline | str | Path | None = None,
+    reference: Tables | Baseline | str | Path | None = None,
     nees_a: ArrayLike | None = None,
     nees_b: ArrayLike | None = None,
     dof: int | None = None,
@@ -375,7 +373,7 @@ def _source(results: Any) -> Source:
     return results_source(results)
 
 
-def _baseline(reference: BenchResults | Baseline | str | Path | None, skip: int | str | None) -> Baseline | None:
+def _baseline(reference: Tables | Baseline | str | Path | None, skip: int | str | None) -> Baseline | None:
     """Reference of a comparison: a baseline, its file, or results of the bench in memory or in a folder."""
     from consistency.referee.verdicts.baselines import Baseline, baseline, read_baseline
 

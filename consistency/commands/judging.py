@@ -214,7 +214,7 @@ def plan_command(
         from consistency.bench.runs.sequential import pilots_in
 
         pilots = pilots_in(like, filters)
-    elif scenario is not None:
+    elif scenario is not None and filters:
         plan_runs(dof, detect, false_alarm, power, allow, lost=lost)  # refuse before the work
         from consistency.bench.runs.sequential import pilots_in_world
 

@@ -121,7 +121,7 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
     assert heads == "filter,verdict,ANEES,true / stated,RMSE m,RMSE deg,NIS/dof,failed"
     assert cells.startswith("est,overconfident,29.00,")
     refusal = (
-        "from pathlib import Path\nfrom consistency.referee.gating.session import refusal\nprint(refusal(Path('a.b')))"
+        "from pathlib import Path\nfrom consistency.referee.gating.session import path_fault\nprint(path_fault(Path('a.b')))"
     )
     assert ".csv" in python(copy, refusal).stdout
 

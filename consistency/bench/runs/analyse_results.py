@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from consistency.referee.diagnostics import Record, Settings, Verdict
 from consistency.referee.diagnostics.records.skipping import Skip
@@ -12,9 +12,9 @@ from consistency.referee.verdicts.sources import Source
 from consistency.referee.verdicts.sources import analyse as analyse_records
 
 if TYPE_CHECKING:
-    from consistency.bench.store.results import Results, StoredResults
+    from consistency.bench.store.results import Tables
 
-    AnyResults = Source | Sequence[Record] | Results | StoredResults | str | Path
+    AnyResults = Source | Sequence[Record] | Tables | str | Path
 
 
 def analyse(
@@ -41,8 +41,10 @@ def analyse(
     InputError
         Unknown filter, a confidence outside (0, 1), or nothing is left.
     """
-    if not isinstance(results, Source | list | tuple):
+    if isinstance(results, Source | list | tuple):
+        source: Source | Sequence[Record] = results
+    else:
         from consistency.bench.runs.results_to_records import results_source
 
-        results = results_source(results)
-    return analyse_records(results, filters, confidence, settings, skip, optimal_gain)
+        source = results_source(cast("Tables | str | Path", results))
+    return analyse_records(source, filters, confidence, settings, skip, optimal_gain)

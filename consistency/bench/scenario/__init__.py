@@ -13,7 +13,7 @@ from consistency.bench.scenario.sensor import (
     UvdSensor,
 )
 from consistency.bench.scenario.sensor_view import PLANAR_SENSORS, Mount
-from consistency.bench.scenario.toml_tables import Count, Finite, Positive, TomlTable, explain, read_table
+from consistency.bench.scenario.toml_tables import Count, Finite, Positive, Table, explain, read_table
 from consistency.bench.scenario.truth import (
     AnnularLandmarks,
     Circle,
@@ -66,7 +66,7 @@ __all__ = [
     "RoundedRectangle",
     "Scenario",
     "SigmaPoints",
-    "TomlTable",
+    "Table",
     "TrueSensor",
     "Truth",
     "UniformLandmarks",

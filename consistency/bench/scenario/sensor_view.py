@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import SerializerFunctionWrapHandler, ValidationInfo, field_validator, model_serializer, model_validator
 
 from consistency.bench.models.point import Mounting
-from consistency.bench.scenario.toml_tables import Count, Finite, Interval, Positive, Sigmas, TomlTable, Triple
+from consistency.bench.scenario.toml_tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 from consistency.referee.geometry import rotation
 
 PLANAR_SENSORS = ("relative-xy", "range-bearing")  # of landmarks in the plane, with two values each
@@ -20,7 +20,7 @@ def _size(model: str | None) -> int:
     return 2 if model in PLANAR_SENSORS else 3
 
 
-class Mount(TomlTable):
+class Mount(Table):
     """Pose of the sensor in the robot frame; zero is the robot's origin, looking along +x."""
 
     position: Triple = (0.0, 0.0, 0.0)
@@ -31,7 +31,7 @@ class Mount(TomlTable):
         return Mounting(*self.position, *(float(entry) for entry in rotation(*self.rotation).ravel()))
 
 
-class Sensor(TomlTable):
+class Sensor(Table):
     """What is measured, with which noise and focal length, and from where on the robot."""
 
     model: Literal["xyz", "uvd", "linear", "relative-xy", "range-bearing"]

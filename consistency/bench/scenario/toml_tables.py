@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, one_line, read_toml, reading
 
-T = TypeVar("T", bound="TomlTable")
+T = TypeVar("T", bound="Table")
 
 # units that a key may carry at its end: by key, and sigma's by the sensor's model
 UNITS = {
@@ -40,7 +40,7 @@ def _scaled(value: Any, factor: float) -> Any:
     return value * factor if isinstance(value, int | float) and factor != 1.0 else value
 
 
-class TomlTable(BaseModel):
+class Table(BaseModel):
     """A table of the file: unknown keys are refused, a key may end in its unit (``heading_deg``, ``f_px``…)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -65,7 +65,7 @@ class TomlTable(BaseModel):
         return out
 
     @classmethod
-    def kinds(cls) -> list[type[TomlTable]]:
+    def kinds(cls) -> list[type[Table]]:
         """Tables that may stand in the place of this one, told apart by a tag of their own."""
         return []
 
@@ -82,7 +82,7 @@ def read_table(path: Path, model: type[T], **extra: Any) -> T:
             raise InputError(f"{path}: {explain(error, model)}") from None
 
 
-def explain(error: ValueError, model: type[TomlTable]) -> str:
+def explain(error: ValueError, model: type[Table]) -> str:
     """One complaint of pydantic in one line: key, what is wrong, what is allowed; unknown keys first."""
     if not isinstance(error, ValidationError):
         return str(error)
@@ -122,9 +122,9 @@ def _keys(location: tuple[int | str, ...]) -> list[str]:
     return [str(part) for i, part in enumerate(location) if part not in tags and i not in behind]
 
 
-def _allowed(model: type[TomlTable], path: list[str]) -> list[str]:
+def _allowed(model: type[Table], path: list[str]) -> list[str]:
     """Keys of the table at ``path``, following tagged unions by their tag."""
-    current: list[type[TomlTable]] = [model]
+    current: list[type[Table]] = [model]
     for part in path:
         if part in current[0].model_fields:
             current = _tables(current[0].model_fields[part].annotation)
@@ -133,7 +133,7 @@ def _allowed(model: type[TomlTable], path: list[str]) -> list[str]:
     return [name for name in current[0].model_fields if name not in current[0].not_in_file]
 
 
-def _tables(annotation: Any) -> list[type[TomlTable]]:
-    if isinstance(annotation, type) and issubclass(annotation, TomlTable):
+def _tables(annotation: Any) -> list[type[Table]]:
+    if isinstance(annotation, type) and issubclass(annotation, Table):
         return [annotation, *annotation.kinds()]
     return [table for part in getattr(annotation, "__args__", ()) for table in _tables(part)]

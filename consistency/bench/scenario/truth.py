@@ -7,14 +7,14 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from consistency.bench.scenario.sensor import TrueSensor_
-from consistency.bench.scenario.toml_tables import Count, Finite, Interval, NonNegative, Positive, TomlTable, Triple
+from consistency.bench.scenario.toml_tables import Count, Finite, Interval, NonNegative, Positive, Table, Triple
 
 MOST_STEPS = 1_000_000  # a trial of so many steps takes some hundred MiB
 MOST_LANDMARKS = 1_000_000
 MOST_LOOKS = 200_000_000  # landmarks times steps: each is one byte while what is in view is searched
 
 
-class _Path(TomlTable):
+class _Path(Table):
     """Where the robot drives: it starts at ``start`` and repeats the shape until the steps are done."""
 
     start: tuple[Finite, Finite]
@@ -70,7 +70,7 @@ class Waypoints(_Path):
 Path_ = Annotated[Circle | RoundedRectangle | FigureOfEight | Corridor | Waypoints, Field(discriminator="shape")]
 
 
-class UniformLandmarks(TomlTable):
+class UniformLandmarks(Table):
     """``count`` landmarks drawn once, uniformly in a box, from ``seed``."""
 
     layout: Literal["uniform"]
@@ -89,12 +89,12 @@ class UniformLandmarks(TomlTable):
         return self
 
 
-class ListedLandmarks(TomlTable):
+class ListedLandmarks(Table):
     layout: Literal["listed"]
     points: Annotated[list[Triple], Field(min_length=1)]
 
 
-class CircularLandmarks(TomlTable):
+class CircularLandmarks(Table):
     """``count`` landmarks at equal distances on a circle at height 0, the first in the direction of x."""
 
     layout: Literal["circular"]
@@ -103,7 +103,7 @@ class CircularLandmarks(TomlTable):
     radius: Positive
 
 
-class AnnularLandmarks(TomlTable):
+class AnnularLandmarks(Table):
     """``count`` landmarks drawn once in each of some rings at height 0, uniformly in radius and direction."""
 
     layout: Literal["annular"]
@@ -124,7 +124,7 @@ Landmarks_ = Annotated[
 ]
 
 
-class TrueMotion(TomlTable):
+class TrueMotion(Table):
     """Eq. 18 with Gaussian noise on v and omega, or its first-order expansion (``linear``).
 
     ``noise_on = "odometry"``: the robot drives the path and is told noisy velocities.
@@ -137,7 +137,7 @@ class TrueMotion(TomlTable):
     noise_on: Literal["odometry", "motion"]
 
 
-class Truth(TomlTable):
+class Truth(Table):
     """What is the case."""
 
     dt: Positive

@@ -15,7 +15,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from consistency.bench.scenario.effects import LocalBias
 from consistency.bench.scenario.sensor import BelievedSensor
-from consistency.bench.scenario.toml_tables import UNITS, Count, Finite, NonNegative, Positive, TomlTable, read_table
+from consistency.bench.scenario.toml_tables import UNITS, Count, Finite, NonNegative, Positive, Table, read_table
 from consistency.bench.scenario.truth import Truth
 from consistency.bench.shipped import data_folder
 from consistency.referee.errors import InputError
@@ -28,12 +28,12 @@ OPTIONAL = (("sensor", ("disparity_growth",)),)
 ARRAYS = re.compile(r"\[\n((?: +[-+.\w]+,\n)+) *\]")  # an array of numbers, each on a line
 
 
-class BelievedMotion(TomlTable):
+class BelievedMotion(Table):
     sigma_v: NonNegative
     sigma_omega: NonNegative
 
 
-class SigmaPoints(TomlTable):
+class SigmaPoints(Table):
     """Scaled sigma points over the L variables that a transform involves (robot, or robot and seen).
 
     Spread alpha sqrt(L + kappa), weights after Merwe (2004). The default (1, 0, 0) is the cubature set of
@@ -46,7 +46,7 @@ class SigmaPoints(TomlTable):
     kappa: Finite = 0.0
 
 
-class GuardSettings(TomlTable):
+class GuardSettings(Table):
     """What a guarded filter takes for spurious; an unguarded one does not read it.
 
     ``confidence`` is the share of right observations that a gate lets pass. The default, 0.99, is that of Neira &
@@ -63,7 +63,7 @@ class GuardSettings(TomlTable):
     forget_after: Count | None = None
 
 
-class Belief(TomlTable):
+class Belief(Table):
     """What the filter takes to be the case."""
 
     motion: BelievedMotion
@@ -80,7 +80,7 @@ class Belief(TomlTable):
         return content
 
 
-class Scenario(TomlTable):
+class Scenario(Table):
     """One world and one belief about it."""
 
     not_in_file: ClassVar[frozenset[str]] = frozenset({"name"})  # it follows from the file's name

@@ -73,7 +73,7 @@ class MeanFit:
     high: Array
     free: Array  # (p,) bool, which are corrected
     instruments: str  # what the coefficients rest on, of FORWARD and NEIGHBOURS
-    rotation_vectors: tuple[float, float]  # scale by least squares on the estimated motion, and on the true one
+    turns: tuple[float, float]  # scale by least squares on the estimated motion, and on the true one
     strength: float  # first-stage F of the weakest coefficient by neighbours
     lasts: bool  # errors of different windows depend on each other
 

@@ -26,7 +26,7 @@ def to_property(entry: Entry) -> tuple[str, str]:
 class Tested:
     nodeid: str
     location: tuple[str, int | None, str]
-    outcome_text: str = ""
+    outcome: str = ""
     expected_to_fail: bool = False
     entries: list[Entry] = field(default_factory=list)
 

@@ -33,7 +33,7 @@ class Levels:
     rate: float  # that any interval misses
     sigma: int = 3
     growth: int = 1
-    bias_coefficients: int = 1
+    bias: int = 1
     correlation: int = 3
     offset: int = 3
     tails: int = 4

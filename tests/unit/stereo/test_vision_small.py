@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
-from consistency.stereo import visual_odometry
 from consistency.stereo.visual_odometry import batch_inverses
 
 
@@ -33,16 +29,3 @@ def test_what_is_not_positive_definite_is_told(m: int, rng: np.random.Generator)
         assert np.isfinite(inverse).all()
     assert batch_inverses.symmetric_inverses(-np.eye(m)[None])[1].tolist() == [False]
     assert batch_inverses.symmetric_inverses(np.full((1, m, m), np.nan))[1].tolist() == [False]
-
-
-def test_the_mathematics_needs_no_opencv() -> None:
-    code = "import sys, consistency.stereo.visual_odometry; print('cv2' in sys.modules, 'matplotlib' in sys.modules)"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    assert out.stdout.split() == ["False", "False"]
-
-
-def test_public_names() -> None:
-    for name in visual_odometry.__all__:
-        assert getattr(visual_odometry, name) is not None
-    with pytest.raises(AttributeError, match="visual_odometry attribute nonsense"):
-        _ = visual_odometry.nonsense

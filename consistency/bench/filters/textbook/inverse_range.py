@@ -38,7 +38,7 @@ class Corrections(NamedTuple):
     promptness: bool = True  # landmarks are parked soon
     spread: bool = True  # covariance of a landmark that moves, to second order in the noise of turn and drive
     patience: bool = True  # nothing is parked at a pose whose last motions are not yet corrected by a sight
-    pose_moments: bool = True  # the covariance of the pose is that of Exp(xi) T, not of a linear error
+    moments: bool = True  # the covariance of the pose is that of Exp(xi) T, not of a linear error
     adrift: bool = True  # a return is in doubt, too, where the robot's own heading is little known
     tempering: bool = True  # the noise of a return begins at what is not known of it
 

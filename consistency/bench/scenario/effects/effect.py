@@ -10,12 +10,12 @@ from pydantic import Field, ModelWrapValidatorHandler, TypeAdapter, model_valida
 from pydantic_core import PydanticCustomError
 
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import TomlTable
+from consistency.bench.scenario.toml_tables import Table
 
 E = TypeVar("E", bound="ListedEffect")
 
 
-class ListedEffect(TomlTable):
+class ListedEffect(Table):
     """An effect that a scenario lists: its fields are the keys of its table.
 
     A subclass gives ``kind`` a value, adds keys of its own and defines :meth:`apply`. Two effects of one kind need
@@ -39,7 +39,7 @@ class ListedEffect(TomlTable):
         """What becomes of ``observations``; ``rng`` is this effect's own in this run."""
 
     @classmethod
-    def kinds(cls) -> list[type[TomlTable]]:
+    def kinds(cls) -> list[type[Table]]:
         return list(EFFECTS.values())
 
     @model_validator(mode="wrap")

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Finite, Positive, TomlTable
+from consistency.bench.scenario.toml_tables import Finite, Positive, Table
 from consistency.referee.types import Array
 
 Nodes = Annotated[tuple[Finite, ...], Field(min_length=1)]
@@ -37,7 +37,7 @@ def bilinear(u: Array, v: Array, u_nodes: Array, v_nodes: Array) -> Array:
     return np.asarray((down[:, :, None] * across[:, None, :]).reshape(len(u), -1))
 
 
-class BiasMap(TomlTable):
+class BiasMap(Table):
     """Constant errors of u, v and d as tables over the image: bilinear between the nodes, constant beyond them.
 
     Herath et al. (2007) sec. 4.1 and fig. 8.
@@ -114,7 +114,7 @@ class LocalBias(UvdEffect, BiasMap):
         return BiasMap.model_validate(self.model_dump(include=set(BiasMap.model_fields)))
 
 
-class DisparityGrowth(TomlTable):
+class DisparityGrowth(Table):
     """The standard deviation of a disparity d is ``sigma[2]`` times ``ratio`` at d.
 
     Herath et al. (2007) eq. 20, sec. 3.4 and fig. 5c.

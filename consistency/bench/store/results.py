@@ -143,7 +143,7 @@ class Results(Tables):
             yield {column: rows[column].to_numpy()[selection] for column in columns}
 
     def write(self, folder: Path, overwrite: bool = False, keep_others: bool = False) -> None:
-        """Write the folder at once, as :func:`write_folder`: it appears complete or not at all."""
+        """Write the folder at once, as :func:`write_tables`: it appears complete or not at all."""
         tables = {"estimates": self.estimates, "failures": self.failures}
         optional = {
             "truth": self.truth, "landmarks": self.landmarks, "map": self.map, "rejections": self.rejections,

@@ -15,7 +15,7 @@ from calibration_cases import DETECT, FALSE_ALARM, POWER
 from calibration_gates import row, shared
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.referee.diagnostics.planning.number_of_runs import pilot_plan
+from consistency.referee.diagnostics.statistics.number_of_runs import pilot_plan
 from consistency.referee.diagnostics.questions.innovations import whiteness
 from consistency.referee.diagnostics.questions.scale import scale_test
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES

@@ -21,7 +21,7 @@ from scipy.linalg import expm
 from script_options import options_of
 
 from consistency.referee.diagnostics import Evidence, Verdict
-from consistency.referee.diagnostics.planning.number_of_runs import power_of
+from consistency.referee.diagnostics.statistics.number_of_runs import power_of
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.geometry.groups import carried, composed, to_left, vectors
 from consistency.referee.readers.formats.sheet import Places

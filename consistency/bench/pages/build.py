@@ -18,7 +18,7 @@ from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
 from consistency.bench.types import outcome
 from consistency.referee.diagnostics import Settings
-from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
+from consistency.referee.diagnostics.judge import judge_runs, with_map
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.sentences import plural
 from consistency.referee.document.blocks import Block, Chapter, Document

@@ -23,7 +23,7 @@ from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import Design, Record, Verdict, look, sequential_design, speaks
 from consistency.referee.diagnostics.questions.scale import FEW
-from consistency.referee.diagnostics.verdict.judge import of_look, with_map
+from consistency.referee.diagnostics.judge import of_look, with_map
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
 from consistency.referee.types import Array

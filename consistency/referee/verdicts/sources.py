@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from consistency.referee.diagnostics import Record, Settings, Verdict
 from consistency.referee.diagnostics.records.skipping import Skip
-from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
+from consistency.referee.diagnostics.judge import judge_runs, with_map
 from consistency.referee.errors import InputError
 from consistency.referee.extras import outside
 from consistency.referee.verdicts.options import settings_of, skip_asked

@@ -20,7 +20,7 @@ from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Evidence, Settings, judge, summary
 from consistency.referee.diagnostics.records import large_arrays
 from consistency.referee.diagnostics.records.large_arrays import Symmetric
-from consistency.referee.diagnostics.records.sample import sample_of
+from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render

@@ -25,7 +25,7 @@ from consistency.referee.diagnostics import (
     lost_runs,
     pilot_plan,
 )
-from consistency.referee.diagnostics.planning.number_of_runs import share_limit
+from consistency.referee.diagnostics.statistics.number_of_runs import share_limit
 from consistency.referee.diagnostics.questions.lost_runs import lost_evidence, lost_of
 from consistency.referee.gating.watch import Watch, watching
 from consistency.referee.types import Array, Failure

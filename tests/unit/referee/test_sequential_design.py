@@ -27,9 +27,9 @@ from consistency.referee.diagnostics import (
     look,
     sequential_design,
 )
-from consistency.referee.diagnostics.planning import e_process as betting
+from consistency.referee.diagnostics.statistics import e_process as betting
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
-from consistency.referee.diagnostics.verdict.verdict import Look, judge_alone
+from consistency.referee.diagnostics.judging.decide import Look, judge_alone
 from consistency.referee.types import Array, Failure
 
 SURE = 1e-5

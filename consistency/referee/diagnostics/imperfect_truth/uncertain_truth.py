@@ -15,13 +15,13 @@ from consistency.referee.diagnostics.questions.bias import hotelling, t_squared
 from consistency.referee.diagnostics.questions.equivalence import equivalence, equivalent
 from consistency.referee.diagnostics.questions.scale import scale_test
 from consistency.referee.diagnostics.questions.shape import weighted_chi_square_tail
-from consistency.referee.diagnostics.records.sample import Sample, sample_of
+from consistency.referee.diagnostics.questions.sample import Sample, sample_of
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES, least
-from consistency.referee.diagnostics.verdict.fault_location import accuracy_of, bias_of
+from consistency.referee.diagnostics.judging.fault_location import accuracy_of, bias_of
 from consistency.referee.diagnostics.verdict.parts import Equivalence, Interval, Settings, TruthShare, Verdict
-from consistency.referee.diagnostics.words.headline import at_share
+from consistency.referee.diagnostics.judging.status import at_share
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

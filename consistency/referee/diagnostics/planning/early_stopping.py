@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.planning.e_process import e_process, ever
+from consistency.referee.diagnostics.statistics.e_process import e_process, ever
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.sample import sample_of
+from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.diagnostics.verdict.parts import Settings, Verdict
-from consistency.referee.diagnostics.verdict.verdict import Look, judge_alone
+from consistency.referee.diagnostics.judging.decide import Look, judge_alone
 
 FIRST = 12  # runs at the first look; with fewer hardly anything but a failed run would be found
 PARTS = 4  # times that the scale is looked at from one look to the next

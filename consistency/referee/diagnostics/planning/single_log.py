@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.planning.number_of_runs import MARGIN
+from consistency.referee.diagnostics.statistics.number_of_runs import MARGIN
 from consistency.referee.diagnostics.questions.equivalence import deciding_runs
 from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest, run_means
 from consistency.referee.diagnostics.records.record import Record, arrays_of, numbered_axes

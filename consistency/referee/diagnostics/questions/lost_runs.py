@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.planning.e_process import ever
-from consistency.referee.diagnostics.planning.number_of_runs import lost_runs, share_limit
+from consistency.referee.diagnostics.statistics.e_process import ever
+from consistency.referee.diagnostics.statistics.number_of_runs import lost_runs, share_limit
 from consistency.referee.diagnostics.questions.scale import run_means
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import EarlyEnds, Lost, Settings

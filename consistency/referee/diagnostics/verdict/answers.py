@@ -12,7 +12,7 @@ from consistency.referee.diagnostics.questions.bias import Moments, hotelling, m
 from consistency.referee.diagnostics.questions.outliers import Outlier, beyond_stated, outliers
 from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test
 from consistency.referee.diagnostics.questions.shape import Largest, largest_direction, mean_shape, sphericity
-from consistency.referee.diagnostics.records.sample import Sample
+from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics.nees import Pit, pit
 from consistency.referee.diagnostics.verdict.parts import Answer, Settings

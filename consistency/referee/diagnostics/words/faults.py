@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
-from consistency.referee.diagnostics.verdict.fault_location import VISIBLE
+from consistency.referee.diagnostics.judging.fault_location import VISIBLE
 from consistency.referee.diagnostics.verdict.parts import TINY, Answer, Innovations, Interval, JointScore, Verdict
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, off_by_factor, plain, plural, short
 

@@ -18,7 +18,7 @@ from consistency.referee.diagnostics.words.faults import (
     shape_text,
     tails_text,
 )
-from consistency.referee.diagnostics.words.headline import smaller
+from consistency.referee.diagnostics.judging.status import smaller
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, p_text, percent, plain, plural, short
 
 __all__ = ["UNCERTAIN", "off_by", "p_text", "percent", "plain", "plural", "question_text", "reasons", "short"]

@@ -279,7 +279,7 @@ class ReadingFit:
 def _status(fit: ReadingFit) -> int:
     """0 where the NEES is shown to be consistent, 1 where it may be, 2 where it is not."""
     from consistency.referee.diagnostics.records.record import Record
-    from consistency.referee.diagnostics.verdict.verdict import judge_alone
+    from consistency.referee.diagnostics.judging.decide import judge_alone
 
     nees = np.full((len(fit.whitened), max(map(len, fit.whitened))), np.nan)
     for row, w in zip(nees, fit.whitened, strict=True):

@@ -12,7 +12,7 @@ from consistency.referee.diagnostics.questions.bias import hotelling
 from consistency.referee.diagnostics.questions.outliers import Outlier
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
 from consistency.referee.diagnostics.records.large_arrays import Symmetric, blocks, by_runs
-from consistency.referee.diagnostics.records.sample import ATTITUDE, POSITION, Sample
+from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.accuracy import coverage, coverage_interval, noncredibility, rmse

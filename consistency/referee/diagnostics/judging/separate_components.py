@@ -12,13 +12,13 @@ from consistency.referee.diagnostics.questions.lost_runs import lost_of
 from consistency.referee.diagnostics.questions.scale import FEW, ratio_interval, run_means
 from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.sample import names_of
+from consistency.referee.diagnostics.questions.sample import names_of
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.verdict.answers import SCALE, SHARES
 from consistency.referee.diagnostics.verdict.parts import Answer, Settings, Verdict
-from consistency.referee.diagnostics.verdict.verdict import judge_alone
+from consistency.referee.diagnostics.judging.decide import judge_alone
 from consistency.referee.diagnostics.words import sentences
-from consistency.referee.diagnostics.words.headline import clear, few_lost
+from consistency.referee.diagnostics.judging.status import clear, few_lost
 
 INNOVATIONS = "innovations"
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.sample import ATTITUDE
+from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.verdict.answers import SHARES
 from consistency.referee.diagnostics.verdict.parts import Guess, Scale, Settings, Verdict
-from consistency.referee.diagnostics.verdict.verdict import DEFAULT, judge_alone
+from consistency.referee.diagnostics.judging.decide import DEFAULT, judge_alone
 from consistency.referee.diagnostics.words.sentences import percent, plain
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | No
     world = None if record.world is None else judge_alone(record.in_world, settings)
     if not runs.parts:
         return _beside(judge_alone(runs, settings, truth=truth), record, world)
-    from consistency.referee.diagnostics.verdict.separate_components import judge_parts
+    from consistency.referee.diagnostics.judging.separate_components import judge_parts
 
     return _beside(judge_parts(runs, settings), record, world)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.planning.number_of_runs import detectable_ratio
+from consistency.referee.diagnostics.statistics.number_of_runs import detectable_ratio
 from consistency.referee.diagnostics.questions.band import simultaneous_band
 from consistency.referee.diagnostics.questions.equivalence import (
     equivalence,
@@ -21,8 +21,8 @@ from consistency.referee.diagnostics.questions.lost_runs import early_ends, lost
 from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
 from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.sample import Sample, impossible, innovations_of, sample_of
-from consistency.referee.diagnostics.records.sample import shape_of as shape_of_arrays
+from consistency.referee.diagnostics.questions.sample import Sample, impossible, innovations_of, sample_of
+from consistency.referee.diagnostics.questions.sample import shape_of as shape_of_arrays
 from consistency.referee.diagnostics.statistics.nees import anees, chi2_mean_interval
 from consistency.referee.diagnostics.verdict.answers import (
     AXIS,
@@ -35,7 +35,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     answers,
     ask,
 )
-from consistency.referee.diagnostics.verdict.fault_location import (
+from consistency.referee.diagnostics.judging.fault_location import (
     accuracy_of,
     axes_of,
     bias_of,
@@ -53,7 +53,7 @@ from consistency.referee.diagnostics.verdict.parts import (
     Verdict,
 )
 from consistency.referee.diagnostics.words import sentences
-from consistency.referee.diagnostics.words.headline import at_share, deciding_axis, status_of
+from consistency.referee.diagnostics.judging.status import at_share, deciding_axis, status_of
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import UncertainTruth

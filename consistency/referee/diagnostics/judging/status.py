@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import scale_test, spreads_more, spreads_more_in_steps
-from consistency.referee.diagnostics.records.sample import Sample
+from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.statistics.nees import anees
 from consistency.referee.diagnostics.verdict.answers import (
     AXIS,

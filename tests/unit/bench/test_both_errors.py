@@ -19,9 +19,9 @@ from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.store.results import open_results
 from consistency.referee.column_names import OWN_COVARIANCE
 from consistency.referee.diagnostics import Interval, Settings, judge, map_score, sequential_design
+from consistency.referee.diagnostics.judge_record import judge_runs, with_map
 from consistency.referee.diagnostics.questions.scale import ratio_interval
-from consistency.referee.diagnostics.judge import judge_runs, with_map
-from consistency.referee.diagnostics.verdict.parts import MapScore
+from consistency.referee.diagnostics.verdict.verdict import MapScore
 from consistency.referee.document.map import map_text
 from consistency.referee.document.verdict import document
 from consistency.referee.gating.input_checks import of_results

@@ -17,10 +17,10 @@ import pytest
 import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.results import open_results
-from consistency.referee.diagnostics import Evidence, Settings, judge, summary
+from consistency.referee.diagnostics import Record, Settings, judge, summary
+from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records import large_arrays
 from consistency.referee.diagnostics.records.large_arrays import Symmetric
-from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
@@ -30,7 +30,7 @@ STEPS = 200
 RUNS = 4000
 
 
-def evidence(runs: int, steps: int = STEPS, bias: float = 0.3) -> Evidence:
+def evidence(runs: int, steps: int = STEPS, bias: float = 0.3) -> Record:
     """Errors with a mean, so that every question is asked twice, and covariances in half."""
     rng = np.random.default_rng(0)
     P = Symmetric.filled((runs, steps), 3, 0.2)
@@ -38,10 +38,10 @@ def evidence(runs: int, steps: int = STEPS, bias: float = 0.3) -> Evidence:
         P.entry(i, i)[:] = 1.0 + i
     error = rng.standard_normal((runs, steps, 3)) + bias
     nis = rng.chisquare(2, (runs, steps))
-    return Evidence("f", error, P, nis=nis, nis_dof=np.full((runs, steps), 2), axes=("x", "y", "heading"))
+    return Record("f", error, P, nis=nis, nis_dof=np.full((runs, steps), 2), axes=("x", "y", "heading"))
 
 
-def numbers_a_cell(work: Callable[[Evidence], object], runs: int = 1400) -> float:
+def numbers_a_cell(work: Callable[[Record], object], runs: int = 1400) -> float:
     """Most numbers of 8 bytes that ``work`` holds beside what it is given, for each further pair of run and step."""
     most = []
     for count in (runs, 3 * runs):

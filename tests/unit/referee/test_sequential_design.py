@@ -17,7 +17,6 @@ from scipy import integrate, stats
 from consistency.bench.runs import sequential
 from consistency.referee.diagnostics import (
     Design,
-    Evidence,
     Record,
     Verdict,
     e_process,
@@ -27,9 +26,9 @@ from consistency.referee.diagnostics import (
     look,
     sequential_design,
 )
-from consistency.referee.diagnostics.statistics import e_process as betting
-from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
 from consistency.referee.diagnostics.judging.decide import Look, judge_alone
+from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
+from consistency.referee.diagnostics.statistics import e_process as betting
 from consistency.referee.types import Array, Failure
 
 SURE = 1e-5
@@ -42,7 +41,7 @@ def inspections(design: Design, count: int) -> list[tuple[int, float | None]]:
 def evidence_from(error: Array, **more: Any) -> Any:
     """The first runs of a filter, as many as asked for."""
     P = identities(error)
-    return lambda runs: Evidence("f", error[:runs], P[:runs], **more)
+    return lambda runs: Record("f", error[:runs], P[:runs], **more)
 
 
 # --- the grid -----------------------------------------------------------------------------------------
@@ -157,7 +156,7 @@ def test_failed_runs_decide_at_once() -> None:
 def test_without_truth_looks_are_at_the_innovations() -> None:
     rng = np.random.default_rng(78)
     nis, dof = 2.0 * rng.chisquare(2, (48, 30)), np.full((48, 30), 2)
-    evidence = Evidence("f", nis=nis, nis_dof=dof, optimal_gain=True)
+    evidence = Record("f", nis=nis, nis_dof=dof, optimal_gain=True)
     design = Design(3, false_alarm=1e-3)
     assert look(design, evidence, None).status == "undecided"
     at_look = look(design, evidence, 1 / 12)
@@ -210,7 +209,7 @@ def test_a_limit_is_not_exceeded() -> None:
     error = independent(np.random.default_rng(82), 400, 2, 3)
     asked: list[int] = []
 
-    def evidence(runs: int) -> Evidence:
+    def evidence(runs: int) -> Record:
         asked.append(runs)
         return evidence_from(error)(runs)
 
@@ -241,7 +240,7 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPa
     calls: list[tuple[str, int]] = []
     script = {("early", 12): "overconfident", ("late", 24): "conservative"}
 
-    def verdict_at(design: Design, evidence: Evidence, spent: float | None) -> Verdict:
+    def verdict_at(design: Design, evidence: Record, spent: float | None) -> Verdict:
         runs = len(evidence.run_numbers)
         calls.append((evidence.name, runs))
         status = script.get((evidence.name, runs), "consistent" if evidence.name == "early" else "undecided")
@@ -372,7 +371,7 @@ def test_ever_is_the_inverse_of_the_largest_value() -> None:
 
 
 def test_what_was_seen_is_not_forgotten() -> None:
-    """Evidence against a fault that comes later does not take an earlier finding back."""
+    """Record against a fault that comes later does not take an earlier finding back."""
     bet = e_process(np.concatenate([np.full(20, 2.0), np.full(200, 0.9)]), 3)
     assert ever(bet.up) < 1e-4
     assert bet.up[-1] < 1.0

@@ -8,14 +8,15 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.statistics.number_of_runs import MARGIN
+from consistency.referee.diagnostics.planning.pilot import MARGIN
 from consistency.referee.diagnostics.questions.equivalence import deciding_runs
 from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest, run_means
 from consistency.referee.diagnostics.records.record import Record, arrays_of, numbered_axes
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.answers import BIAS
-from consistency.referee.diagnostics.verdict.parts import Interval, Settings, Within
+from consistency.referee.diagnostics.verdict.parts import Interval, Within
+from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 

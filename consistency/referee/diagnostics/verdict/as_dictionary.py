@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.verdict.parts import Equivalence, Verdict
+    from consistency.referee.diagnostics.verdict.parts import Equivalence
+    from consistency.referee.diagnostics.verdict.verdict import Verdict
 
 
 def flat(v: Verdict) -> dict[str, Any]:

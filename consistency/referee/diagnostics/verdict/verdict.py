@@ -1,0 +1,247 @@
+"""The verdict on one filter: what the tests found, the status that follows, and the sentences that say so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from consistency.referee.diagnostics.records.record import Record, shown_by
+from consistency.referee.diagnostics.records.skipping import Skipped
+from consistency.referee.diagnostics.verdict.parts import (
+    TINY,
+    Accuracy,
+    Answer,
+    Axes,
+    Bias,
+    EarlyEnds,
+    Equivalence,
+    Innovations,
+    Interval,
+    JointScore,
+    Location,
+    Lost,
+    RejectionScore,
+    Scale,
+    Shape,
+    Tails,
+    TruthShare,
+)
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.errors import InputError
+from consistency.referee.types import Failure, Indices
+
+UNKNOWN_ENDS = (float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the tests found in the errors and innovations of one filter; a part is None if it could not be computed."""
+
+    filter: str
+    status: str  # see STATUSES
+    runs: int
+    steps: int
+    settings: Settings
+    answers: tuple[Answer, ...] = ()
+    failures: tuple[Failure, ...] = ()
+    impossible: tuple[tuple[int, int], ...] = ()  # (run, step) of what no filter may say
+    left_out_steps: tuple[int, ...] = ()  # rank-deficient covariance
+    scale: Scale | None = None
+    axes: Axes | None = None
+    bias: Bias | None = None
+    shape: Shape | None = None
+    tails: Tails | None = None
+    innovations: Innovations | None = None
+    location: Location | None = None
+    accuracy: Accuracy | None = None
+    landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
+    joint: JointScore | None = None  # of the verdict on a map
+    unit: str = "run"  # what a run is called, as in :class:`~consistency.diagnostics.Record`
+    lost: Lost | None = None  # where there is a NEES
+    ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
+    skipped: Skipped | None = None  # first steps of each run that were left out
+    truth: TruthShare | None = None  # where the truth has a covariance of its own
+    parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
+
+    @property
+    def consistent(self) -> bool:
+        return self.status == "consistent"
+
+    def place(self, step: int) -> str:
+        """Name of step 1..T: "step 3", or "landmark 17" where landmarks stand in the place of steps."""
+        if self.landmarks is None:
+            return f"step {step}"
+        return f"landmark {self.landmarks[step - 1]}"
+
+    @property
+    def places(self) -> str:
+        """Noun for the second axis of the arrays: steps, or landmarks of a map."""
+        if self.landmarks is None:
+            return "steps"
+        return "landmarks"
+
+    @property
+    def worst_axis(self) -> tuple[str, Interval] | None:
+        """Component whose ratio is farthest from 1, on the side of a fault of the scale; None if there is only one."""
+        if self.axes is None or len(self.axes.names) < 2:
+            return None
+        side = 0.0
+        if self.status == "overconfident":
+            side = 1.0
+        elif self.status == "conservative":
+            side = -1.0
+        elif self.settings.one_sided:
+            side = 1.0
+        worst, farthest = None, -np.inf
+        for axis, interval in self.axes.inflation.items():
+            log = float(np.log(max(interval.value, TINY)))
+            if axis not in self.axes.names or not np.isfinite(log):
+                continue
+            distance = side * log if side else abs(log)
+            if distance > farthest:
+                worst, farthest = (axis, interval), distance
+        return worst
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Questions in which a fault was found, those within the tolerance left out."""
+        return tuple(a.question for a in self.answers if a.found and not a.tolerated)
+
+    @property
+    def p_value(self) -> float:
+        """False-alarm rate at which some fault would just be found, all questions together; NaN without any."""
+        return min((min(1.0, a.p_value / a.share) for a in self.answers if not a.tolerated), default=float("nan"))
+
+    @property
+    def statistic(self) -> float:
+        """Mean NEES over runs and steps; without truth, NIS per degree of freedom."""
+        if self.scale is not None:
+            return self.scale.mean_anees
+        if self.innovations is not None:
+            return self.innovations.ratio
+        return float("nan")
+
+    @property
+    def threshold(self) -> tuple[float, float]:
+        """Interval in which ``statistic`` is no fault."""
+        if self.scale is not None:
+            return self.scale.accepted
+        if self.innovations is not None:
+            return self.innovations.interval
+        return UNKNOWN_ENDS
+
+    @property
+    def inflation(self) -> float:
+        """Factor by which the stated covariance has to grow (below 1: shrink) to be that of the errors."""
+        if self.scale is None:
+            return float("nan")
+        return self.scale.inflation.value
+
+    @property
+    def inflation_interval(self) -> tuple[float, float]:
+        """95 % interval of ``inflation``, from the spread between runs."""
+        if self.scale is None:
+            return UNKNOWN_ENDS
+        return self.scale.inflation[1:]
+
+    @property
+    def equivalence(self) -> Equivalence | None:
+        """Equivalence of the scale of the NEES, or of the NIS without truth."""
+        if self.scale is not None:
+            return self.scale.equivalence
+        if self.innovations is not None:
+            return self.innovations.equivalence
+        return None
+
+    @property
+    def first_step(self) -> int | None:
+        """First step in which the ANEES is outside its simultaneous band; None if in none."""
+        if self.location is None:
+            return None
+        return self.location.first_step
+
+    @property
+    def subset(self) -> str | None:
+        """Axes that carry the fault; None if no axis stands out."""
+        if self.location is None:
+            return None
+        return self.location.subset
+
+
+@dataclass(frozen=True)
+class MapScore:
+    """Landmarks in the map after the last step, each with 3 degrees of freedom, or 2 in the plane."""
+
+    ratio: Interval  # mean over runs of the mean NEES over its degrees of freedom, 95 % by the spread between runs
+    runs: int  # with a landmark that has a NEES
+    landmarks: int  # that have one, of all runs
+    left_out: int  # that have none: no landmark of the world, not known where, or covariance not positive definite
+    verdict: Verdict | None = None  # on the map, landmarks in the place of steps; None where it is not judged
+
+
+class ConventionResult(NamedTuple):
+    """What the errors say if they are of one convention, where none is declared."""
+
+    status: str  # of that convention
+    faults: tuple[str, ...]
+    ratio: Interval  # of true to stated covariance, simultaneous over the conventions
+    possible: bool  # no fault is found
+
+
+@dataclass(frozen=True, repr=False)
+class Verdict(Findings):
+    """The referee's answer for one filter.
+
+    ``print`` shows the sentence and a short table.
+    """
+
+    reasons: tuple[str, ...] = ()  # the first is a sentence to act on
+    axis: tuple[str, Interval] | None = None  # that decides the status, with its ratio; None where the whole does
+    convention: str | None = None  # of the error that is judged, where files or the filter declare one
+    notes: tuple[str, ...] = ()  # of whoever read the files
+    causes: tuple[str, ...] = ()  # probable mix-ups; they stand in the reasons and notes, too
+    align: str | None = None  # how estimates in files were moved into the world of the truth
+    world: Verdict | None = None  # the same runs in the additive error of the world, where the filter has another
+    map: MapScore | None = None
+    rejection: RejectionScore | None = None  # of a filter with a guard
+    guesses: Mapping[str, ConventionResult] = field(default_factory=dict)  # by convention, where none is declared
+    record: Record | None = None  # what was judged, where it is kept to be drawn
+
+    @property
+    def in_world(self) -> Verdict:
+        """The verdict whose errors are those of the pose in the world: ``world``, or this one."""
+        if self.world is None:
+            return self
+        return self.world
+
+    @property
+    def statistics(self) -> dict[str, Any]:
+        """Every number as one flat dictionary, as ``--json`` has it."""
+        from consistency.referee.diagnostics.verdict.as_dictionary import flat
+
+        return flat(self)
+
+    def __str__(self) -> str:
+        return str(shown_by("verdict_text", self))
+
+    def __repr__(self) -> str:
+        return f"<Verdict {self.filter}: {self.status}, {self.runs} runs x {self.steps} steps; print() shows it>"
+
+    def _repr_html_(self) -> str:
+        return str(shown_by("verdict_html", self))
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Errors with their bounds, NEES with its band, and coverage; arguments as those of :meth:`Record.plot`.
+
+        Raises
+        ------
+        InputError
+            The verdict was not made by ``consistency.judge``, or nothing can be drawn.
+        """
+        if self.record is None:
+            raise InputError(f"{self.filter}: the record was not kept with the verdict; draw record.plot() of it")
+        return shown_by("plot", self.record, self, path)

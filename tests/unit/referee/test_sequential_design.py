@@ -26,7 +26,7 @@ from consistency.referee.diagnostics import (
     look,
     sequential_design,
 )
-from consistency.referee.diagnostics.judging.decide import Look, judge_alone
+from consistency.referee.diagnostics.judging.findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
 from consistency.referee.diagnostics.statistics import e_process as betting
 from consistency.referee.types import Array, Failure
@@ -170,9 +170,9 @@ def test_a_look_inside_judge() -> None:
     """A scale just below and just above its half of the rate."""
     evidence = evidence_from(independent(np.random.default_rng(79), 24, 6, 3))(24)
     design = Design(3, false_alarm=0.01)
-    found = judge_alone(evidence, design.settings, Look(None, 0.00499))
+    found = findings_of(evidence, design.settings, Inspection(None, 0.00499))
     assert found.faults == ("scale",)
-    assert judge_alone(evidence, design.settings, Look(None, 0.00501)).faults == ()
+    assert findings_of(evidence, design.settings, Inspection(None, 0.00501)).faults == ()
 
 
 # --- until decided -------------------------------------------------------------------------------------
@@ -244,7 +244,7 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPa
         runs = len(evidence.run_numbers)
         calls.append((evidence.name, runs))
         status = script.get((evidence.name, runs), "consistent" if evidence.name == "early" else "undecided")
-        return Verdict(evidence.name, status, (f"{status}: at {runs}",), runs, 1, design.settings)
+        return Verdict(evidence.name, status, runs, 1, design.settings, reasons=(f"{status}: at {runs}",))
 
     monkeypatch.setattr(sequential, "look", verdict_at)
     monkeypatch.setattr(sequential, "speaks", lambda design, evidence, spent: spent is not None)

@@ -255,7 +255,7 @@ def test_equivalence_is_shown_at_its_level() -> None:
 
 
 def of(*given: Answer, **more: Any) -> Verdict:
-    return Verdict("f", "inconsistent", ("inconsistent: so",), 3, 4, Settings(), given, **more)
+    return Verdict("f", "inconsistent", 3, 4, Settings(), given, reasons=("inconsistent: so",), **more)
 
 
 def test_faults_are_what_was_found_and_not_tolerated() -> None:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.verdict.as_dictionary import whole
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, p_text, percent, plural, ratio_text, short
 from consistency.referee.diagnostics.words.sentences import question_text
 from consistency.referee.document.blocks import (
@@ -262,7 +261,7 @@ def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = T
     blocks: list[Block] = [_overview(verdicts), *(Text(line) for line in _below(verdicts))]
     if reasons:
         blocks.append(Reasons(tuple(reason(v, name) for name, v in verdicts.items())))
-    return Document(title, "", (), tuple(blocks), {name: whole(v) for name, v in verdicts.items()})
+    return Document(title, "", (), tuple(blocks), {name: v.as_dictionary() for name, v in verdicts.items()})
 
 
 def _overview(verdicts: Mapping[str, Verdict]) -> Table:

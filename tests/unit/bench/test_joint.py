@@ -14,7 +14,7 @@ from consistency.bench.filters import get_filter
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.diagnostics import JointNees, Record, Settings, Verdict, judge
-from consistency.referee.diagnostics.maps.map_nees import joint_nees, joint_test
+from consistency.referee.diagnostics.maps.map_nees import joint_nees, joint_test, last_nees
 from consistency.referee.diagnostics.questions.equivalence import is_tolerated
 from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
 from consistency.referee.geometry.conventions import planar_error, planar_map_error
@@ -201,8 +201,8 @@ def results() -> cs.Results:
 
 
 def _evidence(results: cs.Results, name: str) -> Record:
-    ends = record_of(results, name).ends
-    evidence = ends.map().record(ends.nees[:, 0])
+    record = record_of(results, name)
+    evidence = record.map().record(last_nees(record))
     assert evidence is not None
     return evidence
 

@@ -27,7 +27,6 @@ from consistency.referee.diagnostics.planning.single_log import (
 from consistency.referee.diagnostics.questions.independence import ALIKE, ENOUGH, FEWEST, RATE, SIZES, independence
 from consistency.referee.diagnostics.questions.lost_runs import early_ends
 from consistency.referee.diagnostics.verdict.answers import BIAS
-from consistency.referee.diagnostics.verdict.as_dictionary import flat
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import analyse
@@ -415,10 +414,10 @@ def test_runs_that_end_lost_are_named_and_others_are_not(rng: np.random.Generato
     verdict = judge(Record("f", nees=np.where(ended, np.nan, nees), dof=3))
     assert verdict.ends.lost
     assert "that end early have a larger NEES in their last step than" in verdict.reasons[1]
-    assert flat(verdict)["early_ends"]["lost"]
+    assert verdict.statistics["early_ends"]["lost"]
     whole = judge(Record("f", nees=nees, dof=3))
     assert whole.ends is None
-    assert "early_ends" not in flat(whole)
+    assert "early_ends" not in whole.statistics
     lost = 0
     for _ in range(60):
         nees, length = runs(rng, 25, 20), rng.integers(1, 21, 25)

@@ -11,6 +11,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record, shown_by
 from consistency.referee.diagnostics.records.skipping import Skipped
+from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
 from consistency.referee.diagnostics.verdict.parts import (
     TINY,
     Accuracy,
@@ -220,10 +221,67 @@ class Verdict(Findings):
 
     @property
     def statistics(self) -> dict[str, Any]:
-        """Every number as one flat dictionary, as ``--json`` has it."""
-        from consistency.referee.diagnostics.verdict.as_dictionary import flat
+        """Every number as one flat dictionary, as ``--json`` has it; parts that could not be computed are left out."""
+        numbers: dict[str, Any] = {
+            "runs": self.runs,
+            "steps": self.steps,
+            "unit": self.unit,
+            "false_alarm": self.settings.false_alarm,
+            "confidence": 1.0 - self.settings.false_alarm,
+            "detect": self.settings.detect,
+            "power": self.settings.power,
+            "tolerance": self.settings.tolerance,
+            "allow": self.settings.allow,
+            "failures": [[failure.run, failure.step, failure.reason] for failure in self.failures],
+            "answers": [vars(answer) for answer in self.answers],
+            "p_value": self.p_value,
+            "left_out_steps": list(self.left_out_steps),
+        }
+        numbers |= dictionary.of_scale(self.scale) | dictionary.of_lost(self.lost, self.settings.lost)
+        numbers |= dictionary.of_location(self.location) | self._of_axes() | dictionary.of_bias(self.bias)
+        numbers |= dictionary.of_shape(self.shape) | dictionary.of_tails(self.tails)
+        numbers |= dictionary.of_innovations(self.innovations) | dictionary.of_accuracy(self.accuracy) | self._of_map()
+        if self.landmarks is not None:
+            numbers["landmarks"] = list(self.landmarks)
+        numbers |= dictionary.of_joint(self.joint) | dictionary.of_rejection(self.rejection)
+        numbers |= dictionary.of_ends(self.ends) | dictionary.of_skipped(self.skipped)
+        if self.guesses:
+            numbers["guesses"] = {kind: guess._asdict() for kind, guess in self.guesses.items()}
+        numbers |= dictionary.of_truth(self.truth)
+        if self.convention is not None or self.notes:
+            numbers |= {"convention": self.convention, "align": self.align, "notes": list(self.notes)}
+        if self.world is not None:
+            numbers["world"] = self.world.as_dictionary()
+        return numbers
 
-        return flat(self)
+    def as_dictionary(self) -> dict[str, Any]:
+        """Status, reasons and statistics."""
+        return {"status": self.status, "reasons": self.reasons, "statistics": self.statistics}
+
+    def _of_axes(self) -> dict[str, Any]:
+        if self.axes is None:
+            return {}
+        numbers = dictionary.of_axes(self.axes) | {"impossible": [list(pair) for pair in self.impossible]}
+        for key, axis in (("worst_axis", self.worst_axis), ("axis", self.axis)):
+            if axis is not None:
+                numbers |= {key: axis[0], f"{key}_ratio": tuple(axis[1])}
+        if self.axes.largest is not None:
+            numbers |= {"largest": tuple(self.axes.largest), "largest_direction": self.axes.direction}
+        return numbers
+
+    def _of_map(self) -> dict[str, Any]:
+        if self.map is None:
+            return {}
+        numbers: dict[str, Any] = {
+            "map_ratio": self.map.ratio.value,
+            "map_ratio_interval": tuple(self.map.ratio[1:]),
+            "map_runs": self.map.runs,
+            "map_landmarks": self.map.landmarks,
+            "map_left_out": self.map.left_out,
+        }
+        if self.map.verdict is not None:
+            numbers["map"] = self.map.verdict.as_dictionary()
+        return numbers
 
     def __str__(self) -> str:
         return str(shown_by("verdict_text", self))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import takewhile
+from typing import NamedTuple
 
 from consistency.referee.diagnostics.judging.findings import Inspection, findings_of
 from consistency.referee.diagnostics.judging.status import deciding_axis
@@ -17,10 +18,10 @@ from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.diagnostics.verdict.parts import RejectionScore, Scale
 from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, MapScore, Verdict
-from consistency.referee.diagnostics.words.sentences import reasons
-from consistency.referee.diagnostics.words.undecided import (
+from consistency.referee.diagnostics.words.sentences import (
     LATER,
     other_ways,
+    reasons,
     sentences_of_conventions,
     unshown_sentence,
 )
@@ -28,8 +29,10 @@ from consistency.referee.diagnostics.words.undecided import (
 DEFAULT = Settings()
 
 
-def judge(record: Record, settings: Settings = DEFAULT, design: Design | None = None) -> Verdict:
-    """Judge one filter: a status of ``records.STATUSES``, with reasons.
+def judge(
+    record: Record, settings: Settings = DEFAULT, design: Design | None = None, keep_record: bool = False
+) -> Verdict:
+    """Judge one filter: consistent, overconfident, conservative, biased, undecided, ..., with reasons.
 
     Runs are independent, steps are not: every test takes a run as one observation, or holds under any
     dependence between steps. A filter whose errors are Gaussian with the stated covariance is found at fault in
@@ -54,6 +57,7 @@ def judge(record: Record, settings: Settings = DEFAULT, design: Design | None = 
     ----------
     design : plan of looks at growing numbers of runs, in place of the settings; the verdict is that of the look that
         decides, or of the last one
+    keep_record : keep the record with the verdict, which can then be drawn
 
     Raises
     ------
@@ -63,7 +67,7 @@ def judge(record: Record, settings: Settings = DEFAULT, design: Design | None = 
     if design is not None:
         return follow(design, record.first_runs, len(record.run_numbers))[0]
     if record.guesses:
-        return _judge_conventions(record, settings)
+        return _judge_conventions(record, settings, keep_record)
     evidence, truth, unshown = record.as_runs, None, record.unshown
     if record.truth_covariance is not None:
         from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import uncertain_truth
@@ -81,12 +85,22 @@ def judge(record: Record, settings: Settings = DEFAULT, design: Design | None = 
         found = findings_of(evidence, settings, truth=truth)
     first = ""
     if unshown and found.scale is not None and found.status != "failed":
-        found = _undecided(found, found.scale)
+        found = replace(found, status="undecided", scale=_not_shown(found.scale))
         first = unshown_sentence(found, unshown)
     world = None
     if record.world is not None:
         world = in_words(findings_of(record.in_world, settings))
-    return _with_beside(record, found, first, world, _map_of(record, settings), _rejections_of(record, None))
+    beside = Beside(world, _map_of(record, settings), _rejections_of(record, None), record if keep_record else None)
+    return _whole(record, found, first, beside)
+
+
+class Beside(NamedTuple):
+    """What a verdict says beside the errors and innovations."""
+
+    world: Verdict | None
+    map: MapScore | None
+    rejection: RejectionScore | None
+    record: Record | None = None
 
 
 def in_words(found: Findings, first: str = "") -> Verdict:
@@ -94,20 +108,12 @@ def in_words(found: Findings, first: str = "") -> Verdict:
     return Verdict(**vars(found), reasons=tuple(reasons(found, first)), axis=deciding_axis(found))
 
 
-def _undecided(found: Findings, scale: Scale) -> Findings:
-    """The findings where nothing can be shown, whatever they are."""
-    equivalence = replace(scale.equivalence, p_value=float("nan"), runs=None)
-    return replace(found, status="undecided", scale=replace(scale, equivalence=equivalence))
+def _not_shown(scale: Scale) -> Scale:
+    """The scale of which nothing can be shown."""
+    return replace(scale, equivalence=replace(scale.equivalence, p_value=float("nan"), runs=None))
 
 
-def _with_beside(
-    record: Record,
-    found: Findings,
-    first: str,
-    world: Verdict | None,
-    map_score: MapScore | None,
-    rejection: RejectionScore | None,
-) -> Verdict:
+def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdict:
     """The whole verdict: the findings in words, and what the record says beside its arrays."""
     sentence, *figures = reasons(found, first)
     if record.caption:
@@ -127,9 +133,7 @@ def _with_beside(
         align=align,
         notes=tuple(record.notes),
         causes=tuple(record.causes),
-        world=world,
-        map=map_score,
-        rejection=rejection,
+        **beside._asdict(),
     )
 
 
@@ -169,7 +173,7 @@ def _end_of_runs(record: Record) -> int:
 # --- errors whose convention nobody declared ---------------------------------------------------------
 
 
-def _judge_conventions(record: Record, settings: Settings) -> Verdict:
+def _judge_conventions(record: Record, settings: Settings, keep_record: bool) -> Verdict:
     """Undecided, with every convention that is not rejected at ``settings.false_alarm``, and its ratio.
 
     The right convention is rejected with that probability at most, whichever it is. The intervals of the ratio hold
@@ -192,7 +196,7 @@ def _judge_conventions(record: Record, settings: Settings) -> Verdict:
     first = next(iter(verdicts.values()))
     scale = first.scale
     if scale is not None:
-        scale = replace(scale, equivalence=replace(scale.equivalence, p_value=float("nan"), runs=None))
+        scale = _not_shown(scale)
     return replace(
         first,
         status="undecided",
@@ -202,6 +206,7 @@ def _judge_conventions(record: Record, settings: Settings) -> Verdict:
         convention=None,
         notes=tuple(record.notes),
         reasons=tuple(sentences_of_conventions(found, verdicts, settings)),
+        record=record if keep_record else None,
     )
 
 
@@ -268,7 +273,7 @@ def _of_look(design: Design, record: Record, runs: int, found: Findings, first: 
     if record.world is not None:
         errors = replace(record.in_world, map=None, rejections=None, caption="", causes=(), notes=(), convention="")
         world, _ = follow(design, errors.first_runs, runs)
-    return _with_beside(record, found, first, world, _map_of(record, None), _rejections_of(record, runs))
+    return _whole(record, found, first, Beside(world, _map_of(record, None), _rejections_of(record, runs)))
 
 
 def _p_of_scale(design: Design, evidence: Record) -> float:

@@ -20,7 +20,6 @@ from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Record, Settings, judge, summary
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records import large_arrays
-from consistency.referee.diagnostics.records.large_arrays import every_entry
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
@@ -102,12 +101,6 @@ def test_evidence_is_not_changed_by_a_verdict() -> None:
     assert "bias" in judge(given).faults
     np.testing.assert_array_equal(given.error, same.error)
     np.testing.assert_array_equal(given.covariance, same.covariance)
-
-
-def test_every_entry_is_asked() -> None:
-    P = np.zeros((4, 5, 3, 3))
-    P[1, 2, 0, 2] = P[3, 4, 1, 1] = np.nan
-    assert np.argwhere(~every_entry(np.isfinite, P)).tolist() == [[1, 2], [3, 4]]
 
 
 @pytest.mark.parametrize("n", range(1, 12))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.document.blocks import Block, Bullets, Chapter, Document
 from consistency.referee.document.drawing import Figure
 from consistency.referee.document.verdict import summary
@@ -12,7 +12,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import is_installed
 
 
-def compose_plain(records: Sequence[Record], judged: Mapping[str, Verdict], title: str) -> Document:
+def compose_plain(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> Document:
     """Sentence and figures of each verdict, why, and what was read; pictures where Matplotlib is installed."""
     named = {record.name: record for record in records}
     chapters = []
@@ -29,7 +29,7 @@ def compose_plain(records: Sequence[Record], judged: Mapping[str, Verdict], titl
     return Document(f"Estimator consistency: {title}", "", tuple(chapters))
 
 
-def picture(record: Record, verdict: Verdict) -> tuple[Figure, ...]:
+def picture(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
     """Errors, NEES and coverage; nothing without Matplotlib or where nothing can be drawn."""
     if not is_installed("plot"):
         return ()

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
+from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.document.colours import TRUTH, Look, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet
@@ -22,13 +22,13 @@ TRUE, ESTIMATED = Look(TRUTH, width=0.9), replace(style(0), width=1.0)
 ELLIPSE, AT = replace(style(1), dash=(), width=0.9), Look(TRUTH, marker="X", size=5.0)
 
 
-def shown_run(record: Record) -> int:
+def shown_run(record: Evidence) -> int:
     """Row of the run that is drawn: the first that reaches furthest."""
     assert record.error is not None
     return int(np.argmax(np.isfinite(record.error).all(axis=-1).sum(axis=1)))
 
 
-def trajectory(record: Record) -> Figure | None:
+def trajectory(record: Evidence) -> Figure | None:
     """Figure of the run that is drawn; None where positions are not known, or of runs of one step.
 
     It shows the two axes over which the path reaches furthest.
@@ -83,7 +83,7 @@ def ellipse(centre: Array, P: Array) -> Array:
     return np.asarray(centre + circle @ np.linalg.cholesky(P).T)
 
 
-def _worst(record: Record, row: int) -> Indices:
+def _worst(record: Evidence, row: int) -> Indices:
     """Steps of the largest NEES, at most five, and apart from each other by a twentieth of the run."""
     if record.nees is None:
         return np.empty(0, np.int64)

@@ -18,7 +18,7 @@ from consistency.referee.system.atomic import write_whole
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from consistency.referee.diagnostics import Record, Verdict
+    from consistency.referee.diagnostics import Evidence, Verdict
     from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
     from consistency.referee.document.blocks import Document
     from consistency.referee.document.drawing import Sheet
@@ -44,7 +44,7 @@ def require_pages(html: Path | None, pdf: Path | None, overwrite: bool) -> None:
 
 
 def write_file_pages(
-    records: Sequence[Record], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
+    records: Sequence[Evidence], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
 ) -> None:
     """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
     from consistency.referee.pages.files_report import compose_files
@@ -54,7 +54,7 @@ def write_file_pages(
 
 
 def write_file_reports(
-    records: Sequence[Record],
+    records: Sequence[Evidence],
     judged: Mapping[str, Verdict],
     folder: Path,
     title: str,

@@ -10,7 +10,7 @@ from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.diagnostics import Record
+from consistency.referee.diagnostics import Evidence
 from consistency.referee.document.drawing import Line, Points
 from consistency.referee.pages.files_report import record_figures, record_sheet, unit_of
 from consistency.referee.pages.trajectory import ELLIPSE, MOST, ellipse, trajectory
@@ -19,7 +19,7 @@ from consistency.referee.types import Array
 STEPS = 60
 
 
-def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> Record:
+def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> Evidence:
     """A path along x and z, with errors of 1 sigma but for three steps."""
     k = np.arange(float(STEPS))
     true = np.column_stack([k, 0.01 * k, 5.0 * np.sin(k / 10.0)])
@@ -31,12 +31,12 @@ def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> 
     nees = np.square(error / sigma)[:, index].sum(axis=1)
     P = np.broadcast_to(np.diag(sigma**2)[np.ix_(index, index)], (1, STEPS, len(axes), len(axes)))
     path = np.stack([true, true - error], axis=1)[None]
-    return Record(
+    return Evidence(
         "est", error[None][..., index], P, nees[None], len(axes), axes=axes, t=k, convention=convention, path=path
     )
 
 
-def ellipses(one: Record) -> list[Line]:
+def ellipses(one: Evidence) -> list[Line]:
     figure = trajectory(one)
     (panel,) = figure.panels
     return [mark for mark in panel.marks if isinstance(mark, Line) and mark.look == ELLIPSE]
@@ -82,7 +82,7 @@ def test_only_what_is_judged_is_drawn() -> None:
     assert figure.panels[0].y.label == "y (m)"
     assert trajectory(record(axes=("z",))) is None
     bare = record()
-    assert trajectory(Record("est", bare.error, bare.covariance, axes=bare.axes)) is None
+    assert trajectory(Evidence("est", bare.error, bare.covariance, axes=bare.axes)) is None
 
 
 def test_units() -> None:

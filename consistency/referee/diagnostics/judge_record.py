@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import takewhile
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from consistency.referee.diagnostics.judging.findings import Inspection, findings_of
 from consistency.referee.diagnostics.judging.status import deciding_axis
-from consistency.referee.diagnostics.planning.early_stopping import Design
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
@@ -25,6 +24,9 @@ from consistency.referee.diagnostics.words.sentences import (
     sentences_of_conventions,
     unshown_sentence,
 )
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.planning.early_stopping import Design
 
 DEFAULT = Settings()
 

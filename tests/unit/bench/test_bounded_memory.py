@@ -19,7 +19,6 @@ from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Record, Settings, judge, summary
 from consistency.referee.diagnostics.questions.sample import sample_of
-from consistency.referee.diagnostics.records import large_arrays
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
@@ -51,14 +50,6 @@ def numbers_a_cell(work: Callable[[Record], object], runs: int = 1400) -> float:
     return (most[1] - most[0]) / (2 * runs * STEPS * 8)
 
 
-def numbers(value: object) -> list[float]:
-    """Every number of a verdict, one after the other."""
-    if isinstance(value, dict | list | tuple | np.ndarray):
-        parts = value.values() if isinstance(value, dict) else value
-        return [number for part in parts for number in numbers(part)]
-    return [float(value)] if isinstance(value, int | float | np.number) else []
-
-
 @pytest.mark.parametrize("settings", [Settings(), Settings(allow="conservative")], ids=["both", "conservative"])
 def test_a_verdict_takes_six_numbers_for_each_step_of_a_run(settings: Settings) -> None:
     """Four are kept (whitened errors and NEES), one is on the way; the whole-array copies of before took 15."""
@@ -68,19 +59,6 @@ def test_a_verdict_takes_six_numbers_for_each_step_of_a_run(settings: Settings) 
 def test_a_summary_of_runs_takes_hardly_any() -> None:
     nees = np.random.default_rng(0).chisquare(3, (4200, STEPS))
     assert numbers_a_cell(lambda g: summary(nees[: len(np.asarray(g.nis))], 3, g.error, g.covariance)) < 0.5
-
-
-@pytest.mark.parametrize("settings", [Settings(tolerance=1.1), Settings(allow="conservative")], ids=["both", "one"])
-def test_small_blocks_say_what_large_ones_do(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = evidence(90, 23)
-    given.error[::7, 11:] = np.nan
-    given.error[40:, 15:] *= 3.0
-    whole = judge(given, settings)
-    monkeypatch.setattr(large_arrays, "ROWS", 400)
-    monkeypatch.setattr(large_arrays, "FEWER", 100)
-    parts = judge(given, settings)
-    assert parts.reasons == whole.reasons
-    np.testing.assert_allclose(numbers(parts.statistics), numbers(whole.statistics), rtol=1e-12)
 
 
 def test_errors_about_their_mean() -> None:
@@ -94,13 +72,6 @@ def test_errors_about_their_mean() -> None:
     centred = sample.centred()
     np.testing.assert_allclose(centred.nees, nees)
     np.testing.assert_allclose(centred.group_means([1]), (np.square(about[..., 1]) / 2.0).mean(axis=1))
-
-
-def test_evidence_is_not_changed_by_a_verdict() -> None:
-    given, same = evidence(40, 20), evidence(40, 20)
-    assert "bias" in judge(given).faults
-    np.testing.assert_array_equal(given.error, same.error)
-    np.testing.assert_array_equal(given.covariance, same.covariance)
 
 
 @pytest.mark.parametrize("n", range(1, 12))

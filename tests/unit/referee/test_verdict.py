@@ -73,23 +73,6 @@ def broken(case: Case, run: int, step: int) -> Case:
 # --- with truth ----------------------------------------------------------------------------------
 
 
-def test_biased_is_caught() -> None:
-    """A bias of 1.5 standard deviations in x adds at least 2.25 to the NEES; less the bias the covariance is right."""
-    verdict = make(bias=1.5).verdict()
-    assert verdict.status == "biased"
-    assert {"scale", "bias"} <= set(verdict.faults)
-    assert verdict.reasons[0].startswith("biased: mean error +1.")
-    assert "too small" not in verdict.reasons[0]
-    assert 0.7 < verdict.bias.inflation_without.value < 1.4 < verdict.inflation
-
-
-def test_a_bias_does_not_hide_a_covariance_too_small() -> None:
-    verdict = make(scale=3.0, bias=1.5).verdict()
-    assert verdict.status == "overconfident"
-    assert "mean error +" in verdict.reasons[0]
-    assert "covariance about the mean too small by x" in verdict.reasons[0]
-
-
 def test_statistics_of_a_calibrated_filter() -> None:
     case = make()
     s = case.verdict(false_alarm=0.05).statistics

@@ -19,7 +19,7 @@ from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.scenario import Scenario, misbelief
 from consistency.referee.diagnostics import Settings, Verdict
 from consistency.referee.diagnostics.verdict.answers import BIAS, SCALE
-from consistency.referee.diagnostics.words.sentences import short
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.system.progress import quiet
 from consistency.referee.types import Array
 

@@ -21,7 +21,7 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.sentences import short
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.system.provenance import manifest_of
 
 TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}

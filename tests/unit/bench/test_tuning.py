@@ -30,7 +30,7 @@ from consistency.bench.tuning.tune import MOST_TOLERATED, tolerant
 from consistency.commands import main
 from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.sentences import short
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.geometry import pose_error
 from consistency.referee.geometry.conventions import planar_error
 

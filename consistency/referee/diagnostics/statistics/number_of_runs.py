@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
 
-import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.questions.scale import FEW, scale_test
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
-from consistency.referee.types import Array
 
 LARGEST = 10**7  # runs; more is refused as a mistake
-MARGIN = 1.15  # on the runs of a pilot's plan, measured: it then keeps its power
 
 
 def required_runs(
@@ -40,7 +35,7 @@ def required_runs(
     ValueError
         An argument out of its range, or a ratio so near 1 that over 10 million runs are needed.
     """
-    _require(dof, false_alarm, power)
+    require_rates(dof, false_alarm, power)
     if not 0.0 < ratio < float("inf") or ratio == 1.0:
         raise ValueError(f"ratio must be positive and not 1, got {ratio}")
 
@@ -65,14 +60,18 @@ def gate_runs(
     This is :func:`required_runs` at the half of ``false_alarm`` that a verdict gives to the mean NEES, and at least
     :func:`lost_runs` where a share ``lost`` of lost runs is to be excluded. Raises the same exceptions.
     """
-    _require(dof, false_alarm, power)
+    require_rates(dof, false_alarm, power)
     runs = required_runs(dof, detect, SHARES[MAIN] * false_alarm, power, two_sided=allow is None)
-    return runs if lost is None else max(runs, lost_runs(lost, power))
+    if lost is None:
+        return runs
+    return max(runs, lost_runs(lost, power))
 
 
 def share_limit(lost: int, runs: int, confidence: float = CONFIDENCE) -> float:
     """Upper limit of the share of lost runs, where ``lost`` of ``runs`` are (Clopper & Pearson 1934)."""
-    return float(special.betaincinv(lost + 1, runs - lost, confidence)) if lost < runs else 1.0
+    if lost >= runs:
+        return 1.0
+    return float(special.betaincinv(lost + 1, runs - lost, confidence))
 
 
 def lost_runs(share: float, power: float = POWER, lost: int = 0) -> int:
@@ -92,57 +91,9 @@ def lost_runs(share: float, power: float = POWER, lost: int = 0) -> int:
     return few + bisect_left(range(few, LARGEST), True, key=lambda runs: share_limit(lost, runs, power) <= share)
 
 
-@dataclass(frozen=True)
-class PilotPlan:
-    """Number of runs that a verdict needs, according to a pilot."""
-
-    pilot_runs: int
-    effective_dof: float  # of one run, one standard error to the safe side
-    standard_error: float  # of its logarithm
-    runs: int
-
-
-def pilot_plan(
-    means: Array,
-    dof: int,
-    steps: int,
-    detect: float,
-    false_alarm: float = FALSE_ALARM,
-    power: float = POWER,
-    allow: str | None = None,
-    lost: float | None = None,
-) -> PilotPlan:
-    """Runs that :func:`judge` needs if steps depend on each other as in a pilot, and not completely.
-
-    :func:`gate_runs` at the pilot's effective degrees of freedom, one standard error to the safe side, times 1.15: a
-    verdict estimates them again from its own runs. At least 20 runs, as it needs for that. Scale and bias of the pilot
-    do not matter, only the spread of its run means.
-
-    Parameters
-    ----------
-    means : (runs,), mean NEES of each run over ``dof``; at least 20
-    steps : of a run
-    lost : share of lost runs that is to be excluded
-
-    Raises
-    ------
-    ValueError
-        Fewer than 20 runs, or an argument that :func:`required_runs` or :func:`lost_runs` refuses.
-    """
-    _require(dof, false_alarm, power)
-    if len(means) < FEW:
-        raise ValueError(f"a pilot needs at least {FEW} runs, got {len(means)}")
-    test = scale_test(means / means.mean(), dof, steps)
-    share = SHARES[MAIN] * false_alarm
-    least = required_runs(test.effective_dof, detect, share, power, two_sided=allow is None)
-    runs = min(int(np.ceil(MARGIN * least)), gate_runs(dof, detect, false_alarm, power, allow))
-    runs = max(runs, FEW) if lost is None else max(runs, FEW, lost_runs(lost, power))
-    return PilotPlan(len(means), test.effective_dof, float(np.sqrt(2.0 / test.spread)), runs)
-
-
 def power_of(dof: float, runs: int, ratio: float, false_alarm: float = FALSE_ALARM, two_sided: bool = True) -> float:
     """Chance that ``runs`` runs find a covariance wrong by ``ratio``; the complement of :func:`required_runs`."""
-    tail, k = false_alarm / (2 if two_sided else 1), dof * runs
+    tail, k = _one_tail(false_alarm, two_sided), dof * runs
     if ratio > 1.0:
         return float(distributions.chi2.sf(distributions.chi2.isf(tail, k) / ratio, k))
     return float(distributions.chi2.cdf(distributions.chi2.ppf(tail, k) / ratio, k))
@@ -152,14 +103,27 @@ def detectable_ratio(
     dof: int, runs: int, false_alarm: float = FALSE_ALARM, power: float = POWER, two_sided: bool = True
 ) -> float:
     """Smallest ratio of true to stated covariance that ``runs`` runs find with ``power``."""
-    _require(dof, false_alarm, power)
-    tail = false_alarm / (2 if two_sided else 1)
+    require_rates(dof, false_alarm, power)
+    tail = _one_tail(false_alarm, two_sided)
     return float(distributions.chi2.isf(tail, dof * runs) / distributions.chi2.ppf(1.0 - power, dof * runs))
 
 
-def _require(dof: float, false_alarm: float, power: float) -> None:
+def require_rates(dof: float, false_alarm: float, power: float) -> None:
+    """Refuse numbers out of their range.
+
+    Raises
+    ------
+    ValueError
+        Degrees of freedom below 1, or a rate or power outside (0, 1).
+    """
     if not dof >= 1:
         raise ValueError(f"dof must be at least 1, got {dof}")
     for name, value in (("false_alarm", false_alarm), ("power", power)):
         if not 0.0 < value < 1.0:
             raise ValueError(f"{name} must lie between 0 and 1, got {value}")
+
+
+def _one_tail(false_alarm: float, two_sided: bool) -> float:
+    if two_sided:
+        return false_alarm / 2
+    return false_alarm

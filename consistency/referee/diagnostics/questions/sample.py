@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
-from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs, by_steps, of_runs
+from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.validity import negative
-from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, subset, whiten
-from consistency.referee.diagnostics.verdict.parts import Settings
+from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, whiten, whiten_group
+from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.types import Array
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
@@ -36,11 +36,10 @@ class Errors:
         assert self.record.error is not None
         return self.record.error
 
-    @cached_property
-    def covariance(self) -> Symmetric:
+    @property
+    def covariance(self) -> Array:
         """(N, T, n, n)."""
-        assert self.record.covariance is not None
-        return Symmetric.of(self.record.covariance)
+        return np.asarray(self.record.covariance, float)
 
 
 class Centre(NamedTuple):
@@ -88,16 +87,18 @@ class Sample:
 
     def group_means(self, index: Sequence[int], steps: slice = slice(None), centre: Centre | None = None) -> Array:
         """Mean NEES of a group of components alone, of errors about the ``centre``, over its number of components."""
-        e, index = self.known_errors, list(index)
-        centre = e.centre if centre is None else centre
-        centre = None if centre is None else Centre(centre.mean[steps], centre.factor[steps])
+        e = self.known_errors
+        if centre is None:
+            centre = e.centre
+        if centre is not None:
+            centre = Centre(centre.mean[steps], centre.factor[steps])
 
-        def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
-            error = error if centre is None else centre.about(error, counted)
-            return means_and_counts(np.where(counted, squared_length(subset(error[..., index], P, own)), np.nan))
+        def of_block(error: Array, P: Array, counted: Array) -> Array:
+            if centre is not None:
+                error = centre.about(error, counted)
+            return means_and_counts(np.where(counted, squared_length(whiten_group(error, P, index)), np.nan))
 
-        own, P = list(range(len(index))), e.covariance.part(index)[:, steps]  # slicing all of many components is slow
-        means, counts = by_runs(of_block, e.error[:, steps], P, self.counted[:, steps]).T
+        means, counts = by_runs(of_block, e.error[:, steps], e.covariance[:, steps], self.counted[:, steps]).T
         return np.asarray(means[counts > 0] / len(index))
 
     def centre(self) -> Centre:
@@ -123,7 +124,7 @@ class Sample:
         return Sample(self.nees, self.dof, replace(e, centre=centre))
 
 
-def sample_of(evidence: Record, settings: Settings) -> Sample | None:
+def sample_of(record: Record, settings: Settings) -> Sample | None:
     """Sample of the errors, or of the NEES alone; None without either.
 
     Raises
@@ -131,27 +132,28 @@ def sample_of(evidence: Record, settings: Settings) -> Sample | None:
     ValueError
         Names or subsets that do not fit, or NEES without dof.
     """
-    e = evidence
-    if e.error is None or e.covariance is None:
-        if e.nees is None:
+    if record.error is None or record.covariance is None:
+        if record.nees is None:
             return None
-        if not e.dof:
+        if not record.dof:
             raise ValueError("nees needs dof, the dimension of the error")
-        return Sample(e.nees, e.dof)
-    n, P = e.error.shape[-1], Symmetric.of(e.covariance)
-    names = names_of(e)
-    groups = groups_of(names, settings.subsets)
-    whitened, nees = np.empty(e.error.shape), np.empty(e.error.shape[:2])
+        return Sample(record.nees, record.dof)
+    names = names_of(record)
+    groups = component_groups(names, settings.subsets)
+    error, P = record.error, np.asarray(record.covariance, float)
+    whitened, nees = np.empty(error.shape), np.empty(error.shape[:2])
     for here in of_runs(nees):
-        w = whiten(e.error[here], P[here])
-        counted = all_finite(w) if e.nees is None else np.isfinite(e.nees[here])
+        w = whiten(error[here], P[here])
+        counted = all_finite(w)
+        if record.nees is not None:
+            counted = np.isfinite(record.nees[here])
         nees[here] = np.where(counted, squared_length(w), np.nan)
         w[~np.isfinite(nees[here])] = np.nan
         whitened[here] = w
-    return Sample(nees, n, Errors(e, whitened, names, groups))
+    return Sample(nees, error.shape[-1], Errors(record, whitened, names, groups))
 
 
-def names_of(e: Record) -> tuple[str, ...]:
+def names_of(record: Record) -> tuple[str, ...]:
     """Names of the components of the error; axis 0, axis 1, ... where they have none.
 
     Raises
@@ -159,15 +161,16 @@ def names_of(e: Record) -> tuple[str, ...]:
     ValueError
         Other than one name for each component.
     """
-    assert e.error is not None
-    n = e.error.shape[-1]
-    names = tuple(() if e.axes is None else e.axes) or numbered_axes(n)
-    if len(names) != n:
-        raise ValueError(f"{len(names)} names of axes for {n} components")
-    return names
+    assert record.error is not None
+    n = record.error.shape[-1]
+    if record.axes is None or not len(record.axes):
+        return numbered_axes(n)
+    if len(record.axes) != n:
+        raise ValueError(f"{len(record.axes)} names of axes for {n} components")
+    return tuple(record.axes)
 
 
-def groups_of(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:
+def component_groups(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:
     """Each component, position and attitude where they are more than one and not all, and the subsets."""
     groups = {axis: [i] for i, axis in enumerate(names)}
     for label, members in (("position", POSITION), ("attitude", ATTITUDE)):
@@ -182,31 +185,22 @@ def groups_of(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | Non
     return groups
 
 
-def innovations_of(evidence: Record) -> tuple[Array, Array] | None:
-    """NIS and its degrees of freedom, (runs, steps) each; None without any."""
-    if evidence.nis is not None and evidence.nis_dof is not None:
-        return evidence.nis, evidence.nis_dof
-    if evidence.innovations is not None and evidence.innovation_covariances is not None:
-        from consistency.referee.diagnostics.questions.innovations import nis_of
-
-        return nis_of(evidence.innovations, evidence.innovation_covariances)
-    return None
-
-
-def shape_of(e: Record) -> tuple[int, int]:
-    """Runs and steps that all arrays agree on.
+def runs_and_steps(record: Record) -> tuple[int, int]:
+    """Numbers of runs and steps that all arrays agree on.
 
     Raises
     ------
     ValueError
         They do not agree, or nothing is there.
     """
-    arrays = {"error": e.error, "covariance": e.covariance, "nees": e.nees, "nis": e.nis, "nis_dof": e.nis_dof,
-              "innovations": e.innovations}  # fmt: skip
-    if all(array is None for name, array in arrays.items() if name not in ("covariance", "nis_dof")):
-        raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
     dimensions = {"error": 3, "covariance": 4, "nees": 2, "nis": 2, "nis_dof": 2, "innovations": 3}
-    shapes = {name: np.shape(array) for name, array in arrays.items() if array is not None}
+    shapes = {}
+    for name in dimensions:
+        array = getattr(record, name)
+        if array is not None:
+            shapes[name] = np.shape(array)
+    if not set(shapes) - {"covariance", "nis_dof"}:
+        raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
     for name, shape in shapes.items():
         if len(shape) != dimensions[name]:
             raise ValueError(f"{name} must be (runs, steps{', n' * (dimensions[name] - 2)}), got shape {shape}")
@@ -218,15 +212,14 @@ def shape_of(e: Record) -> tuple[int, int]:
     return int(runs), int(steps)
 
 
-def impossible(e: Record, counted: Array) -> Array:
-    """(runs, steps) of bool: impossible values, an infinite error or a covariance with a negative variance."""
-    assert e.error is not None
-    assert e.covariance is not None
+def impossible_values(record: Record, counted: Array) -> Array:
+    """(runs, steps) of bool: values that no filter may say, an infinite error or a negative variance."""
 
-    def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
-        odd = np.isinf(error).any(axis=-1) | ~P.where_all(lambda entry: ~np.isinf(entry))
-        suspect = ~counted & ~odd & P.where_all(np.isfinite)
-        odd[suspect] = negative(np.asarray(P[suspect]))
+    def of_block(error: Array, P: Array, counted: Array) -> Array:
+        odd = np.isinf(error).any(axis=-1) | ~every_entry(lambda entry: ~np.isinf(entry), P)
+        suspect = ~counted & ~odd & every_entry(np.isfinite, P)
+        odd[suspect] = negative(P[suspect])
         return odd
 
-    return by_runs(of_block, e.error, Symmetric.of(e.covariance), counted)
+    assert record.error is not None
+    return by_runs(of_block, record.error, np.asarray(record.covariance, float), counted)

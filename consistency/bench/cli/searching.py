@@ -104,9 +104,6 @@ def tune(
     filter_name: Annotated[str, typer.Option("--filter", help="Filter name (see 'list').")],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
-    by: Annotated[
-        str, typer.Option("--by", help="innovations: their likelihood, without truth; nees: the errors.")
-    ] = "innovations",
     groups: Annotated[
         str,
         typer.Option("--groups", metavar="A,B", help="Noises with one factor each, as Q.v,Q.omega,R; '+' joins."),
@@ -151,7 +148,7 @@ def tune(
     if out is not None:
         require_free(out, overwrite, KIND)
     tuning = tune_filter(
-        load_scenario(str(scenario)) if log is None else read_log(log), filter_name, by=by, groups=groups,
+        load_scenario(str(scenario)) if log is None else read_log(log), filter_name, groups=groups,
         runs=50 if runs is None else runs, seed=0 if seed is None else seed, jobs=jobs, timeout=timeout,
         settings=settings,
     )  # fmt: skip

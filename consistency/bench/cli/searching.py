@@ -39,10 +39,6 @@ def sweep(
         list[str] | None,
         typer.Option("--filter", metavar="NAME", help="In place of the file's filters; may be repeated."),
     ] = None,
-    share: Annotated[
-        str | None,
-        typer.Option("--share", metavar="I/N", help="Only this share of the cells, I from 1 to N; for job arrays."),
-    ] = None,
     jobs: Jobs = -1,
     backend: BackendName = "local",
     scheduler: Scheduler = None,
@@ -62,7 +58,7 @@ def sweep(
     from consistency.referee.system.stopping import stoppable
 
     if out is None and Path(source).is_dir():
-        if filters or share or overwrite:
+        if filters or overwrite:
             raise InputError(f"{source}: a folder is only reported again; give the sweep and --out to run cells")
         folder = open_sweep(Path(source))
     else:
@@ -73,13 +69,10 @@ def sweep(
         require_scheduler(backend, scheduler, "a sweep")
         with stoppable() as stop:
             try:
-                folder, missing = run_sweep(plan, out, *_share(share), jobs, overwrite, place)
+                folder = run_sweep(plan, out, overwrite, jobs, backend=place)
             except KeyboardInterrupt:
                 say(f"stopped: what is finished is in {out}; the same command goes on")
                 sys.exit(stop.status)
-        if missing:
-            print(f"this share is done; {missing} of the whole sweep are missing in {out}")
-            return
     from consistency.bench.pages import write_regime_reports
     from consistency.bench.sweeps.printing import regime_blocks
     from consistency.referee.show import terminal
@@ -88,16 +81,6 @@ def sweep(
     terminal.show(*regime_blocks(regime))
     for path in (*write_regime(regime, folder.path), *write_regime_reports(regime, folder.path)):
         print(path)
-
-
-def _share(text: str | None) -> tuple[int, int]:
-    """Part and number of parts of ``I/N``."""
-    if text is None:
-        return 1, 1
-    part, slash, parts = text.partition("/")
-    if not (slash and part.isdecimal() and parts.isdecimal()):
-        raise InputError(f"--share {text}: must be I/N, as 2/8")
-    return int(part), int(parts)
 
 
 def tune(

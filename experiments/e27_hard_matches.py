@@ -25,8 +25,8 @@ from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import RelativePose, StereoRig, triangulate
-from consistency.stereo.visual_odometry.features import opencv
-from consistency.stereo.visual_odometry.input_errors import ConsensusError
+from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError
+from consistency.stereo.visual_odometry.cameras.opencv import opencv
 from consistency.stereo.visual_odometry.motion import MotionSettings, estimate_motion
 
 if TYPE_CHECKING:

@@ -1,16 +1,16 @@
 """Names of the stereo front-end and the modules they come from; ``__init__.py`` loads each when it is first used."""
 
+from .cameras.input_errors import ConsensusError as ConsensusError
+from .cameras.input_errors import ConvergenceError as ConvergenceError
+from .cameras.input_errors import DegenerateError as DegenerateError
+from .cameras.input_errors import GimbalLockError as GimbalLockError
+from .cameras.input_errors import PointError as PointError
 from .cameras.rig import StereoRig as StereoRig
 from .cameras.rig import triangulable as triangulable
 from .cameras.rig import triangulate as triangulate
 from .covariance_propagation import implicit_covariance as implicit_covariance
 from .covariance_propagation import registration_covariance as registration_covariance
 from .covariance_propagation import triangulation_covariance as triangulation_covariance
-from .input_errors import ConsensusError as ConsensusError
-from .input_errors import ConvergenceError as ConvergenceError
-from .input_errors import DegenerateError as DegenerateError
-from .input_errors import GimbalLockError as GimbalLockError
-from .input_errors import PointError as PointError
 from .maximum_likelihood import Refined as Refined
 from .maximum_likelihood import refine_reprojection as refine_reprojection
 from .maximum_likelihood import register_weighted as register_weighted

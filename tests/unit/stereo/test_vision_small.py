@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from consistency.stereo import visual_odometry
-from consistency.stereo.visual_odometry import batch_inverses
+from consistency.stereo.visual_odometry.cameras import batch_inverses
 
 
 @pytest.mark.parametrize("m", [2, 3, 6])

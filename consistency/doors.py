@@ -25,7 +25,7 @@ DOORS = {
     "vision": "stereo.visual_odometry",
     "diagnostics.shared_errors": "referee.diagnostics.imperfect_truth.shared_errors",
     "diagnostics.skipping": "referee.diagnostics.records.skipping",
-    "scenario.tables": "bench.scenario.toml_tables",
+    "scenario.tables": "bench.scenario.tables.toml_tables",
     "reporting": "bench.pages",  # this and what is below it: of sections of reports written before there were roots
     "reporting.drawing": "referee.document.drawing",
     "reporting.model": "bench.pages.report_input",

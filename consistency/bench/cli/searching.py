@@ -185,7 +185,7 @@ def challenge(
     """Look for the world in which a filter is most overconfident, and confirm it on fresh runs."""
     from consistency.bench.challenging.challenge import Plan
     from consistency.bench.challenging.challenge import challenge as challenge_filter
-    from consistency.bench.challenging.wording import as_data, lines, require_writable, write_scenario
+    from consistency.bench.challenging.challenge_text import as_data, lines, require_writable, write_scenario
 
     require_word("--fail-on", fail_on, "found")
     if minutes is None and trials is None:

@@ -12,7 +12,7 @@ from recorded import read_recordings
 from scipy.linalg import block_diag
 
 import consistency as cs
-from consistency.referee.diagnostics import Record, judge
+from consistency.referee.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import (
     KINDS,
     VAGUE,

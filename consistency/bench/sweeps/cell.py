@@ -6,6 +6,7 @@ import threading
 import time
 import warnings
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields
 from typing import Any, NamedTuple
 
@@ -20,7 +21,6 @@ from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.bench.runs.trial_work import Backend
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import simulate
 from consistency.bench.store.journal import Journal
@@ -68,7 +68,7 @@ def run_cell(
     cell: Cell,
     filter_name: str,
     jobs: int = -1,
-    backend: Backend | None = None,
+    executor: Executor | None = None,
     journal: Journal | None = None,
 ) -> CellOutcome:
     """Run one filter in one cell until it is decided.
@@ -89,7 +89,7 @@ def run_cell(
         with quiet():
             results, verdicts = run_until_decided(
                 cell.scenario, [filter_name], **sweep.rule.model_dump(), seed=sweep.seed_of(cell), jobs=jobs,
-                backend=backend, journal=journal,
+                executor=executor, journal=journal,
             )  # fmt: skip
         verdict, found = verdicts[filter_name], record_of(results, filter_name)
     except Exception as error:  # what breaks one cell must not end a night of others

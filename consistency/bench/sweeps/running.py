@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -12,14 +13,12 @@ from pathlib import Path
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
-from consistency.bench.runs.trial_work import Backend
 from consistency.bench.store.journal import Busy, Journal, unfinished_of
 from consistency.bench.sweeps.cell import CellResult, run_cell
 from consistency.bench.sweeps.plan import Sweep
 from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
-from consistency.referee.system.stopping import Stop, stoppable
 
 LOOKED_AT = 400  # cells whose kernels are compiled ahead, 10 ms each; cells of one grid differ little
 PAUSE = 1.0  # s, between looks at whether another process has done what is left
@@ -32,7 +31,7 @@ def run_sweep(
     parts: int = 1,
     jobs: int = -1,
     overwrite: bool = False,
-    backend: Backend | None = None,
+    executor: Executor | None = None,
 ) -> tuple[SweepFolder, int]:
     """Do what is not done yet of a share, each filter in each cell by itself.
 
@@ -43,7 +42,7 @@ def run_sweep(
     out : folder, which may hold a part of the same sweep; several processes may write into it, and do no cell twice
     part, parts : this share, 1 to ``parts``
     overwrite : run cells again that were made with other inputs
-    backend : where the runs are done, if not by ``jobs`` workers of this machine
+    executor : does the runs, in place of ``jobs`` threads of this process
 
     Returns
     -------
@@ -67,15 +66,12 @@ def run_sweep(
     todo = [work for work in share if folder.fresh(work) is None or unfinished_of(folder.place(work)).exists()]
     if len(todo) < len(share):
         say(f"{len(share) - len(todo)} of {len(share)} are there already")
-    with stoppable() as stop:
-        if backend is None:
-            with suppress(Exception):  # what breaks a cell is said of it
-                _compile(sweep, todo, jobs)
-            if stop.number is not None:
-                raise KeyboardInterrupt
-        for count, (work, seconds) in enumerate(_in_turn(folder, todo, partial(_do, stop, jobs, backend)), 1):
-            left = _left(seconds * (len(todo) - count))
-            say(f"{count} of {len(todo)}: {work.text}: {_said(folder.done(work))}{left}")
+    if executor is None:
+        with suppress(Exception):  # what breaks a cell is said of it
+            _compile(sweep, todo, jobs)
+    for count, (work, seconds) in enumerate(_in_turn(folder, todo, partial(_do, jobs, executor)), 1):
+        left = _left(seconds * (len(todo) - count))
+        say(f"{count} of {len(todo)}: {work.text}: {_said(folder.done(work))}{left}")
     missing = sum(folder.fresh(work) is None for work in folder.all_work())
     return folder, missing
 
@@ -115,11 +111,9 @@ def _in_turn(
         waiting = busy
 
 
-def _do(stop: Stop, jobs: int, backend: Backend | None, folder: SweepFolder, work: CellWork, journal: Journal) -> None:
+def _do(jobs: int, executor: Executor | None, folder: SweepFolder, work: CellWork, journal: Journal) -> None:
     begun = time.monotonic()
-    outcome = run_cell(folder.sweep, work.cell, work.filter, jobs, backend, journal)
-    if stop.number is not None:  # and the cell took it for an error of its own
-        raise KeyboardInterrupt
+    outcome = run_cell(folder.sweep, work.cell, work.filter, jobs, executor, journal)
     folder.write(work, outcome, time.monotonic() - begun)
 
 

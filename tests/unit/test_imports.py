@@ -35,9 +35,10 @@ RANKS = {
         "store.parquet": 3, "store.folder_tables": 4, "store.results_check": 4, "store.log_tables": 4,
         "store.journal": 5, "store.results": 5, "store.trial_rows": 6, "store.log": 8,
         "runs.memory_needed": 8, "runs.gather": 8,
-        "runs.isolation": 8, "runs.compiling": 8, "runs.trial_work": 9, "runs.backends": 10,
-        "runs.campaign": 10, "runs.montecarlo": 11, "runs.results_to_records": 8, "runs.run_scores": 9,
-        "runs.sequential": 12, "runs.findings": 13,
+        "runs.isolation": 8, "runs.compiling": 8, "runs.trial_work": 9, "runs.backends": 8,
+        "runs.local_threads": 10, "runs.remote_batch": 10, "runs.batches": 11, "runs.campaign": 10,
+        "runs.montecarlo": 12, "runs.results_to_records": 8, "runs.run_scores": 9,
+        "runs.sequential": 13, "runs.findings": 13,
         "sweeps": 14, "challenging": 14, "tuning": 14, "pages": 15, "cli": 16,
     },
     "stereo": {"visual_odometry": 0, "rendered_images": 1, "frontend": 2, "characterising": 3, "pages": 4, "cli": 5},
@@ -306,8 +307,9 @@ def test_the_package_itself_loads_nothing_heavy() -> None:
 
 def test_engines_of_clusters_are_loaded_when_they_are_chosen() -> None:
     engines = {"dask", "distributed", "submitit"}
-    choose = "import consistency.bench.runs.montecarlo\nfrom consistency.bench.runs.backends import choosing\n"
-    choose += "choosing.backend_for({!r})"
+    choose = "import consistency.bench.runs.montecarlo\n"
+    choose += "from consistency.bench.runs.backends.choosing import executor_for\n"
+    choose += "with executor_for({!r}): pass"
     assert not loaded(choose.format("local")) & engines
     assert loaded(choose.format("dask")) & engines == {"dask", "distributed"}
     assert loaded(choose.format("slurm")) & engines == {"submitit"}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
 import threading
 import time
 from dataclasses import replace
@@ -302,28 +301,6 @@ def test_a_sweep_that_is_stopped_while_a_cell_writes_goes_on(at: Path, monkeypat
     assert (missing, len(done)) == (0, 2)
     assert {path: path.read_bytes() for path in kept} == kept
     assert repr(numbers(folder)) == repr(numbers(whole))
-
-
-def test_a_stop_that_is_taken_for_an_error_is_no_result(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where Ctrl-C comes inside a serialiser of pydantic, which makes another exception of it."""
-
-    def swallows(*_: Any, **__: Any) -> Any:
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt as stop:
-            raise ValueError("while serialising") from stop
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored where the shell said so
-    try:
-        with monkeypatch.context() as patch:
-            patch.setattr(cells, "run_until_decided", swallows)
-            with pytest.raises(KeyboardInterrupt):
-                run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert open_sweep(at / "out").results() == {}
-    assert run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)[1] == 0
 
 
 def test_shares_fill_one_folder(at: Path) -> None:

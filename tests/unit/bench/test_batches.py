@@ -6,7 +6,7 @@ import pickle
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -18,7 +18,7 @@ import pytest
 from misbehaving import Deadly, Still
 
 import consistency as cs
-from consistency.bench.runs import remote_batch
+from consistency.bench.runs import batches, remote_batch
 from consistency.bench.runs.backends.choosing import executor_for
 from consistency.bench.runs.batches import ExecutorWorkers, failed
 from consistency.bench.runs.isolation.filter_process import Isolation
@@ -46,7 +46,7 @@ class Killed(Exception):
 class Fake(Executor):
     """An executor with a worker that some runs kill, together with the batch that waits behind it.
 
-    What waits is done when four batches are there, or somebody asks. A batch gives back ``most`` runs at a time.
+    What waits is done when somebody waits for it. A batch gives back ``most`` runs at a time.
     """
 
     at_a_time = 4
@@ -56,31 +56,39 @@ class Fake(Executor):
         self.sent: list[tuple[int, ...]] = []
         self.seconds: list[float] = []
         self.waiting: list[tuple[tuple[int, ...], Future[BatchResult]]] = []
-        self.most_waiting = 0
+        self.together: list[int] = []  # batches that wait, each time that somebody waits for them
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
         assert function is do_batch
         _, runs, seconds, _ = arguments
         future: Future[BatchResult] = Future()
-        future.add_done_callback = lambda call: (Future.add_done_callback(future, call), self.work())  # type: ignore[assignment, func-returns-value, misc]
         self.sent.append(runs)
         self.seconds.append(seconds)
         self.waiting.append((runs, future))
-        self.most_waiting = max(self.most_waiting, len(self.waiting))
         return future
 
     def work(self) -> None:
-        while self.waiting:
-            runs, future = self.waiting.pop(0)
-            if not self.killers & {*runs}:
-                future.set_result(self.answer(runs[: self.most]))
-                continue
-            future.set_exception(Killed())
-            if self.waiting:
-                self.waiting.pop(0)[1].set_exception(Killed())
+        self.together.append(len(self.waiting))
+        runs, future = self.waiting.pop(0)
+        if not self.killers & {*runs}:
+            future.set_result(self.answer(runs[: self.most]))
+            return
+        future.set_exception(Killed())
+        if self.waiting:
+            self.waiting.pop(0)[1].set_exception(Killed())
 
     def answer(self, runs: Sequence[int]) -> BatchResult:
         return result(runs, **self.changes)
+
+    def outcomes(self, work: TrialWork) -> Generator[RunOutcome, None, None]:
+        def next_of(finished: Any) -> Any:
+            if finished.empty():
+                self.work()
+            return finished.get(timeout=5.0)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(batches, "_next_of", next_of)
+            yield from ExecutorWorkers(self).outcomes(work, range(RUNS))
 
 
 @pytest.fixture(scope="module")
@@ -88,9 +96,9 @@ def work(xyz: cs.Scenario) -> TrialWork:
     return TrialWork(Simulated(xyz, 0), Isolation([Still("still")], xyz.belief))
 
 
-def done(executor: Executor, work: TrialWork) -> dict[int, RunOutcome]:
+def done(executor: Fake, work: TrialWork) -> dict[int, RunOutcome]:
     """What came of the runs; each came once."""
-    outcomes = list(ExecutorWorkers(executor).outcomes(work, range(RUNS)))
+    outcomes = list(executor.outcomes(work))
     assert sorted(outcome.run for outcome in outcomes) == list(range(RUNS))
     return {outcome.run: outcome for outcome in outcomes}
 
@@ -116,7 +124,7 @@ def test_an_executor_says_how_long_a_batch_takes_and_how_many_it_has(work: Trial
 def test_what_a_batch_leaves_is_done_next(work: TrialWork) -> None:
     executor = Fake(most=2)
     done(executor, work)
-    assert executor.sent[1][0] == 2
+    assert executor.sent[executor.at_a_time][0] == 2
 
 
 @pytest.mark.parametrize("killers", [(0,), (17, 18), (3, 39), tuple(range(RUNS))])
@@ -130,30 +138,14 @@ def test_a_run_that_kills_has_failed_and_no_other(work: TrialWork, killers: tupl
         assert Counter(executor.sent)[(run,)] >= 2, "by itself, and alone"
 
 
-class Together(Fake):
-    """Does nothing before it has been asked for a while, so that all batches are with it."""
-
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
-        future = super().submit(function, *arguments, **options)
-        del future.add_done_callback
-        return future
-
-
-def test_a_doubtful_run_is_alone(work: TrialWork, monkeypatch: pytest.MonkeyPatch) -> None:
-    executor, alone = Together([20]), list[int]()
-
-    def worked(queue: Any) -> Any:
-        if [len(runs) for runs, _ in executor.waiting] == [1]:
-            alone.extend(executor.waiting[0][0])
-        executor.work()
-        return queue.get()
-
-    monkeypatch.setattr("consistency.bench.runs.batches._next_of", worked)
+def test_a_doubtful_run_is_alone(work: TrialWork) -> None:
+    executor = Fake([20])
     outcomes = done(executor, work)
-    assert executor.most_waiting == executor.at_a_time
+    assert max(executor.together) == executor.at_a_time
     assert {run for run, outcome in outcomes.items() if outcome.failures} == {20}
-    assert 20 in alone
-    assert Counter(executor.sent)[(20,)] == 2
+    doubtful = {runs for runs in executor.sent if executor.sent.count(runs) == 2}
+    assert (20,) in doubtful
+    assert executor.together[-len(doubtful) :] == [1] * len(doubtful)
 
 
 def test_bad_input_keeps_what_is_finished(work: TrialWork) -> None:
@@ -162,7 +154,7 @@ def test_bad_input_keeps_what_is_finished(work: TrialWork) -> None:
             kept = [run for run in runs if run < 3]
             return result(kept, refusal="" if len(kept) == len(runs) else "nothing in view")
 
-    outcomes = ExecutorWorkers(Refusing(most=5)).outcomes(work, range(RUNS))
+    outcomes = Refusing(most=5).outcomes(work)
     assert [next(outcomes).run for _ in range(3)] == [0, 1, 2]
     with pytest.raises(cs.InputError, match=r"^nothing in view$"):
         next(outcomes)
@@ -180,8 +172,7 @@ def test_bad_input_keeps_what_is_finished(work: TrialWork) -> None:
 def test_an_executor_that_cannot_go_on(work: TrialWork, error: Exception, raised: Any, sentence: str) -> None:
     class Ends(Fake):
         def work(self) -> None:
-            while self.waiting:
-                self.waiting.pop()[1].set_exception(error)
+            self.waiting.pop()[1].set_exception(error)
 
     with pytest.raises(raised, match=sentence) as told:
         done(Ends(), work)
@@ -190,18 +181,11 @@ def test_an_executor_that_cannot_go_on(work: TrialWork, error: Exception, raised
 
 
 def test_what_is_not_done_is_cancelled(work: TrialWork) -> None:
-    executor = Together()
-    workers = ExecutorWorkers(executor)
-    outcomes = workers.outcomes(work, range(RUNS))
-    pool = ThreadPoolExecutor(1)
-    pool.submit(lambda: executor.waiting or executor)
-    first = pool.submit(next, outcomes)
-    while len(executor.waiting) < executor.at_a_time:
-        pass
-    executor.waiting.pop(0)[1].set_result(result(range(10)))
-    assert first.result(20).run == 0
+    executor = Fake()
+    outcomes = executor.outcomes(work)
+    assert next(outcomes).run == 0
+    assert executor.waiting
     outcomes.close()
-    pool.shutdown()
     assert all(future.cancelled() for _, future in executor.waiting)
 
 

@@ -7,7 +7,6 @@ that a script needs no guard on ``__main__``.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import os
 import signal
@@ -18,6 +17,7 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, Timeo
 from functools import cache
 from multiprocessing import current_process
 from multiprocessing.connection import Connection
+from multiprocessing.util import Finalize
 from typing import Any
 
 from consistency.bench.filters.compiled import Compiled
@@ -43,6 +43,7 @@ _idle: list[_Worker] = []  # of earlier studies, as starting one takes seconds
 @cache
 def _starter() -> ThreadPoolExecutor:
     """Return a thread that never ends and starts all workers: on Linux they end with the thread that started them."""
+    Finalize(None, dismiss, exitpriority=10)  # before a worker of multiprocessing, which has no atexit, waits for them
     return ThreadPoolExecutor(1)
 
 
@@ -290,7 +291,6 @@ def _show(printed: Connection) -> None:
                 left -= len(text)
 
 
-@atexit.register
 def dismiss() -> None:
     """End the processes that wait for a study."""
     while _idle:

@@ -1,16 +1,16 @@
 """Is a command gone within a second of a signal, with no process left, and does --resume give the same tables?
 
-    python benchmarks/signals.py                  # 60 SIGKILL, 60 of SIGTERM, SIGHUP and SIGINT: half an hour on two idle cores
+    python benchmarks/signals.py                  # 60 SIGKILL, 60 of the others: half an hour on two idle cores
     python benchmarks/signals.py --signals 12     # of each kind
 
-Signals come to ``run --jobs 1`` and ``2`` at moments uniform between the start and the length of the command. Half of the
-commands begin with an empty cache of kernels, and one in six has a filter of one's own, in processes, from a script without
-a guard. Exit status 1 where a status is wrong, a process is left, tables differ, or a command was there after a second.
+Signals come to ``run --jobs 1`` and ``2`` at moments uniform between the start and the length of the command. Half of
+the other commands begin with an empty cache of kernels, and one in three has a filter of one's own, in processes, from
+a script without a guard. Exit status 1 where a status is wrong, a process is left, tables differ, or a command was
+there after a second.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import signal

@@ -30,7 +30,7 @@ pytestmark = [
     pytest.mark.skipif(os.name == "nt", reason="signals"),
     pytest.mark.filterwarnings("ignore::ResourceWarning"),  # sockets that dask leaves to the collector
 ]
-RUNS = 60
+RUNS = 30
 SEED = 3
 
 
@@ -41,15 +41,15 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 @pytest.fixture(scope="module")
-def world(linear: cs.Scenario) -> cs.Scenario:
-    return linear
+def world(xyz: cs.Scenario) -> cs.Scenario:
+    return xyz
 
 
 @pytest.fixture(scope="module")
 def filters(world: cs.Scenario) -> list[str | Still]:
     """One that is compiled, and one whose process ends in one run."""
     doomed = cs.types.Control(*Simulated(world, SEED)(7).controls[0])
-    return ["kf", Still("still", KINDS["os._exit(3)"][0], doomed)]
+    return ["ekf-xyz", Still("still", KINDS["os._exit(3)"][0], doomed)]
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_a_worker_that_is_killed_loses_nothing(
 
 @pytest.mark.slow
 def test_runs_that_kill_their_workers_have_failed(world: cs.Scenario) -> None:
-    trials, isolation = Simulated(world, SEED), Isolation([cs.get_filter("kf")], world.belief)
+    trials, isolation = Simulated(world, SEED), Isolation([cs.get_filter("ekf-xyz")], world.belief)
     work = TrialWork(Deadly(trials, (0, 20), os.getpid()), isolation)
     with DaskExecutor(jobs=2) as executor:
         outcomes = {outcome.run: outcome for outcome in ExecutorWorkers(executor).outcomes(work, range(30))}
@@ -122,8 +122,8 @@ def test_runs_that_kill_their_workers_have_failed(world: cs.Scenario) -> None:
         o.run: o for o in LocalThreads(1).outcomes(TrialWork(trials, isolation), range(30))
     }
     for run in set(outcomes) - {0, 20}:
-        for column, values in outcomes[run].estimates["kf"].items():
-            assert values.tobytes() == expected[run].estimates["kf"][column].tobytes()
+        for column, values in outcomes[run].estimates["ekf-xyz"].items():
+            assert values.tobytes() == expected[run].estimates["ekf-xyz"][column].tobytes()
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_an_error_of_a_worker_is_an_error_here(
 def test_nobody_at_the_address(world: cs.Scenario, tmp_path: Path) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
     with pytest.raises(cs.InputError, match=f"^the scheduler {address} cannot be reached for 0.5 s$"):
-        run_trials(world, ["kf"], RUNS, out=tmp_path / "out", executor=DaskExecutor(address, wait=0.5))
+        run_trials(world, ["ekf-xyz"], RUNS, out=tmp_path / "out", executor=DaskExecutor(address, wait=0.5))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -172,4 +172,4 @@ def test_what_makes_no_sense_is_refused(options: dict[str, object], sentence: st
 
 def test_tls_without_certificates(world: cs.Scenario) -> None:
     with pytest.raises(cs.InputError, match=r"^scheduler tls://127.0.0.1:1: tls needs the certificates"):
-        run_trials(world, ["kf"], RUNS, executor=DaskExecutor("tls://127.0.0.1:1", wait=0.5))
+        run_trials(world, ["ekf-xyz"], RUNS, executor=DaskExecutor("tls://127.0.0.1:1", wait=0.5))

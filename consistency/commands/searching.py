@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -49,13 +48,11 @@ def sweep_command(
     ] = False,
 ) -> None:
     """A grid of scenarios, each filter in each until decided; then a map of where which filter is consistent."""
-    from consistency.bench.runs.backends.choosing import backend_for, require_scheduler
+    from consistency.bench.runs.backends.choosing import executor_for
     from consistency.bench.sweeps.plan import load_sweep
     from consistency.bench.sweeps.regime import regime_of, write_regime
     from consistency.bench.sweeps.running import run_sweep
     from consistency.bench.sweeps.sweep_folder import open_sweep
-    from consistency.referee.system.progress import say
-    from consistency.referee.system.stopping import stoppable
 
     if out is None and Path(source).is_dir():
         if filters or overwrite:
@@ -65,14 +62,8 @@ def sweep_command(
         if out is None:
             raise InputError(f"--out: missing; give a folder for the cells of {source}")
         plan = load_sweep(source, filters)
-        place = backend_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out)
-        require_scheduler(backend, scheduler, "a sweep")
-        with stoppable() as stop:
-            try:
-                folder = run_sweep(plan, out, overwrite, jobs, backend=place)
-            except KeyboardInterrupt:
-                say(f"stopped: what is finished is in {out}; the same command goes on")
-                sys.exit(stop.status)
+        with executor_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out) as executor:
+            folder = run_sweep(plan, out, overwrite, jobs, executor=executor)
     from consistency.bench.pages import write_regime_reports
     from consistency.bench.sweeps.printing import regime_blocks
     from consistency.referee.show import terminal

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -51,7 +52,7 @@ def monitor(
 ) -> None:
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
     from consistency.referee.document.monitor import monitor_document
-    from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
+    from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash
     from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch, watch_lines
 
@@ -76,7 +77,9 @@ def monitor(
             require_plot(plot, overwrite)
         watched = watch(log, watcher)
     if plot is not None:
-        write_monitor_plot(plot, watched)
+        from consistency.referee.pages.monitor import monitor_drawing
+
+        plotted(partial(monitor_drawing, watched), plot)
     show(monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t), as_json)
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
@@ -87,7 +90,7 @@ def _show_ratios(
 ) -> None:
     """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
     from consistency.referee.document.monitor import ratios_document
-    from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
+    from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.ardupilot_log import read_ratios
 
     if plot is not None:
@@ -95,5 +98,7 @@ def _show_ratios(
     ratios, notes = read_ratios(path, sensor, core)
     tell(notes)
     if plot is not None:
-        write_monitor_plot(plot, ratios)
+        from consistency.referee.pages.monitor import monitor_drawing
+
+        plotted(partial(monitor_drawing, ratios), plot)
     show(ratios_document(path.stem, ratios), as_json)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.extras import is_installed
 from consistency.referee.fit_covariance.motions import write_motions
 from consistency.referee.fit_covariance.noise_model import NoiseModel
 from consistency.referee.fit_covariance.page import page
@@ -31,7 +30,7 @@ def write_model(model: NoiseModel, folder: Path, overwrite: bool = False) -> lis
     """
     texts = snippets(model)
     texts["verdict.json"] = as_json.render(document(model)) + "\n"
-    texts["report.html"] = as_html.render(page(model, with_pictures=is_installed("plot")))
+    texts["report.html"] = as_html.render(page(model))
     names: list[str] = []
 
     def contents(at: Path) -> None:

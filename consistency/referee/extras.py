@@ -25,7 +25,7 @@ EXTRAS = {
         "pyarrow", "pydantic", "rich>=14.1", "tomli-w",
     ),
     "plot": ("matplotlib",),
-    "report": ("[plot]", "bokeh", "jinja2", "typst"),
+    "report": ("[plot]", "typst"),
     "vision": ("[bench]", "opencv-python-headless", "pyyaml"),
     "parquet": ("pyarrow",),
     "ros": ("rosbags",),

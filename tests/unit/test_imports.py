@@ -50,7 +50,7 @@ ONLY = {  # all that these may import of ours
 }
 ARRAYS = {"diagnostics", "document"}  # rooms that need these alone
 OF_ARRAYS = {"numpy", "scipy"} | sys.stdlib_module_names
-DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}
+DRAWING = {"matplotlib", "typst"}
 PAINTERS = {"show"}
 IN_EXPERIMENTS = {"consistency", "numpy", "pandas", "scipy"}
 # what the bench sets beside ours, and an experiment on images, which draws them
@@ -211,7 +211,7 @@ FORBIDDEN = [
     ("referee.document", "from consistency.referee.verdicts.options import settings_of"),
     ("referee.document", "from rich.console import Console"),
     ("referee.show", "from consistency.referee.system.provenance import manifest_of"),
-    ("stereo.visual_odometry", "from consistency.stereo.pages.images import IMAGES"),
+    ("stereo.visual_odometry", "from consistency.stereo.pages.sensor import compose_sensor"),
 ]
 
 
@@ -285,7 +285,7 @@ def test_diagnostics_load_arrays_and_distributions_only() -> None:
     names = "import consistency.referee.diagnostics as d\n_ = [getattr(d, name) for name in d.__all__]"
     modules_ = loaded(names)
     assert {"numpy", "scipy"} <= modules_
-    assert not modules_ & {"pandas", "matplotlib", "numba", "pydantic", "joblib", "bokeh"}
+    assert not modules_ & {"pandas", "matplotlib", "numba", "pydantic", "joblib"}
 
 
 def test_gates_need_arrays_only() -> None:
@@ -299,7 +299,7 @@ def test_the_pytest_plugin_loads_nothing_heavy() -> None:
 
 
 def test_the_package_itself_loads_nothing_heavy() -> None:
-    heavy = {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "bokeh", "typer"}
+    heavy = {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "typer"}
     assert not loaded("import consistency") & heavy
     assert "numba" in loaded("import consistency; consistency.get_filter('ekf-uvd')")  # negative control
 
@@ -330,7 +330,7 @@ def test_a_new_session_lists_the_public_names(package: str) -> None:
 def test_the_help_loads_nothing_heavy() -> None:
     modules_ = loaded("from consistency.referee.cli.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
     assert "typer" in modules_
-    assert not modules_ & {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "bokeh"}
+    assert not modules_ & {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib"}
 
 
 def test_every_public_name_is_there() -> None:

@@ -89,7 +89,7 @@ def heat_figure(regime: Regime, name: str) -> Figure:
 
 
 def _draw(regime: Regime, name: str, shown: Sequence[View], columns: int, rows: int) -> Drawing:
-    from matplotlib.patches import Patch
+    from matplotlib.patches import Rectangle
 
     height = (ROW * rows + MARGIN) * -(-len(shown) // columns)
     figure, panels = canvas(height, columns, len(shown))
@@ -97,7 +97,7 @@ def _draw(regime: Regime, name: str, shown: Sequence[View], columns: int, rows: 
         _draw_tiles(axes, regime, name, sides, fixed)
     ends = ((f"{FULL:g} and more: overconfident", LARGE), (f"1/{FULL:g} and less: conservative", SMALL))
     for label, colour in (*ends, ("no ratio", NOTHING)):
-        panels[0].add_patch(Patch(facecolor=colour, label=label, visible=False))
+        panels[0].add_patch(Rectangle((0, 0), 0, 0, facecolor=colour, label=label, visible=False))
     return add_legend(figure)
 
 

@@ -139,9 +139,7 @@ def edges(axes: Axes, x: Array, ends: Array, look: Look, label: str = "", tag: s
     curve(axes, x, high, look, "", tag)
 
 
-def points(
-    axes: Axes, x: Array, y: Array, look: Look, label: str = "", tag: str = "", limit: int = LIMIT
-) -> None:
+def points(axes: Axes, x: Array, y: Array, look: Look, label: str = "", tag: str = "", limit: int = LIMIT) -> None:
     """N small round points as one path, which takes little room in a file; ``look`` has their size."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path

@@ -60,7 +60,7 @@ def svg(draw: Callable[[], Figure], name: str = "figure", titles: Titles | None 
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    with mpl.rc_context({**RC, "svg.hashsalt": name}):
+    with mpl.rc_context(RC):
         figure = draw()
         # laid out here and not by savefig, which draws everything once more for that
         figure.set_dpi(POINTS)
@@ -68,17 +68,13 @@ def svg(draw: Callable[[], Figure], name: str = "figure", titles: Titles | None 
         engine: Any = figure.get_layout_engine()
         engine.execute(figure)
         figure.set_layout_engine("none")
-        text = saved(figure, "svg").decode("utf-8")
-        kind = "narrow" if figure.get_figwidth() < WIDTH else "full"
-    return _compact(text, kind, titles or Titles())
+    kind = "narrow" if figure.get_figwidth() < WIDTH else "full"
+    return _compact(saved(figure, "svg", name=name).decode("utf-8"), kind, titles or Titles())
 
 
 def png(draw: Callable[[], Figure], resolution: int = 200) -> bytes:
     """A drawing as PNG."""
-    import matplotlib as mpl
-
-    with mpl.rc_context(RC):
-        return saved(draw(), "png", resolution)
+    return saved(drawn(draw), "png", resolution)
 
 
 def drawn(draw: Callable[[], Figure]) -> Figure:
@@ -89,14 +85,16 @@ def drawn(draw: Callable[[], Figure]) -> Figure:
         return draw()
 
 
-def saved(figure: Figure, kind: str, resolution: int = 200) -> bytes:
-    """A figure as PNG, PDF or SVG, without date and software."""
+def saved(figure: Figure, kind: str, resolution: int = 200, name: str = "figure") -> bytes:
+    """A figure as PNG, PDF or SVG, without date and software; ``name`` is that of :func:`svg`."""
+    import matplotlib as mpl
+
     without: dict[str, dict[str, None]] = {
         "png": {"Software": None}, "pdf": {"CreationDate": None},
         "svg": dict.fromkeys(("Date", "Creator", "Format", "Type")),
     }  # fmt: skip
     buffer = BytesIO()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), mpl.rc_context({**RC, "svg.hashsalt": name}):
         # a name in a script that the font lacks is drawn as boxes; the tables of the page show it
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         figure.savefig(buffer, format=kind, dpi=resolution, metadata=without[kind])

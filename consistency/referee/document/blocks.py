@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Drawing
-
     from consistency.referee.document.colours import Look
 
 
@@ -185,7 +183,7 @@ class Figure:
 
     title: str
     caption: str
-    drawings: tuple[Callable[[], Drawing], ...]
+    drawings: tuple[Callable[[], Any], ...]  # each gives a figure of Matplotlib
     level: int = 3  # of the heading
 
 

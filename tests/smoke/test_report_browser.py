@@ -31,7 +31,7 @@ return [...document.querySelectorAll('.chart svg')].filter((svg) =>
   svg.getBoundingClientRect().width > 100 && svg.querySelectorAll('path').length > 20).length;
 """
 VISIBLE = """
-return [...document.querySelectorAll('.filter-' + arguments[0])].map((part) => part.checkVisibility());
+return [...document.querySelectorAll('.filter-' + arguments[0])].map((part) => getComputedStyle(part).display !== 'none');
 """
 
 

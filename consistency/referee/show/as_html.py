@@ -227,7 +227,7 @@ def _class(column: Column, cell: Cell = "") -> str:
 def _cell(cell: Cell) -> str:
     match cell:
         case Name():
-            return f"{_swatch(cell.look)} {escape(cell.text)}"
+            return f"<span>{_swatch(cell.look)} {escape(cell.text)}</span>"
         case Status():
             kind = escape(cell.text.replace(" ", "-"))
             return f'<span class="verdict {kind}">{escape(cell.text)}</span>{escape(cell.note)}'

@@ -79,7 +79,7 @@ def _picture(report: Report) -> Figure:
     factor = next(track for study in report.studies for track in study.tracks).verdict.settings.factor
 
     def draw() -> Drawing:
-        figure, (axes,) = canvas(0.6 + 0.3 * len(report.studies))
+        figure, (axes,) = canvas(0.5 + 0.22 * len(report.studies))
         axes.set(xlabel=LABEL, xlim=window_of(found, factor))
         name_rows(axes, [study.name for study in report.studies])
         axes.axvspan(

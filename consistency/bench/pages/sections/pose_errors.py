@@ -17,7 +17,7 @@ from consistency.referee.types import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
-COMPONENTS = ("x error (m)", "y error (m)", "heading error (deg)")
+COMPONENTS = ("x error (m)", "y error (m)", "heading error\n(deg)")
 DEGREES = np.array([1.0, 1.0, 180.0 / np.pi])
 
 

@@ -31,7 +31,8 @@ return [...document.querySelectorAll('.chart svg')].filter((svg) =>
   svg.getBoundingClientRect().width > 100 && svg.querySelectorAll('path').length > 20).length;
 """
 VISIBLE = """
-return [...document.querySelectorAll('.filter-' + arguments[0])].map((part) => getComputedStyle(part).display !== 'none');
+const parts = [...document.querySelectorAll('.filter-' + arguments[0])];
+return parts.map((part) => getComputedStyle(part).display !== 'none');
 """
 
 

@@ -117,10 +117,6 @@ class Column:
     number: bool = False  # set at the right
     most: int | None = None  # characters of it on a terminal
 
-    @property
-    def short(self) -> str:
-        return self.paper or self.head
-
 
 @dataclass(frozen=True)
 class Table:

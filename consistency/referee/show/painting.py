@@ -28,7 +28,7 @@ FILTER, TITLE = "filter:", "title:"  # begin the identifier of what a checkbox h
 NARROWEST = 0.15  # span of one axis of a map over that of the other, at least: room for the tick labels
 WIDE = 200.0  # a log axis that spans more has room for powers of ten only
 UNNAMED = re.compile(r"_child\d+|_nolegend_|")  # labels that Matplotlib gives
-RC: dict[str, Any] = {
+RC: Any = {
     "font.family": "DejaVu Sans", "font.size": 6.5, "axes.titlesize": 7, "axes.labelsize": 6.5, "legend.fontsize": 6.5,
     "axes.titlelocation": "left", "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6,
     "axes.grid": True, "grid.color": "#ececec", "grid.linewidth": 0.6, "axes.axisbelow": True, "axes.spines.top": False,
@@ -199,7 +199,7 @@ def log_axis(axes: Axes, side: str) -> None:
     axes.set(**{f"{side}scale": "log"})
     low, high = getattr(axes, f"get_{side}lim")()
     ticks = getattr(axes, f"{side}axis")
-    parts = (1.0, 2.0, 5.0)
+    parts: tuple[float, ...] = (1.0, 2.0, 5.0)
     if high > WIDE * low:
         parts = (1.0,)
     ticks.set_major_locator(LogLocator(subs=parts))
@@ -241,7 +241,7 @@ def add_legend(figure: Figure, beside: bool = False) -> Figure:
         longest = max(len(line) for label in labels for line in label.split("\n"))
         columns = max(1, min(len(labels), int(17.5 * figure.get_figwidth() / (longest + 7))))
     rows = -(-len(labels) // columns)
-    place = "outside upper left"
+    place: Any = "outside upper left"
     if beside:
         place = "outside right center"
     else:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import re
 import tempfile
-from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
 from importlib import resources
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib as mpl
 import typst
@@ -30,19 +30,11 @@ def render_pdf(document: blocks.Document, pictures: Pictures | None = None) -> b
     ----------
     pictures : those of the document, painted here if none are given
     """
-    pictures = paint(document) if pictures is None else pictures
     with tempfile.TemporaryDirectory(prefix="consistency-report-") as name:
         folder = Path(name)
-        paper = Paper(folder, pictures)
-        data = {
-            "title": soft(document.title),
-            "answer": soft(document.answer),
-            "opening": _blocks(document.opening, "opening", paper),
-            "chapters": [
-                {"title": soft(c.title), "summary": soft(c.summary), "blocks": _blocks(c.blocks, c.anchor, paper)}
-                for c in document.chapters
-            ],
-        }
+        paper = Paper(folder, paint(document) if pictures is None else pictures)
+        parts = ("title", "answer", "opening", "chapters")
+        data = {part: paper.plain(getattr(document, part)) for part in parts}
         (folder / "data.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8")
         template = resources.files("consistency.referee.show").joinpath("templates").joinpath(TEMPLATE)
         (folder / TEMPLATE).write_text(template.read_text(encoding="utf-8"), encoding="utf-8")
@@ -52,71 +44,45 @@ def render_pdf(document: blocks.Document, pictures: Pictures | None = None) -> b
         return pdf
 
 
-class Paper(NamedTuple):
-    """Where the files of a document are written, and what they show."""
+class Paper:
+    """What the template is given: the fields of each block by name, with its kind."""
 
-    folder: Path
-    pictures: Pictures
+    def __init__(self, folder: Path, pictures: Pictures) -> None:
+        self.folder = folder
+        self.pictures = pictures
+        self.files = 0
 
+    def plain(self, value: Any) -> Any:
+        """A block, a cell, or what they hold; text can break, and figures are files."""
+        match value:
+            case str():
+                return soft(value)
+            case tuple():
+                return [self.plain(each) for each in value]
+            case blocks.Name() | blocks.Quantity() | blocks.Reason():
+                return soft(written(value))
+            case blocks.Reasons():
+                return {"kind": "Reasons", "entries": [self._fields(entry) for entry in value.entries]}
+            case blocks.Settings():
+                return {"kind": "Settings", "cells": _settings(json.loads(value.text))}
+            case blocks.Figure():
+                images = [self._file(svg) for svg in self.pictures.get(id(value), ())]
+                return {"kind": "Figure", "images": images, "title": soft(value.title), "caption": soft(value.caption)}
+            case _ if is_dataclass(value):
+                return self._fields(value)
+            case _:
+                return value
 
-def _blocks(part: Sequence[blocks.Block], name: str, paper: Paper) -> list[dict[str, Any]]:
-    return [_block(block, f"{name}-{i}", paper) for i, block in enumerate(part)]
+    def _fields(self, value: Any) -> dict[str, Any]:
+        named = {field.name: self.plain(getattr(value, field.name)) for field in fields(value)}
+        return {"kind": type(value).__name__} | named
 
-
-def _block(block: blocks.Block, name: str, paper: Paper) -> dict[str, Any]:
-    """What the template needs of a block; images are files in ``folder`` whose names begin with ``name``."""
-    match block:
-        case blocks.Figure():
-            content = _figure(block, name, paper)
-        case blocks.Heading():
-            content = {"text": soft(block.text)}
-        case blocks.Text():
-            content = {"lead": soft(block.lead), "text": soft(block.text)}
-        case blocks.Table():
-            content = {
-                "columns": [{"head": soft(c.short), "width": c.width, "number": c.number} for c in block.columns],
-                "groups": [[soft(title), [list(map(_cell, row)) for row in rows]] for title, rows in block.groups],
-                "caption": soft(block.caption), "style": block.style, "whole": block.whole,
-            }  # fmt: skip
-        case blocks.Reasons():
-            entries = [
-                {"name": soft(e.name), "sentence": soft(e.sentence), "others": list(map(soft, e.others))}
-                for e in block.entries
-            ]
-            content = {"entries": entries}
-        case blocks.Facts():
-            rows = [[soft(key), soft(value)] for key, value in block.rows]
-            content = {"rows": rows, "heads": block.heads, "width": block.width}
-        case blocks.Bullets():
-            content = {"texts": [soft(text) for text in block.texts]}
-        case blocks.Settings():
-            content = {"cells": _settings(json.loads(block.text))}
-        case blocks.Details():
-            inner = _blocks(block.blocks, name, paper)
-            content = {"heading": soft(block.summary), "blocks": inner, "whole": block.whole}
-    return {"kind": type(block).__name__} | content
-
-
-def _figure(figure: blocks.Figure, name: str, paper: Paper) -> dict[str, Any]:
-    images = []
-    for number, svg in enumerate(paper.pictures.get(id(figure), ())):
-        path = paper.folder / f"{name}-{number}.svg"
-        path.write_text(svg, encoding="utf-8")
-        images.append(path.name)
-    return {"images": images, "title": soft(figure.title), "caption": soft(figure.caption)}
-
-
-def _cell(cell: blocks.Cell) -> Any:
-    match cell:
-        case blocks.Answer():
-            return {"kind": "Answer", "mark": cell.mark, "text": soft(cell.text), "emphasis": cell.emphasis}
-        case blocks.Stack():
-            below = [{"text": soft(line.text), "italic": line.italic} for line in cell.below]
-            return {"kind": "Stack", "text": soft(cell.text), "bold": cell.bold, "below": below}
-        case blocks.Status():
-            return {"kind": "Status", "text": soft(cell.text), "note": soft(cell.note)}
-        case _:
-            return soft(written(cell))
+    def _file(self, svg: str) -> str:
+        """The name of a file with a picture."""
+        self.files += 1
+        name = f"{self.files}.svg"
+        (self.folder / name).write_text(svg, encoding="utf-8")
+        return name
 
 
 def soft(text: str) -> str:

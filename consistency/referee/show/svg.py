@@ -94,7 +94,7 @@ def saved(figure: Figure, kind: str, resolution: int = 200, name: str = "figure"
         "svg": dict.fromkeys(("Date", "Creator", "Format", "Type")),
     }  # fmt: skip
     buffer = BytesIO()
-    with warnings.catch_warnings(), mpl.rc_context({**RC, "svg.hashsalt": name}):
+    with warnings.catch_warnings(), mpl.rc_context(RC | {"svg.hashsalt": name}):
         # a name in a script that the font lacks is drawn as boxes; the tables of the page show it
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         figure.savefig(buffer, format=kind, dpi=resolution, metadata=without[kind])

@@ -47,7 +47,7 @@ def samples_png(samples: Array, centre: Array, covariance: Array, resolution: in
         for axes, (i, j, *labels) in zip(panels, PLANES, strict=True):
             both, places = np.ix_([i, j], [i, j]), 1e3 * samples[:, [i, j]]
             mean = places.mean(axis=0)
-            points(axes, *places.T, SAMPLE, limit=len(places))
+            points(axes, places[:, 0], places[:, 1], SAMPLE, limit=len(places))
             path(axes, ellipse(mean, 1e6 * spread[both], POSES), MONTE_CARLO)
             path(axes, ellipse(1e3 * centre[[i, j]], 1e6 * covariance[both], POSES), IMPLICIT)
             axes.plot(*mean[:, None], **dots(MEAN))
@@ -65,5 +65,5 @@ def ellipse(centre: Array, covariance: Array, scale: float) -> Array:
     width, axis = np.linalg.eigh(covariance)
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     half = scale * np.sqrt(np.maximum(width, 0.0))
-    curve = axis @ (half[:, None] * np.stack([np.cos(turn), np.sin(turn)])) + np.asarray(centre)[:, None]
+    curve: Array = axis @ (half[:, None] * np.stack([np.cos(turn), np.sin(turn)])) + np.asarray(centre)[:, None]
     return curve.T

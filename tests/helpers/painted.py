@@ -37,7 +37,7 @@ def places(axes: Axes) -> list[Array]:
 
 def shaded(axes: Axes, number: int = 0) -> tuple[float, float]:
     """Least and greatest height of a band."""
-    heights = axes.collections[number].get_paths()[0].vertices[:, 1]
+    heights = np.asarray(axes.collections[number].get_paths()[0].vertices)[:, 1]
     return float(heights.min()), float(heights.max())
 
 

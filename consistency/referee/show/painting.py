@@ -149,12 +149,13 @@ def points(axes: Axes, x: Array, y: Array, look: Look, label: str = "", tag: str
     places = np.repeat(np.column_stack([x[rows], y[rows]]).astype(float), 2, axis=0)
     if not len(places):
         places = np.full((2, 2), np.nan)
+    places[1::2, 0] += 1e-7 * (np.ptp(places[:, 0]) or 1.0)  # what has no length at all is left out of a PNG
     codes = np.tile([Path.MOVETO, Path.LINETO], len(places) // 2)
     shape = Path(places, codes)
     shape.should_simplify = False
     axes.add_patch(PathPatch(
         shape, fill=False, edgecolor=look.colour, linewidth=look.size, capstyle="round", alpha=look.alpha,
-        label=label, gid=owned(tag), zorder=2.0,
+        label=label, gid=owned(tag), zorder=2.0, snap=False,
     ))  # fmt: skip
     axes.autoscale_view()
 

@@ -274,6 +274,16 @@ def test_files_of_a_figure_hold_no_date(kind: str, begin: bytes):
     assert first == second
 
 
+def test_small_points_are_seen_in_a_png():
+    import io
+
+    from matplotlib import image
+
+    dark = partial(draw, lambda axes: points(axes, STEPS, STEPS, Look("#ff0000", size=4.0)))
+    pixels = image.imread(io.BytesIO(png(dark, 100)))
+    assert ((pixels[..., 0] > 0.9) & (pixels[..., 1] < 0.1)).sum() > 50
+
+
 def test_a_picture_is_as_fine_as_it_is_asked_to_be():
     assert len(png(line_of(), 200)) > len(png(line_of(), 50))
 

@@ -59,9 +59,7 @@ def by_depth(report: Report) -> tuple[Figure, ...]:
         low, high = PERCENT * same["low"], PERCENT * same["high"]
         axes.axhspan(low, high, color=BAND, linewidth=0, zorder=0.4, label="accepted by the test")
         axes.axhline(PERCENT * same["expected"], **stroke(EXPECTED), label="95 %")
-        look = style(0)
-        marker = {"marker": look.marker, "markersize": look.size}
-        axes.plot(table["depth"], PERCENT * table["share"], label="measured", **stroke(look), **marker)
+        axes.plot(table["depth"], PERCENT * table["share"], label="measured", marker="o", **stroke(style(0)))
         axes.set(xlabel="depth (m)", ylabel="inside the 95 % region (%)")
         axes.set_xlim(left=0.0)
         return add_legend(figure)

@@ -125,7 +125,7 @@ def stereo_noise(report: Report) -> tuple[Figure, ...]:
 
 def _draw(d: Distribution) -> Drawing:
     figure, (cloud, histogram) = canvas(2.0, 2, 2)
-    points(cloud, *d.points.T, DOTS, limit=DRAWN)
+    points(cloud, d.points[:, 0], d.points[:, 1], DOTS, limit=DRAWN)
     cloud.set(xlabel="x (m)", ylabel="y (m)", xlim=d.window[0], ylim=d.window[1])
     histogram.stairs(d.density, d.edges, fill=True, color=SAMPLES.colour, label="samples")
     for look, outline, density, label in (

@@ -13,8 +13,8 @@ from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, ZERO, solid, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, Span
-from consistency.referee.fit_covariance.covariance_ratios import Judged
-from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
+from consistency.referee.fit_covariance.covariance_ratios import SpanRatios
+from consistency.referee.fit_covariance.noise_model import NoiseModel, windows_over
 from consistency.referee.fit_covariance.white_noise import nees_of
 from consistency.referee.fit_covariance.windows import span_of
 from consistency.referee.fit_covariance.wording import document
@@ -62,14 +62,14 @@ def plot(model: NoiseModel, path: str | Path | None) -> Any:
     return plotted(Sheet((*errors, *rest), 5.0, columns=3), path)
 
 
-def _errors(model: NoiseModel, judged: Judged) -> Panel:
-    windows = error_windows(model, judged)
-    error, C = windows.errors, model.noise.covariance(windows.pieces).mean(axis=0)[:2, :2]
-    values, vectors = np.linalg.eigh(C)
+def _errors(model: NoiseModel, judged: SpanRatios) -> Panel:
+    windows = windows_over(model, judged)
+    error = windows.errors
+    C = model.noise.covariance(windows.pieces)[:, :2, :2]
+    values, vectors = np.linalg.eigh(C.mean(axis=0))
     radius = np.sqrt(float(stats.chi2.ppf(CONFIDENCE, 2)))
     ellipse = radius * (vectors * np.sqrt(np.maximum(values, 0.0))) @ np.array([np.cos(CIRCLE), np.sin(CIRCLE)])
-    squared = nees_of(error[:, :2], model.noise.covariance(windows.pieces)[:, :2, :2])
-    inside = float((stats.chi2.cdf(squared, 2) < CONFIDENCE).mean())
+    inside = float((stats.chi2.cdf(nees_of(error[:, :2], C), 2) < CONFIDENCE).mean())
     marks: tuple[Mark, ...] = (
         Points(error[:, 0], error[:, 1], replace(style(0), size=2.5, alpha=0.7), whole=True),
         Line(ellipse[0], ellipse[1], solid(style(1)), path=True),
@@ -80,12 +80,10 @@ def _errors(model: NoiseModel, judged: Judged) -> Panel:
 
 
 def _growth(model: NoiseModel, axes: range, unit: str) -> Panel:
-    found = [error_windows(model, judged) for judged in model.spans]
+    found = [windows_over(model, judged) for judged in model.spans]
     spans = np.array([windows.span.size for windows in found])
     squares = np.array([(windows.errors**2).mean(axis=0) for windows in found])
-    stated = np.array([
-        np.diagonal(model.noise.covariance(windows.pieces), axis1=1, axis2=2).mean(axis=0) for windows in found
-    ])  # fmt: skip
+    stated = np.array([model.noise.variances(windows.pieces).mean(axis=0) for windows in found])
     marks: list[Mark] = []
     for look, axis in enumerate(axes):
         marks += [

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from consistency.referee.fit_covariance.systematic_errors import fit_mean, fit_slip, jacobian_of_mean
+from consistency.referee.fit_covariance.systematic_errors import fit_mean, fit_slip, jacobian_of_mean, left_by
 from consistency.referee.fit_covariance.white_noise import MotionNoise
-from consistency.referee.fit_covariance.windows import MotionWindows, angles, blocks_of, ways
+from consistency.referee.fit_covariance.windows import MotionWindows, angles, blocks_of, mean_square, ways
 from consistency.referee.types import Array, Indices
 
 SURE = 0.01  # chance to find a dependence where there is none, all questions together
@@ -58,7 +58,7 @@ def mean_by_motion(noise: MotionNoise, windows: MotionWindows) -> MotionDependen
     questions = _questions(corrected)
     found = min(questions, key=lambda each: each.p_value)
     values, error = values_by_bin(corrected, found.bins, found.scale)
-    shares = (error**2).mean(axis=0) / noise.variances(corrected.pieces).mean(axis=0)
+    shares = mean_square(error) / noise.variances(corrected.pieces).mean(axis=0)
     axis = int(np.argmax(shares))
     there = np.unique(found.bins)
     starts = [float(found.sizes[found.bins == k].min()) for k in there]
@@ -125,11 +125,11 @@ def p_value_of(windows: MotionWindows, pieces: Array, bins: Indices, scale: int)
     for name in names:
         rows = np.flatnonzero(windows.drive == name)
         mean = own[rows].reshape(-1, own.shape[-1])
-        left = both[rows].reshape(-1, BINS)
-        left = left - mean @ np.linalg.lstsq(mean, left, rcond=None)[0]
-        products = (left[:, :-1] * left[:, -1:]).reshape(len(rows), -1, BINS - 1).sum(axis=1)
+        left = left_by(mean, both[rows].reshape(-1, BINS))
+        products = left[:, :-1] * left[:, -1:]
+        by_window = products.reshape(len(rows), -1, BINS - 1).sum(axis=1)
         blocks = min(max(round(BLOCKS / len(names)), 1), len(rows))
-        sums += [block.sum(axis=0) for block in np.array_split(products, blocks)]
+        sums += [block.sum(axis=0) for block in np.array_split(by_window, blocks)]
     numbers = windows.errors.size
     spent = X.shape[-1] * len(names)
     return _hotelling(np.array(sums), numbers / max(numbers - spent, 1))
@@ -164,8 +164,7 @@ def values_by_bin(windows: MotionWindows, bins: Indices, scale: int) -> tuple[Ar
 
 def _size_of_errors(windows: MotionWindows) -> Array:
     """Root mean square of each axis, (n, 1)."""
-    square = (windows.errors**2).mean(axis=0)
-    return np.maximum(np.sqrt(square), 1e-150)[:, None]
+    return np.maximum(np.sqrt(mean_square(windows.errors)), 1e-150)[:, None]
 
 
 def held_out_gain(windows: MotionWindows, blocks: Sequence[Indices]) -> float:

@@ -12,9 +12,9 @@ from scipy import stats
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.refusals import ErrorGrowth
-from consistency.referee.fit_covariance.systematic_errors import jacobian_of_mean
+from consistency.referee.fit_covariance.systematic_errors import FORWARD, jacobian_of_mean, normal_equations
 from consistency.referee.fit_covariance.white_noise import MotionNoise
-from consistency.referee.fit_covariance.windows import ENOUGH, MotionWindows, in_plane
+from consistency.referee.fit_covariance.windows import ENOUGH, MotionWindows, in_plane, mean_square, motions_between
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.readers.relative_motions import BENT
 from consistency.referee.types import Array, Indices
@@ -81,9 +81,9 @@ def persistent_errors(noise: MotionNoise, windows: MotionWindows) -> tuple[Persi
     if len(drives) < ENOUGH:
         return ()
     corrected = noise.mean.applied(windows)
-    effects = (jacobian_of_mean(corrected.pieces) ** 2).mean(axis=0)  # (n, p), of a term of 1 on squares of an axis
+    effects = mean_square(jacobian_of_mean(corrected.pieces))  # (n, p), of a term of 1 on squares of an axis
     stated = noise.variances(corrected.pieces).mean(axis=0)
-    own = [_own_mean(noise, corrected.of(windows.drive == drive)) for drive in drives]
+    own = [_own_mean(noise, windows.of(windows.drive == drive)) for drive in drives]
     values, variances = (np.array(each) for each in zip(*own, strict=True))  # (drives, p)
     terms = values.shape[1]
     found: dict[str, PersistentError] = {}
@@ -114,11 +114,9 @@ def _between(values: Array, variances: Array, chance: float) -> float:
 
 def _own_mean(noise: MotionNoise, windows: MotionWindows) -> tuple[Array, Array]:
     """Scale, turn and drift (p,) that a drive has beyond the mean of all, and their variances; infinite if unknown."""
-    X = jacobian_of_mean(windows.pieces)
-    both = np.concatenate([X, windows.errors[..., None]], axis=-1)
-    solved = np.linalg.solve(noise.covariance(windows.pieces), both)
-    moments = (np.swapaxes(X, 1, 2) @ solved).sum(axis=0)
-    H, g = moments[:, :-1], moments[:, -1]
+    C = noise.covariance(noise.mean.corrected(windows.pieces))
+    equations = normal_equations(windows, noise.mean, C, [FORWARD])[FORWARD]
+    H, g = equations.A.sum(axis=0), equations.b.sum(axis=0)
     size = np.sqrt(np.maximum(np.diag(H), 1e-300))
     inverted = np.linalg.pinv(H / np.outer(size, size), rcond=1e-6)
     variance = np.where(np.diag(H) > 1e-200, np.diag(inverted) / size**2, np.inf)
@@ -162,7 +160,7 @@ def errors_of_second(noise: MotionNoise, windows: MotionWindows, second: Sequenc
         start = _rows_at(twin, drive, windows.first[rows])
         end = _rows_at(twin, drive, windows.last[rows])
         both = (start >= 0) & (end >= 0)
-        estimated = inverse(twin.estimate[start[both]]) @ twin.estimate[end[both]]
+        estimated = motions_between(twin.estimate, start[both], end[both])
         if windows.d == 2 and twin.d == 3:
             estimated = in_plane(estimated)
         true = windows.true[rows[both]]
@@ -176,9 +174,10 @@ def errors_of_second(noise: MotionNoise, windows: MotionWindows, second: Sequenc
         raise InputError(f"--second: has {len(a)} windows in common; its times must be those of the estimates")
     a = _centered(a)
     b = _centered(b)
-    size_of_a = np.maximum(np.sqrt((a**2).mean(axis=0)), 1e-300)
-    size_of_b = np.maximum(np.sqrt((b**2).mean(axis=0)), 1e-300)
-    return SecondErrors((a * b).mean(axis=0) / (size_of_a * size_of_b), size_of_b / size_of_a)
+    size = np.maximum(np.sqrt(mean_square(a)), 1e-300)
+    size_of_second = np.maximum(np.sqrt(mean_square(b)), 1e-300)
+    correlation = (a * b).mean(axis=0) / (size * size_of_second)
+    return SecondErrors(correlation, size_of_second / size)
 
 
 def _centered(error: Array) -> Array:

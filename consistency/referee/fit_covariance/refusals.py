@@ -12,7 +12,15 @@ from scipy import stats
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, no_mean
-from consistency.referee.fit_covariance.windows import ROUNDED, STILL, MotionWindows, rotation_vectors
+from consistency.referee.fit_covariance.windows import (
+    ROUNDED,
+    STILL,
+    MotionWindows,
+    mean_square,
+    motions_between,
+    norms,
+    rotation_vectors,
+)
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.types import Array, Indices
 
@@ -92,16 +100,15 @@ def _are_placeholders(T: Array, other: Array) -> bool:
     d = T.shape[-1] - 1
     if np.abs(T[:, :d, :d] - T[0, :d, :d]).max() > CONSTANT:
         return False
-    steps = np.diff(other[:, :d, d], axis=0)
-    along = np.swapaxes(other[:-1, :d, :d], -1, -2) @ steps[..., None]
-    in_world = np.linalg.norm(steps.sum(axis=0))
-    in_body = np.linalg.norm(along.sum(axis=0))
-    return bool(in_body - in_world > FOLLOWS * np.linalg.norm(steps, axis=1).sum())
+    steps = np.diff(other[:, :-1, -1], axis=0)
+    in_body = np.swapaxes(other[:-1, :d, :d], -1, -2) @ steps[..., None]
+    excess = np.linalg.norm(in_body.sum(axis=0)) - np.linalg.norm(steps.sum(axis=0))
+    return bool(excess > FOLLOWS * norms(steps).sum())
 
 
 def _are_increments(T: Array, other: Array) -> bool:
     """Whether positions have the size of the steps of another, in most rows that move, and their own steps do not."""
-    sizes = np.linalg.norm(T[1:, :-1, -1], axis=1)
+    sizes = norms(T[1:, :-1, -1])
     own = _steps(T)
     steps = _steps(other)
     moves = steps > STILL * np.median(steps)
@@ -111,7 +118,7 @@ def _are_increments(T: Array, other: Array) -> bool:
 
 def _steps(T: Array) -> Array:
     """Distances between neighbouring poses, (N - 1,), m."""
-    return np.asarray(np.linalg.norm(np.diff(T[:, :-1, -1], axis=0), axis=1))
+    return norms(np.diff(T[:, :-1, -1], axis=0))
 
 
 # --- drives -----------------------------------------------------------------------------------------------------------
@@ -135,7 +142,7 @@ def require_sound(windows: MotionWindows, correct: bool) -> None:
         )
     growth = growth_of_errors(windows, no_mean(windows))  # a map leaves no mean to correct
     rotations = windows.errors[:, windows.d :]
-    rounding = float(np.sqrt((rotations**2).sum(axis=1).mean()))
+    rounding = float(np.sqrt(mean_square(rotations).sum()))
     if growth.shrinks and rounding < ROUNDED:
         raise InputError(
             f"rotations of estimate and truth differ by {rounding:.2g} rad, as by rounding, and not by more over "
@@ -195,7 +202,7 @@ def body_turn(windows: MotionWindows) -> BodyTurn:
 def _vectors(motions: Array) -> Array:
     """What a turn of the body turns: positions (W, 2) in the plane; positions and rotations (2 W, 3) in space."""
     d = motions.shape[-1] - 1
-    positions = motions[:, :d, d]
+    positions = motions[:, :-1, -1]
     if d == 2:
         return positions
     return np.concatenate([positions, rotation_vectors(motions[:, None])[:, 0]])
@@ -220,7 +227,7 @@ def growth_of_errors(windows: MotionWindows, mean: Mean) -> ErrorGrowth:
         if some is None or len(some.drive) < FEW:
             break
         rotations = mean.applied(some).errors[:, some.d :]
-        squares.append(float((rotations**2).sum(axis=1).mean()))
+        squares.append(mean_square(rotations).sum())
         counts.append(len(some.drive))
     if len(squares) < 3:
         return ErrorGrowth(float("nan"), float("nan"))
@@ -267,7 +274,7 @@ def _passes(place: Array, way: Array, far: float, near: float) -> Indices:
     i = 0
     while i < len(place):
         j = int(np.searchsorted(way, way[i] + far))
-        apart = np.linalg.norm(place[j:] - place[i], axis=1)
+        apart = norms(place[j:] - place[i])
         close = np.flatnonzero(apart < near)
         if not len(close):
             i += 1
@@ -280,7 +287,6 @@ def _passes(place: Array, way: Array, far: float, near: float) -> Indices:
 
 def _turned(drive: Drive, first: Indices, last: Indices) -> Array:
     """Angles of the rotation error of motions, rad."""
-    estimated = inverse(drive.estimate[first]) @ drive.estimate[last]
-    true = inverse(drive.truth[first]) @ drive.truth[last]
-    rotations = log(inverse(estimated) @ true)[:, drive.d :]
-    return np.asarray(np.linalg.norm(rotations, axis=1))
+    estimated = motions_between(drive.estimate, first, last)
+    true = motions_between(drive.truth, first, last)
+    return norms(log(inverse(estimated) @ true)[:, drive.d :])

@@ -15,6 +15,7 @@ from consistency.referee.fit_covariance.windows import (
     MotionWindows,
     blocks_of,
     lengthened,
+    mean_square,
     rests,
     rotated,
     rotation_vectors,
@@ -52,11 +53,10 @@ class Mean:
 
     def corrected(self, pieces: Array) -> Array:
         """Motions (W, P, d + 1, d + 1) with this mean taken out."""
-        d = pieces.shape[-1] - 1
         pieces = lengthened(pieces, self.slip)
         drifts = ways(pieces)[..., None] * np.asarray(self.drift)
         out = rotated(pieces, self.turn * rotation_vectors(pieces) + drifts)
-        out[..., :d, d] *= self.way
+        out[..., :-1, -1] *= self.way
         return out
 
     def applied(self, windows: MotionWindows) -> MotionWindows:
@@ -172,7 +172,7 @@ def normal_equations(
     corrected = mean.applied(windows)
     error = corrected.errors
     if covariance is None:
-        square = (error**2).mean(axis=0)
+        square = mean_square(error)
         covariance = np.diag(np.maximum(square, 1e-12 * square.max() + 1e-100))[None]
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     X = whiten @ jacobian_of_mean(corrected.pieces)
@@ -255,23 +255,23 @@ def _strength(equations: NormalEquations) -> float:
     smallest = 1e100
     for j in range(p):
         others = np.delete(equations.Z, j, axis=-1).reshape(-1, p - 1)
-        x = _left_by(others, equations.X[..., j].ravel())
-        z = _left_by(others, equations.Z[..., j].ravel())
+        x = left_by(others, equations.X[..., j].ravel(), WEAK)
+        z = left_by(others, equations.Z[..., j].ravel(), WEAK)
         slope = float(z @ x) / max(float(z @ z), 1e-300)
         scores = (z * (x - slope * z)).reshape(W, -1).sum(axis=1)
         smallest = min(smallest, abs(z @ x) / max(np.linalg.norm(scores), 1e-300))
     return float(smallest**2)
 
 
-def _left_by(X: Array, y: Array) -> Array:
+def left_by(X: Array, y: Array, weak: float | None = None) -> Array:
     """What least squares on X (N, p) leaves of y, (N,) or (N, k)."""
-    return np.asarray(y - X @ np.linalg.lstsq(X, y, rcond=WEAK)[0])
+    return np.asarray(y - X @ np.linalg.lstsq(X, y, rcond=weak)[0])
 
 
 def _lasts(corrected: MotionWindows) -> bool:
     """Whether rotation errors of windows one or two apart correlate positively; jitter of their ends does not."""
     error = corrected.errors[:, corrected.d :]
-    error = error / np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-300)
+    error = error / np.maximum(np.sqrt(mean_square(error)), 1e-300)
     for lag in (1, 2):
         same_drive = corrected.drive[lag:] == corrected.drive[:-lag]
         products = (error[lag:] * error[:-lag]).sum(axis=1)[same_drive]
@@ -294,51 +294,39 @@ def fit_slip(windows: MotionWindows) -> float:
         mean = fit_mean(longer)
         corrected = mean.applied(longer)
         error = corrected.errors
-        size = np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-150)
-        X = (jacobian_of_mean(corrected.pieces) / size[:, None]).reshape(error.size, -1)
-        effect = (jacobian_of_slip(corrected.pieces) / size).ravel()
+        size = np.maximum(np.sqrt(mean_square(error)), 1e-150)
+        derivatives = (jacobian(corrected.pieces) / size[:, None]).reshape(error.size, -1)
+        X, effect = derivatives[:, :-1], derivatives[:, -1]
         y = (error / size).ravel()
-        left, y = (each - X @ np.linalg.lstsq(X, each, rcond=None)[0] for each in (effect, y))
+        left = left_by(X, effect)
         if not left @ left > APART * effect @ effect:
             return 0.0
-        slip += float(left @ y / (left @ left)) / mean.way
+        slip += float(left @ left_by(X, y) / (left @ left)) / mean.way
     return slip
 
 
 # --- derivatives of errors --------------------------------------------------------------------------------------------
 
 
-def jacobian_of_mean(pieces: Array) -> Array:
-    """Derivative (W, n, 2 + 1) or (W, n, 2 + 3) of the errors by scale of the way, scale of the turn, and drift."""
+def jacobian(pieces: Array) -> Array:
+    """Derivative (W, n, p + 1) of the errors by the p coefficients of a mean, and by a slip."""
     d = pieces.shape[-1] - 1
     turns = rotation_vectors(pieces)
     axes = turns.shape[-1]
-    local = np.zeros((*turns.shape[:2], d + axes, SCALES + axes))
-    local[..., :d, 0] = _along(pieces)
+    local = np.zeros((*turns.shape[:2], d + axes, SCALES + axes + 1))
+    along = -inverse(pieces)[..., :-1, -1]  # R' t: at the end of its piece a longer way is an error along it
+    local[..., :d, 0] = along
     local[..., d:, 1] = turns
-    local[..., d:, SCALES:] = ways(pieces)[..., None, None] * np.eye(axes)
-    return _at_the_end(pieces, local)
-
-
-def jacobian_of_slip(pieces: Array) -> Array:
-    """Derivative (W, n) of the errors by the way that a radian of turn adds."""
-    d = pieces.shape[-1] - 1
-    local = np.zeros((*pieces.shape[:2], 3 if d == 2 else 6, 1))
-    local[..., :d, 0] = _along(pieces) * turn_per_way(pieces)[..., None]
-    return _at_the_end(pieces, local)[..., 0]
-
-
-def _along(pieces: Array) -> Array:
-    """R' t (W, P, d) of each piece, along which a longer way is an error at its end."""
-    d = pieces.shape[-1] - 1
-    return -inverse(pieces)[..., :d, d]
-
-
-def _at_the_end(pieces: Array, local: Array) -> Array:
-    """Derivatives (W, n, p) of errors at the end of a window, from those at the ends of its pieces, (W, P, n, p)."""
+    local[..., d:, SCALES:-1] = ways(pieces)[..., None, None] * np.eye(axes)
+    local[..., :d, -1] = along * turn_per_way(pieces)[..., None]
     W, P, n, p = local.shape
     A = np.moveaxis(carriers(pieces)[:, 1:], 1, 2)
     return np.asarray(A.reshape(W, n, P * n) @ local.reshape(W, P * n, p))
+
+
+def jacobian_of_mean(pieces: Array) -> Array:
+    """Derivative (W, n, p) of the errors by scale of the way, scale of turns, and drift."""
+    return jacobian(pieces)[..., :-1]
 
 
 def carriers(pieces: Array) -> Array:

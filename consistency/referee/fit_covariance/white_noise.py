@@ -24,7 +24,7 @@ from consistency.referee.fit_covariance.systematic_errors import (
     no_mean,
     sum_of_neighbours,
 )
-from consistency.referee.fit_covariance.windows import MotionWindows, angles, blocks_of, ways
+from consistency.referee.fit_covariance.windows import MotionWindows, angles, blocks_of, mean_square, norms, ways
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
@@ -65,7 +65,8 @@ class MotionNoise:
         corrected = self.mean.applied(windows)
         error = corrected.errors
         C = self.covariance(corrected.pieces)
-        return nees_of(error, C) / error.shape[1], error**2 / np.diagonal(C, axis1=1, axis2=2)
+        own = np.diagonal(C, axis1=1, axis2=2)
+        return nees_of(error, C) / error.shape[1], error**2 / own
 
 
 def fit_noise(
@@ -144,7 +145,7 @@ def least_of(error: Array) -> Array:
     InputError
         All errors of one kind are nothing but rounding.
     """
-    square = (error**2).mean(axis=0)
+    square = mean_square(error)
     d = 2 if len(square) == 3 else 3
     parts = {"positions": square[:d], "rotations": square[d:]}
     for what, part in parts.items():
@@ -164,19 +165,14 @@ def jitter_of(noise: MotionNoise, windows: MotionWindows) -> Array:
     sizes = windows.span.size / np.array(SHORTER)
     if windows.span.unit == "step":
         sizes = np.round(sizes[sizes >= 1])
-    squares, stated, counts = [], [], []
-    for size in sizes.tolist():
-        some = windows.over(size)
-        if some is None:
-            continue
-        corrected = noise.mean.applied(some)
-        squares.append((corrected.errors**2).mean(axis=0))
-        stated.append(noise.variances(corrected.pieces).mean(axis=0))
-        counts.append(len(some.drive))
-    if len(squares) < LENGTHS:
+    cut = [windows.over(size) for size in sizes.tolist()]
+    corrected = [noise.mean.applied(each) for each in cut if each is not None]
+    if len(corrected) < LENGTHS:
         return np.zeros(len(noise.axes))
-    axes = zip(np.transpose(squares), np.transpose(stated), strict=True)
-    return np.array([constant_of(square, variance, np.array(counts)) for square, variance in axes])
+    squares = np.array([mean_square(each.errors) for each in corrected])
+    stated = np.array([noise.variances(each.pieces).mean(axis=0) for each in corrected])
+    counts = np.array([len(each.drive) for each in corrected])
+    return np.array([constant_of(square, each, counts) for square, each in zip(squares.T, stated.T, strict=True)])
 
 
 def constant_of(squares: Array, stated: Array, counts: Array) -> float:
@@ -185,10 +181,12 @@ def constant_of(squares: Array, stated: Array, counts: Array) -> float:
     A mean square of W windows has a relative variance of 2 / W.
     """
     weight = np.sqrt(counts / 2.0)
-    X = np.column_stack([stated, np.ones(len(stated))]) * (weight / np.maximum(squares, 1e-100))[:, None]
-    size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
-    slope, constant = np.linalg.lstsq(X / size, weight, rcond=None)[0] / size
-    error = np.sqrt(np.linalg.pinv((X / size).T @ (X / size))[1, 1]) / size[1]
+    relative = weight / np.maximum(squares, 1e-100)
+    X = np.column_stack([stated * relative, relative])
+    size = np.maximum(norms(X.T), 1e-300)
+    X = X / size
+    slope, constant = np.linalg.lstsq(X, weight, rcond=None)[0] / size
+    error = np.sqrt(np.linalg.pinv(X.T @ X)[1, 1]) / size[1]
     is_shown = slope > 0 and constant > SHOWN * error
     return float(constant) if is_shown else 0.0
 
@@ -286,7 +284,7 @@ def _start(error: Array, F: Array) -> Array:
     """The mean square of each axis, divided evenly among its terms."""
     axis = np.arange(F.shape[1]) % error.shape[1]
     own = F.mean(axis=0)[np.arange(F.shape[1]), axis, axis]
-    square = (error**2).mean(axis=0)[axis]
+    square = mean_square(error)[axis]
     return np.asarray(square / (2 * np.where(own > 0, own, np.inf)) + 1e-30)
 
 
@@ -300,7 +298,8 @@ def _likelihood(error: Array, C: Array) -> float:
 
 def nees_of(error: Array, C: Array) -> Array:
     """e' C^-1 e, (W,)."""
-    return np.asarray((error * np.linalg.solve(C, error[..., None])[..., 0]).sum(axis=1))
+    solved = np.linalg.solve(C, error[..., None])[..., 0]
+    return np.asarray((error * solved).sum(axis=1))
 
 
 def _nonnegative(H: Array, g: Array) -> Array:

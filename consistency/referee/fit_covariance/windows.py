@@ -139,15 +139,15 @@ def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, p
 
 def _cut_drive(drives: tuple[Drive, ...], number: int, span: Relative, planar: bool, pieces: int) -> MotionWindows:
     drive = drives[number]
-    position = drive.truth[:, : drive.d, drive.d]
+    position = drive.truth[:, :-1, -1]
     rows = drive.row if span.unit == "step" else np.arange(len(position))
     first, last, left_out = windows(drive.t, position, rows, span, drive.name)
     first = np.searchsorted(rows, first)
     last = np.searchsorted(rows, last)
     ends = _ends(first, last, pieces)
-    estimated = inverse(drive.estimate[ends[:, :-1]]) @ drive.estimate[ends[:, 1:]]
-    true_pieces = inverse(drive.truth[ends[:, :-1]]) @ drive.truth[ends[:, 1:]]
-    true = inverse(drive.truth[first]) @ drive.truth[last]
+    estimated = motions_between(drive.estimate, ends[:, :-1], ends[:, 1:])
+    true_pieces = motions_between(drive.truth, ends[:, :-1], ends[:, 1:])
+    true = motions_between(drive.truth, first, last)
     if planar and drive.d == 3:
         estimated = in_plane(estimated)
         true_pieces = in_plane(true_pieces)
@@ -182,8 +182,8 @@ def _jumps(of: MotionWindows) -> Array:
     rotations = slice(of.d, None), ROUNDED
     found = np.zeros(W, bool)
     for part, least in (positions, rotations):
-        of_pieces = np.linalg.norm(errors[..., part], axis=-1)
-        of_windows = np.linalg.norm(of.errors[:, part], axis=-1)
+        of_pieces = norms(errors[..., part])
+        of_windows = norms(of.errors[:, part])
         for drive in np.unique(of.drive):
             rows = of.drive == drive
             by_pieces = JUMP_OF_PIECES * float(np.nanmedian(of_pieces[rows]))
@@ -195,6 +195,11 @@ def _jumps(of: MotionWindows) -> Array:
 
 
 # --- motions in pieces ------------------------------------------------------------------------------------------------
+
+
+def motions_between(T: Array, first: Indices, last: Indices) -> Array:
+    """Motions between rows of poses (N, d + 1, d + 1), in the frame of the first."""
+    return inverse(T[first]) @ T[last]
 
 
 def in_plane(T: Array) -> Array:
@@ -216,8 +221,7 @@ def rests(pieces: Array) -> Array:
 
 def ways(pieces: Array) -> Array:
     """Length of each piece, (W, P), m."""
-    d = pieces.shape[-1] - 1
-    return np.asarray(np.linalg.norm(pieces[..., :d, d], axis=-1))
+    return norms(pieces[..., :-1, -1])
 
 
 def rotation_vectors(pieces: Array) -> Array:
@@ -233,7 +237,7 @@ def rotation_vectors(pieces: Array) -> Array:
 
 def angles(pieces: Array) -> Array:
     """Angle by which each piece turns, (W, P), rad, at least 0."""
-    return np.asarray(np.linalg.norm(rotation_vectors(pieces), axis=-1))
+    return norms(rotation_vectors(pieces))
 
 
 def rotated(pieces: Array, vectors: Array) -> Array:
@@ -258,10 +262,22 @@ def turn_per_way(pieces: Array) -> Array:
 def lengthened(pieces: Array, slip: float) -> Array:
     """Motions whose way is longer by ``slip`` for each radian of their turn; none goes backwards by this."""
     out = np.array(pieces)
-    d = pieces.shape[-1] - 1
     factor = np.maximum(1.0 + slip * turn_per_way(pieces), 0.0)
-    out[..., :d, d] *= factor[..., None]
+    out[..., :-1, -1] *= factor[..., None]
     return out
+
+
+# --- numbers of windows -----------------------------------------------------------------------------------------------
+
+
+def norms(vectors: Array) -> Array:
+    """Lengths of vectors (..., n)."""
+    return np.asarray(np.linalg.norm(vectors, axis=-1))
+
+
+def mean_square(errors: Array) -> Array:
+    """Mean square of each axis, (W, ...) -> (...)."""
+    return np.asarray((errors**2).mean(axis=0))
 
 
 def blocks_of(drive: Indices, enough: int = ENOUGH) -> list[Indices]:

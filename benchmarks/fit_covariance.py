@@ -30,11 +30,11 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.mean_by_motion import mean_by_motion
+from consistency.referee.fit_covariance.motion_windows import PLANE, SPACE, DriveWindows, cut_windows, span_of
 from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.persistence import doubts, persistent_errors
-from consistency.referee.fit_covariance.refusals import growth_of_errors, require_sound
+from consistency.referee.fit_covariance.refusals import require_sound, rotation_growth
 from consistency.referee.fit_covariance.white_noise import fit_noise, intervals, terms_of
-from consistency.referee.fit_covariance.windows import PLANE, SPACE, MotionWindows, cut_windows, span_of
 from consistency.referee.geometry.groups import composed, matrices, vectors
 from consistency.referee.types import Array
 
@@ -271,7 +271,7 @@ CASES = (
 )
 
 
-def told(rng: np.random.Generator, case: Case, fresh: MotionWindows) -> tuple[str, float, str]:
+def told(rng: np.random.Generator, case: Case, fresh: DriveWindows) -> tuple[str, float, str]:
     """Status, true ratio of the exported model on ``fresh`` drives, and the reason of a refusal or first warning.
 
     The parts of :func:`consistency.fit_covariance` that decide, without those that describe.
@@ -289,7 +289,7 @@ def told(rng: np.random.Generator, case: Case, fresh: MotionWindows) -> tuple[st
     depends = mean_by_motion(noise, windows).is_found
     judged_status = judged_by(folds, windows, case.fitted > 1).status
     status = decided(judged_status, any(each.decides for each in lasting), depends)
-    growth = growth_of_errors(windows, noise.mean)
+    growth = rotation_growth(windows, noise.mean)
     warnings = doubts(noise, windows, growth, lasting)
     nees = noise.nees(fresh)[0]
     means = [nees[fresh.drive == i].mean() for i in range(FRESH)]

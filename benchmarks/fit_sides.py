@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 from script_options import options_of
 
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of
 from consistency.referee.fit_covariance.systematic_errors import MeanFit
 from consistency.referee.fit_covariance.white_noise import fit_noise, jitter_of
-from consistency.referee.fit_covariance.windows import cut_windows, span_of
 from consistency.referee.geometry.groups import composed, matrices
 from consistency.referee.types import Array
 

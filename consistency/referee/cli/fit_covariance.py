@@ -62,8 +62,8 @@ def fit_covariance(
     from dataclasses import replace
 
     from consistency.referee.fit_covariance.drives import read_drives
+    from consistency.referee.fit_covariance.model_text import noise_document
     from consistency.referee.fit_covariance.noise_model import fit_covariance as fit
-    from consistency.referee.fit_covariance.wording import document
     from consistency.referee.system.folders import require_free
 
     require_word("--fail-on", fail_on, "inconsistent")
@@ -81,6 +81,6 @@ def fit_covariance(
         from consistency.referee.fit_covariance.writing import write_model
 
         written = write_model(model, out, overwrite)
-    show(document(model), as_json, written)
+    show(noise_document(model), as_json, written)
     if fail_on and model.status != "consistent":
         raise typer.Exit(1)

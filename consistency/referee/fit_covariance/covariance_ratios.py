@@ -10,8 +10,8 @@ from scipy import special, stats
 
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.white_noise import MotionNoise
-from consistency.referee.fit_covariance.windows import BLOCKS, ENOUGH, MotionWindows
+from consistency.referee.fit_covariance.motion_windows import BLOCKS, ENOUGH, DriveWindows
+from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array, Indices
 
@@ -24,11 +24,11 @@ IN_TURN = "in turn"
 class Fold:
     """A fit to some drives or first halves, and what it is judged by."""
 
-    noise: MotionNoise
+    noise: WhiteNoise
     judged: Indices  # drives
     since: Array  # (drives,), row from which a window may be judged; 0 where the whole drive is
 
-    def judges(self, windows: MotionWindows) -> Array:
+    def judges(self, windows: DriveWindows) -> Array:
         """Which windows chose nothing of this fit, (W,)."""
         return np.asarray(np.isin(windows.drive, self.judged) & (windows.first >= self.since[windows.drive]))
 
@@ -64,7 +64,7 @@ class Ratio:
 
 
 @dataclass(frozen=True)
-class SpanRatios:
+class JudgedSpan:
     """What the windows of one span show."""
 
     span: str
@@ -83,14 +83,14 @@ class SpanRatios:
         return "undecided" if "undecided" in found else "consistent"
 
 
-def are_halves(windows: MotionWindows, held_out: str | None) -> bool:
+def are_halves(windows: DriveWindows, held_out: str | None) -> bool:
     """Whether second halves of drives are judged by a fit to the first ones."""
     return held_out == HALF or (held_out is None and len(windows.drives) == 1)
 
 
 def folds_of(
-    windows: MotionWindows, held_out: str | None, fit: Callable[[MotionWindows], MotionNoise]
-) -> tuple[MotionNoise, list[Fold]]:
+    windows: DriveWindows, held_out: str | None, fit: Callable[[DriveWindows], WhiteNoise]
+) -> tuple[WhiteNoise, list[Fold]]:
     """The fit that is handed out, and those that are judged.
 
     Parameters
@@ -126,7 +126,7 @@ def _middle(ends: Indices) -> int:
     return int(ends[(len(ends) - 1) // 2]) if len(ends) else 0
 
 
-def _named(windows: MotionWindows, held_out: str) -> Indices:
+def _named(windows: DriveWindows, held_out: str) -> Indices:
     names = [name.strip() for name in held_out.split(",")]
     known = [drive.name for drive in windows.drives]
     for name in names:
@@ -135,7 +135,7 @@ def _named(windows: MotionWindows, held_out: str) -> Indices:
     return np.array([known.index(name) for name in names])
 
 
-def judged_by(folds: Sequence[Fold], windows: MotionWindows, general: bool) -> SpanRatios:
+def judged_by(folds: Sequence[Fold], windows: DriveWindows, general: bool) -> JudgedSpan:
     """Ratios of the windows of a span, each by the fit that it did not choose; of the whole and of each axis."""
     drives, parts = [], []
     for fold in folds:
@@ -151,7 +151,7 @@ def judged_by(folds: Sequence[Fold], windows: MotionWindows, general: bool) -> S
     n = len(windows.axes)
     whole = ratio_of(by_drive[:, 0], values[:, 0], general, n * counts)
     axes = tuple(ratio_of(by_drive[:, k], values[:, k], general, counts) for k in range(1, n + 1))
-    return SpanRatios(windows.span.option, whole, axes, by_drive)
+    return JudgedSpan(windows.span.option, whole, axes, by_drive)
 
 
 def ratio_of(by_drive: Array, values: Array, general: bool = True, dof: Array | None = None) -> Ratio:

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
+from consistency.referee.fit_covariance.motion_windows import DriveWindows, angles, blocks_of, mean_square, ways
 from consistency.referee.fit_covariance.systematic_errors import fit_mean, fit_slip, jacobian_of_mean, left_by
-from consistency.referee.fit_covariance.white_noise import MotionNoise
-from consistency.referee.fit_covariance.windows import MotionWindows, angles, blocks_of, mean_square, ways
+from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.types import Array, Indices
 
 SURE = 0.01  # chance to find a dependence where there is none, all questions together
@@ -52,7 +52,7 @@ class Question(NamedTuple):
     bins: Indices  # (W,)
 
 
-def mean_by_motion(noise: MotionNoise, windows: MotionWindows) -> MotionDependence:
+def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> MotionDependence:
     """Find the dependence with the smallest p-value, which is times the number of questions."""
     corrected = noise.mean.applied(windows)
     questions = _questions(corrected)
@@ -80,7 +80,7 @@ def mean_by_motion(noise: MotionNoise, windows: MotionWindows) -> MotionDependen
     return dependence
 
 
-def _questions(corrected: MotionWindows) -> list[Question]:
+def _questions(corrected: DriveWindows) -> list[Question]:
     """All questions that are asked.
 
     Windows are divided once by the estimated and once by the true motion, and both must show it: the noise of a motion
@@ -108,7 +108,7 @@ def bins_of(sizes: Array) -> Indices:
     return np.searchsorted(edges, sizes, side="right")
 
 
-def p_value_of(windows: MotionWindows, pieces: Array, bins: Indices, scale: int) -> float:
+def p_value_of(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) -> float:
     """p-value of one scale in all bins, by a score test; errors are of ``windows``, and motions ``pieces``.
 
     Each drive has constants of its own. The scores of blocks of windows, in all bins but the first, are compared with
@@ -148,7 +148,7 @@ def _hotelling(sums: Array, inflation: float) -> float:
     return float(stats.f.sf(squared * (G - q) / (q * (G - 1)), q, G - q))
 
 
-def values_by_bin(windows: MotionWindows, bins: Indices, scale: int) -> tuple[Array, Array]:
+def values_by_bin(windows: DriveWindows, bins: Indices, scale: int) -> tuple[Array, Array]:
     """What a scale is more in each bin, (BINS,), and mean errors (W, n) by its differences; 0 where nothing tells."""
     X = jacobian_of_mean(windows.pieces)
     in_bin = bins[:, None] == np.arange(BINS)
@@ -162,12 +162,12 @@ def values_by_bin(windows: MotionWindows, bins: Indices, scale: int) -> tuple[Ar
     return values, Z @ (values - squares @ values / squares.sum())
 
 
-def _size_of_errors(windows: MotionWindows) -> Array:
+def _size_of_errors(windows: DriveWindows) -> Array:
     """Root mean square of each axis, (n, 1)."""
     return np.maximum(np.sqrt(mean_square(windows.errors)), 1e-150)[:, None]
 
 
-def held_out_gain(windows: MotionWindows, blocks: Sequence[Indices]) -> float:
+def held_out_gain(windows: DriveWindows, blocks: Sequence[Indices]) -> float:
     """Share of the squared error of positions that a slip takes out of the blocks that chose nothing of it."""
     before = after = 0.0
     for block in blocks:
@@ -178,7 +178,7 @@ def held_out_gain(windows: MotionWindows, blocks: Sequence[Indices]) -> float:
     return 1.0 - after / before if before > 0 else 0.0
 
 
-def _squares_left(fitted: MotionWindows, judged: MotionWindows, slip: float) -> float:
+def _squares_left(fitted: DriveWindows, judged: DriveWindows, slip: float) -> float:
     """Sum of squared errors of positions, with a slip and the mean that is fitted to others beside it."""
     mean = fit_mean(fitted.lengthened(slip))
     error = mean.applied(judged.lengthened(slip)).errors

@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.column_names import COVARIANCE
 from consistency.referee.diagnostics import Record
 from consistency.referee.fit_covariance.covariance_ratios import Fold
-from consistency.referee.fit_covariance.windows import MotionWindows
+from consistency.referee.fit_covariance.motion_windows import DriveWindows
 from consistency.referee.geometry.groups import carried, composed, to_left, vectors
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.relative_motions import Stretch, relative_recording
@@ -20,7 +20,7 @@ from consistency.referee.types import Array
 CONVENTIONS = {3: "so2", 6: "so3"}  # the defaults of files, so that they are read without further options
 
 
-def stretches_of(windows: MotionWindows, folds: Sequence[Fold]) -> list[tuple[str, Stretch]]:
+def stretches_of(windows: DriveWindows, folds: Sequence[Fold]) -> list[tuple[str, Stretch]]:
     """Drive and rows of each stretch of neighbouring windows that are judged; a window left out begins another."""
     found: list[tuple[str, Stretch]] = []
     for fold in folds:
@@ -34,7 +34,7 @@ def stretches_of(windows: MotionWindows, folds: Sequence[Fold]) -> list[tuple[st
     return found
 
 
-def _stretch(run: int, windows: MotionWindows, C: Array) -> tuple[str, Stretch]:
+def _stretch(run: int, windows: DriveWindows, C: Array) -> tuple[str, Stretch]:
     """Neighbouring windows of one drive as rows, the first of which is only where they start."""
     drive = windows.drives[windows.drive[0]]
     n = len(windows.axes)

@@ -20,14 +20,15 @@ from consistency.referee.fit_covariance.covariance_ratios import (
     HALF,
     IN_TURN,
     Fold,
+    JudgedSpan,
     Ratio,
-    SpanRatios,
     are_halves,
     folds_of,
     judged_by,
 )
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.mean_by_motion import MotionDependence, mean_by_motion
+from consistency.referee.fit_covariance.motion_windows import ENOUGH, PIECES, DriveWindows, cut_windows, span_of
 from consistency.referee.fit_covariance.motions import record_of_motions, stretches_of
 from consistency.referee.fit_covariance.persistence import (
     PersistentError,
@@ -36,9 +37,8 @@ from consistency.referee.fit_covariance.persistence import (
     errors_of_second,
     persistent_errors,
 )
-from consistency.referee.fit_covariance.refusals import ErrorGrowth, growth_of_errors, require_poses, require_sound
-from consistency.referee.fit_covariance.white_noise import MotionNoise, fit_noise, intervals, jitter_of
-from consistency.referee.fit_covariance.windows import ENOUGH, PIECES, MotionWindows, cut_windows, span_of
+from consistency.referee.fit_covariance.refusals import RotationGrowth, require_poses, require_sound, rotation_growth
+from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, intervals, jitter_of
 from consistency.referee.geometry.groups import log, matrices
 from consistency.referee.readers.relative_motions import Stretch
 from consistency.referee.types import Array
@@ -54,21 +54,21 @@ class NoiseModel:
 
     name: str
     span: str  # 1m, 2s, 100
-    noise: MotionNoise
+    noise: WhiteNoise
     per_m: tuple[Interval, ...]  # (n,), variances a metre
     per_rad: tuple[Interval, ...]  # (n,)
-    spans: tuple[SpanRatios, ...]  # the first is that of the fit
+    spans: tuple[JudgedSpan, ...]  # the first is that of the fit
     record: Record = field(repr=False)  # judged motions, each a run
     verdict: Verdict = field(repr=False)  # of the referee on these motions
     fitted_drives: tuple[str, ...]
     judged_drives: tuple[str, ...]
     held_out: str  # "in turn", "half" or names
-    growth: ErrorGrowth  # of the squared rotation error over the span
+    growth: RotationGrowth  # of the squared rotation error over the span
     warnings: tuple[str, ...]
     lasting: tuple[PersistentError, ...]  # errors that differ between drives
     by_motion: MotionDependence | None  # whether the mean depends on the motion; None where it is left in
     second: SecondErrors | None  # errors of the second estimator
-    windows: MotionWindows = field(repr=False)
+    windows: DriveWindows = field(repr=False)
     folds: tuple[Fold, ...] = field(repr=False)
 
     @property
@@ -125,12 +125,12 @@ class NoiseModel:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        from consistency.referee.fit_covariance.page import plot  # draws
+        from consistency.referee.fit_covariance.page import plot_noise  # draws
 
-        return plot(self, path)
+        return plot_noise(self, path)
 
     def __repr__(self) -> str:
-        from consistency.referee.fit_covariance.wording import sentence  # of this class
+        from consistency.referee.fit_covariance.model_text import sentence  # of this class
 
         return f"<NoiseModel {self.name}: {sentence(self)}>"
 
@@ -193,7 +193,7 @@ def fit_covariance(
     jitter = jitter_of(fit_noise(windows, correct, by_turn), windows)
     fit = partial(fit_noise, correct=correct, by_turn=by_turn, jitter=jitter)
     noise, folds = folds_of(windows, held_out, fit)
-    growth = growth_of_errors(windows, noise.mean)
+    growth = rotation_growth(windows, noise.mean)
     lasting = persistent_errors(noise, windows)
     by_halves = are_halves(windows, held_out)
     if cautious is not None:
@@ -259,7 +259,7 @@ def evenly(motion: Array, pieces: int) -> Array:
     return np.repeat(linalg.expm(generator)[None], pieces, axis=0)
 
 
-def _matrices(motion: ArrayLike, noise: MotionNoise) -> Array:
+def _matrices(motion: ArrayLike, noise: WhiteNoise) -> Array:
     values = np.atleast_2d(np.asarray(motion, float))
     width = 3 if len(noise.axes) == 3 else 7
     if values.ndim != 2 or values.shape[1] != width or not np.isfinite(values).all():
@@ -280,7 +280,7 @@ def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
     return spaces == {2} or axes == 3
 
 
-def _judge_spans(folds: Sequence[Fold], windows: MotionWindows, general: bool) -> tuple[SpanRatios, ...]:
+def _judge_spans(folds: Sequence[Fold], windows: DriveWindows, general: bool) -> tuple[JudgedSpan, ...]:
     """Judge the fit at its span and at longer ones, as long as there are windows."""
     found = []
     for times in SPANS:
@@ -296,7 +296,7 @@ def _judge_spans(folds: Sequence[Fold], windows: MotionWindows, general: bool) -
     return tuple(found)
 
 
-def windows_over(model: NoiseModel, judged: SpanRatios) -> MotionWindows:
+def error_windows(model: NoiseModel, judged: JudgedSpan) -> DriveWindows:
     """The windows of a span, corrected."""
     found = model.windows.over(span_of(judged.span).size)
     assert found is not None

@@ -11,10 +11,16 @@ from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.refusals import ErrorGrowth
+from consistency.referee.fit_covariance.motion_windows import (
+    ENOUGH,
+    DriveWindows,
+    in_plane,
+    mean_square,
+    motions_between,
+)
+from consistency.referee.fit_covariance.refusals import RotationGrowth
 from consistency.referee.fit_covariance.systematic_errors import FORWARD, jacobian_of_mean, normal_equations
-from consistency.referee.fit_covariance.white_noise import MotionNoise
-from consistency.referee.fit_covariance.windows import ENOUGH, MotionWindows, in_plane, mean_square, motions_between
+from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.readers.relative_motions import BENT
 from consistency.referee.types import Array, Indices
@@ -46,7 +52,7 @@ class PersistentError:
 
 
 def doubts(
-    noise: MotionNoise, windows: MotionWindows, growth: ErrorGrowth, persistent: Sequence[PersistentError]
+    noise: WhiteNoise, windows: DriveWindows, growth: RotationGrowth, persistent: Sequence[PersistentError]
 ) -> list[str]:
     """Sentences on errors that outlast a window or a drive, and on angles beyond first order."""
     found = []
@@ -70,7 +76,7 @@ def doubts(
     return found
 
 
-def persistent_errors(noise: MotionNoise, windows: MotionWindows) -> tuple[PersistentError, ...]:
+def persistent_errors(noise: WhiteNoise, windows: DriveWindows) -> tuple[PersistentError, ...]:
     """Terms that differ between drives by more than white noise, from ``ENOUGH`` drives on.
 
     Each drive has means of its own, by generalised least squares on the estimated motion; their differences are
@@ -112,7 +118,7 @@ def _between(values: Array, variances: Array, chance: float) -> float:
     return float((statistic - dof) / (weight.sum() - (weight**2).sum() / weight.sum()))
 
 
-def _own_mean(noise: MotionNoise, windows: MotionWindows) -> tuple[Array, Array]:
+def _own_mean(noise: WhiteNoise, windows: DriveWindows) -> tuple[Array, Array]:
     """Scale, turn and drift (p,) that a drive has beyond the mean of all, and their variances; infinite if unknown."""
     C = noise.covariance(noise.mean.corrected(windows.pieces))
     equations = normal_equations(windows, noise.mean, C, [FORWARD])[FORWARD]
@@ -143,7 +149,7 @@ class SecondErrors(NamedTuple):
         return np.asarray(self.size > 1.0 / SHARED)
 
 
-def errors_of_second(noise: MotionNoise, windows: MotionWindows, second: Sequence[Drive]) -> SecondErrors:
+def errors_of_second(noise: WhiteNoise, windows: DriveWindows, second: Sequence[Drive]) -> SecondErrors:
     """Compare the errors of another estimator with the corrected ones.
 
     Raises

@@ -11,16 +11,16 @@ from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, no_mean
-from consistency.referee.fit_covariance.windows import (
+from consistency.referee.fit_covariance.motion_windows import (
     ROUNDED,
     STILL,
-    MotionWindows,
+    DriveWindows,
     mean_square,
     motions_between,
     norms,
     rotation_vectors,
 )
+from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, no_mean
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.types import Array, Indices
 
@@ -40,7 +40,7 @@ LIVE = "record the live odometry, before loops are closed or a map corrects it"
 
 
 @dataclass(frozen=True)
-class ErrorGrowth:
+class RotationGrowth:
     """Power of the span with which the squared rotation error grows; NaN where drives are too short to tell."""
 
     power: float
@@ -124,7 +124,7 @@ def _steps(T: Array) -> Array:
 # --- drives -----------------------------------------------------------------------------------------------------------
 
 
-def require_sound(windows: MotionWindows, correct: bool) -> None:
+def require_sound(windows: DriveWindows, correct: bool) -> None:
     """Refuse drives that no white noise describes.
 
     Raises
@@ -140,7 +140,7 @@ def require_sound(windows: MotionWindows, correct: bool) -> None:
             "a model without them is none of this odometry; if the clocks of estimates and truth differ, give their "
             "--time-offset S, or 'estimate'; otherwise mend the jumps, or state them as failures of the odometry"
         )
-    growth = growth_of_errors(windows, no_mean(windows))  # a map leaves no mean to correct
+    growth = rotation_growth(windows, no_mean(windows))  # a map leaves no mean to correct
     rotations = windows.errors[:, windows.d :]
     rounding = float(np.sqrt(mean_square(rotations).sum()))
     if growth.shrinks and rounding < ROUNDED:
@@ -176,7 +176,7 @@ def require_sound(windows: MotionWindows, correct: bool) -> None:
         )
 
 
-def body_turn(windows: MotionWindows) -> BodyTurn:
+def body_turn(windows: DriveWindows) -> BodyTurn:
     """Find the constant turn B with M = B^-1 D B that fits best (Wahba 1965), and its chance by F."""
     d = windows.d
     estimated = _vectors(windows.motions)
@@ -208,14 +208,14 @@ def _vectors(motions: Array) -> Array:
     return np.concatenate([positions, rotation_vectors(motions[:, None])[:, 0]])
 
 
-def _squares_left(windows: MotionWindows) -> float:
+def _squares_left(windows: DriveWindows) -> float:
     """Sum of squared errors of positions that the means leave."""
     corrected = fit_mean(windows).applied(windows)
     errors = corrected.motions[:, :-1, -1] - windows.true[:, :-1, -1]
     return float((errors**2).sum())
 
 
-def growth_of_errors(windows: MotionWindows, mean: Mean) -> ErrorGrowth:
+def rotation_growth(windows: DriveWindows, mean: Mean) -> RotationGrowth:
     """Fit the growth by weighted least squares of the logarithms of mean squares and spans.
 
     A mean square of W windows has a relative variance of 2 / W; errors of several spans depend on each other, which
@@ -230,16 +230,16 @@ def growth_of_errors(windows: MotionWindows, mean: Mean) -> ErrorGrowth:
         squares.append(mean_square(rotations).sum())
         counts.append(len(some.drive))
     if len(squares) < 3:
-        return ErrorGrowth(float("nan"), float("nan"))
+        return RotationGrowth(float("nan"), float("nan"))
     x = np.log(LONGER[: len(squares)])
     y = np.log(np.maximum(squares, 1e-300))
     weight = 0.5 * np.array(counts, float)
     x = x - (weight * x).sum() / weight.sum()
     information = float((weight * x**2).sum())
-    return ErrorGrowth(float((weight * x * y).sum()) / information, float(np.sqrt(2.0 / information)))
+    return RotationGrowth(float((weight * x * y).sum()) / information, float(np.sqrt(2.0 / information)))
 
 
-def revisits(windows: MotionWindows) -> Revisits:
+def revisits(windows: DriveWindows) -> Revisits:
     """Compare rotation errors between passes of a place with those of windows of ten spans.
 
     Passes are ``FAR`` spans of the way apart, so that white noise has twice the square at least; its chance is by F

@@ -10,9 +10,9 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.fit_covariance.windows import (
+from consistency.referee.fit_covariance.motion_windows import (
     BLOCKS,
-    MotionWindows,
+    DriveWindows,
     blocks_of,
     lengthened,
     mean_square,
@@ -59,7 +59,7 @@ class Mean:
         out[..., :-1, -1] *= self.way
         return out
 
-    def applied(self, windows: MotionWindows) -> MotionWindows:
+    def applied(self, windows: DriveWindows) -> DriveWindows:
         return replace(windows, pieces=self.corrected(windows.pieces))
 
 
@@ -100,12 +100,12 @@ class Estimate(NamedTuple):
     high: Array
 
 
-def no_mean(windows: MotionWindows) -> Mean:
+def no_mean(windows: DriveWindows) -> Mean:
     """The mean that corrects nothing."""
     return Mean(drift=(0.0,) * (len(windows.axes) - windows.d))
 
 
-def fit_mean(windows: MotionWindows, covariance: Array | None = None) -> Mean:
+def fit_mean(windows: DriveWindows, covariance: Array | None = None) -> Mean:
     """Fit a mean by generalised least squares on the estimated motion.
 
     Parameters
@@ -119,7 +119,7 @@ def fit_mean(windows: MotionWindows, covariance: Array | None = None) -> Mean:
     return mean
 
 
-def choose_mean(windows: MotionWindows, covariance: Array | None = None, start: Mean | None = None) -> MeanFit:
+def choose_mean(windows: DriveWindows, covariance: Array | None = None, start: Mean | None = None) -> MeanFit:
     """Fit the mean that holds whether the odometry's noise is in the estimated motion or in the true one.
 
     Errors in variables (Fuller 1987, "Measurement Error Models"): least squares on the estimated motion is right where
@@ -148,7 +148,7 @@ def choose_mean(windows: MotionWindows, covariance: Array | None = None, start: 
 
 
 def _select(
-    windows: MotionWindows, near: Mean, equations: Sequence[NormalEquations]
+    windows: DriveWindows, near: Mean, equations: Sequence[NormalEquations]
 ) -> tuple[Mean, Array, Array, Array]:
     """Mean of the coefficients whose range, over all equations, excludes none; ranges, and which coefficients, (p,)."""
     none = no_mean(windows).values
@@ -166,7 +166,7 @@ def _select(
 
 
 def normal_equations(
-    windows: MotionWindows, mean: Mean, covariance: Array | None, instruments: Sequence[str]
+    windows: DriveWindows, mean: Mean, covariance: Array | None, instruments: Sequence[str]
 ) -> dict[str, NormalEquations]:
     """Equations of each kind of instruments, at a mean."""
     corrected = mean.applied(windows)
@@ -189,7 +189,7 @@ def normal_equations(
     return found
 
 
-def estimate(windows: MotionWindows, near: Mean, equations: NormalEquations, free: Array | None = None) -> Estimate:
+def estimate(windows: DriveWindows, near: Mean, equations: NormalEquations, free: Array | None = None) -> Estimate:
     """The mean after a step of Gauss and Newton, with intervals from the scatter between blocks of what it leaves.
 
     Parameters
@@ -228,7 +228,7 @@ def _solve(A: Array, b: Array) -> Array:
     return np.asarray((x.T / size).T)
 
 
-def _of_neighbours(windows: MotionWindows) -> Array:
+def _of_neighbours(windows: DriveWindows) -> Array:
     """Derivatives of the windows before and after, (W, n, p), less what is next to this one: its ends may be shared."""
     early = np.array(windows.pieces)
     late = np.array(windows.pieces)
@@ -236,7 +236,7 @@ def _of_neighbours(windows: MotionWindows) -> Array:
     return sum_of_neighbours(windows, jacobian_of_mean(early), jacobian_of_mean(late))
 
 
-def sum_of_neighbours(windows: MotionWindows, before: Array, after: Array) -> Array:
+def sum_of_neighbours(windows: DriveWindows, before: Array, after: Array) -> Array:
     """Sum of a value of the window before and another of the one after, each (W, ...); 0 where there is none."""
     follows = (windows.first[1:] == windows.last[:-1]) & (np.diff(windows.drive) == 0)
     second = np.flatnonzero(follows) + 1
@@ -268,7 +268,7 @@ def left_by(X: Array, y: Array, weak: float | None = None) -> Array:
     return np.asarray(y - X @ np.linalg.lstsq(X, y, rcond=weak)[0])
 
 
-def _lasts(corrected: MotionWindows) -> bool:
+def _lasts(corrected: DriveWindows) -> bool:
     """Whether rotation errors of windows one or two apart correlate positively; jitter of their ends does not."""
     error = corrected.errors[:, corrected.d :]
     error = error / np.maximum(np.sqrt(mean_square(error)), 1e-300)
@@ -283,7 +283,7 @@ def _lasts(corrected: MotionWindows) -> bool:
 # --- a way by turn, where wheels slip ---------------------------------------------------------------------------------
 
 
-def fit_slip(windows: MotionWindows) -> float:
+def fit_slip(windows: DriveWindows) -> float:
     """Fit the way that a turn adds, m a rad, by least squares beside the mean.
 
     It is 0 where it cannot be told from a scale of the way, or of turns.

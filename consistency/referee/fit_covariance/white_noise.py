@@ -14,6 +14,7 @@ from scipy import optimize, stats
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.motion_windows import DriveWindows, angles, blocks_of, mean_square, norms, ways
 from consistency.referee.fit_covariance.systematic_errors import (
     NEIGHBOURS,
     Mean,
@@ -24,7 +25,6 @@ from consistency.referee.fit_covariance.systematic_errors import (
     no_mean,
     sum_of_neighbours,
 )
-from consistency.referee.fit_covariance.windows import MotionWindows, angles, blocks_of, mean_square, norms, ways
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
@@ -36,7 +36,7 @@ STEPS, CLOSE = 100, 1e-7  # of scoring; gain of the log likelihood of a window a
 
 
 @dataclass(frozen=True)
-class MotionNoise:
+class WhiteNoise:
     """Cov e = sum over pieces of A diag(per_m |way| + per_rad |turn|) A', and the floor; n axes."""
 
     axes: tuple[str, ...]
@@ -60,7 +60,7 @@ class MotionNoise:
         """Diagonals of the covariances, (W, n)."""
         return np.diagonal(self.covariance(pieces), axis1=1, axis2=2)
 
-    def nees(self, windows: MotionWindows) -> tuple[Array, Array]:
+    def nees(self, windows: DriveWindows) -> tuple[Array, Array]:
         """NEES over dof (W,), and of each axis alone (W, n), of windows whose motions are not corrected yet."""
         corrected = self.mean.applied(windows)
         error = corrected.errors
@@ -70,8 +70,8 @@ class MotionNoise:
 
 
 def fit_noise(
-    windows: MotionWindows, correct: bool = True, by_turn: bool = False, jitter: Array | float = 0.0
-) -> MotionNoise:
+    windows: DriveWindows, correct: bool = True, by_turn: bool = False, jitter: Array | float = 0.0
+) -> WhiteNoise:
     """Fit mean and noise of windows, each given the other in turn.
 
     Parameters
@@ -103,11 +103,11 @@ def fit_noise(
             fit = choose_mean(windows, C, fit.whole)
         mean = fit.mean
     theta, floor, _ = _fit_about(windows, mean, fit, jitter, theta)
-    return MotionNoise(windows.axes, mean, theta[:n], theta[n:], floor, mean_fit=fit)
+    return WhiteNoise(windows.axes, mean, theta[:n], theta[n:], floor, mean_fit=fit)
 
 
 def _fit_about(
-    windows: MotionWindows, mean: Mean, fit: MeanFit | None, jitter: Array | float, start: Array | None
+    windows: DriveWindows, mean: Mean, fit: MeanFit | None, jitter: Array | float, start: Array | None
 ) -> tuple[Array, Array, Array]:
     """Variances (2 n,), floor (n,) and covariances (W, n, n) of the errors about a mean."""
     corrected = mean.applied(windows)
@@ -118,7 +118,7 @@ def _fit_about(
     return theta, floor, sum_of_terms(theta, F, floor)
 
 
-def fitted_terms(windows: MotionWindows, fit: MeanFit | None) -> Array:
+def fitted_terms(windows: DriveWindows, fit: MeanFit | None) -> Array:
     """Terms (W, 2 n, n, n) that variances are fitted to, of windows whose motions are corrected.
 
     Where turns are measured with noise, an error is large where its own noise makes |turn| large, so that the turns of
@@ -157,7 +157,7 @@ def least_of(error: Array) -> Array:
     return np.concatenate([np.full(len(part), LEAST * part.max()) for part in parts.values()])
 
 
-def jitter_of(noise: MotionNoise, windows: MotionWindows) -> Array:
+def jitter_of(noise: WhiteNoise, windows: DriveWindows) -> Array:
     """Variance that both ends of a motion add to its error, (n,), where shorter windows show it; 0 otherwise.
 
     The mean square error of windows of several lengths is what the noise says, times a factor, and a constant.
@@ -191,7 +191,7 @@ def constant_of(squares: Array, stated: Array, counts: Array) -> float:
     return float(constant) if is_shown else 0.0
 
 
-def intervals(noise: MotionNoise, windows: MotionWindows) -> tuple[Interval, ...]:
+def intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[Interval, ...]:
     """Intervals of the variances a metre and a radian, (2 n,), from the jackknife over drives or blocks of windows."""
     corrected = noise.mean.applied(windows)
     error = corrected.errors

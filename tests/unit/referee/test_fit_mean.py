@@ -13,6 +13,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.fit_covariance import systematic_errors as errors_
+from consistency.referee.fit_covariance.model_text import correction, data, noise_lines
+from consistency.referee.fit_covariance.motion_windows import DriveWindows, cut_windows, span_of
 from consistency.referee.fit_covariance.systematic_errors import (
     BACKWARD,
     FORWARD,
@@ -28,15 +30,13 @@ from consistency.referee.fit_covariance.systematic_errors import (
     sum_of_neighbours,
 )
 from consistency.referee.fit_covariance.white_noise import (
-    MotionNoise,
+    WhiteNoise,
     constant_of,
     fit_noise,
     fitted_terms,
     jitter_of,
     terms_of,
 )
-from consistency.referee.fit_covariance.windows import MotionWindows, cut_windows, span_of
-from consistency.referee.fit_covariance.wording import correction, data, limits
 
 FIT = MeanFit(
     Mean(1.0, 0.95, (0.0,)), Mean(1.01, 0.94, (0.001,)), np.array([0.98, 0.9, -0.01]), np.array([1.03, 0.98, 0.012]),
@@ -44,7 +44,7 @@ FIT = MeanFit(
 )  # fmt: skip
 
 
-def cut(side: Side, seed: int) -> MotionWindows:
+def cut(side: Side, seed: int) -> DriveWindows:
     return cut_windows(sides.drives(np.random.default_rng(seed), side), span_of("1m"))
 
 
@@ -235,7 +235,7 @@ def test_jitter_is_the_constant_of_mean_squares() -> None:
 def test_the_floor_is_added() -> None:
     w = cut(Side(3), 9).of(np.arange(4))
     theta, floor = np.arange(1.0, 7.0), np.array([0.1, 0.2, 0.3])
-    noise = MotionNoise(w.axes, no_mean(w), theta[:3], theta[3:], floor, 2.0)
+    noise = WhiteNoise(w.axes, no_mean(w), theta[:3], theta[3:], floor, 2.0)
     F = terms_of(w.pieces)
     np.testing.assert_allclose(noise.covariance(w.pieces), 2.0 * (np.tensordot(theta, F, (0, 1)) + np.diag(floor)))
 
@@ -272,7 +272,7 @@ def model() -> cs.NoiseModel:
 def said(model: cs.NoiseModel, **changes: object) -> str:
     fit = replace(FIT, **changes)  # type: ignore[arg-type]
     noise = replace(model.noise, mean=fit.mean, mean_fit=fit)
-    return "\n".join([correction(replace(model, noise=noise)), *limits(replace(model, noise=noise))])
+    return "\n".join([correction(replace(model, noise=noise)), *noise_lines(replace(model, noise=noise))])
 
 
 def test_sentences_of_the_mean(model: cs.NoiseModel) -> None:

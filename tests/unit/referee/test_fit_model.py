@@ -18,9 +18,11 @@ import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import Ratio, folds_of, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
+from consistency.referee.fit_covariance.model_text import noise_lines, sentence
+from consistency.referee.fit_covariance.motion_windows import DriveWindows, blocks_of, cut_windows, in_plane, span_of
 from consistency.referee.fit_covariance.noise_model import caution
 from consistency.referee.fit_covariance.persistence import TERMS, PersistentError
-from consistency.referee.fit_covariance.refusals import ErrorGrowth, body_turn, growth_of_errors, revisits
+from consistency.referee.fit_covariance.refusals import RotationGrowth, body_turn, revisits, rotation_growth
 from consistency.referee.fit_covariance.systematic_errors import (
     FORWARD,
     Mean,
@@ -38,8 +40,6 @@ from consistency.referee.fit_covariance.white_noise import (
     nees_of,
     terms_of,
 )
-from consistency.referee.fit_covariance.windows import MotionWindows, blocks_of, cut_windows, in_plane, span_of
-from consistency.referee.fit_covariance.wording import limits, sentence
 from consistency.referee.geometry.groups import composed, inverse, log, vectors
 from consistency.referee.types import Array
 
@@ -53,7 +53,7 @@ def drive_in(group: str, rng: np.random.Generator, steps: int = 400, name: str =
     return drive_of(name, spatial.vectors(T), spatial.vectors(made.truth), 0.1 * np.arange(len(T)))
 
 
-def cut(group: str, rng: np.random.Generator, span: str = "3m") -> MotionWindows:
+def cut(group: str, rng: np.random.Generator, span: str = "3m") -> DriveWindows:
     return cut_windows([drive_in(group, rng)], span_of(span))
 
 
@@ -446,7 +446,7 @@ def test_growth_of_white_noise_and_of_a_persistent_drift(rng: np.random.Generato
     for drift, low, high in ((World(), 0.6, 1.4), (World(memory=2000.0, coloured=3e-3), 1.6, 2.1)):
         made = drives(rng, 5, drift)
         w = cut_windows(made, span_of(SPAN))
-        growth = growth_of_errors(w, fit_noise(w).mean)
+        growth = rotation_growth(w, fit_noise(w).mean)
         assert low < growth.power < high
         assert growth.persists == (low > 1)
         told = [each for each in cs.fit_covariance(made, SPAN).warnings if "errors last longer than a window" in each]
@@ -454,15 +454,15 @@ def test_growth_of_white_noise_and_of_a_persistent_drift(rng: np.random.Generato
         assert not growth.shrinks
     short = drives(rng, 1, length=150.0)
     w = cut_windows(short, span_of(SPAN))
-    assert np.isnan(growth_of_errors(w, fit_noise(w).mean).power)
+    assert np.isnan(rotation_growth(w, fit_noise(w).mean).power)
 
 
 def test_growth_needs_its_standard_errors() -> None:
-    assert ErrorGrowth(0.3, 0.1).shrinks
-    assert not ErrorGrowth(0.3, 0.3).shrinks
-    assert not ErrorGrowth(0.6, 0.01).shrinks
-    assert ErrorGrowth(1.6, 0.1).persists
-    assert not ErrorGrowth(1.6, 0.3).persists
+    assert RotationGrowth(0.3, 0.1).shrinks
+    assert not RotationGrowth(0.3, 0.3).shrinks
+    assert not RotationGrowth(0.6, 0.01).shrinks
+    assert RotationGrowth(1.6, 0.1).persists
+    assert not RotationGrowth(1.6, 0.3).persists
 
 
 @pytest.mark.parametrize(
@@ -521,8 +521,8 @@ def test_a_second_estimator_with_the_same_errors(rng: np.random.Generator) -> No
     assert np.abs(other.second.correlation).max() < 0.4
     assert other.second.is_rough.tolist() == [False] * 3
     assert rough.second.is_rough.tolist() == [True, True, False]
-    assert list(limits(rough))[1].endswith("above 0.7 they are the truth's; it errs too much to tell in x, y")
-    assert "too much" not in list(limits(other))[1]
+    assert list(noise_lines(rough))[1].endswith("above 0.7 they are the truth's; it errs too much to tell in x, y")
+    assert "too much" not in list(noise_lines(other))[1]
     with pytest.raises(InputError, match="--second"):
         cs.fit_covariance(made, SPAN, second=[replace(each, name="else") for each in made])
 

@@ -13,7 +13,7 @@ from fit_covariance import OWN_CONSTANTS, World, drives, matrices_of
 import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.clocks import clock_offset
-from consistency.referee.fit_covariance.covariance_ratios import Ratio, SpanRatios, ratio_of
+from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan, Ratio, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.mean_by_motion import (
     SCALES,
@@ -22,11 +22,8 @@ from consistency.referee.fit_covariance.mean_by_motion import (
     p_value_of,
     values_by_bin,
 )
-from consistency.referee.fit_covariance.noise_model import decided
-from consistency.referee.fit_covariance.refusals import require_poses
-from consistency.referee.fit_covariance.systematic_errors import Mean, fit_slip, jacobian_of_mean
-from consistency.referee.fit_covariance.white_noise import fit_noise
-from consistency.referee.fit_covariance.windows import (
+from consistency.referee.fit_covariance.model_text import correction, noise_lines, sentence
+from consistency.referee.fit_covariance.motion_windows import (
     ROUNDED,
     blocks_of,
     cut_windows,
@@ -35,7 +32,10 @@ from consistency.referee.fit_covariance.windows import (
     span_of,
     ways,
 )
-from consistency.referee.fit_covariance.wording import correction, limits, sentence
+from consistency.referee.fit_covariance.noise_model import decided
+from consistency.referee.fit_covariance.refusals import require_poses
+from consistency.referee.fit_covariance.systematic_errors import Mean, fit_slip, jacobian, jacobian_of_mean
+from consistency.referee.fit_covariance.white_noise import fit_noise
 from consistency.referee.fit_covariance.writing import toml
 from consistency.referee.geometry.groups import composed, inverse, vectors
 from consistency.referee.readers.options import Reading
@@ -230,7 +230,7 @@ def test_pieces_of_the_true_motion(rng: np.random.Generator) -> None:
 def test_an_undecided_axis_makes_it_undecided_and_is_named(rng: np.random.Generator) -> None:
     axes = (RIGHT, RIGHT, OPEN)
     assert OPEN.status == "undecided"
-    judged = SpanRatios(SPAN, RIGHT, axes, np.ones((1, 4)))
+    judged = JudgedSpan(SPAN, RIGHT, axes, np.ones((1, 4)))
     assert judged.status == "undecided"
     assert replace(judged, axes=(RIGHT, replace(RIGHT, low=1.2, high=1.6), OPEN)).status == "inconsistent"
     assert replace(judged, whole=replace(RIGHT, low=1.2, high=1.6)).status == "overconfident"
@@ -309,8 +309,8 @@ def test_the_command_reads_an_offset_that_is_estimated(tmp_path: Path, rng: np.r
     np.testing.assert_array_equal(found[2].truth, fixed[2].truth)
     assert fixed[0].shift == 0.0
     model = cs.fit_covariance(found, SPAN)
-    assert f"clocks: {found[0].shift:.3g} s are added to the timestamps" in "\n".join(limits(model))
-    assert "clocks" not in "\n".join(limits(replace(model, windows=replace(model.windows, drives=tuple(fixed)))))
+    assert f"clocks: {found[0].shift:.3g} s are added to the timestamps" in "\n".join(noise_lines(model))
+    assert "clocks" not in "\n".join(noise_lines(replace(model, windows=replace(model.windows, drives=tuple(fixed)))))
     with pytest.raises(InputError, match="--time-offset fast: must be a number of seconds, or 'estimate'"):
         cs.read_drives(tmp_path / "est", reading=replace(given, time_offset="fast"))
     whole = [cs.read_drives(tmp_path / "est", reading=replace(given, time_offset=one))[0].t[0] for one in (1, 1.0)]

@@ -11,12 +11,12 @@ from consistency.referee.defaults import DETECT
 from consistency.referee.diagnostics.verdict.as_dictionary import flat, plain
 from consistency.referee.diagnostics.words.sentences import plural, short
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
-from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, IN_TURN, Ratio, SpanRatios
+from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, IN_TURN, JudgedSpan, Ratio
 from consistency.referee.fit_covariance.mean_by_motion import MotionDependence
+from consistency.referee.fit_covariance.motion_windows import ENOUGH, span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel
 from consistency.referee.fit_covariance.persistence import SHARED
 from consistency.referee.fit_covariance.systematic_errors import NEIGHBOURS, STRONG, Mean, MeanFit
-from consistency.referee.fit_covariance.windows import ENOUGH, span_of
 
 RATIO = ("value", "low", "high", "spread", "drives", "windows", "status")  # of a ratio, as programs have it
 EVIDENCE = ("low", "high", "free", "instruments", "turns", "strength", "lasts", "is_open")  # of a mean, the same
@@ -105,12 +105,12 @@ def _unit(axis: str) -> str:
     return "m" if axis in "xyz" else "rad"
 
 
-def document(model: NoiseModel) -> Document:
+def noise_document(model: NoiseModel) -> Document:
     """Sentence, corrections, table over axes and spans, and limits; numbers as data."""
     texts = [f"{model.name}: {sentence(model)}"]
     if corrected := correction(model):
         texts.append(corrected)
-    opening = (*map(Text, texts), _table(model), *map(Text, limits(model)))
+    opening = (*map(Text, texts), _table(model), *map(Text, noise_lines(model)))
     return Document(f"{model.name}: noise of motions over {_text(model.span)}", "", (), opening, data(model))
 
 
@@ -178,7 +178,7 @@ def _cell(ratio: Ratio) -> Cell:
     return _shown(ratio) + MARK[ratio.status]
 
 
-def limits(model: NoiseModel) -> Iterator[str]:
+def noise_lines(model: NoiseModel) -> Iterator[str]:
     """Limits of the model, what was left out, and what the referee says of the judged motions."""
     yield "; ".join(_limits_of_use(model))
     if model.noise.factor != 1.0:
@@ -256,7 +256,7 @@ def data(model: NoiseModel) -> dict[str, Any]:
     return found
 
 
-def _data_of_span(span: SpanRatios, axes: tuple[str, ...]) -> dict[str, Any]:
+def _data_of_span(span: JudgedSpan, axes: tuple[str, ...]) -> dict[str, Any]:
     ratios = dict(zip(("whole", *axes), (span.whole, *span.axes), strict=True))
     found: dict[str, Any] = {name: {key: getattr(ratio, key) for key in RATIO} for name, ratio in ratios.items()}
     return {"span": span.span, **found, "by_drive": span.by_drive[:, 0]}

@@ -26,7 +26,7 @@ ROWS = ("drive", "first", "last", "pieces", "true", "true_pieces")  # what there
 
 
 @dataclass(frozen=True)
-class MotionWindows:
+class DriveWindows:
     """W windows of some drives, in P pieces of estimated motion each; a piece that is the identity is none."""
 
     drives: tuple[Drive, ...] = field(repr=False)
@@ -66,15 +66,15 @@ class MotionWindows:
         """Windows, and those left out."""
         return {"windows": len(self.drive), "long": self.long, "still": self.still, "jumps": self.jumps}
 
-    def of(self, keep: Indices | Array) -> MotionWindows:
+    def of(self, keep: Indices | Array) -> DriveWindows:
         """Some of the windows, by index or mask."""
         return replace(self, **{name: getattr(self, name)[keep] for name in ROWS})
 
-    def lengthened(self, slip: float) -> MotionWindows:
+    def lengthened(self, slip: float) -> DriveWindows:
         """The same windows with a longer estimated way in each piece that turns."""
         return replace(self, pieces=lengthened(self.pieces, slip))
 
-    def over(self, size: float) -> MotionWindows | None:
+    def over(self, size: float) -> DriveWindows | None:
         """Windows of all drives over a span of another size, in pieces of the same size; None where none fits.
 
         Turns of another size would hold another share of the noise.
@@ -103,7 +103,7 @@ def span_of(text: str | float) -> Relative:
     return replace(span, flag="--span")
 
 
-def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> MotionWindows:
+def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> DriveWindows:
     """Cut all drives into windows; drives in which none fits have none.
 
     Parameters
@@ -116,7 +116,7 @@ def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, p
     InputError
         No window fits in any drive.
     """
-    parts: list[MotionWindows] = []
+    parts: list[DriveWindows] = []
     refused: InputError | None = None
     for number in range(len(drives)):
         try:
@@ -137,7 +137,7 @@ def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, p
     return counted.of(sound)
 
 
-def _cut_drive(drives: tuple[Drive, ...], number: int, span: Relative, planar: bool, pieces: int) -> MotionWindows:
+def _cut_drive(drives: tuple[Drive, ...], number: int, span: Relative, planar: bool, pieces: int) -> DriveWindows:
     drive = drives[number]
     position = drive.truth[:, :-1, -1]
     rows = drive.row if span.unit == "step" else np.arange(len(position))
@@ -153,7 +153,7 @@ def _cut_drive(drives: tuple[Drive, ...], number: int, span: Relative, planar: b
         true_pieces = in_plane(true_pieces)
         true = in_plane(true)
     index = np.full(len(first), number)
-    return MotionWindows(drives, span, planar, index, first, last, estimated, true, true_pieces, left_out)
+    return DriveWindows(drives, span, planar, index, first, last, estimated, true, true_pieces, left_out)
 
 
 def _ends(first: Indices, last: Indices, pieces: int) -> Indices:
@@ -162,7 +162,7 @@ def _ends(first: Indices, last: Indices, pieces: int) -> Indices:
     return np.rint(first[:, None] + shares * (last - first)[:, None]).astype(np.int64)
 
 
-def _moves(of: MotionWindows) -> Array:
+def _moves(of: DriveWindows) -> Array:
     """Which windows have motion, (W,): on the way, for a span in m; in way or turn, compared with others, otherwise."""
     way = ways(of.pieces).sum(axis=1)
     if of.span.unit == "m":
@@ -171,7 +171,7 @@ def _moves(of: MotionWindows) -> Array:
     return np.asarray((way > STILL * np.median(way)) | (angle > STILL * np.median(angle)))
 
 
-def _jumps(of: MotionWindows) -> Array:
+def _jumps(of: DriveWindows) -> Array:
     """Which windows have a piece whose error, of position or rotation, is a jump in its drive, (W,)."""
     W, P = of.pieces.shape[:2]
     gaps = inverse(of.pieces) @ of.true_pieces

@@ -89,7 +89,9 @@ def are_halves(windows: DriveWindows, held_out: str | None) -> bool:
 
 
 def folds_of(
-    windows: DriveWindows, held_out: str | None, fit: Callable[[DriveWindows], WhiteNoise]
+    windows: DriveWindows,
+    held_out: str | None,
+    fit: Callable[[DriveWindows], WhiteNoise],
 ) -> tuple[WhiteNoise, list[Fold]]:
     """The fit that is handed out, and those that are judged.
 
@@ -147,14 +149,22 @@ def judged_by(folds: Sequence[Fold], windows: DriveWindows, general: bool) -> Ju
     by_drive = np.full((len(windows.drives), values.shape[1]), np.nan)
     for i in np.unique(drive):
         by_drive[i] = values[drive == i].mean(axis=0)
-    counts = np.bincount(drive, minlength=len(by_drive))
-    n = len(windows.axes)
-    whole = ratio_of(by_drive[:, 0], values[:, 0], general, n * counts)
-    axes = tuple(ratio_of(by_drive[:, k], values[:, k], general, counts) for k in range(1, n + 1))
-    return JudgedSpan(windows.span.option, whole, axes, by_drive)
+    dof = np.bincount(drive, minlength=len(by_drive))
+    axes = zip(by_drive.T[1:], values.T[1:], strict=True)
+    return JudgedSpan(
+        span=windows.span.option,
+        whole=ratio_of(by_drive[:, 0], values[:, 0], general, len(windows.axes) * dof),
+        axes=tuple(ratio_of(*axis, general, dof) for axis in axes),
+        by_drive=by_drive,
+    )
 
 
-def ratio_of(by_drive: Array, values: Array, general: bool = True, dof: Array | None = None) -> Ratio:
+def ratio_of(
+    by_drive: Array,
+    values: Array,
+    general: bool = True,
+    dof: Array | None = None,
+) -> Ratio:
     """Geometric mean of the ratios of drives, (drives,), with Student's interval of its logarithm.
 
     The logarithm of a mean square with few degrees of freedom, ``dof`` (drives,), is too small on average, by what a
@@ -175,9 +185,12 @@ def ratio_of(by_drive: Array, values: Array, general: bool = True, dof: Array | 
         reach = _student(drives) * spread / np.sqrt(drives)
     elif drives == 1:
         center = float(np.log(values.mean()))
-        blocks = np.array([block.mean() for block in np.array_split(values, min(BLOCKS, len(values)))])
-        k = len(blocks)
-        reach = _student(k) * blocks.std(ddof=1) / np.sqrt(k) / blocks.mean() if k > 1 else np.inf
+        parts = np.array_split(values, min(BLOCKS, len(values)))
+        reach = np.inf
+        if len(parts) > 1:
+            means = np.array([part.mean() for part in parts])
+            error = means.std(ddof=1) / np.sqrt(len(means))
+            reach = _student(len(means)) * error / means.mean()
     low = float(np.exp(center - reach))
     high = float(np.exp(np.minimum(center + reach, 700.0)))
     return Ratio(float(np.exp(center)), low, high, spread, drives, len(values), general)

@@ -85,7 +85,12 @@ def read_drives(
 
 
 def drive_of(
-    name: str, estimate: Array, truth: Array, t: Array | None = None, row: Indices | None = None, motions: bool = False
+    name: str,
+    estimate: Array,
+    truth: Array,
+    t: Array | None = None,
+    row: Indices | None = None,
+    motions: bool = False,
 ) -> Drive:
     """A drive of arrays.
 

@@ -60,9 +60,12 @@ def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> MotionDependence
     values, error = values_by_bin(corrected, found.bins, found.scale)
     shares = mean_square(error) / noise.variances(corrected.pieces).mean(axis=0)
     axis = int(np.argmax(shares))
+    starts, reaches = [], []
     there = np.unique(found.bins)
-    starts = [float(found.sizes[found.bins == k].min()) for k in there]
-    reaches = [float(np.abs(error[found.bins == k, axis]).mean()) for k in there]
+    for k in there:
+        is_in = found.bins == k
+        starts.append(float(found.sizes[is_in].min()))
+        reaches.append(float(np.abs(error[is_in, axis]).mean()))
     scales = noise.mean.values[found.scale] * (1.0 + values[there])
     dependence = MotionDependence(
         scale=SCALES[found.scale],
@@ -108,7 +111,12 @@ def bins_of(sizes: Array) -> Indices:
     return np.searchsorted(edges, sizes, side="right")
 
 
-def p_value_of(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) -> float:
+def p_value_of(
+    windows: DriveWindows,
+    pieces: Array,
+    bins: Indices,
+    scale: int,
+) -> float:
     """p-value of one scale in all bins, by a score test; errors are of ``windows``, and motions ``pieces``.
 
     Each drive has constants of its own. The scores of blocks of windows, in all bins but the first, are compared with
@@ -145,7 +153,8 @@ def _hotelling(sums: Array, inflation: float) -> float:
     t = sums.mean(axis=0) / size
     correlation = scatter / np.outer(size, size)
     squared = G * float(t @ np.linalg.pinv(correlation, rcond=1e-9) @ t)
-    return float(stats.f.sf(squared * (G - q) / (q * (G - 1)), q, G - q))
+    ratio = squared * (G - q) / (q * (G - 1))
+    return float(stats.f.sf(ratio, q, G - q))
 
 
 def values_by_bin(windows: DriveWindows, bins: Indices, scale: int) -> tuple[Array, Array]:

@@ -72,10 +72,14 @@ def _reasons(model: NoiseModel) -> Iterator[str]:
                 f"{each.term} differs between drives and makes up {each.share:.0%} of the variance of an axis, so that "
                 "new drives may have another covariance"
             )
-    statuses = {name: axis.status for name, axis in zip(model.noise.axes, at_span.axes, strict=True) if axis.drives}
-    if wrong := [f"{name} {status}" for name, status in statuses.items() if status in WRONG]:
+    wrong, unknown = [], []
+    for name, axis in zip(model.noise.axes, at_span.axes, strict=True):
+        if axis.status in WRONG:
+            wrong.append(f"{name} {axis.status}")
+        elif axis.status == "undecided" and axis.drives:
+            unknown.append(name)
+    if wrong:
         yield ", ".join(wrong)
-    unknown = [name for name, status in statuses.items() if status == "undecided"]
     if unknown and ratio.status == "consistent":
         yield f"undecided: {', '.join(unknown)}"
     if model.by_motion is not None and model.by_motion.is_found:
@@ -134,9 +138,12 @@ def _drifts(mean: Mean) -> tuple[str, ...]:
 def _of_mean(fit: MeanFit) -> Iterator[str]:
     """What is not corrected, and whether the scale of turns depends on whose noise it is."""
     names = ["way x", "turn x", *(f"{each} " for each in _drifts(fit.mean))]
-    ranges = [f"{name}[{low:.3g}, {high:.3g}]" for name, low, high in zip(names, fit.low, fit.high, strict=True)]
-    if not fit.free.all():
-        yield f"not corrected, as the interval holds none: {', '.join(np.array(ranges)[~fit.free])}"
+    left = []
+    for name, low, high, is_free in zip(names, fit.low, fit.high, fit.free, strict=True):
+        if not is_free:
+            left.append(f"{name}[{low:.3g}, {high:.3g}]")
+    if left:
+        yield f"not corrected, as the interval holds none: {', '.join(left)}"
     forward, backward = (f"x{short(each)}" for each in fit.turns)
     sides = f"{forward} if the robot's motion errs about the odometry, {backward} if the odometry errs about the motion"
     if fit.instruments == NEIGHBOURS:
@@ -257,6 +264,8 @@ def data(model: NoiseModel) -> dict[str, Any]:
 
 
 def _data_of_span(span: JudgedSpan, axes: tuple[str, ...]) -> dict[str, Any]:
-    ratios = dict(zip(("whole", *axes), (span.whole, *span.axes), strict=True))
-    found: dict[str, Any] = {name: {key: getattr(ratio, key) for key in RATIO} for name, ratio in ratios.items()}
-    return {"span": span.span, **found, "by_drive": span.by_drive[:, 0]}
+    found: dict[str, Any] = {"span": span.span}
+    for name, ratio in zip(("whole", *axes), (span.whole, *span.axes), strict=True):
+        found[name] = {key: getattr(ratio, key) for key in RATIO}
+    found["by_drive"] = span.by_drive[:, 0]
+    return found

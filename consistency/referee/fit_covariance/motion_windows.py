@@ -103,7 +103,12 @@ def span_of(text: str | float) -> Relative:
     return replace(span, flag="--span")
 
 
-def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> DriveWindows:
+def cut_windows(
+    drives: Sequence[Drive],
+    span: Relative,
+    planar: bool = False,
+    pieces: int = PIECES,
+) -> DriveWindows:
     """Cut all drives into windows; drives in which none fits have none.
 
     Parameters
@@ -137,7 +142,13 @@ def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, p
     return counted.of(sound)
 
 
-def _cut_drive(drives: tuple[Drive, ...], number: int, span: Relative, planar: bool, pieces: int) -> DriveWindows:
+def _cut_drive(
+    drives: tuple[Drive, ...],
+    number: int,
+    span: Relative,
+    planar: bool,
+    pieces: int,
+) -> DriveWindows:
     drive = drives[number]
     position = drive.truth[:, :-1, -1]
     rows = drive.row if span.unit == "step" else np.arange(len(position))

@@ -20,9 +20,9 @@ from consistency.referee.types import Array
 CONVENTIONS = {3: "so2", 6: "so3"}  # the defaults of files, so that they are read without further options
 
 
-def stretches_of(windows: DriveWindows, folds: Sequence[Fold]) -> list[tuple[str, Stretch]]:
-    """Drive and rows of each stretch of neighbouring windows that are judged; a window left out begins another."""
-    found: list[tuple[str, Stretch]] = []
+def stretches_of(windows: DriveWindows, folds: Sequence[Fold]) -> list[Stretch]:
+    """Each stretch of neighbouring windows of a drive that are judged; a window left out begins another."""
+    found: list[Stretch] = []
     for fold in folds:
         some = windows.of(fold.judges(windows))
         corrected = fold.noise.mean.applied(some)
@@ -34,7 +34,7 @@ def stretches_of(windows: DriveWindows, folds: Sequence[Fold]) -> list[tuple[str
     return found
 
 
-def _stretch(run: int, windows: DriveWindows, C: Array) -> tuple[str, Stretch]:
+def _stretch(run: int, windows: DriveWindows, C: Array) -> Stretch:
     """Neighbouring windows of one drive as rows, the first of which is only where they start."""
     drive = windows.drives[windows.drive[0]]
     n = len(windows.axes)
@@ -44,7 +44,7 @@ def _stretch(run: int, windows: DriveWindows, C: Array) -> tuple[str, Stretch]:
     start = np.eye(windows.d + 1)[None]
     rows = np.arange(len(D) + 1)
     places = Places(lambda row: f"{drive.name}, window {row}", rows)
-    stretch = Stretch(
+    return Stretch(
         run=run,
         file=drive.name,
         place=places,
@@ -56,25 +56,24 @@ def _stretch(run: int, windows: DriveWindows, C: Array) -> tuple[str, Stretch]:
         truth=vectors(composed(np.concatenate([start, windows.true]))),
         convention=convention,
     )
-    return drive.name, stretch
 
 
-def record_of_motions(stretches: Sequence[tuple[str, Stretch]], axes: Sequence[str]) -> Record:
+def record_of_motions(stretches: Sequence[Stretch], axes: Sequence[str]) -> Record:
     """The record that ``analyse --motions --relative 1`` has of the written files."""
     one = Relative(1.0, "step", motions=True, independent=True)
     names = ("x", "y", "heading") if len(axes) == 3 else axes
-    return relative_recording("motions", "motions", [each for _, each in stretches], names, range(len(axes)), one)
+    return relative_recording("motions", "motions", stretches, names, range(len(axes)), one)
 
 
-def write_motions(stretches: Sequence[tuple[str, Stretch]], folder: Path) -> list[str]:
+def write_motions(stretches: Sequence[Stretch], folder: Path) -> list[str]:
     """motions.csv and truth.csv in the plane, folders motions/ and truth/ of trajectories in space; their names."""
-    if stretches[0][1].d == 2:
-        _write_tables([each for _, each in stretches], folder)
+    if stretches[0].d == 2:
+        _write_tables(stretches, folder)
         return ["motions.csv", "truth.csv"]
     for part in ("motions", "truth"):
         (folder / part).mkdir()
-    for name, each in stretches:
-        file = f"{each.run:03d}-{name.replace('/', '_')}.tum"
+    for each in stretches:
+        file = f"{each.run:03d}-{each.file.replace('/', '_')}.tum"
         covariances = each.covariance.reshape(len(each.t), -1)
         _write(folder / "motions" / file, np.column_stack([each.t, each.estimate, covariances]), " ")
         _write(folder / "truth" / file, np.column_stack([each.t, each.truth]), " ")
@@ -94,11 +93,18 @@ def _write_tables(stretches: Sequence[Stretch], folder: Path) -> None:
     truths = np.concatenate([each.truth for each in stretches])
     keys = [f"{each.run},{row}" for each in stretches for row in range(len(each.t))]
     motions = np.column_stack([times, estimates, stated])
-    _write(folder / "motions.csv", motions, ",", keys, ["run", "step", *columns, *COVARIANCE])
-    _write(folder / "truth.csv", np.column_stack([times, truths]), ",", keys, ["run", "step", *columns])
+    head = ["run", "step", *columns]
+    _write(folder / "motions.csv", motions, ",", keys, [*head, *COVARIANCE])
+    _write(folder / "truth.csv", np.column_stack([times, truths]), ",", keys, head)
 
 
-def _write(path: Path, numbers: Array, between: str, keys: Sequence[str] = (), head: Sequence[str] = ()) -> None:
+def _write(
+    path: Path,
+    numbers: Array,
+    between: str,
+    keys: Sequence[str] = (),
+    head: Sequence[str] = (),
+) -> None:
     """Lines of numbers with all their digits, each after its key."""
     lines = [between.join(map(repr, row)) for row in numbers.tolist()]
     if keys:

@@ -93,7 +93,7 @@ class NoiseModel:
         return decided(self.spans[0].status, doubted, self.by_motion is not None and self.by_motion.is_found)
 
     @property
-    def stretches(self) -> list[tuple[str, Stretch]]:
+    def stretches(self) -> list[Stretch]:
         """Judged motions as files have them."""
         return stretches_of(self.windows, self.folds)
 
@@ -280,7 +280,11 @@ def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
     return spaces == {2} or axes == 3
 
 
-def _judge_spans(folds: Sequence[Fold], windows: DriveWindows, general: bool) -> tuple[JudgedSpan, ...]:
+def _judge_spans(
+    folds: Sequence[Fold],
+    windows: DriveWindows,
+    general: bool,
+) -> tuple[JudgedSpan, ...]:
     """Judge the fit at its span and at longer ones, as long as there are windows."""
     found = []
     for times in SPANS:

@@ -28,7 +28,8 @@ CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 def noise_page(model: NoiseModel, with_pictures: bool) -> Document:
     said = noise_document(model)
     blocks: tuple[Block, ...] = noise_figures(model) if with_pictures else ()
-    return Document(said.title, "", (Chapter("pictures", "Pictures", "pictures", blocks),), said.opening, said.data)
+    chapter = Chapter("pictures", "Pictures", "pictures", blocks)
+    return Document(said.title, "", (chapter,), said.opening, said.data)
 
 
 def noise_figures(model: NoiseModel) -> tuple[Figure, ...]:

@@ -52,7 +52,10 @@ class PersistentError:
 
 
 def doubts(
-    noise: WhiteNoise, windows: DriveWindows, growth: RotationGrowth, persistent: Sequence[PersistentError]
+    noise: WhiteNoise,
+    windows: DriveWindows,
+    growth: RotationGrowth,
+    persistent: Sequence[PersistentError],
 ) -> list[str]:
     """Sentences on errors that outlast a window or a drive, and on angles beyond first order."""
     found = []

@@ -85,7 +85,13 @@ def require_poses(drives: Sequence[Drive]) -> None:
         _require_poses(drive.name, "truth", drive.truth, drive.estimate, "compound them to poses")
 
 
-def _require_poses(drive: str, name: str, T: Array, other: Array, remedy: str) -> None:
+def _require_poses(
+    drive: str,
+    name: str,
+    T: Array,
+    other: Array,
+    remedy: str,
+) -> None:
     if _are_placeholders(T, other):
         raise InputError(
             f"{drive}: all rows of the {name} have one orientation, though the path turns: it is a placeholder, as "
@@ -236,7 +242,8 @@ def rotation_growth(windows: DriveWindows, mean: Mean) -> RotationGrowth:
     weight = 0.5 * np.array(counts, float)
     x = x - (weight * x).sum() / weight.sum()
     information = float((weight * x**2).sum())
-    return RotationGrowth(float((weight * x * y).sum()) / information, float(np.sqrt(2.0 / information)))
+    power = float((weight * x * y).sum()) / information
+    return RotationGrowth(power, float(np.sqrt(2.0 / information)))
 
 
 def revisits(windows: DriveWindows) -> Revisits:

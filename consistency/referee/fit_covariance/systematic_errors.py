@@ -119,7 +119,11 @@ def fit_mean(windows: DriveWindows, covariance: Array | None = None) -> Mean:
     return mean
 
 
-def choose_mean(windows: DriveWindows, covariance: Array | None = None, start: Mean | None = None) -> MeanFit:
+def choose_mean(
+    windows: DriveWindows,
+    covariance: Array | None = None,
+    start: Mean | None = None,
+) -> MeanFit:
     """Fit the mean that holds whether the odometry's noise is in the estimated motion or in the true one.
 
     Errors in variables (Fuller 1987, "Measurement Error Models"): least squares on the estimated motion is right where
@@ -166,7 +170,10 @@ def _select(
 
 
 def normal_equations(
-    windows: DriveWindows, mean: Mean, covariance: Array | None, instruments: Sequence[str]
+    windows: DriveWindows,
+    mean: Mean,
+    covariance: Array | None,
+    instruments: Sequence[str],
 ) -> dict[str, NormalEquations]:
     """Equations of each kind of instruments, at a mean."""
     corrected = mean.applied(windows)
@@ -189,7 +196,12 @@ def normal_equations(
     return found
 
 
-def estimate(windows: DriveWindows, near: Mean, equations: NormalEquations, free: Array | None = None) -> Estimate:
+def estimate(
+    windows: DriveWindows,
+    near: Mean,
+    equations: NormalEquations,
+    free: Array | None = None,
+) -> Estimate:
     """The mean after a step of Gauss and Newton, with intervals from the scatter between blocks of what it leaves.
 
     Parameters

@@ -70,7 +70,10 @@ class WhiteNoise:
 
 
 def fit_noise(
-    windows: DriveWindows, correct: bool = True, by_turn: bool = False, jitter: Array | float = 0.0
+    windows: DriveWindows,
+    correct: bool = True,
+    by_turn: bool = False,
+    jitter: Array | float = 0.0,
 ) -> WhiteNoise:
     """Fit mean and noise of windows, each given the other in turn.
 
@@ -107,7 +110,11 @@ def fit_noise(
 
 
 def _fit_about(
-    windows: DriveWindows, mean: Mean, fit: MeanFit | None, jitter: Array | float, start: Array | None
+    windows: DriveWindows,
+    mean: Mean,
+    fit: MeanFit | None,
+    jitter: Array | float,
+    start: Array | None,
 ) -> tuple[Array, Array, Array]:
     """Variances (2 n,), floor (n,) and covariances (W, n, n) of the errors about a mean."""
     corrected = mean.applied(windows)
@@ -236,7 +243,12 @@ def sum_of_terms(theta: Array, F: Array, floor: Array) -> Array:
     return np.asarray(np.diag(floor) + np.tensordot(theta, F, (0, 1)))
 
 
-def fit_terms(error: Array, F: Array, floor: Array, start: Array | None = None) -> Array:
+def fit_terms(
+    error: Array,
+    F: Array,
+    floor: Array,
+    start: Array | None = None,
+) -> Array:
     """Fit variances theta >= 0 (p,) with Cov e_w = diag(floor) + sum theta_p F_wp, by maximum likelihood.
 
     Scoring for covariances that are linear in their parameters (Anderson 1973, "Asymptotically efficient estimation of

@@ -366,6 +366,33 @@ def test_a_scale_that_is_not_metric_is_not_taken_for_increments(rng: np.random.G
         cs.fit_covariance(drives(rng, 2, World(metric=2.2)), SPAN)
 
 
+@pytest.mark.parametrize("side", ["estimates", "truth"])
+@pytest.mark.parametrize("kind", ["npz", "csv", "folder"])
+def test_headings_in_degrees_are_refused(kind: str, side: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    """Those of unwrapped radians are read, though they are beyond a turn."""
+    drive = drives(rng, 1, length=300.0)[0]
+    rows = {"estimates": vectors(drive.estimate), "truth": vectors(drive.truth)}
+
+    def read() -> list[Drive]:
+        if kind == "npz":
+            np.savez(tmp_path / "a.npz", t=drive.t, **rows)
+            return cs.read_drives(tmp_path / "a.npz")
+        paths = {each: tmp_path / each / "a.csv" for each in rows}
+        for each, path in paths.items():
+            path.parent.mkdir(exist_ok=True)
+            table = np.column_stack([drive.t, rows[each]])
+            np.savetxt(path, table, delimiter=",", header="t,x,y,heading", comments="", fmt="%.12g")
+        if kind == "csv":
+            return cs.read_drives(paths["estimates"], paths["truth"])
+        return cs.read_drives(tmp_path / "estimates", tmp_path / "truth")
+
+    rows[side][:, 2] += 6.0 * np.pi
+    assert len(read()) == 1
+    rows[side][:, 2] = np.rad2deg(rows[side][:, 2] - 6.0 * np.pi)
+    with pytest.raises(InputError, match=rf"headings of the {side} .* seem to be in degrees; write headings in rad"):
+        read()
+
+
 @pytest.mark.parametrize("size", [1e-12, 1e-9, 1e-5])
 def test_rotations_equal_to_rounding_are_no_closed_loops(size: float, rng: np.random.Generator) -> None:
     """Headings of the truth, rounded to a step of ``size``; positions err as they did."""

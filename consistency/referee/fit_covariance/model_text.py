@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.defaults import DETECT
 from consistency.referee.diagnostics.verdict.as_dictionary import flat, plain
 from consistency.referee.diagnostics.words.sentences import plural, short
-from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
+from consistency.referee.document.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, IN_TURN, JudgedSpan, Ratio
 from consistency.referee.fit_covariance.mean_by_motion import MotionDependence
 from consistency.referee.fit_covariance.motion_windows import ENOUGH, span_of
@@ -111,11 +111,12 @@ def _unit(axis: str) -> str:
 
 def noise_document(model: NoiseModel) -> Document:
     """Sentence, corrections, table over axes and spans, and limits; numbers as data."""
-    texts = [f"{model.name}: {sentence(model)}"]
+    opening: list[Block] = [Text(f"{model.name}: {sentence(model)}")]
     if corrected := correction(model):
-        texts.append(corrected)
-    opening = (*map(Text, texts), _table(model), *map(Text, noise_lines(model)))
-    return Document(f"{model.name}: noise of motions over {_text(model.span)}", "", (), opening, data(model))
+        opening.append(Text(corrected))
+    opening.append(_table(model))
+    opening += map(Text, noise_lines(model))
+    return Document(f"{model.name}: noise of motions over {_text(model.span)}", "", (), tuple(opening), data(model))
 
 
 def correction(model: NoiseModel) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -131,7 +132,7 @@ def cut_windows(
     if not parts:
         assert refused is not None
         raise refused
-    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ROWS}
+    rows: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ROWS}
     found = replace(parts[0], **rows, long=sum(part.long for part in parts))
     moves = _moves(found)
     jumps = _jumps(found)

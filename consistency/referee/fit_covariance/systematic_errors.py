@@ -271,8 +271,9 @@ def _strength(equations: NormalEquations) -> float:
         z = left_by(others, equations.Z[..., j].ravel(), WEAK)
         slope = float(z @ x) / max(float(z @ z), 1e-300)
         scores = (z * (x - slope * z)).reshape(W, -1).sum(axis=1)
-        smallest = min(smallest, abs(z @ x) / max(np.linalg.norm(scores), 1e-300))
-    return float(smallest**2)
+        spread = max(float(np.linalg.norm(scores)), 1e-300)
+        smallest = min(smallest, abs(float(z @ x)) / spread)
+    return smallest**2
 
 
 def left_by(X: Array, y: Array, weak: float | None = None) -> Array:

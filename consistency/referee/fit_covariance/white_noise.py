@@ -288,7 +288,7 @@ def _target(error: Array, F: Array, floor: Array, theta: Array) -> Array:
     H = np.tensordot(flat, turned, ((0, 2), (0, 2)))
     u = (inverse @ error[..., None])[..., 0]
     of_errors = np.einsum("wi,wpij,wj->p", u, F, u, optimize=True)
-    of_floor = np.einsum("wpij,wji->p", G, inverse * floor[:, None], optimize=True)
+    of_floor = np.einsum("wpij,wji->p", G, inverse * floor, optimize=True)
     return _nonnegative(H, of_errors - of_floor)
 
 

@@ -194,11 +194,12 @@ def test_terms_are_sums_over_pieces(group: str, rng: np.random.Generator) -> Non
         np.testing.assert_allclose(F[k, n + axis], by_hand[1], atol=1e-12)
 
 
-def test_fitted_variances_are_a_fixed_point_and_the_best(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("least", [(1e-9,) * 3, (4e-3, 1e-4, 1e-8)], ids=["hardly any floor", "as large as the noise"])
+def test_fitted_variances_are_a_fixed_point_and_the_best(least: tuple[float, ...], rng: np.random.Generator) -> None:
     """theta = theta (sum u'Fu / sum tr C^-1 F)^.5 where it is positive, and no neighbour is likelier."""
-    made = drives(rng, 3)
+    made = drives(rng, 3, World(offset=float(np.sqrt(least[0] / 2))))
     w = cut_windows(made, span_of("10m"))
-    F, e, floor = terms_of(w.pieces), w.errors, np.full(3, 1e-9)
+    F, e, floor = terms_of(w.pieces), w.errors, np.array(least)
     theta = fit_terms(e, F, floor)
     C = np.diag(floor) + np.tensordot(theta, F, (0, 1))
     u = np.linalg.solve(C, e[..., None])[..., 0]

@@ -17,6 +17,7 @@ from consistency.referee.readers.relative_motions import Stretch, relative_recor
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 
+DIGITS = "%.17g"  # all that a number has
 CONVENTIONS = {3: "so2", 6: "so3"}  # the defaults of files, so that they are read without further options
 
 
@@ -75,40 +76,22 @@ def write_motions(stretches: Sequence[Stretch], folder: Path) -> list[str]:
     for each in stretches:
         file = f"{each.run:03d}-{each.file.replace('/', '_')}.tum"
         covariances = each.covariance.reshape(len(each.t), -1)
-        _write(folder / "motions" / file, np.column_stack([each.t, each.estimate, covariances]), " ")
-        _write(folder / "truth" / file, np.column_stack([each.t, each.truth]), " ")
+        np.savetxt(folder / "motions" / file, np.column_stack([each.t, each.estimate, covariances]), DIGITS)
+        np.savetxt(folder / "truth" / file, np.column_stack([each.t, each.truth]), DIGITS)
     return ["motions", "truth"]
 
 
 def _write_tables(stretches: Sequence[Stretch], folder: Path) -> None:
     """Two tables, with a clock where all stretches have one."""
-    columns = ["t", "x", "y", "heading"]
-    times = np.concatenate([each.t for each in stretches])[:, None]
-    if not np.isfinite(times).all():
-        columns.remove("t")
-        times = times[:, :0]
+    keys = np.concatenate([np.column_stack([np.full(len(each.t), each.run), each.rows]) for each in stretches])
+    times = np.concatenate([each.t for each in stretches])
+    head = ["run", "step", "x", "y", "heading"]
+    if np.isfinite(times).all():
+        head.insert(2, "t")
+        keys = np.column_stack([keys, times])
     P = np.concatenate([each.covariance for each in stretches])
     stated = np.column_stack([P[:, i, j] for i, j in COVARIANCE.values()])
-    estimates = np.concatenate([each.estimate for each in stretches])
-    truths = np.concatenate([each.truth for each in stretches])
-    keys = [f"{each.run},{row}" for each in stretches for row in range(len(each.t))]
-    motions = np.column_stack([times, estimates, stated])
-    head = ["run", "step", *columns]
-    _write(folder / "motions.csv", motions, ",", keys, [*head, *COVARIANCE])
-    _write(folder / "truth.csv", np.column_stack([times, truths]), ",", keys, head)
-
-
-def _write(
-    path: Path,
-    numbers: Array,
-    between: str,
-    keys: Sequence[str] = (),
-    head: Sequence[str] = (),
-) -> None:
-    """Lines of numbers with all their digits, each after its key."""
-    lines = [between.join(map(repr, row)) for row in numbers.tolist()]
-    if keys:
-        lines = [f"{key}{between}{line}" for key, line in zip(keys, lines, strict=True)]
-    if head:
-        lines.insert(0, between.join(head))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    motions = np.column_stack([keys, np.concatenate([each.estimate for each in stretches]), stated])
+    truth = np.column_stack([keys, np.concatenate([each.truth for each in stretches])])
+    for name, columns, numbers in (("motions", [*head, *COVARIANCE], motions), ("truth", head, truth)):
+        np.savetxt(folder / f"{name}.csv", numbers, DIGITS, ",", header=",".join(columns), comments="")

@@ -69,7 +69,8 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
         for rows in np.array_split(some, -(-PARTS // len(drives))):
             if len(rows):
                 ends = last[rows]
-                parts.append(Part(poses, poses.t[rows], poses.t[ends], inverse(T[rows]) @ T[ends]))
+                motions = inverse(T[rows]) @ T[ends]
+                parts.append(Part(poses, poses.t[rows], poses.t[ends], motions))
     if len(parts) > 1:
         offset = _best(parts)
         spread = float(np.std([_best([part]) for part in parts], ddof=1))

@@ -30,7 +30,8 @@ class Fold:
 
     def judges(self, windows: DriveWindows) -> Array:
         """Which windows chose nothing of this fit, (W,)."""
-        return np.asarray(np.isin(windows.drive, self.judged) & (windows.first >= self.since[windows.drive]))
+        is_late = windows.first >= self.since[windows.drive]
+        return np.asarray(np.isin(windows.drive, self.judged) & is_late)
 
 
 @dataclass(frozen=True)

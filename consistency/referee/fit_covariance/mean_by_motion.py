@@ -167,7 +167,8 @@ def values_by_bin(windows: DriveWindows, bins: Indices, scale: int) -> tuple[Arr
     size = _size_of_errors(windows)
     design = np.concatenate([Z, np.delete(X, scale, axis=-1)], axis=-1) / size
     y = (windows.errors[..., None] / size).ravel()
-    values = np.linalg.lstsq(design.reshape(len(y), -1), y, rcond=None)[0][:BINS]
+    values = np.linalg.lstsq(design.reshape(len(y), -1), y, rcond=None)[0]
+    values = values[:BINS]
     return values, Z @ (values - squares @ values / squares.sum())
 
 

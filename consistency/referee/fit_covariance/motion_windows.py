@@ -67,6 +67,12 @@ class DriveWindows:
         """Windows, and those left out."""
         return {"windows": len(self.drive), "long": self.long, "still": self.still, "jumps": self.jumps}
 
+    @property
+    def follows(self) -> Array:
+        """Whether each window but the first begins where the one before ends, (W - 1,)."""
+        same_drive = self.drive[1:] == self.drive[:-1]
+        return same_drive & (self.first[1:] == self.last[:-1])
+
     def of(self, keep: Indices | Array) -> DriveWindows:
         """Some of the windows, by index or mask."""
         return replace(self, **{name: getattr(self, name)[keep] for name in ROWS})
@@ -132,15 +138,17 @@ def cut_windows(
     if not parts:
         assert refused is not None
         raise refused
-    rows: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ROWS}
+    rows: dict[str, Any] = {}
+    for name in ROWS:
+        rows[name] = np.concatenate([getattr(part, name) for part in parts])
     found = replace(parts[0], **rows, long=sum(part.long for part in parts))
     moves = _moves(found)
     jumps = _jumps(found)
     sound = moves & ~jumps
     if not sound.any():
         raise InputError(f"--span {span.option}: no window of {drives[0].name} has motion without a jump; take another")
-    counted = replace(found, still=int((~moves).sum()), jumps=int((moves & jumps).sum()))
-    return counted.of(sound)
+    still = int((~moves).sum())
+    return replace(found, still=still, jumps=int((moves & jumps).sum())).of(sound)
 
 
 def _cut_drive(
@@ -187,7 +195,8 @@ def _jumps(of: DriveWindows) -> Array:
     """Which windows have a piece whose error, of position or rotation, is a jump in its drive, (W,)."""
     W, P = of.pieces.shape[:2]
     gaps = inverse(of.pieces) @ of.true_pieces
-    errors = log(gaps.reshape(W * P, of.d + 1, of.d + 1)).reshape(W, P, -1)
+    flat = gaps.reshape(W * P, of.d + 1, of.d + 1)
+    errors = log(flat).reshape(W, P, -1)
     ends = _ends(of.first, of.last, P)
     errors[ends[:, 1:] == ends[:, :-1]] = np.nan  # a piece without a row
     positions = slice(0, of.d), 0.0
@@ -217,8 +226,9 @@ def motions_between(T: Array, first: Indices, last: Indices) -> Array:
 def in_plane(T: Array) -> Array:
     """Motions in space (..., 4, 4) as x, y and yaw, (..., 3, 3); yaw is the direction of the x axis."""
     yaw = np.arctan2(T[..., 1, 0], T[..., 0, 0])
-    poses = np.stack([T[..., 0, 3], T[..., 1, 3], yaw], axis=-1)
-    return matrices(poses.reshape(-1, 3)).reshape(*T.shape[:-2], 3, 3)
+    poses = np.concatenate([T[..., :2, 3], yaw[..., None]], axis=-1)
+    flat = matrices(poses.reshape(-1, 3))
+    return flat.reshape(*yaw.shape, 3, 3)
 
 
 def rests(pieces: Array) -> Array:

@@ -28,8 +28,8 @@ def stretches_of(windows: DriveWindows, folds: Sequence[Fold]) -> list[Stretch]:
         some = windows.of(fold.judges(windows))
         corrected = fold.noise.mean.applied(some)
         C = fold.noise.covariance(corrected.pieces)
-        follows = (np.diff(some.drive) == 0) & (some.first[1:] == some.last[:-1])
-        for part in np.split(np.arange(len(C)), np.flatnonzero(~follows) + 1):
+        begins = np.flatnonzero(~some.follows) + 1
+        for part in np.split(np.arange(len(C)), begins):
             if len(part):
                 found.append(_stretch(len(found), corrected.of(part), C[part]))
     return found
@@ -83,7 +83,8 @@ def write_motions(stretches: Sequence[Stretch], folder: Path) -> list[str]:
 
 def _write_tables(stretches: Sequence[Stretch], folder: Path) -> None:
     """Two tables, with a clock where all stretches have one."""
-    keys = np.concatenate([np.column_stack([np.full(len(each.t), each.run), each.rows]) for each in stretches])
+    runs = np.concatenate([np.full(len(each.t), each.run) for each in stretches])
+    keys = np.column_stack([runs, np.concatenate([each.rows for each in stretches])])
     times = np.concatenate([each.t for each in stretches])
     head = ["run", "step", "x", "y", "heading"]
     if np.isfinite(times).all():

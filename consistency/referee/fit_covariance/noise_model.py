@@ -243,7 +243,8 @@ def caution(ratio: Ratio, probability: float) -> float:
         raise InputError(
             f"--cautious: {ratio.drives} judged drives do not tell how drives differ; it takes {ENOUGH} or more"
         )
-    reach = float(stats.t.ppf(probability, ratio.drives - 1)) * ratio.spread * np.sqrt(1.0 + 1.0 / ratio.drives)
+    error = ratio.spread * np.sqrt(1.0 + 1.0 / ratio.drives)  # of a new drive
+    reach = float(stats.t.ppf(probability, ratio.drives - 1)) * error
     return float(max(1.0, ratio.value * np.exp(reach)))
 
 

@@ -108,8 +108,9 @@ def _are_placeholders(T: Array, other: Array) -> bool:
         return False
     steps = np.diff(other[:, :-1, -1], axis=0)
     in_body = np.swapaxes(other[:-1, :d, :d], -1, -2) @ steps[..., None]
-    excess = np.linalg.norm(in_body.sum(axis=0)) - np.linalg.norm(steps.sum(axis=0))
-    return bool(excess > FOLLOWS * norms(steps).sum())
+    agree_in_body = np.linalg.norm(in_body.sum(axis=0))
+    agree_in_world = np.linalg.norm(steps.sum(axis=0))
+    return bool(agree_in_body - agree_in_world > FOLLOWS * norms(steps).sum())
 
 
 def _are_increments(T: Array, other: Array) -> bool:

@@ -229,14 +229,16 @@ def estimate(
     scales = start[:SCALES] * (1 + step[:SCALES])
     drift = start[SCALES:] * (1 + step[1]) + step[SCALES:] * near.way
     value = np.where(free, np.append(scales, drift), none)
-    mean = Mean(float(value[0]), float(value[1]), tuple(value[SCALES:].tolist()))
+    way, turn, *drifts = value.tolist()
+    mean = Mean(way, turn, tuple(drifts))
     return Estimate(mean, value - reach, value + reach)
 
 
 def _solve(A: Array, b: Array) -> Array:
     """x of A x = b, (p, p) and (p,) or (p, k); 0 in directions that are not determined."""
     size = np.sqrt(np.maximum(np.abs(np.diag(A)), 1e-300))
-    x = np.linalg.lstsq(A / np.outer(size, size), (b.T / size).T, rcond=WEAK**2)[0]
+    scaled = A / np.outer(size, size)
+    x = np.linalg.lstsq(scaled, (b.T / size).T, rcond=WEAK**2)[0]
     return np.asarray((x.T / size).T)
 
 
@@ -250,8 +252,7 @@ def _of_neighbours(windows: DriveWindows) -> Array:
 
 def sum_of_neighbours(windows: DriveWindows, before: Array, after: Array) -> Array:
     """Sum of a value of the window before and another of the one after, each (W, ...); 0 where there is none."""
-    follows = (windows.first[1:] == windows.last[:-1]) & (np.diff(windows.drive) == 0)
-    second = np.flatnonzero(follows) + 1
+    second = np.flatnonzero(windows.follows) + 1
     out = np.zeros_like(before)
     out[second] += before[second - 1]
     out[second - 1] += after[second]

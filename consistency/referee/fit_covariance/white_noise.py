@@ -138,7 +138,8 @@ def fitted_terms(windows: DriveWindows, fit: MeanFit | None) -> Array:
     one = np.ones(len(F))
     number = sum_of_neighbours(windows, one, one)
     known = number > 0
-    others = sum_of_neighbours(windows, F[:, n:], F[:, n:])[known] / number[known, None, None, None]
+    others = sum_of_neighbours(windows, F[:, n:], F[:, n:])[known]
+    others = others / number[known, None, None, None]
     F[:, n:] = others.mean(axis=0)
     F[known, n:] = others
     return F
@@ -154,14 +155,16 @@ def least_of(error: Array) -> Array:
     """
     square = mean_square(error)
     d = 2 if len(square) == 3 else 3
-    parts = {"positions": square[:d], "rotations": square[d:]}
-    for what, part in parts.items():
-        if not part.max() > 1e-20:
+    least = np.empty(len(square))
+    for what, part in (("positions", slice(d)), ("rotations", slice(d, None))):
+        largest = square[part].max()
+        if not largest > 1e-20:
             raise InputError(
                 f"estimate and truth have the same {what}; there is no error to fit: give those that the odometry "
                 "estimates itself"
             )
-    return np.concatenate([np.full(len(part), LEAST * part.max()) for part in parts.values()])
+        least[part] = LEAST * largest
+    return least
 
 
 def jitter_of(noise: WhiteNoise, windows: DriveWindows) -> Array:
@@ -179,7 +182,8 @@ def jitter_of(noise: WhiteNoise, windows: DriveWindows) -> Array:
     squares = np.array([mean_square(each.errors) for each in corrected])
     stated = np.array([noise.variances(each.pieces).mean(axis=0) for each in corrected])
     counts = np.array([len(each.drive) for each in corrected])
-    return np.array([constant_of(square, each, counts) for square, each in zip(squares.T, stated.T, strict=True)])
+    axes = zip(squares.T, stated.T, strict=True)
+    return np.array([constant_of(*axis, counts) for axis in axes])
 
 
 def constant_of(squares: Array, stated: Array, counts: Array) -> float:
@@ -206,14 +210,15 @@ def intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[Interval, ...]:
     whole: Indices = np.arange(len(error))
     rests = [np.setdiff1d(whole, block) for block in blocks_of(windows.drive)]
     left = [fit_terms(error[rest], F[rest], noise.floor, noise.theta) for rest in rests]
-    return tuple(interval_of(*each) for each in zip(noise.theta.tolist(), np.transpose(left), strict=True))
+    terms = zip(noise.theta.tolist(), np.transpose(left), strict=True)
+    return tuple(interval_of(*term) for term in terms)
 
 
 def interval_of(value: float, left_out: Sequence[float] | Array) -> Interval:
     """Interval of a variance from its values with each block left out, in cube roots (Wilson & Hilferty 1931)."""
     roots = np.cbrt(np.asarray(left_out))
     k = len(roots)
-    error = float(np.sqrt((k - 1) / k * ((roots - roots.mean()) ** 2).sum()))
+    error = float(np.sqrt(k - 1) * roots.std())
     if not error > 0:  # 0 with any block left out: its upper end is not known
         return Interval(value, 0.0, float("nan"))
     reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1)) * error
@@ -319,5 +324,6 @@ def _nonnegative(H: Array, g: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     root = np.sqrt(np.maximum(values, 1e-9))
-    least, _ = optimize.nnls(root[:, None] * vectors.T, (vectors.T @ (g / scale)) / root)
+    target = (vectors.T @ (g / scale)) / root
+    least, _ = optimize.nnls(root[:, None] * vectors.T, target)
     return np.asarray(least / scale)

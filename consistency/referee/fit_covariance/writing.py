@@ -116,9 +116,11 @@ def twist_covariance(v: float, w: float, dt: float) -> list[float]:
 def seconds(model: NoiseModel) -> float:
     """Median time that a motion over the span takes, s, over which the floor is spread; 1 without a clock."""
     windows = model.windows
-    times = [drive.t for drive in windows.drives]
-    spans = zip(windows.drive, windows.first, windows.last, strict=True)
-    median = float(np.median([times[i][last] - times[i][first] for i, first, last in spans]))
+    took = []
+    for i, first, last in zip(windows.drive, windows.first, windows.last, strict=True):
+        t = windows.drives[i].t
+        took.append(t[last] - t[first])
+    median = float(np.median(took))
     return median if np.isfinite(median) and median > 0 else 1.0
 
 
@@ -178,7 +180,9 @@ def straight(model: NoiseModel) -> Array:
     """Covariance (n, n) of a straight motion as long as the median one of the windows."""
     corrected = model.noise.mean.corrected(model.windows.pieces)
     way = float(np.median(ways(corrected).sum(axis=1)))
-    return model.covariance([way, 0.0, 0.0] if model.windows.d == 2 else [way, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    if model.windows.d == 2:
+        return model.covariance([way, 0.0, 0.0])
+    return model.covariance([way, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
 def _origin(model: NoiseModel) -> str:

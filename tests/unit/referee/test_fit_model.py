@@ -206,8 +206,8 @@ def test_fitted_variances_are_a_fixed_point_and_the_best(least: tuple[float, ...
     up = np.einsum("wi,wpij,wj->p", u, F, u)
     down = np.einsum("wij,wpji->p", np.linalg.inv(C), F)
     positive = theta > 1e-3 * theta.max()
-    np.testing.assert_allclose((up / down)[positive], 1.0, atol=0.02)
-    assert (up[~positive] <= 1.05 * down[~positive]).all()
+    np.testing.assert_allclose((up / down)[positive], 1.0, atol=2e-3)  # 2e-4 at most in 60 draws
+    assert (up[~positive] <= 1.002 * down[~positive]).all()
 
     def value(t: Array) -> float:
         P = np.diag(floor) + np.tensordot(t, F, (0, 1))

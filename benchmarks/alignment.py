@@ -27,7 +27,7 @@ from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.clock_offset import clocks_and_frames
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 

@@ -131,7 +131,7 @@ def test_the_kind_of_files_of_the_document_is_read(copy: Path) -> None:
     module, row = code("Add a kind of files")
     (copy / "consistency/referee/readers/formats/run_lines.py").write_text(module, encoding="utf-8")
     last = ")  # fmt: skip\nSUFFIXES"
-    changed(copy / "consistency/referee/readers/file_kinds.py", last, f"    {row.strip()},\n{last}")
+    changed(copy / "consistency/referee/readers/formats/file_kinds.py", last, f"    {row.strip()},\n{last}")
     lines = [f'{{"errors": [[{run}], [{run}]], "covariances": [[[1]], [[1]]]}}' for run in (3, 7)]
     (copy / "est.runs").write_text("\n".join(lines), encoding="utf-8")
     (copy / "bad.runs").write_text("\n".join([*lines, "{}"]), encoding="utf-8")

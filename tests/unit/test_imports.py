@@ -195,7 +195,7 @@ FORBIDDEN = [
     ("referee.diagnostics", "import pandas as pd"),
     ("referee.diagnostics", "from matplotlib.axes import Axes"),
     ("referee.diagnostics", "from consistency.bench.scenario import Belief"),
-    ("referee.diagnostics", "from consistency.referee.readers.read_files import read_recordings"),
+    ("referee.diagnostics", "from consistency.referee.readers.pipeline.read_files import read_recordings"),
     ("referee.cli.judging", "def f():\n    from consistency.bench.store.results import open_results"),
     ("referee.readers.formats.ros_bag", "import consistency.stereo.visual_odometry"),
     ("bench.runs.montecarlo", "from consistency.bench.pages import write_reports"),

@@ -12,7 +12,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import function_at
 from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.geometry.groups import composed, matrices
-from consistency.referee.readers.file_kinds import (
+from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
     TRAJECTORIES,
@@ -24,9 +24,9 @@ from consistency.referee.readers.file_kinds import (
     trajectory_files,
     unknown_kind,
 )
-from consistency.referee.readers.formats.sheet import refuse
 from consistency.referee.readers.formats.table import table_poses
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.places import refuse
 from consistency.referee.readers.truth_matching import NamedPoses, truth_at
 from consistency.referee.types import Array, Indices
 

@@ -13,7 +13,7 @@ from consistency.referee.fit_covariance.covariance_ratios import Fold
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.windows import Windows
 from consistency.referee.geometry.groups import carried, composed, to_left, vectors
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.windows import Relative
 

@@ -18,7 +18,7 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.diagnostics.words.sentences import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble
 from consistency.referee.readers.truth_matching import common_times
 from consistency.referee.readers.windows import Relative, windows

@@ -15,7 +15,7 @@ from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, 
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.sheet import Places, refuse
+from consistency.referee.readers.places import Places, refuse
 from consistency.referee.types import Array, Failure, Indices
 
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated

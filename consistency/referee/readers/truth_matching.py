@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,8 +14,7 @@ import numpy as np
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.readers.formats.named_columns import UNIT_NAMES, unit_of
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.types import Array, Indices
 
 Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more
@@ -102,20 +100,6 @@ def nearest(times: Array, reference: Array, before: Indices) -> Indices:
     """The nearest sample to each of ``times`` (k,), from the one at or before it."""
     after = np.minimum(before + 1, len(reference) - 1)
     return np.where(np.abs(times - reference[after]) < np.abs(times - reference[before]), after, before)
-
-
-def unit_apart(t: Array, other_t: Array, names: Sequence[Path | str]) -> str:
-    """Which of two files seems to have times in another unit than seconds, as the end of a sentence; "" of neither."""
-    units = unit_of(t), unit_of(other_t)
-    for unit in sorted(UNIT_NAMES, reverse=True):  # the smallest that makes them overlap, 1 where they do
-        units = (unit, 1) if _overlap(t / unit, other_t) else (1, unit) if _overlap(t, other_t / unit) else units
-    if units[0] == units[1]:
-        return ""
-    return f"; {names[units[0] < units[1]]} seems to be in {UNIT_NAMES[max(units)]}, and has to be in seconds"
-
-
-def _overlap(t: Array, other_t: Array) -> bool:
-    return bool(t[0] <= other_t[-1] and t[-1] >= other_t[0])
 
 
 def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Array:

@@ -41,7 +41,7 @@ from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees,
 from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.clock_offset import clocks_and_frames
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 

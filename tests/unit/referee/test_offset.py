@@ -15,7 +15,7 @@ import consistency as cs
 from consistency.referee.geometry import wrap
 from consistency.referee.readers import clock_offset
 from consistency.referee.readers.clock_offset import Offset, clock_shift, offset_of, steps_of
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 

@@ -12,12 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file
 from consistency.referee.readers.formats.text_blocks import opened
-from consistency.referee.types import Array
 
 PEEKED = 2**16  # bytes of a file that hold its header and its first row
 POSITIONS = ("p_rs_r_{}", "p_{}", "p{}", "t_{}", "t{}", "pos_{}", "position_{}", "translation_{}", "{}")
@@ -31,8 +28,6 @@ INNER = ("position_{}", "translation_{}", "orientation_{}", "rotation_{}")  # wh
 CLOCKS = ("header_stamp", "stamp", "timestamp", "timestamps", "t", "time", "")  # pandas leaves its index without a name
 HALVES = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"))
 UNITS = {"s": 1, "sec": 1, "ms": 10**3, "us": 10**6, "ns": 10**9, "nsec": 10**9}  # in a second
-UNIT_NAMES = {1: "seconds", 10**3: "milliseconds", 10**6: "microseconds", 10**9: "nanoseconds"}
-EPOCHS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3))  # times since 1970 are larger than this in ns, us and ms
 RECORDED = ("field_header_stamp",)  # names whose times are in ns: rostopic echo -p
 LABELS = (("x", "y", "z", "roll", "pitch", "yaw"), ("x", "y", "z", "rx", "ry", "rz"), ("x", "y", "z", "a", "b", "c"))
 MOVING_LABELS = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # behind those of a pose
@@ -281,14 +276,6 @@ def _places(plain: list[str], pairs: Iterator[tuple[str, str]]) -> tuple[int, ..
 
 
 # --- numbers -----------------------------------------------------------------------------------------
-
-
-def unit_of(t: Array, unit: int | None = None) -> int:
-    """How many units of times are a second: what their name says, or what times since 1970 are large enough for."""
-    if unit is not None:
-        return unit
-    middle = float(np.median(np.abs(t))) if len(t) else 0.0
-    return next((each for least, each in EPOCHS if middle > least), 1)
 
 
 def require_units(names: Sequence[str], path: Path) -> None:

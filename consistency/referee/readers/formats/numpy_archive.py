@@ -17,10 +17,11 @@ from consistency.referee.diagnostics.records.record import each_alone, numbered_
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
-from consistency.referee.readers.formats.sheet import Places, are_dof, bounded
+from consistency.referee.readers.formats.sheet import are_dof, bounded
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble, symmetric
 from consistency.referee.readers.truth_matching import Manifold, NamedPoses, Poses
 from consistency.referee.types import Array, Failure, Indices

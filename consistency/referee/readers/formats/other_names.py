@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.column_names import POSE
-from consistency.referee.readers.file_kinds import HEADINGS, PLACES
+from consistency.referee.readers.clock_units import unit_of
+from consistency.referee.readers.formats.file_kinds import HEADINGS, PLACES
 from consistency.referee.readers.formats.named_columns import (
     DEVIATIONS,
     clock_of,
     plain_name,
     require_units,
-    unit_of,
 )
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.types import Array

@@ -9,8 +9,9 @@ import numpy as np
 from consistency.referee.column_names import COVARIANCE, POSE
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.file_kinds import PLACES, SPEEDS, TURNS, is_poses
-from consistency.referee.readers.formats.named_columns import UNIT_NAMES, clock_of, head_of, places_of
+from consistency.referee.readers.clock_units import UNIT_NAMES
+from consistency.referee.readers.formats.file_kinds import PLACES, SPEEDS, TURNS, is_poses
+from consistency.referee.readers.formats.named_columns import clock_of, head_of, places_of
 from consistency.referee.readers.formats.other_names import TRUE, covariance_places, state_places
 from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
 from consistency.referee.readers.formats.sheet import Lines, TableRows, increasing

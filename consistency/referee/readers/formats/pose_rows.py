@@ -14,17 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
-from consistency.referee.readers.file_kinds import is_solution
+from consistency.referee.readers.clock_units import UNIT_NAMES, unit_of
+from consistency.referee.readers.formats.file_kinds import is_solution
 from consistency.referee.readers.formats.geodetic import read_solution
 from consistency.referee.readers.formats.named_columns import (  # fmt: skip
-    UNIT_NAMES,
     Head,
     Roles,
     fields_of,
     head_of,
     require_units,
     roles_of,
-    unit_of,
 )
 from consistency.referee.readers.formats.sheet import (
     Lines,
@@ -33,9 +32,9 @@ from consistency.referee.readers.formats.sheet import (
     read_numbers,
     read_rows,
     read_sheet,
-    refuse,
 )
 from consistency.referee.readers.formats.text_blocks import blocks
+from consistency.referee.readers.places import refuse
 from consistency.referee.types import Array, Indices
 
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance

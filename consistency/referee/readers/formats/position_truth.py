@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
-from consistency.referee.readers.formats.sheet import Lines, Places
+from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.pipeline.records import AXES, TrajectorySource
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.space_trajectories import AXES, TrajectorySource
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array

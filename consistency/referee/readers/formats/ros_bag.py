@@ -17,18 +17,18 @@ from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.geometry.groups import inverse, matrices, vectors
 from consistency.referee.parsing import reading
-from consistency.referee.readers.file_kinds import is_one_bag
+from consistency.referee.readers.formats.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.pose_rows import POSE
 from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.formats.tum import UNIT, bare_poses, poses_of
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.relative_motions import MARGINAL
-from consistency.referee.readers.space_trajectories import (
+from consistency.referee.readers.pipeline.records import (
     AXES,
     recordings_of,
     require_axes,
 )
+from consistency.referee.readers.relative_motions import MARGINAL
 from consistency.referee.readers.truth_matching import NamedPoses, Poses, truth_at
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array

@@ -6,7 +6,7 @@ import csv
 import itertools
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -126,26 +126,6 @@ class Lines:
     def of(self, columns: slice) -> Lines:
         """Some of the columns, without holding the others in memory."""
         return replace(self, values=self.values[:, columns].copy())
-
-
-class Places:
-    """Places of some rows of a file, put into words when asked for."""
-
-    def __init__(self, of: Callable[[int], str], rows: Indices) -> None:
-        self._of, self._rows = of, rows
-
-    def __getitem__(self, which: int) -> str:
-        return self._of(int(self._rows[which]))
-
-    def at(self, rows: Indices | slice) -> Places:
-        return Places(self._of, self._rows[rows])
-
-
-def refuse(bad: Any, place: Callable[[int], str], what: str | Callable[[int], str]) -> None:
-    """Refuse rows, (N,) of bool, that are ``bad``, by what is wrong with the first of them."""
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(f"{place(row)}: {what if isinstance(what, str) else what(row)}")
 
 
 def bounded(values: Array) -> Array:

@@ -15,10 +15,10 @@ from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
-from consistency.referee.readers.file_kinds import is_drive, is_plane, is_poses
+from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.formats.named_columns import begins_with_numbers, head_of
 from consistency.referee.readers.formats.other_names import true_columns, with_clock, with_known_names
-from consistency.referee.readers.formats.sheet import Places, TableRows, read_sheet
+from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.table_columns import (
     POSE,
     by_run,
@@ -35,6 +35,7 @@ from consistency.referee.readers.formats.table_columns import (
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble
 from consistency.referee.readers.truth_matching import Aligned, Known, NamedPoses, Poses, common_steps, common_times
 from consistency.referee.types import Array

@@ -11,11 +11,13 @@ import numpy as np
 from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
+from consistency.referee.readers.clock_units import unit_apart
 from consistency.referee.readers.formats.named_columns import DEVIATIONS
-from consistency.referee.readers.formats.sheet import TableRows, are_dof, exact, refuse
+from consistency.referee.readers.formats.sheet import TableRows, are_dof, exact
 from consistency.referee.readers.options import COLUMNS
+from consistency.referee.readers.places import refuse
 from consistency.referee.readers.runs_to_record import listed, symmetric
-from consistency.referee.readers.truth_matching import Known, Manifold, Poses, unit_apart
+from consistency.referee.readers.truth_matching import Known, Manifold, Poses
 from consistency.referee.types import Array, Indices
 
 POSE = ("x", "y", "heading")

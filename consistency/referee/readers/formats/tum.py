@@ -12,7 +12,7 @@ from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
-from consistency.referee.readers.file_kinds import TABLES, is_drive, trajectory_files
+from consistency.referee.readers.formats.file_kinds import TABLES, is_drive, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.readers.formats.named_columns import head_of, numbered
@@ -29,10 +29,9 @@ from consistency.referee.readers.formats.pose_rows import (
     read_poses,
 )
 from consistency.referee.readers.formats.position_truth import fixed, placeholder, position_source, positions
-from consistency.referee.readers.formats.sheet import Lines, Places, read_numbers, refuse
+from consistency.referee.readers.formats.sheet import Lines, read_numbers
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.space_trajectories import (
+from consistency.referee.readers.pipeline.records import (
     ALONE,
     BLOCKS,
     POINTS,
@@ -44,6 +43,8 @@ from consistency.referee.readers.space_trajectories import (
     recordings_of,
     require_axes,
 )
+from consistency.referee.readers.places import Places, refuse
+from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import NamedPoses, Poses, associate
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices

@@ -17,7 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import function_at
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
 from consistency.referee.parsing import require_name
-from consistency.referee.readers.file_kinds import (
+from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     OF_BAGS,
     OF_TRAJECTORIES,

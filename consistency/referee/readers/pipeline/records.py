@@ -13,12 +13,13 @@ from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.readers.clock_offset import clocks_and_frames
-from consistency.referee.readers.formats.sheet import refuse
+from consistency.referee.readers.clock_units import unit_apart
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.places import refuse
 from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
-from consistency.referee.readers.truth_matching import Poses, common_times, truth_at, unit_apart
+from consistency.referee.readers.truth_matching import Poses, common_times, truth_at
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 

@@ -17,6 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import outside, require
 from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.referee.readers.formats.text_blocks import Block, blocks
+from consistency.referee.readers.places import refuse
 from consistency.referee.types import Array, Indices
 
 Column = Array  # (N,), floats with NaN where a cell is empty; or objects, text for one, with None there

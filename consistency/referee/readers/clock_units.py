@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
 UNIT_NAMES = {1: "seconds", 10**3: "milliseconds", 10**6: "microseconds", 10**9: "nanoseconds"}
@@ -33,3 +34,12 @@ def unit_apart(t: Array, other_t: Array, names: Sequence[Path | str]) -> str:
 
 def _overlap(t: Array, other_t: Array) -> bool:
     return bool(t[0] <= other_t[-1] and t[-1] >= other_t[0])
+
+
+def nothing_near(
+    files: Sequence[Path | str], t: Array, other_t: Array, tolerance: float, what: str, of: str
+) -> InputError:
+    """Message that no time ``t`` of one file is near one of the other."""
+    own, other = (f"{each[0]:.15g} to {each[-1]:.15g}" for each in (t, other_t))
+    where = f"t is {own}, but {other} in {files[1]}{unit_apart(t, other_t, files)}"
+    return InputError(f"{files[0]}: no {what} has a {of} within {tolerance:g} s (--max-dt): {where}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,3 +30,13 @@ def refuse(bad: Any, place: Callable[[int], str], what: str | Callable[[int], st
     if bad.any():
         row = int(np.argmax(bad))
         raise InputError(f"{place(row)}: {what if isinstance(what, str) else what(row)}")
+
+
+def exact(value: float) -> str:
+    """A number with all its digits, as a file has it."""
+    return repr(float(value)).removesuffix(".0")
+
+
+def cut_note(path: Path, line: int) -> str:
+    """A note that the last line of a text is left out."""
+    return f"{path}: the last line, {line}, has no end and is left out; it seems to be cut short"

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics import Record
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.places import Places
@@ -139,20 +140,32 @@ class Poses:
     """
 
     place: Places  # (N,), "est.csv, line 7"
-    t: Array  # (N,), s, increasing
+    t: Array  # (N,), s, or numbers of steps, increasing
     estimate: Array  # (N, m)
     covariance: Array  # (N, n, n)
     stated: Array  # (N,) of bool: there is a covariance
-    true_t: Array  # (M,), s, increasing
+    true_t: Array  # (M,), s or numbers of steps, increasing
     truth: Array  # (M, m)
     manifold: Manifold
     convention: str
     max_dt: float  # s
-    cross: Array | None = None  # (N, n, n), E e_before e' with the row before; dropped where rows are chosen
+    cross: Array | None = None  # (N, n, n), E e_before e' with the row before
     true_covariance: Array | None = None  # (M, n, n), of the truth's own error in the convention; NaN where it has none
+    run: int = 0
+    name: str = ""  # of a drive
+    files: tuple[Path | str, Path | str] = ("the estimates", "the truth")
+    numbered: bool = False  # t are numbers of steps
+    clock: Array | None = None  # (N,), s, where t are numbers of steps
+    true_clock: Array | None = None  # (M,), s
+    nis: Array | None = None  # (N,)
+    nis_dof: Array | None = None  # (N,)
+    open_end: str = ""  # the last row stands in a line without an end: what to note if it is cut short
 
     def known(self, shift: float = 0.0) -> Known:
         """The truth at the timestamps, ``shift`` s later."""
+        if self.true_t is self.t and not shift:  # beside the estimates
+            none = np.zeros(len(self.t))
+            return Known(np.arange(len(self.t)), self.truth, np.arange(len(self.t)), none, none)
         return truth_at(self.t + shift, self.true_t, self.truth, self.manifold, self.max_dt)
 
     def truth_covariances(self, known: Known, shift: float = 0.0) -> Array | None:
@@ -179,19 +192,26 @@ class Poses:
         out[finite] = error(truth[finite], estimate[finite], self.convention)
         return out
 
+    @property
+    def seconds(self) -> Array:
+        """Time of each estimate, (N,), s; NaN where steps have none."""
+        if not self.numbered:
+            return self.t
+        return np.full(len(self.t), np.nan) if self.clock is None else self.clock
+
     def later(self, shift: float) -> Poses:
         return replace(self, t=self.t + shift) if shift else self
 
     def sound(self) -> Poses:
-        return self._of(
-            np.flatnonzero(np.isfinite(self.estimate).all(axis=1) & np.isfinite(self.covariance).all((1, 2)))
-        )
+        """Estimates that are finite, with a finite covariance."""
+        finite = np.isfinite(self.estimate).all(axis=1) & np.isfinite(self.covariance).all((1, 2))
+        return self.of_rows(np.flatnonzero(finite))
 
     def some(self, most: int) -> Poses:
         """At most ``most`` estimates, evenly chosen."""
         if len(self.t) <= most:
             return self
-        return self._of(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
+        return self.of_rows(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
 
     def alone(self) -> Poses:
         """Without velocities and biases behind the poses in space."""
@@ -201,20 +221,19 @@ class Poses:
             self, estimate=self.estimate[:, :7], covariance=self.covariance[:, :6, :6], truth=self.truth[:, :7]
         )
 
-    @classmethod
-    def bare(
-        cls, place: Places, t: Array, estimate: Array, true_t: Array, truth: Array, manifold: Manifold, max_dt: float
-    ) -> Poses:
-        """Poses without covariances, which are NaN."""
-        n = 6 if manifold == "spatial" else truth.shape[1]
-        P = np.broadcast_to(np.nan, (len(t), n, n))
-        return cls(place, t, estimate, P, np.zeros(len(t), bool), true_t, truth, manifold, "left", max_dt)
-
-    def _of(self, rows: Indices) -> Poses:
+    def of_rows(self, rows: Indices) -> Poses:
+        """Some of the estimates beside all of the truth, without their innovations."""
+        clock, cross = (None if values is None else values[rows] for values in (self.clock, self.cross))
         return replace(
             self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
-            covariance=self.covariance[rows], stated=self.stated[rows], cross=None,
+            covariance=self.covariance[rows], stated=self.stated[rows], cross=cross, clock=clock,
+            nis=None, nis_dof=None,
         )  # fmt: skip
+
+
+def unstated(rows: int, n: int) -> tuple[Array, Array]:
+    """Covariances (rows, n, n) that are NaN, and that none is stated, (rows,): where a file states none."""
+    return np.broadcast_to(np.nan, (rows, n, n)), np.zeros(rows, bool)
 
 
 @dataclass(frozen=True)
@@ -229,13 +248,5 @@ class Aligned:
     unavailable: tuple[str, ...] = ()  # questions that have no answer
     unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
 
-    def on(self, recording: Evidence) -> Evidence:
-        return replace(recording, **{key: value for key, value in vars(self).items() if key not in ("runs", "notes")})
-
-
-class NamedPoses(NamedTuple):
-    """A run of a file without its covariances, by name."""
-
-    name: str
-    poses: Poses
-    clock: Array  # (N,), s, of the estimates; NaN where they are numbered by steps alone
+    def on(self, record: Record) -> Record:
+        return replace(record, **{key: value for key, value in vars(self).items() if key not in ("runs", "notes")})

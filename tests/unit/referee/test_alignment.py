@@ -38,9 +38,8 @@ from consistency.referee.geometry import wrap
 from consistency.referee.readers import clock_offset
 from consistency.referee.readers.alignment import residuals
 from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned
+from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned, clocks_and_frames
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
-from consistency.referee.readers.clock_offset import clocks_and_frames
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array

@@ -11,19 +11,28 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import keys_once, reading
+from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.readers.formats.text_blocks import blocks
-from consistency.referee.types import Array, Indices
+from consistency.referee.readers.places import cut_note
+from consistency.referee.types import Array
 
 GPSD = "is a report of gpsd, whose epx, epy and epv are of unknown certainty; solve the receiver's raw data with RTKLIB"
 
 
-def read_json_lines(path: Path) -> tuple[dict[str, Array], Indices]:
-    """Columns of a file of JSON lines, with None or NaN where a line lacks a key, and the numbers of its lines."""
-    lines = [each for block in blocks(path) for each in block.lines()]
-    rows = [_row(path, number, line) for number, line in lines]
+def read_json_lines(path: Path) -> TableRows:
+    """Columns of a file of JSON lines, with None or NaN where a line lacks a key."""
+    numbers, rows, open_line, cut = list[int](), list[dict[str, Any]](), 0, ""
+    for block in blocks(path):
+        for number, line in block.lines():
+            if rows and not block.ends and not line.rstrip().endswith("}"):
+                cut = cut_note(path, number)
+                break
+            rows.append(_row(path, number, line))
+            numbers.append(number)
+            open_line = 0 if block.ends else number
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: _column([row.get(name) for row in rows]) for name in names}
-    return columns, np.array([number for number, _ in lines])
+    return TableRows(path, columns, np.array(numbers), "line", open_line, cut)
 
 
 def _row(path: Path, number: int, line: str) -> dict[str, Any]:

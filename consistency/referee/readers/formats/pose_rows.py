@@ -102,7 +102,7 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
         )
     ahead = Rotation.from_quat(lines.values[:, 4:POSE]).apply([1.0, 0.0, 0.0])
     columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
-    return TableRows(lines.path, columns, lines.line, unit)
+    return TableRows(lines.path, columns, lines.line, unit, lines.open_line, lines.cut)
 
 
 def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
@@ -135,7 +135,8 @@ def read_named(path: Path, head: Head, places: Sequence[int]) -> tuple[Lines, li
     names = list(sheet.data)
     if "run" in names or "filter" in names:
         raise InputError(f"{path}: column 'run' or 'filter': write such poses to a file for each run and estimator")
-    return Lines(path, np.empty((len(sheet), 0)), sheet.line), [sheet.numbers(names[i]) for i in places]
+    lines = Lines(path, np.empty((len(sheet), 0)), sheet.line, open_line=sheet.open_line, cut=sheet.cut)
+    return lines, [sheet.numbers(names[i]) for i in places]
 
 
 def _asl(lines: Lines, true: bool) -> Lines:

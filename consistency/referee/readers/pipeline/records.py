@@ -6,7 +6,7 @@ It is the same for poses in the plane and in space, for states of any components
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,26 +34,6 @@ STILL = (
 )
 
 
-@dataclass(frozen=True)
-class Match:
-    """The estimates of one run that have truth and covariance."""
-
-    poses: Poses
-    known: Known
-    error: Array  # (k, n)
-
-    @property
-    def rows(self) -> Indices:
-        """Rows of these estimates, (k,)."""
-        return self.known.rows
-
-    @property
-    def covariance(self) -> Array:
-        """Stated covariances, (k, n, n)."""
-        P = self.poses.covariance
-        return P if len(self.rows) == len(P) else P[self.rows]
-
-
 def records_of(e: Estimator, r: Reading, relative: Relative | None = None) -> list[Record]:
     """The records of an estimator, one for each group of components that have cross terms.
 
@@ -75,25 +55,28 @@ def records_of(e: Estimator, r: Reading, relative: Relative | None = None) -> li
     if relative is not None:
         return [_windows(e, judged, r, relative)]
     shift, clocks, moved = _clocks_and_frames(e, r, judged)
-    matches = [_match(e, p, r, shift) for p in moved.runs]
-    notes = [*e.notes, *_matching_notes(e, matches)]
-    matches = _without_exact_start(e, matches)
-    if cut := [m for m in matches if _ends_cut(m)]:
-        matches = [_without_last(m) if _ends_cut(m) else m for m in matches]
-        notes = [*(m.poses.open_end for m in cut), *notes]
-    idle = _not_estimated(e, matches, judged) if e.in_space and r.axes is None else []
-    if idle:
-        names = ", ".join(e.axes[i] for i in idle)
-        notes.append(f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too")
-    judged = [i for i in judged if i not in idle]
-    causes = [*_causes(e, moved.runs, shift, judged), *e.causes]
+    runs = moved.runs
+    known = [_known(e, p, r, shift) for p in runs]
+    notes = [*e.notes, *_left_out(e, runs, known)]
+    if _start_is_exact(e, runs):
+        known = [k.of(p.t[k.rows] != 0) for p, k in zip(runs, known, strict=True)]
+    for i, (p, k) in enumerate(zip(runs, known, strict=True)):
+        if p.open_end and _is_cut(p, k.rows):
+            known[i], notes = k.of(np.arange(len(k.rows) - 1)), [p.open_end, *notes]
+    tracks = [_track(e, p, k, shift) for p, k in zip(runs, known, strict=True)]
+    if e.in_space:
+        notes += _space_notes(e, runs, known, tracks)
+        still = _not_estimated(e, tracks, judged) if r.axes is None else []
+        if still:
+            names = ", ".join(e.axes[i] for i in still)
+            notes.append(f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too")
+        judged = [i for i in judged if i not in still]
+    causes = [*_causes(e, runs, shift, judged), *e.causes]
     notes += [*clocks, *moved.notes, *causes]
     if e.convention:
         notes.append(f"error convention {e.convention}: {e.definition}")
-    if e.t is None:  # the runs of an archive are there even if they have no step
-        matches = [m for m in matches if len(m.rows)]
-    columns, t = _columns(e, [(m.poses, m.rows) for m in matches], notes)
-    tracks = [_track(e, m, column, shift) for m, column in zip(matches, columns, strict=True)]
+    tracks, t, numbering = _in_columns(e, runs, known, tracks)
+    notes += numbering
     records = []
     for ending, group in e.stated.groups.items():
         part = [i for i in range(len(e.axes))[group] if i in judged]
@@ -135,92 +118,137 @@ def _clocks_and_frames(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple
 # --- estimates and truth ---------------------------------------------------------------------------
 
 
-def _match(e: Estimator, p: Poses, r: Reading, shift: float) -> Match:
-    """The estimates of a run that have truth and covariance, with their errors."""
-    known = _known(e, p, shift)
-    kept = p.stated[known.rows]
-    if len(kept) and not kept.any():
-        raise InputError(f"{p.files[0]}: no estimate has both a truth and a covariance within {p.max_dt:g} s")
-    if not kept.all():
-        known = _chosen(known, kept)
-    if p.numbered and p.clock is not None and p.true_clock is not None:
-        _require_same_time(p, known, r.tolerance)
-    return Match(p, known, p.error_of(known.rows, known.truth))
-
-
-def _known(e: Estimator, p: Poses, shift: float) -> Known:
-    """The truth at the times or steps of the estimates.
+def _known(e: Estimator, p: Poses, r: Reading, shift: float) -> Known:
+    """The truth of the estimates that have a covariance.
 
     Raises
     ------
     InputError
-        There is none, in a run that is not of an archive.
+        There is none, in a run that is not of an archive; or estimates and truth of a step have different times.
     """
     known = p.known(shift)
-    if len(known.rows) or e.t is not None:
-        return known
+    if not len(known.rows) and e.t is None:
+        raise _nothing_known(e, p, shift)
+    stated = p.stated[known.rows]
+    if len(stated) and not stated.any():
+        raise InputError(f"{p.files[0]}: no estimate has both a truth and a covariance within {p.max_dt:g} s")
+    known = known if stated.all() else known.of(stated)
+    if p.numbered and p.clock is not None and p.true_clock is not None:
+        t, true_t = p.clock[known.rows], p.true_clock[known.before]
+        where = f"in the same step of {p.files[1]}; number the same instants by the same step, or raise --max-dt"
+        refuse(
+            np.abs(t - true_t) > r.tolerance + ROUNDING,
+            p.place.at(known.rows).__getitem__,
+            lambda row: f"t is {exact(t[row])}, but {exact(true_t[row])} {where}",
+        )
+    return known
+
+
+def _nothing_known(e: Estimator, p: Poses, shift: float) -> InputError:
+    """Message that no estimate of a run has a truth."""
+    if p.numbered:
+        own, true = (f"{each.min():.15g} to {each.max():.15g}" for each in (p.t, p.true_t))
+        return InputError(f"{p.files[0]}: no step of run {p.run} ({own}) is in {p.files[1]} ({true})")
     several = len(e.runs) > 1 and e.runs[0].files == e.runs[-1].files
-    if not p.numbered:
-        what = f"estimate of run {p.run}" if several else "estimate"
-        raise nothing_near(p.files, p.t + shift, p.true_t, p.max_dt, what, "truth")
-    own, true = (f"{each.min():.15g} to {each.max():.15g}" for each in (p.t, p.true_t))
-    raise InputError(f"{p.files[0]}: no step of run {p.run} ({own}) is in {p.files[1]} ({true})")
+    what = f"estimate of run {p.run}" if several else "estimate"
+    return nothing_near(p.files, p.t + shift, p.true_t, p.max_dt, what, "truth")
 
 
-def _chosen(known: Known, kept: Array) -> Known:
-    return Known(*(values[kept] for values in known))
-
-
-def _require_same_time(p: Poses, known: Known, tolerance: float) -> None:
-    """Refuse steps of estimates and truth that have other times than each other."""
-    assert p.clock is not None
-    assert p.true_clock is not None
-    t, true_t = p.clock[known.rows], p.true_clock[known.before]
-    where = f"in the same step of {p.files[1]}; number the same instants by the same step, or raise --max-dt"
-    refuse(
-        np.abs(t - true_t) > tolerance + ROUNDING,
-        p.place.at(known.rows).__getitem__,
-        lambda row: f"t is {exact(t[row])}, but {exact(true_t[row])} {where}",
-    )
-
-
-def _without_exact_start(e: Estimator, matches: list[Match]) -> list[Match]:
-    """Steps without step 0 where it is the start of every run, known exactly, and not an estimate."""
-    runs = [m.poses for m in matches]
+def _start_is_exact(e: Estimator, runs: Sequence[Poses]) -> bool:
+    """Whether step 0 is the start of every run, known exactly, and not an estimate."""
     if not runs[0].numbered or e.t is not None or any((p.t < 0).any() for p in runs):
-        return matches
-    kinds = classify(np.concatenate([p.covariance[p.t == 0] for p in runs]), ROUNDED)
-    if not len(kinds) or not np.isin(kinds, (Validity.DEFICIENT, Validity.INDEFINITE)).all():
-        return matches
-    return [_of(m, m.poses.t[m.rows] != 0) for m in matches]
-
-
-def _of(m: Match, kept: Array) -> Match:
-    return Match(m.poses, _chosen(m.known, kept), m.error[kept])
-
-
-def _ends_cut(m: Match) -> bool:
-    """Whether the last line of a file, which has no end, holds a covariance that is not positive definite."""
-    if not m.poses.open_end or len(m.rows) < 2 or m.rows[-1] != len(m.poses.t) - 1:
         return False
-    before, last = classify(m.covariance[-2:], ROUNDED)
-    finite = np.isfinite(m.error[-1]).all() and np.isfinite(m.covariance[-1]).all()
+    kinds = classify(np.concatenate([p.covariance[p.t == 0] for p in runs]), ROUNDED)
+    return bool(np.isin(kinds, (Validity.DEFICIENT, Validity.INDEFINITE)).all())
+
+
+def _is_cut(p: Poses, rows: Indices) -> bool:
+    """Whether the last row of a file has a covariance that is not positive definite, unlike the row before."""
+    if len(rows) < 2 or rows[-1] != len(p.t) - 1:
+        return False
+    before, last = classify(p.covariance[rows[-2:]], ROUNDED)
+    finite = np.isfinite(p.estimate[-1]).all() and np.isfinite(p.covariance[-1]).all()
     return bool(finite and before == Validity.VALID and last != Validity.VALID)
 
 
-def _without_last(m: Match) -> Match:
-    return _of(m, np.arange(len(m.rows)) < len(m.rows) - 1)
+def _track(e: Estimator, p: Poses, known: Known, shift: float) -> Track:
+    """Errors of a run with their covariances; its columns are not yet known."""
+    rows, width, P = known.rows, e.position, p.covariance
+    nis, nis_dof = _innovations_of(p, rows)
+    return Track(
+        p.run, rows, p.place.at(rows), p.error_of(rows, known.truth), P if len(rows) == len(P) else P[rows],
+        nis, nis_dof, t=None if e.t is not None else _times(p, rows),
+        truth_covariance=p.truth_covariances(known, shift),
+        path=np.stack([known.truth[:, :width], p.estimate[rows, :width]], axis=1) if width else None,
+    )  # fmt: skip
+
+
+def _times(p: Poses, rows: Indices) -> Array | None:
+    """Times of some rows, s; None where steps have none."""
+    return None if p.numbered and p.clock is None else p.seconds[rows]
+
+
+def _innovations_of(p: Poses, rows: Indices) -> tuple[Array | None, Array | None]:
+    """NIS and degrees of freedom of some rows; None without any."""
+    if p.nis is None or p.nis_dof is None:
+        return None, None
+    return p.nis[rows], p.nis_dof[rows]
 
 
 # --- what is found -----------------------------------------------------------------------------------
 
 
-def _not_estimated(e: Estimator, matches: Sequence[Match], judged: Sequence[int]) -> list[int]:
+def _left_out(e: Estimator, runs: Sequence[Poses], known: Sequence[Known]) -> list[str]:
+    """Notes on left-out rows, and on a truth between whose samples estimates are."""
+    notes, total = [], sum(len(p.t) for p in runs)
+    if left_out := total - sum(len(k.rows) for k in known):
+        what = "no truth" if all(p.stated.all() for p in runs) else "no truth or no covariance"
+        within = "" if runs[0].numbered else f" within {runs[0].max_dt:g} s (--max-dt)"
+        notes.append(f"{e.said}: {left_out} of {total} estimates have {what}{within} and are left out")
+    furthest = max(float(k.apart.max(initial=0.0)) for k in known)
+    if furthest > ROUNDING and not e.in_space:
+        notes.append(f"{e.said}: the truth is interpolated, from samples up to {furthest:.2g} s away")
+    return notes
+
+
+def _space_notes(e: Estimator, runs: Sequence[Poses], known: Sequence[Known], tracks: Sequence[Track]) -> list[str]:
+    """Notes on probable mix-ups of conventions, and on a truth of too low a rate."""
+    notes = []
+    angle = max(_median(np.linalg.norm(track.error[:, 3:6], axis=1)) for track in tracks)
+    if angle > FAR:
+        notes.append(
+            f"{e.said}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run, which is a "
+            "matter of conventions or frames rather than of an estimator"
+        )
+    bent = max(_median(_bend(p, k)) for p, k in zip(runs, known, strict=True))
+    if bent > BENT:
+        notes.append(
+            f"{e.said}: the truth turns so fast that between its samples it may be off by {bent:.1f} sigma in the "
+            "median of a run, which counts as error; give a truth of a higher rate"
+        )
+    return notes
+
+
+def _bend(p: Poses, known: Known) -> Array:
+    """What the interpolated truth may be off by, (k,), in standard deviations of the position."""
+    variances = np.diagonal(p.covariance, axis1=1, axis2=2)[known.rows, :3]
+    sigma = np.sqrt(np.abs(variances).mean(axis=1))
+    bent = (sigma > 0) & (known.bend > 1e-9)
+    return np.where(bent, known.bend / np.where(sigma > 0, sigma, 1.0), 0.0)
+
+
+def _median(values: Array) -> float:
+    """Median of the finite values; 0 without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else 0.0
+
+
+def _not_estimated(e: Estimator, tracks: Sequence[Track], judged: Sequence[int]) -> list[int]:
     """Components, of those judged, that a robot in the plane does not estimate."""
     part = list(judged)
     variances = [np.diagonal(p.covariance, axis1=1, axis2=2)[p.stated][:, part] for p in e.runs]
-    idle = not_estimated([m.error[:, part] for m in matches], variances)
-    return [i for i, still in zip(part, idle, strict=True) if still]
+    still = not_estimated([track.error[:, part] for track in tracks], variances)
+    return [i for i, idle in zip(part, still, strict=True) if idle]
 
 
 def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
@@ -234,101 +262,44 @@ def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[
     return hints(e.said, e.axes[: len(AXES)], [p.alone() for p in runs], shift, of_pose)
 
 
-def _matching_notes(e: Estimator, matches: Sequence[Match]) -> list[str]:
-    """Notes on left-out rows, on the truth between its samples, and on probable mix-ups of conventions."""
-    notes, runs = [], [m.poses for m in matches]
-    total = sum(len(p.t) for p in runs)
-    if left_out := total - sum(len(m.rows) for m in matches):
-        what = "no truth" if all(p.stated.all() for p in runs) else "no truth or no covariance"
-        within = "" if runs[0].numbered else f" within {runs[0].max_dt:g} s (--max-dt)"
-        notes.append(f"{e.said}: {left_out} of {total} estimates have {what}{within} and are left out")
-    if not e.in_space:
-        furthest = max(float(m.known.apart.max(initial=0.0)) for m in matches)
-        if furthest > ROUNDING:
-            notes.append(f"{e.said}: the truth is interpolated, from samples up to {furthest:.2g} s away")
-        return notes
-    angle = max(_median(np.linalg.norm(m.error[:, 3:6], axis=1)) for m in matches)
-    if angle > FAR:
-        notes.append(
-            f"{e.said}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run, which is a "
-            "matter of conventions or frames rather than of an estimator"
-        )
-    bent = max(_median(_bend(m)) for m in matches)
-    if bent > BENT:
-        notes.append(
-            f"{e.said}: the truth turns so fast that between its samples it may be off by {bent:.1f} sigma in the "
-            "median of a run, which counts as error; give a truth of a higher rate"
-        )
-    return notes
-
-
-def _bend(m: Match) -> Array:
-    """What the interpolated truth may be off by, (k,), in standard deviations of the position."""
-    sigma = np.sqrt(np.abs(np.diagonal(m.covariance[:, :3, :3], axis1=1, axis2=2)).mean(axis=1))
-    known = (sigma > 0) & (m.known.bend > 1e-9)
-    return np.where(known, m.known.bend / np.where(sigma > 0, sigma, 1.0), 0.0)
-
-
-def _median(values: Array) -> float:
-    """Median of the finite values; 0 without any."""
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else 0.0
-
-
 # --- records -----------------------------------------------------------------------------------------
 
 
-def _columns(e: Estimator, runs: Sequence[tuple[Poses, Indices]], notes: list[str]) -> tuple[list[Indices], Array]:
-    """The column of each row in a record, (k,) of each run, and the time of each column, (steps,), s.
+def _in_columns(
+    e: Estimator, runs: Sequence[Poses], known: Sequence[Known], tracks: Sequence[Track]
+) -> tuple[list[Track], Array, list[str]]:
+    """Tracks on common columns, the time of each column, (steps,), s, and a note if the file numbers them otherwise.
 
-    Parameters
-    ----------
-    runs : poses and the rows of them that count
-    notes : one on steps of a file that are not numbered 1, 2, ... is added
+    Runs without a row are left out, but for those of an archive, which numbers its steps.
     """
-    keys = [p.t[rows] for p, rows in runs]
     if e.t is not None:
-        return [own.astype(np.int64) for own in keys], e.t
-    if not e.runs[0].numbered:
-        return common_times(keys)
+        return [replace(track, column=known.rows) for track, known in zip(tracks, known, strict=True)], e.t, []
+    some = [(p, track) for p, track in zip(runs, tracks, strict=True) if len(track.column)]
+    keys = [p.t[track.column] for p, track in some]
+    if not runs[0].numbered:
+        columns, t = common_times(keys)
+        return [replace(track, column=column) for (_, track), column in zip(some, columns, strict=True)], t, []
     columns, steps = common_steps(keys)
     t = np.full(len(steps), np.nan)
-    for (p, rows), column in zip(reversed(runs), reversed(columns), strict=True):
-        t[column] = p.seconds[rows]
-    if not np.array_equal(steps, np.arange(1, len(steps) + 1)):
-        of = f"which has {steps[0]:g} to {steps[-1]:g}"
-        notes.append(f"{e.said}: step k below is the k-th step of the file, {of}")
-    return columns, t
-
-
-def _track(e: Estimator, m: Match, column: Indices, shift: float) -> Track:
-    p, rows, width = m.poses, m.rows, e.position
-    times = p.seconds[rows] if e.t is None and not (p.numbered and p.clock is None) else None
-    path = np.stack([m.known.truth[:, :width], p.estimate[rows, :width]], axis=1) if width else None
-    return Track(
-        p.run, column, p.place.at(rows), m.error, m.covariance, *_innovations_of(p, rows), t=times,
-        truth_covariance=p.truth_covariances(m.known, shift), path=path,
-    )  # fmt: skip
-
-
-def _innovations_of(p: Poses, rows: Indices) -> tuple[Array | None, Array | None]:
-    """NIS and degrees of freedom of some rows; None without any."""
-    if p.nis is None or p.nis_dof is None:
-        return None, None
-    return p.nis[rows], p.nis_dof[rows]
+    for (p, track), column in zip(reversed(some), reversed(columns), strict=True):
+        t[column] = p.seconds[track.column]
+    tracks = [replace(track, column=column) for (_, track), column in zip(some, columns, strict=True)]
+    if np.array_equal(steps, np.arange(1, len(steps) + 1)):
+        return tracks, t, []
+    has = f"{steps[0]:g} to {steps[-1]:g}"
+    return tracks, t, [f"{e.said}: step k below is the k-th step of the file, which has {has}"]
 
 
 def _innovations(e: Estimator) -> Record:
     """The record of innovations without errors; a step whose estimate is broken fails."""
-    notes, rows = list(e.notes), [(p, np.arange(len(p.t))) for p in e.runs]
-    columns, t = _columns(e, rows, notes)
     tracks = []
-    for (p, all_rows), column in zip(rows, columns, strict=True):
-        broken = ~np.isfinite(p.estimate).all(axis=1)
-        nis, dof = _innovations_of(p, all_rows)
-        error = np.where(broken, np.nan, 0.0)[:, None]
-        tracks.append(Track(p.run, column, p.place, error, nis=nis, nis_dof=dof, t=p.clock))
-    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes)
+    for p in e.runs:
+        rows = np.arange(len(p.t))
+        error = np.where(np.isfinite(p.estimate).all(axis=1), 0.0, np.nan)[:, None]
+        nis, dof = _innovations_of(p, rows)
+        tracks.append(Track(p.run, rows, p.place, error, nis=nis, nis_dof=dof, t=p.clock))
+    tracks, t, numbering = _in_columns(e, e.runs, [], tracks)
+    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", [*e.notes, *numbering])
     return replace(record, error=None, dof=0)
 
 
@@ -338,23 +309,23 @@ def _windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative
 
     if e.stated != WHOLE:
         raise InputError(f"{e.path}: --relative needs covariances of whole poses; here parts are stated apart")
-    stretches, matches = [], []
+    stretches, runs, known = [], [], []
     for p in e.runs:
-        rows = np.arange(len(p.t))
         if relative.motions:
             bare = np.append(False, ~p.stated[1:])
             refuse(bare, p.place.__getitem__, f"this motion has no covariance within {p.max_dt:g} s")
-        elif p.cross is not None:
-            rows = rows[p.stated]
-        part = p.of_rows(rows)
-        known = _known(e, part, r.shift)
-        matches.append(Match(part, known, np.empty((0, 6))))
+        elif p.cross is not None and not p.stated.all():
+            p = p.of_rows(np.flatnonzero(p.stated))
+        runs.append(p)
+        known.append(p.known(r.shift))
+        if not len(known[-1].rows):
+            raise _nothing_known(e, p, r.shift)
         stretches.append(
             Stretch(
-                p.run, str(p.files[0]), part.place, part.seconds + r.shift, part.estimate, part.covariance, part.cross,
-                known.rows, known.truth, p.convention,
+                p.run, str(p.files[0]), p.place, p.seconds + r.shift, p.estimate, p.covariance, p.cross,
+                known[-1].rows, known[-1].truth, p.convention,
             )
         )  # fmt: skip
     of = str(e.covariances or e.path)
     record = relative_recording(e.name, of, stretches, e.axes[: len(AXES)], judged, relative)
-    return replace(record, notes=(*e.notes, *_matching_notes(e, matches), *record.notes))
+    return replace(record, notes=(*e.notes, *_left_out(e, runs, known), *record.notes))

@@ -618,7 +618,7 @@ P = np.array([[0.04, 0.01, 0.005], [0.01, 0.09, -0.01], [0.005, -0.01, 0.01]])
 )
 def test_the_unit_that_makes_times_overlap_is_named(unit: int, name: str) -> None:
     for longer in (T, np.arange(600.0)):  # a truth may begin earlier and end later
-        said = [unit_apart(unit * T, longer, ("a", "b"))(longer, unit * T, ("b", "a"))]
+        said = [unit_apart(unit * T, longer, ("a", "b")), unit_apart(longer, unit * T, ("b", "a"))]
         assert said == [f"; a seems to be in {name}, and has to be in seconds" if name else ""] * 2
     assert not unit_apart(T, T + 5000.0, ("a", "b"))
     assert "; b seems to be in nanoseconds" in unit_apart(T, 1.7e18 + T, ("a", "b"))  # of 1970

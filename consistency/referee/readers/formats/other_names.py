@@ -13,6 +13,9 @@ from consistency.referee.readers.clock_units import unit_of
 from consistency.referee.readers.formats.file_kinds import HEADINGS, PLACES
 from consistency.referee.readers.formats.named_columns import (
     DEVIATIONS,
+    OWN,
+    TRUE,
+    VARIANCES,
     clock_of,
     plain_name,
     require_units,
@@ -20,10 +23,7 @@ from consistency.referee.readers.formats.named_columns import (
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.types import Array
 
-OWN = ("{}", "{}_est", "est_{}", "{}_hat", "{}_estimate", "estimate_{}", "{}_estimated", "estimated_{}")
-TRUE = ("true_{}", "{}_true", "truth_{}", "{}_truth", "gt_{}", "{}_gt")
 COVARIANCES = ("p_{}_{}", "p_{}{}", "p{}_{}", "p{}{}", "cov_{}_{}", "cov_{}{}", "cov{}{}")
-VARIANCES = ("var_{}", "var{}", "{}_var", "variance_{}")
 SHORT_HEADINGS = ("h", "th", "t")  # in names of a covariance alone
 KEYS = ("run", "step", "t")
 

@@ -12,8 +12,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.clock_units import UNIT_NAMES
 from consistency.referee.readers.formats.file_kinds import PLACES, SPEEDS, TURNS, is_poses
-from consistency.referee.readers.formats.named_columns import clock_of, head_of, places_of
-from consistency.referee.readers.formats.other_names import TRUE, covariance_places, state_places
+from consistency.referee.readers.formats.named_columns import TRUE, clock_of, head_of, places_of
+from consistency.referee.readers.formats.other_names import covariance_places, state_places
 from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
 from consistency.referee.readers.formats.sheet import TableRows, increasing
 from consistency.referee.readers.formats.table_columns import LOWER_NAMES

@@ -24,6 +24,7 @@ from consistency.referee.readers.formats.named_columns import (  # fmt: skip
     head_of,
     require_units,
     roles_of,
+    true_roles_of,
 )
 from consistency.referee.readers.formats.sheet import (
     Lines,
@@ -87,6 +88,18 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     return states
 
 
+def read_beside(path: Path) -> Lines | None:
+    """The truth in columns beside the estimates of a file with names, in rows that have one; None without any."""
+    head = head_of(path)
+    roles = None if head is None else true_roles_of(head.names, path)
+    if head is None or roles is None or not roles.quaternion:
+        return None
+    lines = _named(path, head, roles, true=True)
+    known = np.isfinite(lines.values).all(axis=1)
+    note = f"{path}: the truth stands in columns beside the estimates"
+    return replace(lines, values=lines.values[known], line=lines.line[known], rest=None, note=note)
+
+
 def on_plane(lines: Lines, unit: str) -> TableRows:
     """Columns t, x, y and heading of poses in space, which is that of the x axis.
 
@@ -110,6 +123,9 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     pose = (*roles.time, *roles.position, *roles.quaternion, *roles.covariance)
     lines, columns = read_named(path, head, (*pose, *roles.rest))
     t, unit = times_of(lines, roles.time, columns[: len(roles.time)], roles.unit)
+    if roles.squared:
+        first = len(roles.time) + len(roles.position) + len(roles.quaternion)
+        columns[first : len(pose)] = [np.sign(each) * np.sqrt(np.abs(each)) for each in columns[first : len(pose)]]
     of = roles.kind if true else roles.kind.replace(" truth", " poses")
     clock = UNIT_NAMES[unit] if len(roles.time) == 1 else "seconds and nanoseconds"
     order = "no orientation"
@@ -118,6 +134,7 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if roles.covariance:
         stated = "standard deviations" if len(roles.covariance) in DEVIATIONS else "covariance"
+        stated = "variances" if roles.squared else stated
         note += f", {stated} in {len(roles.covariance)} columns"
     values = np.column_stack([t, *columns[len(roles.time) : len(pose)]])
     rest = np.column_stack(columns[len(pose) :]) if roles.rest else None

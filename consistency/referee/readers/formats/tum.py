@@ -27,6 +27,7 @@ from consistency.referee.readers.formats.pose_rows import (
     SPLIT,
     TRIANGLE,
     States,
+    read_beside,
     read_deviations,
     read_poses,
 )
@@ -77,9 +78,7 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     if r.error not in (None, *INERTIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
     require_axes(r.axes, STATE)
-    if r.truth is None:
-        raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
-    truth_of = _truths(r)
+    truth_of = _truths(estimates, r)
     files = _runs(estimates, r.truth, None if poses_alone else r.covariance)
     runs = (SpaceRun(read_trajectory(own), truth_of(true), (own, true), P) for own, true, P in files)
     if poses_alone:
@@ -172,10 +171,17 @@ def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
     return Estimator(path.stem, path, poses, STATE[:6], in_space=True)
 
 
-def _truths(r: Reading) -> Callable[[Path], Lines]:
+def _truths(estimates: Path, r: Reading) -> Callable[[Path], Lines]:
+    """What reads a truth: a file of its own, a drive, or columns beside the estimates."""
+
     @lru_cache(maxsize=1)
     def read(path: Path) -> Lines:
-        return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, true=True)
+        if r.truth is not None:
+            return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, true=True)
+        beside = read_beside(path)
+        if beside is None:
+            raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
+        return _checked(beside)
 
     return read
 
@@ -207,13 +213,13 @@ def _origin(stated: Stated) -> str:
     return "written by OpenVINS"
 
 
-def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
-    """Files of every run: estimates, truth, covariance."""
+def _runs(estimates: Path, truth: Path | None, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
+    """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
     if not estimates.is_dir():
         for option, path in (("--truth", truth), ("--covariance", covariance)):
             if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
                 raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
-        return [(estimates, truth, covariance)]
+        return [(estimates, truth or estimates, covariance)]
     files = trajectory_files(estimates)
     if not files:
         tables = any(path.suffix.lower() in TABLES for path in estimates.iterdir())
@@ -226,7 +232,9 @@ def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[P
         raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
     out = []
     for path in files:
-        own_truth = _same_stem(truth, path, "--truth") if truth.is_dir() and not is_drive(truth) else truth
+        own_truth = truth or path
+        if truth is not None and truth.is_dir() and not is_drive(truth):
+            own_truth = _same_stem(truth, path, "--truth")
         own_covariance = None if covariance is None else _same_stem(covariance, path, "--covariance")
         out.append((path, own_truth, own_covariance))
     return out
@@ -371,7 +379,11 @@ def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indic
 
 def read_trajectory(path: Path, true: bool = False) -> Lines:
     """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
-    lines = read_poses(path, true)
+    return _checked(read_poses(path, true), true)
+
+
+def _checked(lines: Lines, true: bool = True) -> Lines:
+    """Poses whose quaternions have unit length, and which are finite if they are a truth."""
     pose = lines.values[:, 1:POSE]
     finite = np.isfinite(pose).all(axis=1)
     if true:

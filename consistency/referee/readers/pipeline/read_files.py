@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from consistency.referee.diagnostics import Record
 from consistency.referee.errors import InputError
@@ -27,10 +27,7 @@ from consistency.referee.readers.formats.file_kinds import (
 )
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.pipeline.kinds import OF_BAGS, OF_TRAJECTORIES, Found, kind_of
-from consistency.referee.readers.pipeline.records import records_of
-
-if TYPE_CHECKING:
-    from consistency.referee.readers.windows import Relative
+from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
@@ -40,7 +37,6 @@ NO_GUESS = {
     "relative": ", which judges motions in one error; name the conventions one by one",
 }
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
-OF_WINDOWS = ("relative", "motions", "windows")
 
 
 def is_recording(path: Path, reading: Reading) -> bool:
@@ -82,10 +78,9 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
 
     sheet = frame_rows(estimates, "estimates") if hasattr(estimates, "columns") else Path(estimates)
     true = frame_rows(truth, "truth") if hasattr(truth, "columns") else truth if truth is None else Path(truth)
-    over = _windows(reading)
-    r = _checked(replace(reading, truth=cast(Any, true)), over)
+    r = _checked(replace(reading, truth=cast(Any, true)))
     _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
-    return _read("tables", r, lambda options: _records(read_tables(sheet, options), options, over))
+    return _read("tables", r, lambda options: _records(read_tables(sheet, options), options))
 
 
 def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Record]:
@@ -100,9 +95,7 @@ def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Rec
     InputError
         Something cannot be used: names file, line, column or option, and what is allowed.
     """
-    reading = reading or Reading()
-    over = _windows(reading)
-    return _read(str(estimates), _checked(reading, over), lambda r: _by_kind(estimates, r, over))
+    return _read(str(estimates), _checked(reading or Reading()), lambda r: _by_kind(estimates, r))
 
 
 def _read(name: str, r: Reading, read: Callable[[Reading], list[Record]]) -> list[Record]:
@@ -131,15 +124,6 @@ def _guessed(name: str, r: Reading, read: Callable[[str | None], list[Record]]) 
     return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
 
 
-def _windows(r: Reading) -> Relative | None:
-    """Windows that are judged in place of poses."""
-    if not r.given(OF_WINDOWS):
-        return None
-    from consistency.referee.readers.windows import relative_of
-
-    return relative_of(r.relative, bool(r.motions), r.windows)
-
-
 def _declared(records: list[Record], r: Reading) -> list[Record]:
     """Records with what is declared of their truth, in pieces where that is asked."""
     if r.given(OF_TRUTH) or any(record.truth_covariance is not None for record in records):
@@ -154,15 +138,18 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
     return [in_pieces(record, pieces or None) for record in records]
 
 
-def _records(found: Found, r: Reading, over: Relative | None) -> list[Record]:
+def _records(found: Found, r: Reading) -> list[Record]:
     """Records of what a reader gives."""
     records: list[Record] = []
     for one in found:
-        records += records_of(one, r, over) if isinstance(one, Estimator) else [one]
+        if isinstance(one, Estimator):
+            records.extend(records_of(one, r))
+        else:
+            records.append(one)
     return records
 
 
-def _by_kind(estimates: Path, r: Reading, over: Relative | None) -> list[Record]:
+def _by_kind(estimates: Path, r: Reading) -> list[Record]:
     if not estimates.exists():
         raise InputError(f"{estimates}: no such file")
     require_name(estimates.name, "file")
@@ -174,7 +161,7 @@ def _by_kind(estimates: Path, r: Reading, over: Relative | None) -> list[Record]
         raise unknown_kind(estimates)
     if r.truth is not None and is_foreign(r.truth):
         raise unknown_kind(r.truth)
-    records = _records(kind.read(estimates, r, False), r, over)
+    records = _records(kind.read(estimates, r, False), r)
     if r.truth is None or not is_drive(r.truth):
         return records
     of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
@@ -201,20 +188,23 @@ def pieces_asked(r: Reading) -> int | None:
     return int(r.split)
 
 
-def _checked(r: Reading, over: Relative | None) -> Reading:
+def _checked(r: Reading) -> Reading:
     """Options that go together, whatever the file; numbers are floats, and no alignment is None."""
+    windows_asked(r)
     if r.error not in (None, GUESS, *CONVENTIONS):
         raise InputError(f"--error {r.error}: must be one of {', '.join((*CONVENTIONS, GUESS))}")
     if r.max_dt is not None and not (math.isfinite(r.max_dt) and r.max_dt >= 0):
         raise InputError(f"--max-dt {r.max_dt:g}: must be 0 or more, in s")
     if r.lever_arm is not None and not (len(r.lever_arm) == 3 and all(map(math.isfinite, r.lever_arm))):
         raise InputError("--lever-arm: must be three numbers x,y,z, in m")
-    offset = float(r.time_offset) if isinstance(r.time_offset, int) else r.time_offset
+    offset = r.time_offset
+    if isinstance(offset, int):
+        offset = float(offset)
     if offset not in (None, "estimate") and not (isinstance(offset, float) and math.isfinite(offset)):
         raise InputError(f"--time-offset {offset}: must be a number of seconds, or 'estimate'")
     if offset is not None and r.truth is None and r.truth_topic is None:
         raise InputError("--time-offset needs --truth: without truth there are no clocks to compare")
-    if over is not None and offset == "estimate":
+    if r.relative is not None and offset == "estimate":
         raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
     if r.given(OF_TRUTH):
         from consistency.referee.readers.truth_covariance import require_truth_options
@@ -225,7 +215,7 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
     align = None if r.align == "none" else r.align
     if align is not None and (r.truth or r.truth_topic) is None:
         raise InputError(f"--align {align} needs --truth, with which the estimates are aligned")
-    if over is not None and align is not None:
+    if r.relative is not None and align is not None:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     pieces_asked(r)  # refused before anything is read
     return replace(r, time_offset=offset, align=align)

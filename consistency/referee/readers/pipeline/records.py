@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,9 +24,12 @@ from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
 from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
 from consistency.referee.readers.truth_matching import ROUNDING, Aligned, Known, Poses, common_steps, common_times
-from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 
+if TYPE_CHECKING:
+    from consistency.referee.readers.windows import Relative
+
+OF_WINDOWS = ("relative", "motions", "windows")  # options
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
 FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
 STILL = (
@@ -34,14 +38,11 @@ STILL = (
 )
 
 
-def records_of(e: Estimator, r: Reading, relative: Relative | None = None) -> list[Record]:
+def records_of(e: Estimator, r: Reading) -> list[Record]:
     """The records of an estimator, one for each group of components that have cross terms.
 
-    Clocks that differ, mix-ups, and components that are not estimated are looked for.
-
-    Parameters
-    ----------
-    relative : judge motions over windows in place of poses
+    Clocks that differ, mix-ups, and components that are not estimated are looked for. With ``--relative`` motions over
+    windows are judged in place of poses.
 
     Raises
     ------
@@ -52,6 +53,7 @@ def records_of(e: Estimator, r: Reading, relative: Relative | None = None) -> li
         return [_innovations(e)]
     require_radians(str(e.path), e.runs)
     judged = _named(e, r)
+    relative = windows_asked(r)
     if relative is not None:
         return [_windows(e, judged, r, relative)]
     shift, clocks, moved = _clocks_and_frames(e, r, judged)
@@ -88,6 +90,15 @@ def records_of(e: Estimator, r: Reading, relative: Relative | None = None) -> li
         records.append(each_alone(record) if e.stated.alone else record)
         notes, causes = [], []
     return records
+
+
+def windows_asked(r: Reading) -> Relative | None:
+    """Windows of ``--relative`` that are judged in place of poses; None without the option."""
+    if not r.given(OF_WINDOWS):
+        return None
+    from consistency.referee.readers.windows import relative_of
+
+    return relative_of(r.relative, bool(r.motions), r.windows)
 
 
 def _named(e: Estimator, r: Reading) -> list[int]:

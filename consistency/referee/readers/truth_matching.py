@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,11 @@ from consistency.referee.types import Array, Indices
 Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more
 BRIDGED = 0.1  # s between two samples of the truth that are always interpolated: a period of 10 Hz
 ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
+
+
+def manifold_of(convention: str) -> Manifold:
+    """What errors of a convention live on, of states and of poses in the plane."""
+    return "vector" if convention == "vector" else "planar"
 
 
 def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
@@ -226,13 +231,28 @@ class Poses:
         )
 
     def of_rows(self, rows: Indices) -> Poses:
-        """Some of the estimates beside all of the truth, without their innovations."""
-        clock, cross = (None if values is None else values[rows] for values in (self.clock, self.cross))
+        """Some of the estimates beside all of the truth."""
+        if len(rows) == len(self.t):
+            return self
         return replace(
             self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
-            covariance=self.covariance[rows], stated=self.stated[rows], cross=cross, clock=clock,
-            nis=None, nis_dof=None,
+            covariance=self.covariance[rows], stated=self.stated[rows], cross=at(self.cross, rows),
+            clock=at(self.clock, rows), nis=at(self.nis, rows), nis_dof=at(self.nis_dof, rows),
         )  # fmt: skip
+
+    def beside(self, samples: Indices) -> Poses:
+        """The estimates beside some samples of the truth."""
+        return replace(
+            self, true_t=self.true_t[samples], truth=self.truth[samples], true_clock=at(self.true_clock, samples),
+            true_covariance=at(self.true_covariance, samples),
+        )  # fmt: skip
+
+
+def at(values: Array | None, rows: Any) -> Array | None:
+    """Some rows of values, if there are any."""
+    if values is None:
+        return None
+    return np.asarray(values[rows])
 
 
 def unstated(rows: int, n: int) -> tuple[Array, Array]:

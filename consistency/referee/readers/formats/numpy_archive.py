@@ -20,7 +20,7 @@ from consistency.referee.readers.mix_ups.hints import turns
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.truth_matching import Manifold, Poses, unstated
+from consistency.referee.readers.truth_matching import Poses, at, manifold_of, unstated
 from consistency.referee.types import Array, Failure, Indices
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
@@ -88,7 +88,6 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
     if kind == OF_POSES:
         truth = _finite_truth(path, estimates, truth, there)
     convention = declared or "vector"
-    manifold: Manifold = "vector" if convention == "vector" else "planar"
     nis, dof = _nis(path, arrays, (runs, steps))
     of_truth, cross = None, None
     if "truth_covariances" in arrays:
@@ -99,17 +98,16 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
     for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
         place, known = steps_of(path, run, np.arange(length)), there[run, :length]
         one = _beside(path, place, estimates[run, :length], truth[run, :length], known, clock)
-        P = np.full((length, n, n), np.nan)
-        P[known] = symmetric(covariances[run, :length][known], place.at(np.flatnonzero(known)).__getitem__)
-        T = None
+        rows, P, T = np.flatnonzero(known), np.full((length, n, n), np.nan), None
+        P[rows] = symmetric(covariances[run, rows], place.at(rows).__getitem__)
         if of_truth is not None:
-            rows = np.flatnonzero(known)
             T = symmetric(of_truth[run, rows], place.at(rows).__getitem__)
-        own_nis, own_dof, own_cross = (None if each is None else each[run, :length] for each in (nis, dof, cross))
+        its = (run, slice(length))
         poses.append(
             replace(
-                one, covariance=P, stated=np.ones(length, bool), manifold=manifold, convention=convention, run=run,
-                true_covariance=T, nis=own_nis, nis_dof=own_dof, cross=own_cross,
+                one, covariance=P, stated=np.ones(length, bool), manifold=manifold_of(convention),
+                convention=convention, run=run, true_covariance=T, nis=at(nis, its), nis_dof=at(dof, its),
+                cross=at(cross, its),
             )
         )  # fmt: skip
     causes = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,8 +30,8 @@ from consistency.referee.readers.formats.table_columns import (
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import listed
-from consistency.referee.readers.truth_matching import Manifold, Poses, unstated
-from consistency.referee.types import Array, Indices
+from consistency.referee.readers.truth_matching import Poses, manifold_of, unstated
+from consistency.referee.types import Array
 
 
 def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = False) -> list[Estimator]:
@@ -170,28 +170,33 @@ def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
 # --- poses -------------------------------------------------------------------------------------------
 
 
-def _runs(sheet: TableRows, runs: Array, key: str) -> Iterator[tuple[Indices, Poses]]:
-    """Rows of each run, and its poses without a state: zeros that are known in every step."""
-    keys, nis, dof = sheet.numbers(key, finite=True), *nis_columns(sheet)
-    clock = sheet.numbers("t") if "t" in sheet else None
+def _by_run(sheet: TableRows, runs: Array, poses: Poses) -> list[Poses]:
+    """The poses of each run, named as in a study of drives, of those of all rows."""
+    found = []
     for run in np.unique(runs):
-        rows = np.flatnonzero(runs == run)
-        t, nothing = keys[rows], np.zeros((len(rows), 1))
-        own_clock, own_nis, own_dof = (None if values is None else values[rows] for values in (clock, nis, dof))
-        yield rows, Poses(
-            Places(sheet.place, rows), t, nothing, *unstated(len(rows), 1), t, nothing, "vector", "vector", 0.0,
-            run=int(run), name=f"run {run}" if "run" in sheet else sheet.path.stem, numbered=key == "step",
-            clock=own_clock, nis=own_nis, nis_dof=own_dof, open_end=sheet.open_end(int(rows[-1])),
-        )  # fmt: skip
+        rows, name = np.flatnonzero(runs == run), sheet.path.stem
+        if "run" in sheet:
+            name = f"run {run}"
+        one = poses.of_rows(rows)
+        found.append(replace(one, run=int(run), name=name, open_end=sheet.open_end(int(rows[-1]))))
+    return found
+
+
+def _clock(sheet: TableRows) -> Array | None:
+    return sheet.numbers("t") if "t" in sheet else None
 
 
 def _innovations(name: str, sheet: TableRows, key: str, axes: Sequence[str]) -> Estimator:
     """Innovations without a truth; a row whose state is broken has no estimate."""
     sheet, runs = by_run(sheet, key)
-    there = [sheet.numbers(axis) for axis in axes if axis in sheet]
-    state = np.column_stack([np.zeros(len(runs)), *there])
-    poses = [replace(one, estimate=state[rows]) for rows, one in _runs(sheet, runs, key)]
-    return Estimator(name, sheet.path, poses, axes, innovations_alone=True)
+    nothing, t = np.zeros((len(sheet), 1)), sheet.numbers(key, finite=True)
+    state = np.column_stack([nothing, *(sheet.numbers(axis) for axis in axes if axis in sheet)])
+    nis, dof = nis_columns(sheet)
+    poses = Poses(
+        Places(sheet.place, np.arange(len(sheet))), t, state, *unstated(len(sheet), 1), t, nothing, "vector", "vector",
+        0.0, numbered=key == "step", clock=_clock(sheet), nis=nis, nis_dof=dof,
+    )  # fmt: skip
+    return Estimator(name, sheet.path, _by_run(sheet, runs, poses), axes, innovations_alone=True)
 
 
 def _estimator(
@@ -208,43 +213,43 @@ def _estimator(
     require_columns(sheet, axes)
     require_columns(truth, axes)
     (sheet, runs), (truth, true_runs) = by_run(sheet, key), by_run(truth, key)
-    notes, stated, cross = _absent(name, truth, runs, true_runs), WHOLE, None
-    if poses_alone:
-        covariance, known = unstated(len(sheet), len(axes))
-    else:
+    covariance, known = unstated(len(sheet), len(axes))
+    notes, stated, cross, of_truth = _absent(name, truth, runs, true_runs), WHOLE, None, None
+    if not poses_alone:
         covariance, stated, said = _covariance(name, sheet, axes, convention)
         known, notes = np.ones(len(sheet), bool), [*notes, *said]
     if r.relative is not None and not r.motions:
         cross = cross_covariances(sheet)
+    if r.truth_covariance is not None:
+        of_truth = stated_covariance(truth, axes)
     estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
     estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
-    true, true_keys = np.column_stack([truth.numbers(axis, finite=True) for axis in axes]), truth.numbers(key)
-    of_truth = None if r.truth_covariance is None else stated_covariance(truth, axes)
-    true_clock = truth.numbers("t") if "t" in truth else None
-    manifold: Manifold = "vector" if convention == "vector" else "planar"
-    poses = []
-    for rows, one in _runs(sheet, runs, key):
-        its = slice(None) if "run" not in truth else np.flatnonzero(true_runs == one.run)
-        if not len(true_keys[its]):
-            has = ", ".join(map(str, np.unique(true_runs)[:5]))
-            raise InputError(
-                f"{truth.path}: holds no run {one.run} (it has {has}); without a column 'run' it serves all"
-            )
-        cross_of, P_of, clock_of = (None if each is None else each[index]
-                                    for each, index in ((cross, rows), (of_truth, its), (true_clock, its)))  # fmt: skip
-        poses.append(
-            replace(
-                one, estimate=estimate[rows], covariance=covariance[rows], stated=known[rows], true_t=true_keys[its],
-                truth=true[its], manifold=manifold, convention=convention, cross=cross_of, true_covariance=P_of,
-                true_clock=clock_of, max_dt=r.tolerance if key == "t" else 0.0, files=(sheet.path, truth.path),
-            )
-        )  # fmt: skip
-    position = 0
-    if axes[:2] == ("x", "y"):
-        position = 3 if axes[2:3] == ("z",) else 2
+    nis, dof = nis_columns(sheet)
+    by_step = key == "step"
+    poses = Poses(
+        Places(sheet.place, np.arange(len(sheet))), sheet.numbers(key, finite=True), estimate, covariance, known,
+        truth.numbers(key), np.column_stack([truth.numbers(axis, finite=True) for axis in axes]),
+        manifold_of(convention), convention, 0.0 if by_step else r.tolerance, cross, of_truth,
+        files=(sheet.path, truth.path), numbered=by_step, clock=_clock(sheet), true_clock=_clock(truth), nis=nis,
+        nis_dof=dof,
+    )  # fmt: skip
+    of_runs = _by_run(sheet, runs, poses)
+    if "run" in truth:
+        of_runs = [one.beside(np.flatnonzero(true_runs == one.run)) for one in of_runs]
+    if missing := [one.run for one in of_runs if not len(one.true_t)]:
+        has = ", ".join(map(str, np.unique(true_runs)[:5]))
+        serves = "without a column 'run' it serves all"
+        raise InputError(f"{truth.path}: holds no run {missing[0]} (it has {has}); {serves}")
     return Estimator(
-        name, sheet.path, poses, axes, convention, PLANAR[convention], stated, notes=notes, position=position
+        name, sheet.path, of_runs, axes, convention, PLANAR[convention], stated, notes=notes, position=_position(axes)
     )
+
+
+def _position(axes: Sequence[str]) -> int:
+    """Leading components that are a position."""
+    if tuple(axes[:2]) != ("x", "y"):
+        return 0
+    return 3 if tuple(axes[2:3]) == ("z",) else 2
 
 
 def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: str) -> tuple[Array, Stated, list[str]]:

@@ -23,7 +23,7 @@ from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
 from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
-from consistency.referee.readers.truth_matching import ROUNDING, Aligned, Known, Poses, common_steps, common_times
+from consistency.referee.readers.truth_matching import ROUNDING, Aligned, Known, Poses, at, common_steps, common_times
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
@@ -185,10 +185,9 @@ def _is_cut(p: Poses, rows: Indices) -> bool:
 def _track(e: Estimator, p: Poses, known: Known, shift: float) -> Track:
     """Errors of a run with their covariances; its columns are not yet known."""
     rows, width, P = known.rows, e.position, p.covariance
-    nis, nis_dof = _innovations_of(p, rows)
     return Track(
         p.run, rows, p.place.at(rows), p.error_of(rows, known.truth), P if len(rows) == len(P) else P[rows],
-        nis, nis_dof, t=None if e.t is not None else _times(p, rows),
+        at(p.nis, rows), at(p.nis_dof, rows), t=None if e.t is not None else _times(p, rows),
         truth_covariance=p.truth_covariances(known, shift),
         path=np.stack([known.truth[:, :width], p.estimate[rows, :width]], axis=1) if width else None,
     )  # fmt: skip
@@ -197,13 +196,6 @@ def _track(e: Estimator, p: Poses, known: Known, shift: float) -> Track:
 def _times(p: Poses, rows: Indices) -> Array | None:
     """Times of some rows, s; None where steps have none."""
     return None if p.numbered and p.clock is None else p.seconds[rows]
-
-
-def _innovations_of(p: Poses, rows: Indices) -> tuple[Array | None, Array | None]:
-    """NIS and degrees of freedom of some rows; None without any."""
-    if p.nis is None or p.nis_dof is None:
-        return None, None
-    return p.nis[rows], p.nis_dof[rows]
 
 
 # --- what is found -----------------------------------------------------------------------------------
@@ -307,8 +299,7 @@ def _innovations(e: Estimator) -> Record:
     for p in e.runs:
         rows = np.arange(len(p.t))
         error = np.where(np.isfinite(p.estimate).all(axis=1), 0.0, np.nan)[:, None]
-        nis, dof = _innovations_of(p, rows)
-        tracks.append(Track(p.run, rows, p.place, error, nis=nis, nis_dof=dof, t=p.clock))
+        tracks.append(Track(p.run, rows, p.place, error, nis=p.nis, nis_dof=p.nis_dof, t=p.clock))
     tracks, t, numbering = _in_columns(e, e.runs, [], tracks)
     record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", [*e.notes, *numbering])
     return replace(record, error=None, dof=0)

@@ -13,7 +13,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.white_noise import Noise, fit_noise
 from consistency.referee.fit_covariance.windows import BLOCKS, ENOUGH, Windows
-from consistency.referee.readers.runs_to_record import listed
+from consistency.referee.readers.places import listed
 from consistency.referee.types import Array, Indices
 
 DECIDE = 50  # windows that decide where drives are fewer than ENOUGH

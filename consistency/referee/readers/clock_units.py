@@ -26,7 +26,10 @@ def unit_apart(t: Array, other_t: Array, names: Sequence[Path | str]) -> str:
     """Which of two files seems to have times in another unit than seconds, as the end of a sentence; "" of neither."""
     units = unit_of(t), unit_of(other_t)
     for unit in sorted(UNIT_NAMES, reverse=True):  # the smallest that makes them overlap, 1 where they do
-        units = (unit, 1) if _overlap(t / unit, other_t) else (1, unit) if _overlap(t, other_t / unit) else units
+        if _overlap(t / unit, other_t):
+            units = unit, 1
+        elif _overlap(t, other_t / unit):
+            units = 1, unit
     if units[0] == units[1]:
         return ""
     return f"; {names[units[0] < units[1]]} seems to be in {UNIT_NAMES[max(units)]}, and has to be in seconds"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,3 +40,9 @@ def exact(value: float) -> str:
 def cut_note(path: Path, line: int) -> str:
     """A note that the last line of a text is left out."""
     return f"{path}: the last line, {line}, has no end and is left out; it seems to be cut short"
+
+
+def listed(items: Sequence[object], most: int = 5) -> str:
+    """The first of some items, separated by commas."""
+    text = ", ".join(map(str, items[:most]))
+    return f"{text}, …" if len(items) > most else text

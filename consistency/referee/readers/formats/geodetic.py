@@ -87,7 +87,8 @@ def geodetic(point: Array) -> Array:
 def axes_at(place: Array) -> Array:
     """Rows east, north, up (..., 3, 3) of a place, as directions from the centre of the earth."""
     phi, lam = np.deg2rad(np.asarray(place, float)[..., 0]), np.deg2rad(np.asarray(place, float)[..., 1])
-    s, c, sl, cl, zero = np.sin(phi), np.cos(phi), np.sin(lam), np.cos(lam), np.zeros_like(phi)
+    s, c = np.sin(phi), np.cos(phi)
+    sl, cl, zero = np.sin(lam), np.cos(lam), np.zeros_like(phi)
     rows = [[-sl, cl, zero], [-s * cl, -s * sl, c], [c * cl, c * sl, s]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
@@ -130,7 +131,10 @@ def read_solution(path: Path) -> Fixes:
     InputError
         The file has no header that names these columns, a row is broken, or times do not increase.
     """
-    clock, names, rows, numbers, cut = "", list[str](), list[list[str]](), list[int](), ""
+    names: list[str] = []
+    rows: list[list[str]] = []
+    numbers: list[int] = []
+    clock = cut = ""
     for block in blocks(path):
         for number, line in block.lines():
             if line.startswith("%"):

@@ -16,8 +16,7 @@ from consistency.referee.readers.formats.numpy_archive import load_arrays, run_l
 from consistency.referee.readers.formats.other_names import with_clock
 from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet
 from consistency.referee.readers.formats.table_columns import row_order
-from consistency.referee.readers.places import refuse
-from consistency.referee.readers.runs_to_record import listed
+from consistency.referee.readers.places import listed, refuse
 from consistency.referee.types import Array
 
 NEEDED = ("nis", "nis_dof")

@@ -21,7 +21,9 @@ GPSD = "is a report of gpsd, whose epx, epy and epv are of unknown certainty; so
 
 def read_json_lines(path: Path) -> TableRows:
     """Columns of a file of JSON lines, with None or NaN where a line lacks a key."""
-    numbers, rows, open_line, cut = list[int](), list[dict[str, Any]](), 0, ""
+    numbers: list[int] = []
+    rows: list[dict[str, Any]] = []
+    open_line, cut = 0, ""
     for block in blocks(path):
         for number, line in block.lines():
             if rows and not block.ends and not line.rstrip().endswith("}"):

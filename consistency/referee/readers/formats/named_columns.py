@@ -151,8 +151,11 @@ def roles_of(names: Sequence[str], where: Path) -> Roles | None:
         Several columns would do.
     """
     true = [_stem_of(name, TRUE) for name in names]
-    own = [OTHER if word else _stem_of(name, OWN[1:]) or name for name, word in zip(names, true, strict=True)]
-    return (_roles(own, where) if any(true) else None) or _roles(names, where)
+    if any(true):
+        own = [OTHER if word else _stem_of(name, OWN[1:]) or name for name, word in zip(names, true, strict=True)]
+        if (roles := _roles(own, where)) is not None:
+            return roles
+    return _roles(names, where)
 
 
 def true_roles_of(names: Sequence[str], where: Path) -> Roles | None:
@@ -234,9 +237,15 @@ def clock_of(names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
     for clock in CLOCKS:
         for i, name in enumerate(bare):
             if name == clock or (clock == "header_stamp" and name.endswith(clock)):
-                said = re.search(r"[\[(_ ]\s*(s|sec|ms|us|ns|nsec)\s*[\])]?$", names[i].lower())
-                return (i,), UNITS[said[1]] if said else 10**9 if plain[i] in RECORDED else None
+                return (i,), _unit_in(names[i])
     return None
+
+
+def _unit_in(name: str) -> int | None:
+    """How many of the units that the name of a time states are a second; None where it states none."""
+    if stated := re.search(r"[\[(_ ]\s*(s|sec|ms|us|ns|nsec)\s*[\])]?$", name.lower()):
+        return UNITS[stated[1]]
+    return 10**9 if plain_name(name) in RECORDED else None
 
 
 def places_of(names: Sequence[str], spellings: Sequence[Sequence[str]]) -> tuple[int, ...] | None:

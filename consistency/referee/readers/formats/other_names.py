@@ -35,7 +35,8 @@ def with_known_names(sheet: TableRows, axes: Sequence[str]) -> tuple[TableRows, 
     require_units([names[place] for place in places.values()], sheet.path)
     taken = ", ".join(f"{names[place]} as {name}" for name, place in places.items())
     data = sheet.data | {name: sheet.data[names[place]] for name, place in places.items()}
-    return replace(sheet, data=data), f"{sheet.path}: read {taken}" * bool(taken)
+    note = f"{sheet.path}: read {taken}" if taken else ""
+    return replace(sheet, data=data), note
 
 
 def with_clock(sheet: TableRows, required: bool = True) -> TableRows:

@@ -21,7 +21,7 @@ from consistency.referee.readers.formats.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.pose_rows import POSE
 from consistency.referee.readers.formats.sheet import Lines
-from consistency.referee.readers.formats.tum import UNIT, SpaceRun, poses_of, require_axes, space_estimator
+from consistency.referee.readers.formats.tum import UNIT, SpaceRun, poses_of, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.relative_motions import MARGINAL
 from consistency.referee.readers.truth_matching import Poses, truth_at
@@ -60,7 +60,6 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
         raise InputError(f"{path}: --relative: {MARGINAL}")
     if r.error not in (None, *SPATIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    require_axes(r.axes, AXES)
     if twice := _parts_of_one(bags):
         raise InputError(
             f"{path}: {twice} and others are parts of one recording; make its metadata by 'ros2 bag reindex'"
@@ -272,8 +271,10 @@ def _fixes(bag: Path, topic: str, messages: Sequence[Any]) -> Fixes:
     values = np.column_stack([np.array(rows, float), P])
     _, first = np.unique(values[:, 0], return_index=True)
     note = f"{bag}: {topic} read as positions by satellite, {len(kept)} of {len(messages)} messages with a fix"
-    note += ", deviations alone" * (kinds <= {DIAGONAL})
-    return Fixes(bag, values[first], first + 1, note, f"message of {topic}", alone=kinds <= {DIAGONAL})
+    alone = kinds <= {DIAGONAL}
+    if alone:
+        note += ", deviations alone"
+    return Fixes(bag, values[first], first + 1, note, f"message of {topic}", alone=alone)
 
 
 def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> Lines:

@@ -17,7 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import outside, require
 from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.referee.readers.formats.text_blocks import Block, blocks
-from consistency.referee.readers.places import cut_note, exact, refuse
+from consistency.referee.readers.places import cut_note, exact, listed, refuse
 from consistency.referee.types import Array, Indices
 
 Column = Array  # (N,), floats with NaN where a cell is empty; or objects, text for one, with None there
@@ -66,8 +66,7 @@ class TableRows:
 
     @property
     def columns(self) -> str:
-        names = list(self.data)
-        return ", ".join(names[:12]) + ", …" * (len(names) > 12)
+        return listed(list(self.data), 12)
 
     def place(self, row: int) -> str:
         return f"{self.path}, {self.unit} {self.line[row]}"
@@ -208,7 +207,9 @@ def _cells(values: Array) -> Column:
 
 def _read_csv(path: Path) -> TableRows:
     names: list[str] = []
-    separator, tables, line, open_line, cut = ",", list[dict[str, Column]](), list[Indices](), 0, ""
+    tables: list[dict[str, Column]] = []
+    line: list[Indices] = []
+    separator, open_line, cut = ",", 0, ""
     for block in blocks(path):
         if not names:
             lines = block.lines()
@@ -332,7 +333,9 @@ def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
 
 def read_rows(path: Path, widths: Sequence[int], layout: str, header: int = 0) -> Lines:
     """A text file of numbers, every line but ``header``, counted from 1, of the same one of the ``widths``."""
-    values, line, width, open_line, cut = list[Array](), list[Indices](), 0, 0, ""
+    values: list[Array] = []
+    line: list[Indices] = []
+    width, open_line, cut = 0, 0, ""
     for block in blocks(path):
         if width and not block.ends and not _are_numbers(block.lines(), width):
             cut = cut_note(path, block.first)
@@ -383,7 +386,9 @@ def _number_rows(
     for number, line in lines:
         fields = line.replace(",", " ").split()
         if len(fields) not in widths:
-            hint = "; columns apart by semicolons need names, and numbers decimal points" * (";" in line)
+            hint = ""
+            if ";" in line:
+                hint = "; columns apart by semicolons need names, and numbers decimal points"
             raise InputError(f"{path}, line {number}: has {len(fields)} columns; should be {layout}{hint}")
         width = width or len(fields)
         if len(fields) != width:

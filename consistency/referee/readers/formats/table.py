@@ -28,8 +28,7 @@ from consistency.referee.readers.formats.table_columns import (
     stated_deviations,
 )
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.places import Places
-from consistency.referee.readers.runs_to_record import listed
+from consistency.referee.readers.places import Places, listed
 from consistency.referee.readers.truth_matching import Poses, manifold_of, unstated
 from consistency.referee.types import Array
 
@@ -214,7 +213,8 @@ def _estimator(
     require_columns(truth, axes)
     (sheet, runs), (truth, true_runs) = by_run(sheet, key), by_run(truth, key)
     covariance, known = unstated(len(sheet), len(axes))
-    notes, stated, cross, of_truth = _absent(name, truth, runs, true_runs), WHOLE, None, None
+    notes, stated = _absent(name, truth, runs, true_runs), WHOLE
+    cross = of_truth = None
     if not poses_alone:
         covariance, stated, said = _covariance(name, sheet, axes, convention)
         known, notes = np.ones(len(sheet), bool), [*notes, *said]

@@ -37,8 +37,11 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
         row = int(order[stuck[0] + 1])
         of = f" of run {runs[row]}" if "run" in sheet else ""
         what = "is there twice" if values[order[stuck[0]]] == values[row] else "is less than the one before"
-        hint = "" if "run" in sheet else "; several runs need a column 'run'"
-        hint += "" if "filter" in sheet else "; several estimators need a column 'filter'" if "run" in sheet else ""
+        hint = ""
+        if "run" not in sheet:
+            hint = "; several runs need a column 'run'"
+        elif "filter" not in sheet:
+            hint = "; several estimators need a column 'filter'"
         raise InputError(f"{sheet.place(row)}: {key} {exact(values[row])}{of} {what}{hint}")
     return order
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,19 +78,12 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     """
     if r.error not in (None, *INERTIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    require_axes(r.axes, STATE)
     truth_of = _truths(estimates, r)
     files = _runs(estimates, r.truth, None if poses_alone else r.covariance)
     runs = (SpaceRun(read_trajectory(own), truth_of(true), (own, true), P) for own, true, P in files)
     if poses_alone:
         return [poses_of(estimates, runs, r)]
     return [space_estimator(estimates, runs, r)]
-
-
-def require_axes(axes: Sequence[str] | None, there: Sequence[str]) -> None:
-    """Refuse components that a pose in space, or what is judged of a state, does not have."""
-    if unknown := [axis for axis in axes or () if axis not in there]:
-        raise InputError(f"--axes {','.join(axes or ())}: '{unknown[0]}' is not one of {', '.join(there)}")
 
 
 def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str = "", mixed: str = "") -> Estimator:
@@ -100,51 +94,77 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     why : reason for the default error, as the end of a note; that of the layout where empty
     mixed : message where runs are of different layouts
     """
-    order, arm = r.covariance_order or ORDERS[0], r.lever_arm or (0.0, 0.0, 0.0)
+    arm = r.lever_arm or (0.0, 0.0, 0.0)
     poses: list[Poses] = []
     notes: list[str] = []
-    stated, convention, first, true_file, is_fixed = WHOLE, "", path, path, False
+    layout: Layout | None = None
     for run in runs:
         own, true, world = localised(run.own, run.true)
-        if not poses:
-            stated, is_fixed, first, true_file = _stated(own), isinstance(own, Fixes), run.files[0], run.files[1]
-            convention = r.error or ("so3" if stated in (WHOLE, ALONE) else "so3-body")
-            require_error(own, r.error)
         notes += [own.cut, true.cut, own.note, true.note, world, _unused(true, r), *run.notes]
-        notes += [] if poses else _order_note(run.files[0], _width(own), r.covariance_order)
-        if stated not in (WHOLE, ALONE) and r.covariance_order not in (None, ORDERS[1]):
-            raise InputError(f"--covariance-order: {run.files[0]} is written by OpenVINS, rotation before translation")
-        if _stated(own) != stated:
-            what = f"{run.files[0]}: has {own.values.shape[1]} columns, {first} another layout"
+        if layout is None:
+            layout = _layout_of(own, run.files, r)
+            notes += _order_note(run.files[0], _width(own), r.covariance_order)
+        elif _stated(own) != layout.stated:
+            what = f"{run.files[0]}: has {own.values.shape[1]} columns, {layout.files[0]} another layout"
             raise InputError(mixed or what)
         if isinstance(own, Fixes):
             one = fixed(own, true, r, _of_truth(true, own, ORDERS[0], r))
         else:
             k, unjudged = judged_rest(own, true, r)
             notes.append(unjudged)
-            one = _poses(own, true, run.covariance, convention, order, r, k)
+            one = _poses(own, true, run.covariance, layout.convention, r, k)
             if _is_point(true):
-                one = positions(one, arm, stated != WHOLE)
+                one = positions(one, arm, layout.stated != WHOLE)
         poses.append(replace(one, run=len(poses), files=run.files, open_end=own.open_end))
+    assert layout is not None
     if poses[0].manifold == "spatial" and r.axes is None and r.relative is None:
         empty, what = placeholder(poses)
-        notes += [f"{true_file}: {what}"] if what else []
+        if what:
+            notes.append(f"{layout.files[1]}: {what}")
         if empty:
-            poses = [positions(one, arm, stated != WHOLE) for one in poses]
-    why = "" if r.error else why or f"; the default of this layout, {_origin(stated)}"
+            poses = [positions(one, arm, layout.stated != WHOLE) for one in poses]
     if any(one.manifold == "vector" for one in poses):
         require_positions(path, poses, r)
-        if not is_fixed:
-            notes.append(position_note(true_file, r.lever_arm))
-            why = f"; of the position, whose covariance follows from that of the error {convention}"
     elif r.lever_arm is not None:
         raise InputError("--lever-arm: goes with a truth of positions alone; this one has the orientation of its body")
     kind = poses[0].convention
+    if kind == "vector" and layout.convention:
+        notes.append(position_note(layout.files[1], r.lever_arm))
+        why = f"; of the position, whose covariance follows from that of the error {layout.convention}"
+    elif r.error is not None:
+        why = ""
+    elif not why:
+        why = f"; the default of this layout, {_origin(layout.stated)}"
     return Estimator(
         path.stem, path, poses, STATE[: poses[0].covariance.shape[-1]], kind,
-        f"{INERTIAL.get(kind) or PLANAR[kind]}{why}", stated, path.name, r.covariance,
+        f"{INERTIAL.get(kind) or PLANAR[kind]}{why}", layout.stated, path.name, r.covariance,
         tuple(dict.fromkeys(note for note in notes if note)), in_space=True, position=3,
     )  # fmt: skip
+
+
+class Layout(NamedTuple):
+    """What the files of all runs have in common."""
+
+    stated: Stated
+    convention: str  # of the error of poses; "" of positions by satellite
+    files: tuple[Path | str, Path | str]  # of the first run
+
+
+def _layout_of(own: Lines, files: tuple[Path | str, Path | str], r: Reading) -> Layout:
+    """The layout of the first run.
+
+    Raises
+    ------
+    InputError
+        An option does not go with it.
+    """
+    stated = _stated(own)
+    require_error(own, r.error)
+    if stated not in (WHOLE, ALONE) and r.covariance_order not in (None, ORDERS[1]):
+        raise InputError(f"--covariance-order: {files[0]} is written by OpenVINS, rotation before translation")
+    if isinstance(own, Fixes):
+        return Layout(stated, "", files)
+    return Layout(stated, r.error or ("so3" if stated in (WHOLE, ALONE) else "so3-body"), files)
 
 
 def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
@@ -222,8 +242,9 @@ def _runs(estimates: Path, truth: Path | None, covariance: Path | None) -> list[
         return [(estimates, truth or estimates, covariance)]
     files = trajectory_files(estimates)
     if not files:
-        tables = any(path.suffix.lower() in TABLES for path in estimates.iterdir())
-        hint = "; tables of several runs go into one file with a column 'run'" * tables
+        hint = ""
+        if any(path.suffix.lower() in TABLES for path in estimates.iterdir()):
+            hint = "; tables of several runs go into one file with a column 'run'"
         raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json{hint}")
     stems = [path.stem for path in files]
     if twice := next((path for path in files if stems.count(path.stem) > 1), None):
@@ -254,12 +275,11 @@ def _poses(
     truth: Lines,
     covariance_path: Path | None,
     convention: str,
-    order: str,
     r: Reading,
     k: int,
 ) -> Poses:
     """A run with its truth, of poses and ``k`` numbers of velocity and biases; P is NaN where none is near."""
-    tolerance = r.tolerance
+    order, tolerance = r.covariance_order or ORDERS[0], r.tolerance
     covariance, source, cross = _inline(own, order), own, None
     rows = picked = np.arange(len(own.t))
     if covariance_path is not None:
@@ -274,11 +294,9 @@ def _poses(
         if source.values.shape[1] == 1 + BOTH:
             cross = _cross(own, source, rows, picked, order)
     if covariance is None:
-        of = (
-            f"the standard deviations of {DEVIATIONS_LAYOUT}"
-            if isinstance(own, States)
-            else f"lines of t and {FULL} numbers"
-        )
+        of = f"lines of t and {FULL} numbers"
+        if isinstance(own, States):
+            of = f"the standard deviations of {DEVIATIONS_LAYOUT}"
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
     covariance = covariance[:, : 6 + k, : 6 + k]
     P = np.full((len(own.t), 6 + k, 6 + k), np.nan)

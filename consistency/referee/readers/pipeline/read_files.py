@@ -76,8 +76,12 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
     from consistency.referee.readers.formats.sheet import frame_rows
     from consistency.referee.readers.formats.table import read_tables
 
-    sheet = frame_rows(estimates, "estimates") if hasattr(estimates, "columns") else Path(estimates)
-    true = frame_rows(truth, "truth") if hasattr(truth, "columns") else truth if truth is None else Path(truth)
+    def rows(table: Any, name: str) -> Any:
+        if hasattr(table, "columns"):
+            return frame_rows(table, name)
+        return None if table is None else Path(table)
+
+    sheet, true = rows(estimates, "estimates"), rows(truth, "truth")
     r = _checked(replace(reading, truth=cast(Any, true)))
     _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
     return _read("tables", r, lambda options: _records(read_tables(sheet, options), options))

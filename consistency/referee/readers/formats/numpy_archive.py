@@ -177,7 +177,7 @@ def _finite_truth(path: Path, estimates: Array, truth: Array, known: Array) -> A
     InputError
         It is not finite beside an estimate that is.
     """
-    finite = np.isfinite(truth).all(axis=-1)
+    finite: Array = np.asarray(np.isfinite(truth).all(axis=-1))
     bad = known & np.isfinite(estimates).all(axis=-1) & ~finite
     if bad.any():
         run, step = np.argwhere(bad)[0]

@@ -217,7 +217,7 @@ def _left_out(e: Estimator, runs: Sequence[Poses], known: Sequence[Known]) -> li
 def _space_notes(e: Estimator, runs: Sequence[Poses], known: Sequence[Known], tracks: Sequence[Track]) -> list[str]:
     """Notes on probable mix-ups of conventions, and on a truth of too low a rate."""
     notes = []
-    angle = max(_median(np.linalg.norm(track.error[:, 3:6], axis=1)) for track in tracks)
+    angle = max(_median(np.linalg.norm(error[:, 3:6], axis=1)) for error in _errors(tracks))
     if angle > FAR:
         notes.append(
             f"{e.said}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run, which is a "
@@ -230,6 +230,10 @@ def _space_notes(e: Estimator, runs: Sequence[Poses], known: Sequence[Known], tr
             "median of a run, which counts as error; give a truth of a higher rate"
         )
     return notes
+
+
+def _errors(tracks: Sequence[Track]) -> list[Array]:
+    return [track.error for track in tracks if track.error is not None]
 
 
 def _bend(p: Poses, known: Known) -> Array:
@@ -250,7 +254,7 @@ def _not_estimated(e: Estimator, tracks: Sequence[Track], judged: Sequence[int])
     """Components, of those judged, that a robot in the plane does not estimate."""
     part = list(judged)
     variances = [np.diagonal(p.covariance, axis1=1, axis2=2)[p.stated][:, part] for p in e.runs]
-    still = not_estimated([track.error[:, part] for track in tracks], variances)
+    still = not_estimated([error[:, part] for error in _errors(tracks)], variances)
     return [i for i, idle in zip(part, still, strict=True) if idle]
 
 

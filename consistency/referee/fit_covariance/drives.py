@@ -10,7 +10,6 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.geometry.groups import composed, matrices
-from consistency.referee.readers.estimator import Estimator
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
@@ -26,7 +25,7 @@ from consistency.referee.readers.formats.table import read_tables
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.kinds import Found, kind_of
 from consistency.referee.readers.places import refuse
-from consistency.referee.readers.truth_matching import Poses, truth_at
+from consistency.referee.readers.truth_matching import Estimator, Poses, truth_at
 from consistency.referee.types import Array, Indices
 
 

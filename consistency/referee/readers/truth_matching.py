@@ -1,12 +1,12 @@
 """Matching of estimates to the truth, which is interpolated on its manifold, and to the steps of other runs.
 
-:class:`Poses` is a run before any error is taken.
+:class:`Poses` is a run before any error is taken, and :class:`Estimator` is what every reader gives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -18,6 +18,9 @@ from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.places import Places
 from consistency.referee.types import Array, Indices
 
+AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
+REST = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # velocity, biases of gyroscope and accelerometer
+STATE = (*AXES, *REST)
 Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more
 BRIDGED = 0.1  # s between two samples of the truth that are always interpolated: a period of 10 Hz
 ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
@@ -275,3 +278,47 @@ class Aligned:
 
     def on(self, record: Record) -> Record:
         return replace(record, **{key: value for key, value in vars(self).items() if key not in ("runs", "notes")})
+
+
+@dataclass(frozen=True)
+class Stated:
+    """Which covariances a file states: components have cross terms with those of their own group only."""
+
+    groups: Mapping[str, slice] = field(default_factory=lambda: {"": slice(None)})  # by the end of a record's name
+    alone: bool = False  # standard deviations: each component of a group is judged by itself
+
+
+WHOLE = Stated()
+ALONE = Stated(alone=True)
+POINTS = Stated({"": slice(3)})  # positions without orientations
+BLOCKS = Stated({" position": slice(3), " rotation": slice(3, 6)})
+SINGLE = Stated(
+    {f" {axis}": slice(i, i + 1) for i, axis in enumerate(AXES)} | {" velocity and biases": slice(6, None)}, alone=True
+)
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """The runs of one estimator, with what its record is called and what a reader must know of it."""
+
+    name: str
+    path: Path  # of the estimates, for messages
+    runs: Sequence[Poses]
+    axes: Sequence[str]  # names of the components of the error
+    convention: str = ""  # of the error; "" where the file holds errors
+    definition: str = ""  # of the convention, in words
+    stated: Stated = WHOLE
+    label: str = ""  # of the estimator in notes; its name if there is none
+    covariances: Path | None = None  # file of the covariances; that of the estimates if there is none
+    notes: Sequence[str] = ()  # what the files were read as
+    causes: Sequence[str] = ()  # mix-ups that are found while reading
+    judged: Sequence[int] | None = None  # components that are estimated; None if the errors tell
+    in_space: bool = False  # poses in space, or positions beside such a truth
+    position: int = 0  # leading components of an estimate that are a position in m, to be drawn
+    t: Array | None = None  # (steps,), s, of an archive, whose poses are numbered by its steps from 0 on
+    innovations_alone: bool = False  # there is no truth
+
+    @property
+    def said(self) -> str:
+        """Its name in notes."""
+        return self.label or self.name

@@ -14,13 +14,12 @@ from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR
 from consistency.referee.parsing import is_file, reading, require_name, require_room
-from consistency.referee.readers.estimator import Estimator
 from consistency.referee.readers.formats.sheet import are_dof, bounded
 from consistency.referee.readers.mix_ups.hints import turns
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.truth_matching import Poses, at, manifold_of, unstated
+from consistency.referee.readers.truth_matching import Estimator, Poses, at, manifold_of, unstated
 from consistency.referee.types import Array, Failure, Indices
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"

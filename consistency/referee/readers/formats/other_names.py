@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.column_names import POSE
-from consistency.referee.readers.clock_units import unit_of
 from consistency.referee.readers.formats.file_kinds import HEADINGS, PLACES
 from consistency.referee.readers.formats.named_columns import (
     DEVIATIONS,
@@ -48,6 +47,8 @@ def with_clock(sheet: TableRows, required: bool = True) -> TableRows:
     names = [] if clock is None else [list(sheet.data)[place] for place in clock[0]]
     if clock is None or not (required or all(sheet.data[name].dtype.kind == "f" for name in names)):
         return sheet
+    from consistency.referee.readers.clock_units import unit_of
+
     columns = [sheet.numbers(name) for name in names]
     t = columns[0] / unit_of(columns[0], clock[1]) + sum(columns[1:]) * 1e-9
     return replace(sheet, data=sheet.data | {"t": t})

@@ -11,13 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.world_frames import skew
-from consistency.referee.readers.estimator import AXES
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import AXES, Poses
 from consistency.referee.types import Array
 
 SAME = 1e-9  # of quaternions

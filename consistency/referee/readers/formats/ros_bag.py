@@ -16,7 +16,6 @@ from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.geometry.groups import inverse, matrices, vectors
 from consistency.referee.parsing import reading
-from consistency.referee.readers.estimator import AXES, Estimator
 from consistency.referee.readers.formats.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.pose_rows import POSE
@@ -24,7 +23,7 @@ from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.formats.tum import UNIT, SpaceRun, poses_of, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.relative_motions import MARGINAL
-from consistency.referee.readers.truth_matching import Poses, truth_at
+from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance

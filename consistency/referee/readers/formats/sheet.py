@@ -168,7 +168,8 @@ def read_sheet(path: Path) -> TableRows:
     elif path.suffix.lower() in (".jsonl", ".ndjson"):
         from consistency.referee.readers.formats.json_lines import read_json_lines
 
-        sheet = read_json_lines(path)
+        columns, line, open_line, cut = read_json_lines(path)
+        sheet = TableRows(path, columns, line, "line", open_line, cut)
     else:
         sheet = _read_csv(path)
     if not len(sheet):

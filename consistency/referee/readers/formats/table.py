@@ -12,7 +12,6 @@ from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
-from consistency.referee.readers.estimator import ALONE, WHOLE, Estimator, Stated
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.formats.named_columns import begins_with_numbers, head_of
 from consistency.referee.readers.formats.other_names import true_columns, with_clock, with_known_names
@@ -29,7 +28,7 @@ from consistency.referee.readers.formats.table_columns import (
 )
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.places import Places, listed
-from consistency.referee.readers.truth_matching import Poses, manifold_of, unstated
+from consistency.referee.readers.truth_matching import ALONE, WHOLE, Estimator, Poses, Stated, manifold_of, unstated
 from consistency.referee.types import Array
 
 

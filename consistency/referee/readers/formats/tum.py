@@ -14,7 +14,6 @@ from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
 from consistency.referee.readers.clock_units import nothing_near
-from consistency.referee.readers.estimator import ALONE, BLOCKS, POINTS, SINGLE, STATE, WHOLE, Estimator, Stated
 from consistency.referee.readers.formats.file_kinds import TABLES, is_drive, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
@@ -43,7 +42,19 @@ from consistency.referee.readers.formats.sheet import Lines, read_numbers
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.places import Places, refuse
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.truth_matching import Poses, associate, unstated
+from consistency.referee.readers.truth_matching import (
+    ALONE,
+    BLOCKS,
+    POINTS,
+    SINGLE,
+    STATE,
+    WHOLE,
+    Estimator,
+    Poses,
+    Stated,
+    associate,
+    unstated,
+)
 from consistency.referee.types import Array, Indices
 
 ORDERS = ("translation-rotation", "rotation-translation")

@@ -15,10 +15,10 @@ from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
-from consistency.referee.readers.estimator import Estimator
 from consistency.referee.readers.formats.numpy_archive import estimator_of_arrays
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.records import records_of
+from consistency.referee.readers.truth_matching import Estimator
 from consistency.referee.types import Array, Indices
 
 

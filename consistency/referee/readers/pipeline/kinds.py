@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from consistency.referee.diagnostics import Record
-from consistency.referee.readers.estimator import Estimator
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
@@ -21,6 +20,7 @@ from consistency.referee.readers.formats.file_kinds import (
     is_spatial,
 )
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.truth_matching import Estimator
 
 OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
 OF_BAGS = ("topic", "truth_topic")

@@ -15,7 +15,6 @@ from consistency.referee.diagnostics import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
 from consistency.referee.parsing import require_name
-from consistency.referee.readers.estimator import Estimator
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TRAJECTORIES,
@@ -28,6 +27,7 @@ from consistency.referee.readers.formats.file_kinds import (
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.pipeline.kinds import OF_BAGS, OF_TRAJECTORIES, Found, kind_of
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
+from consistency.referee.readers.truth_matching import Estimator
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")

@@ -15,15 +15,23 @@ from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
-from consistency.referee.readers.clock_offset import clock_shift
-from consistency.referee.readers.clock_units import nothing_near
-from consistency.referee.readers.estimator import AXES, WHOLE, Estimator
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
 from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
-from consistency.referee.readers.truth_matching import ROUNDING, Aligned, Known, Poses, at, common_steps, common_times
+from consistency.referee.readers.truth_matching import (
+    AXES,
+    ROUNDING,
+    WHOLE,
+    Aligned,
+    Estimator,
+    Known,
+    Poses,
+    at,
+    common_steps,
+    common_times,
+)
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
@@ -123,6 +131,8 @@ def _clocks_and_frames(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple
         return clocks_and_frames(e.said, e.runs, r.time_offset, r.align, judged)
     if e.runs[0].numbered:
         return 0.0, [], Aligned(e.runs)
+    from consistency.referee.readers.clock_offset import clock_shift
+
     return *clock_shift(e.said, e.runs, r.time_offset), Aligned(e.runs)
 
 
@@ -160,6 +170,8 @@ def _nothing_known(e: Estimator, p: Poses, shift: float) -> InputError:
     if p.numbered:
         own, true = (f"{each.min():.15g} to {each.max():.15g}" for each in (p.t, p.true_t))
         return InputError(f"{p.files[0]}: no step of run {p.run} ({own}) is in {p.files[1]} ({true})")
+    from consistency.referee.readers.clock_units import nothing_near
+
     several = len(e.runs) > 1 and e.runs[0].files == e.runs[-1].files
     what = f"estimate of run {p.run}" if several else "estimate"
     return nothing_near(p.files, p.t + shift, p.true_t, p.max_dt, what, "truth")

@@ -29,7 +29,8 @@ from consistency.referee.readers.alignment.world_frames import (
 )
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.mix_ups import hints as readers_hints
-from consistency.referee.readers.mix_ups.hints import FACTOR, ReadingFit, fit_of, hints, turns
+from consistency.referee.readers.mix_ups.hints import hints, turns
+from consistency.referee.readers.mix_ups.reading_fit import FACTOR, ReadingFit, fit_of
 from consistency.referee.readers.mix_ups.known import _ned
 from consistency.referee.readers.runs_to_record import Track, _singular
 from consistency.referee.readers.truth_matching import Poses

@@ -49,8 +49,8 @@ class Guess:
     exact: bool = False  # named by its NEES alone, however little is wrong
 
 
-def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> list[Guess]:
-    """Possible mix-ups, the likelier first; ``part`` is judged."""
+def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], worlds: bool = True) -> list[Guess]:
+    """Possible mix-ups, the likelier first; ``part`` is judged. Motions have no ``worlds``."""
     kind, convention = runs[0].manifold, runs[0].convention
     n = runs[0].covariance.shape[-1]
     if kind == "spatial" and n > 6:
@@ -73,8 +73,10 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
     else:
         own = [*_sides(convention), *_headings(), *scales, *_permuted(axes, 3), *_units(2, slice(2, 3)), *_positions(2)]
     own.append(Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False))
-    worlds = [*_ned(convention)] if kind == "spatial" else [_mirrored(convention)]
-    return [*own, *worlds, *_frames(runs), *_bodies(runs)]
+    if not worlds:
+        return own
+    own += _ned(convention) if kind == "spatial" else [_mirrored(convention)]
+    return [*own, *_frames(runs), *_bodies(runs)]
 
 
 def _blocks(n: int) -> Iterator[Guess]:
@@ -333,10 +335,20 @@ def _squared(P: Array) -> Array:
 
 def _inverted(P: Array, part: list[int]) -> Array:
     """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
-    out, block = np.full_like(P, np.nan), P[:, part][:, :, part]
-    regular = np.flatnonzero(np.abs(np.linalg.det(block)) > 0)
-    out[np.ix_(regular, np.array(part), np.array(part))] = np.linalg.inv(block[regular])
+    out, some = np.full_like(P, np.nan), np.ix_(range(len(P)), part, part)
+    try:
+        out[some] = np.linalg.inv(P[some])
+    except np.linalg.LinAlgError:
+        for k, matrix in enumerate(P[some]):
+            out[np.ix_([k], part, part)] = _inverse_or_nan(matrix)
     return out
+
+
+def _inverse_or_nan(matrix: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.inv(matrix))
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
 
 
 # --- frames -----------------------------------------------------------------------------------------

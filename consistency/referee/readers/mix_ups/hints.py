@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from consistency.referee.readers.mix_ups.known import Guess
 
 MOST = 1000  # estimates that are looked at, of all runs together
-MOST_NUMBERS = 20_000_000  # of their covariances
-MOST_RUNS = 200  # that are looked at, evenly over all
+MOST_NUMBERS = 4_000_000  # of their covariances
+MOST_RUNS, LEAST_EACH = 200, 20  # that are looked at, evenly over all, and estimates of each
 WRONG = 1.0  # decades that the NEES is off, from which on causes are named that look like a bias or a drift
 APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
 SAID = 0.2  # decades from which on the scale that remains is stated
@@ -30,7 +30,8 @@ LIKE = 1.0  # log likelihood by which two causes may differ that are equally lik
 ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
 NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
 
-ErrorsOf = Callable[[Poses], tuple[Array, Array]]
+Change = Callable[[Poses], Poses]
+Pairs = Sequence[tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Candidate:
 
     guess: Guess
     fit: ReadingFit
+    size: float  # independent estimates
     gain: float  # log likelihood over the simple faults of the errors as they are declared; -inf where there is none
 
 
@@ -48,7 +50,7 @@ def hints(
     runs: Sequence[Poses],
     shift: float = 0.0,
     judged: Sequence[int] | None = None,
-    motions_of: ErrorsOf | None = None,
+    errors_without: Callable[[Change], Pairs] | None = None,
 ) -> list[str]:
     """Hints on a probable mix-up, where the covariance does not fit and one other reading of the files does; or none.
 
@@ -59,31 +61,33 @@ def hints(
     Parameters
     ----------
     axes : names of the components of the error, ``judged`` are the indices of those that count
-    motions_of : errors (k, n) of motions over windows, with their covariances; runs are then motions, and not thinned
+    errors_without : errors (k, n) of the motions of each run over windows, with their covariances, after a change of
+        the motions that ``runs`` are; none where no window is left
     """
     if not runs:
         return []
     part = list(range(len(axes))) if judged is None else list(judged)
-    some = list(runs)
-    if motions_of is None:
-        some = _thinned(runs, shift)
-        if _same(some):
-            return [
-                f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies "
-                "of one; give the true poses as the truth"
-            ]
+    some = _thinned(runs, shift) if errors_without is None else list(runs)
+    if errors_without is None and _same(some):
+        return [
+            f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies of "
+            "one; give the true poses as the truth"
+        ]
 
-    def fit_without(change: Callable[[Poses], Poses]) -> ReadingFit | None:
-        pairs = [(motions_of or _errors_of)(change(p)) for p in some]
+    def fit_without(change: Change) -> ReadingFit | None:
+        pairs = [_errors_of(change(p)) for p in some] if errors_without is None else errors_without(change)
         return fit_of([_judged(error, P, part, len(axes)) for error, P in pairs])
 
     declared = fit_without(lambda p: p)
-    if declared is None or declared.size * declared.fault() < LEAST_GAIN:
+    if declared is not None and declared.size * declared.fault() < LEAST_GAIN:
         return []
     from consistency.referee.readers.mix_ups.known import guesses_of  # few files need them
 
-    guesses = guesses_of(some, axes, part, worlds=motions_of is None)
+    guesses = guesses_of(some, axes, part, worlds=errors_without is None)
     fits = [(guess, fit_without(guess.change)) for guess in guesses]
+    if declared is None:
+        shown = [guess.text for guess, fit in fits if fit is not None and fit.is_shown()]
+        return [f"{name}: the covariance is not positive definite, but right if {text}" for text in shown[:1]]
     cause = _cause(fits, declared)
     if cause is None:
         return []
@@ -94,10 +98,10 @@ def hints(
 
 def _thinned(runs: Sequence[Poses], shift: float) -> list[Poses]:
     """Some estimates of some runs, without those that are not finite."""
-    runs = runs[:: -(-len(runs) // MOST_RUNS)]
-    n = runs[0].covariance.shape[-1]
-    most = min(MOST, MOST_NUMBERS // n**2)
-    return [p.later(shift).some(max(most // len(runs), 20)).sound() for p in runs]
+    most = max(MOST_NUMBERS // runs[0].covariance.shape[-1] ** 2, 1)
+    runs = runs[:: -(-len(runs) // min(MOST_RUNS, most))]
+    each = max(min(MOST, most) // len(runs), min(LEAST_EACH, most // len(runs)))
+    return [p.later(shift).some(each).sound() for p in runs]
 
 
 def _same(runs: Sequence[Poses]) -> bool:
@@ -150,11 +154,11 @@ def _candidates(
     for guess, fit in fits:
         if fit is None or len(fit.w) < NEARLY_ALL * len(declared.w) or not (gross or guess.fine):
             continue
+        size = max(min(fit.size, declared.size), len(declared.whitened))  # runs are independent
         gain = -np.inf
         if fit.n == declared.n and fit.near() > simple:
-            size = max(min(fit.size, declared.size), len(declared.whitened))  # runs are independent
             gain = size * (fit.near() - simple)
-        yield Candidate(guess, fit, gain)
+        yield Candidate(guess, fit, size, gain)
 
 
 def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Candidate | None:
@@ -162,8 +166,8 @@ def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: boo
     right = [one for one in candidates if one.gain >= bar and one.fit.right(gross)]
     right = [one for one in right if _status(one.fit) <= _status(declared)]
     right = [one for one in right if not one.guess.last] or right
-    most = max((one.gain for one in right), default=0.0)
-    return next((one for one in right if one.gain >= most - LIKE), None)
+    most = max((one.fit.near() for one in right), default=0.0)
+    return next((one for one in right if one.size * (most - one.fit.near()) <= LIKE), None)
 
 
 def _status(fit: ReadingFit) -> int:

@@ -60,8 +60,9 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], worl
         Guess("it is an information matrix; invert it", _covariance(partial(_inverted, part=part))),
         Guess(
             "it holds the upper root U of an information matrix U'U; write the inverse of U'U",
-            _covariance(lambda P: _inverted(np.swapaxes(np.triu(P), 1, 2) @ np.triu(P), part)),
+            _covariance(lambda P: _inverted(_of_root(P), part)),
         ),
+        Guess("it holds the lower root L of the covariance; write L L'", _covariance(_of_root)),
         *_singular(runs, axes, part),
     ]
     if kind == "vector":
@@ -94,6 +95,7 @@ def _blocks(n: int) -> Iterator[Guess]:
 def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> Iterator[Guess]:
     """Cross terms that make the covariance nearly singular, while each component by itself is right."""
     P = np.concatenate([p.covariance for p in runs])[:, part][:, :, part]
+    P = P[np.isfinite(P).all(axis=(1, 2))]
     sigma = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
     with np.errstate(invalid="ignore", divide="ignore"):
         R = np.median(P / sigma[:, :, None] / sigma[:, None, :], axis=0)
@@ -282,9 +284,13 @@ def _headings() -> Iterator[Guess]:
         change = partial(_scaled, names, degrees)
         yield Guess(f"the headings of {of} are in degrees{remedy}", change, fine="truth" not in names)
     for of in ("both files", "the estimates"):
-        change = partial(_scaled, OF[of], degrees)
+        change = partial(_with_variances, OF[of], degrees)
         words = f"the headings of {of} and their variances are in degrees{remedy}"
-        yield Guess(words, lambda p, change=change: _weighed(change(p), slice(2, 3), DEGREE), fine=False)  # type: ignore[misc]
+        yield Guess(words, change, fine=of == "the estimates")
+
+
+def _with_variances(names: Sequence[str], factors: Array, p: Poses) -> Poses:
+    return _weighed(_scaled(names, factors, p), slice(2, 3), DEGREE)
 
 
 def _scaled(names: Sequence[str], factors: Array, p: Poses) -> Poses:
@@ -331,6 +337,12 @@ def _weighed(p: Poses, part: slice, factor: float) -> Poses:
 
 def _squared(P: Array) -> Array:
     return np.square(_diagonal(P)) * np.eye(P.shape[-1])
+
+
+def _of_root(P: Array) -> Array:
+    """U'U of the upper triangles U, which are the lower ones L turned over."""
+    U = np.triu(P)
+    return np.asarray(np.swapaxes(U, 1, 2) @ U)
 
 
 def _inverted(P: Array, part: list[int]) -> Array:

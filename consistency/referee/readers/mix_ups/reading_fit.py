@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array, Indices
 
 RIGHT = 0.4  # decades that components may differ by with the mix-up undone, or more where chance allows it
 SCALE = 1.0  # decades that all may be off by with the mix-up undone: a filter's own fault beside it
-ENOUGH = 30.0  # independent estimates that show a scale to be the one that a cause makes
+ENOUGH = 100.0  # independent estimates that show a scale to be the one that a cause makes
 BIAS = 6.0  # standard deviations that a filter is off by without a mix-up
 FACTOR = 6.0  # by which a wrong filter's covariance is off without a mix-up: the table of benchmarks/hints.py has 4
 ANY = 1e8  # the same of a number that stands for all variances
@@ -130,18 +129,19 @@ class ReadingFit:
 
         That is any factor on the covariance of all components, with one of at most ``FACTOR`` on that of a single one,
         of position or of attitude, or of any size there where one number was written for all variances; or a bias of
-        at most ``BIAS`` standard deviations with a factor within ``SCALE``.
+        at most ``BIAS`` standard deviations of each component with a factor within ``SCALE``.
         """
         singles = [[j] for j in range(self.n)] if self.n <= FEW else []
         groups = [[], *singles, *GROUPS.get(self.n, ())]
-        return self.likelihood + max(self._with_bias(), *map(self._with_factor, groups))
+        constant, growing = self.error.mean(axis=0) / self.sigma, np.tile(self.own.mean(axis=0), (len(self.own), 1))
+        gains = [self._with_bias(constant), self._with_bias(growing), *map(self._with_factor, groups)]
+        return self.likelihood + max(gains)
 
-    def _with_bias(self) -> float:
-        """Log likelihood that an estimate gains by a bias."""
+    def _with_bias(self, bias: Array) -> float:
+        """Log likelihood that an estimate gains by a bias (K, n), over the standard deviations."""
         before = float(np.square(self.w).sum(axis=1).mean())
-        shift = _solved(self.factor, self.error.mean(axis=0) / self.sigma)
-        size = float(np.sqrt(np.square(shift).sum(axis=1).mean()))
-        shift *= min(1.0, BIAS / max(size, 1e-300))
+        size = float(np.sqrt(np.square(bias).mean(axis=0)).max())
+        shift = _solved(self.factor, bias * min(1.0, BIAS / max(size, 1e-300)))
         after = float(np.square(self.w - shift).sum(axis=1).mean())
         common = float(np.clip(after / self.n, 10.0**-SCALE, 10.0**SCALE))
         return 0.5 * (before - after / common - self.n * float(np.log(common)))
@@ -163,13 +163,17 @@ class ReadingFit:
 
 def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
     """Errors (k, n) of some runs with their covariances (k, n, n); None without any that can be whitened."""
+    if not runs:
+        return None
     errors, P = (np.concatenate(each) for each in zip(*runs, strict=True))
     ends = np.cumsum([len(error) for error, _ in runs])[:-1]
     with np.errstate(invalid="ignore"):
         variance = np.diagonal(P, axis1=1, axis2=2)
         good = np.isfinite(errors).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (variance > 0).all(axis=1)
     sigma = np.sqrt(variance[good])
-    L, definite = _factors(P[good] / sigma[:, :, None] / sigma[:, None, :])
+    R = P[good]
+    R /= sigma[:, :, None] * sigma[:, None, :]
+    L, definite = _factors(R)
     good[good] = definite
     if not good.any():
         return None
@@ -203,6 +207,8 @@ def _solved(L: Array, x: Array) -> Array:
     """L^-1 x of lower factors (K, n, n) and vectors (K, n)."""
     if L.shape[-1] <= SMALL:
         return np.asarray(np.linalg.solve(L, x[..., None])[..., 0])
+    from scipy.linalg import solve_triangular
+
     return np.array([solve_triangular(one, vector, lower=True) for one, vector in zip(L, x, strict=True)])
 
 

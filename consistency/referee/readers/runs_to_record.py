@@ -135,7 +135,7 @@ def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
         for piece in of_runs(out):
             P = covariance[piece]
             if np.triu(P, 1).any() != np.tril(P, -1).any():
-                P = P + np.swapaxes(P, -1, -2) - P * np.eye(P.shape[-1])
+                P = np.where(P == 0, np.swapaxes(P, -1, -2), P)
             rows = Places(place, np.arange(piece.start, piece.stop))
             what = "the covariance is not symmetric; write P = (P + P') / 2"
             refuse(asymmetric(P, ROUNDED), rows.__getitem__, what)

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from consistency.referee.diagnostics.questions.innovation_causes import innovation_causes
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.sample import ATTITUDE, innovations_of
+from consistency.referee.diagnostics.records.sample import ATTITUDE
 from consistency.referee.diagnostics.verdict.answers import SHARES
 from consistency.referee.diagnostics.verdict.parts import Guess, Scale, Settings, Verdict
 from consistency.referee.diagnostics.verdict.verdict import DEFAULT, judge_alone
@@ -16,8 +17,6 @@ from consistency.referee.diagnostics.words.sentences import percent, plain
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning.early_stopping import Design
-
-ABOUT_RIGHT = 0.04  # NIS over its degrees of freedom less 1: no cause is looked for
 
 
 def judge(record: Record, settings: Settings = DEFAULT) -> Verdict:
@@ -113,7 +112,9 @@ def _beside(verdict: Verdict, r: Record, world: Verdict | None, runs: int | None
         rejection = rejection_score(*r.rejections.of_runs(runs)[1:])
     first, *rest = verdict.reasons
     left_out = verdict.left_out_steps
-    causes = (*r.causes, *_innovation_causes(verdict, r))
+    scale = verdict.scale
+    nees_ratio = float("nan") if scale is None else scale.mean_anees / scale.dof
+    causes = (*r.causes, *innovation_causes(r, nees_ratio))
     return replace(
         verdict,
         reasons=(f"{first}; {r.caption}" if r.caption else first, *rest, *causes, *_other_ways(verdict, r)),
@@ -125,19 +126,6 @@ def _beside(verdict: Verdict, r: Record, world: Verdict | None, runs: int | None
         world=world,
         rejection=rejection,
     )
-
-
-def _innovation_causes(verdict: Verdict, r: Record) -> list[str]:
-    nis_and_dof = None
-    if verdict.innovations is not None and abs(verdict.innovations.ratio - 1.0) > ABOUT_RIGHT:
-        nis_and_dof = innovations_of(r)
-    if nis_and_dof is None:
-        return []
-    from consistency.referee.diagnostics.questions.innovation_causes import innovation_causes
-
-    scale = verdict.scale
-    nees_ratio = float("nan") if scale is None else scale.mean_anees / scale.dof
-    return innovation_causes(*nis_and_dof, nees_ratio)
 
 
 def _unshown(verdict: Verdict, why: str) -> Verdict:

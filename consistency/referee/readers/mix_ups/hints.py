@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,6 +33,7 @@ NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, bu
 
 Change = Callable[[Poses], Poses]
 Pairs = Sequence[tuple[Array, Array]]
+ErrorsWithout = Callable[[Change], Pairs]
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ def hints(
     runs: Sequence[Poses],
     shift: float = 0.0,
     judged: Sequence[int] | None = None,
-    errors_without: Callable[[Change], Pairs] | None = None,
+    errors_without: ErrorsWithout | None = None,
 ) -> list[str]:
     """Hints on a probable mix-up, where the covariance does not fit and one other reading of the files does; or none.
 
@@ -66,24 +68,23 @@ def hints(
     """
     if not runs:
         return []
-    part = list(range(len(axes))) if judged is None else list(judged)
-    some = _thinned(runs, shift) if errors_without is None else list(runs)
-    if errors_without is None and _same(some):
-        return [
-            f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies of "
-            "one; give the true poses as the truth"
-        ]
-
-    def fit_without(change: Change) -> ReadingFit | None:
-        pairs = [_errors_of(change(p)) for p in some] if errors_without is None else errors_without(change)
-        return fit_of([_judged(error, P, part, len(axes)) for error, P in pairs])
-
+    part = list(range(len(axes)) if judged is None else judged)
+    some, worlds = runs, errors_without is None
+    if errors_without is None:
+        some = _thinned(runs, shift)
+        errors_without = partial(_errors_without, some)
+        if _same(some):
+            return [
+                f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies "
+                "of one; give the true poses as the truth"
+            ]
+    fit_without = partial(_fit_without, errors_without, part, len(axes))
     declared = fit_without(lambda p: p)
     if declared is not None and declared.size * declared.fault() < LEAST_GAIN:
         return []
     from consistency.referee.readers.mix_ups.known import guesses_of  # few files need them
 
-    guesses = guesses_of(some, axes, part, worlds=errors_without is None)
+    guesses = guesses_of(some, axes, part, worlds)
     fits = [(guess, fit_without(guess.change)) for guess in guesses]
     if declared is None:
         shown = [guess.text for guess, fit in fits if fit is not None and fit.is_shown()]
@@ -117,15 +118,17 @@ def _same(runs: Sequence[Poses]) -> bool:
     return total >= LEAST and same >= NEARLY_ALL * total
 
 
-def _errors_of(p: Poses) -> tuple[Array, Array]:
-    return p.errors(), p.covariance
+def _errors_without(runs: Sequence[Poses], change: Change) -> Pairs:
+    changed = map(change, runs)
+    return [(p.errors(), p.covariance) for p in changed]
 
 
-def _judged(error: Array, P: Array, part: list[int], n: int) -> tuple[Array, Array]:
-    """The components that are judged; all of a state whose quaternion became a rotation of three."""
-    if error.shape[1] != n or len(part) == n:
-        return error, P
-    return error[:, part], P[:, part][:, :, part]
+def _fit_without(errors_without: ErrorsWithout, part: list[int], n: int, change: Change) -> ReadingFit | None:
+    """Fit of the components that are judged; of all of a state whose quaternion became a rotation of three."""
+    pairs = errors_without(change)
+    if len(part) == n or not all(error.shape[1] == n for error, _ in pairs):
+        return fit_of(pairs)
+    return fit_of([(error[:, part], P[:, part][:, :, part]) for error, P in pairs])
 
 
 def _cause(fits: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFit) -> str | None:

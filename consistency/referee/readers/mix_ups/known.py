@@ -203,9 +203,11 @@ def _reordered(
     """Columns of the estimates, components of their covariance, and its error, in place of others where given."""
 
     def change(p: Poses) -> Poses:
-        p = p if estimate is None else replace(p, estimate=p.estimate[:, estimate])
-        p = p if covariance is None else replace(p, covariance=p.covariance[:, covariance][:, :, covariance])
-        return p if convention is None else replace(p, convention=convention)
+        if estimate is not None:
+            p = replace(p, estimate=p.estimate[:, estimate])
+        if covariance is not None:
+            p = replace(p, covariance=p.covariance[:, covariance][:, :, covariance])
+        return replace(p, convention=convention or p.convention)
 
     return change
 
@@ -246,13 +248,14 @@ def _mirrored(convention: str) -> Guess:
 
 
 def _orders(convention: str) -> Iterator[Guess]:
-    swap = [3, 4, 5, 0, 1, 2]
+    whole = [0, 1, 2, 3, 4, 5]
+    turned = "the covariance has its two blocks in the other order (--covariance-order)"
+    yield Guess(turned, _reordered(None, [*whole[3:], *whole[:3]]))
     for other in SPATIAL:
-        for turned in (False, True):
-            if (other, turned) != (convention, False):
-                words = [] if other == convention else [f"the error is '{other}' (--error {other})"]
-                words += ["the covariance has its two blocks in the other order (--covariance-order)"] if turned else []
-                yield Guess(" and ".join(words), _reordered(None, swap if turned else [0, 1, 2, 3, 4, 5], other))
+        if other != convention:
+            words = f"the error is '{other}' (--error {other})"
+            yield Guess(words, _reordered(None, whole, other))
+            yield Guess(f"{words} and {turned}", _reordered(None, [*whole[3:], *whole[:3]], other))
 
 
 def _sides(convention: str) -> Iterator[Guess]:
@@ -295,7 +298,9 @@ def _with_variances(names: Sequence[str], factors: Array, p: Poses) -> Poses:
 
 def _scaled(names: Sequence[str], factors: Array, p: Poses) -> Poses:
     """Estimates and truth with the columns of ``names`` times factors, and headings within half a turn."""
-    p = replace(p, **{name: getattr(p, name) * (factors if name in names else 1.0) for name in ("estimate", "truth")})
+    p = replace(p, estimate=p.estimate.copy(), truth=p.truth.copy())
+    for name in names:
+        getattr(p, name)[:] *= factors
     for values in (p.estimate, p.truth):
         values[:, 2] = wrap(values[:, 2])
     return p
@@ -347,20 +352,10 @@ def _of_root(P: Array) -> Array:
 
 def _inverted(P: Array, part: list[int]) -> Array:
     """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
-    out, some = np.full_like(P, np.nan), np.ix_(range(len(P)), part, part)
-    try:
-        out[some] = np.linalg.inv(P[some])
-    except np.linalg.LinAlgError:
-        for k, matrix in enumerate(P[some]):
-            out[np.ix_([k], part, part)] = _inverse_or_nan(matrix)
+    out, block = np.full_like(P, np.nan), P[:, part][:, :, part]
+    regular = np.flatnonzero(np.linalg.slogdet(block)[0])
+    out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])
     return out
-
-
-def _inverse_or_nan(matrix: Array) -> Array:
-    try:
-        return np.asarray(np.linalg.inv(matrix))
-    except np.linalg.LinAlgError:
-        return np.full_like(matrix, np.nan)
 
 
 # --- frames -----------------------------------------------------------------------------------------
@@ -373,10 +368,11 @@ def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
         return
     angle = np.rad2deg(frame.heading)
     if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
-        turn = f"turned by {angle:.1f} degrees about z and " if abs(angle) > TURN else ""
-        where = ", ".join(f"{value:.3g}" for value in frame.shift[: 3 if runs[0].manifold == "spatial" else 2])
+        turn = ""
+        if abs(angle) > TURN:
+            turn = f"turned by {angle:.1f} degrees about z and "
         words = (
-            f"the world of the estimates is {turn}shifted by ({where}) m to meet that of the truth; "
+            f"the world of the estimates is {turn}shifted by {_place(frame.shift, runs)} m to meet that of the truth; "
             f"write both in one world, or add --align posyaw{'-all' * (len(runs) > 1)}"
         )
         yield Guess(words, lambda p: moved(p, frame), fine=False)
@@ -393,13 +389,18 @@ def _bodies(runs: Sequence[Poses]) -> Iterator[Guess]:
     angle, size = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0, spread(runs)
     parts = []
     if np.linalg.norm(angle) >= TURN:
-        planar = runs[0].manifold == "planar"
-        about = "z" if planar else "x, y, z"
-        turned = f"{angle[2]:.1f}" if planar else f"({', '.join(f'{value:.1f}' for value in angle)})"
-        parts.append(f"turned by {turned} degrees about {about}")
+        turned = f"({angle[0]:.1f}, {angle[1]:.1f}, {angle[2]:.1f}) degrees about x, y, z"
+        if runs[0].manifold == "planar":
+            turned = f"{angle[2]:.1f} degrees about z"
+        parts.append(f"turned by {turned}")
     if np.linalg.norm(body.arm) >= ARM * size:
-        arm = ", ".join(f"{value:.3g}" for value in body.arm[: 2 if runs[0].manifold == "planar" else 3])
-        parts.append(f"shifted by a lever arm of ({arm}) m")
+        parts.append(f"shifted by a lever arm of {_place(body.arm, runs)} m")
     if parts:
         words = f"the body of the truth is {' and '.join(parts)} against that of the estimates; write poses of one body"
         yield Guess(words, lambda p: on_body(p, body), fine=False)
+
+
+def _place(values: Array, runs: Sequence[Poses]) -> str:
+    """Coordinates in space, or x and y."""
+    d = 2 if runs[0].manifold == "planar" else 3
+    return f"({', '.join(f'{value:.3g}' for value in values[:d])})"

@@ -30,7 +30,7 @@ MARGINAL = (
     "covariances of two poses do not tell that of the motion between them; give their cross-covariances, or motions "
     "with --motions (docs/files.md, Relative poses)"
 )
-SEARCHED = 20_000  # rows of all runs in which mix-ups are looked for
+SEARCHED = 20_000  # rows with truth, of all runs, in which mix-ups are looked for
 BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
 
 
@@ -53,15 +53,6 @@ class Stretch:
     def d(self) -> int:
         """2 in the plane, 3 in space."""
         return 2 if self.covariance.shape[-1] == 3 else 3
-
-    def beginning(self, most: int) -> Stretch:
-        """The first rows."""
-        rows = self.rows[self.rows < most]
-        cross = None if self.cross is None else self.cross[:most]
-        return replace(
-            self, place=self.place.at(slice(most)), t=self.t[:most], estimate=self.estimate[:most],
-            covariance=self.covariance[:most], cross=cross, rows=rows, truth=self.truth[: len(rows)],
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -187,7 +178,8 @@ def _causes(
     name: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
 ) -> list[str]:
     """Mix-ups of motions, or of poses with cross-covariances, without which the errors of the windows fit."""
-    stretches = [s.beginning(SEARCHED // len(stretches)) for s in stretches]
+    most = SEARCHED // len(stretches)
+    stretches = [replace(s, rows=s.rows[:most], truth=s.truth[:most]) for s in stretches]
     planar = len(axes) == 3
     runs = [
         Poses(

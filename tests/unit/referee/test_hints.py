@@ -514,7 +514,7 @@ def test_the_likeliest_cause_is_named_whatever_its_size() -> None:
     """Of two that are both right, the one of the larger likelihood, though its NEES spreads more."""
     rng = np.random.default_rng(12)
     w = rng.normal(size=(400, 3))
-    declared, better, worse = fit(30.0 * w), fit(w * np.exp(rng.normal(size=(400, 1)))), fit(w, P=9.0 * np.eye(3))
+    better, worse = fit(w * np.exp(rng.normal(size=(400, 1)))), fit(w, P=9.0 * np.eye(3))
     assert better.size < worse.size
     assert better.near() > worse.near()
     one, other = (Guess(text, lambda p: p) for text in ("one", "other"))

@@ -43,7 +43,7 @@ class Candidate:
     guess: Guess
     fit: ReadingFit
     size: float  # independent estimates
-    gain: float  # log likelihood over the simple faults of the errors as they are declared; -inf where there is none
+    gain: float  # log likelihood of each over the simple faults of the errors as declared; -inf where it is none
 
 
 def hints(
@@ -159,18 +159,18 @@ def _candidates(
             continue
         size = max(min(fit.size, declared.size), len(declared.whitened))  # runs are independent
         gain = -np.inf
-        if fit.n == declared.n and fit.near() > simple:
-            gain = size * (fit.near() - simple)
+        if fit.n == declared.n:
+            gain = fit.near() + guess.volume - simple
         yield Candidate(guess, fit, size, gain)
 
 
 def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Candidate | None:
     """The likeliest candidate that is right but for a common factor; of like ones the first, and the last at need."""
-    right = [one for one in candidates if one.gain >= bar and one.fit.right(gross)]
+    right = [one for one in candidates if one.size * one.gain >= bar and one.fit.right(gross)]
     right = [one for one in right if _status(one.fit) <= _status(declared)]
     right = [one for one in right if not one.guess.last] or right
-    most = max((one.fit.near() for one in right), default=0.0)
-    return next((one for one in right if one.size * (most - one.fit.near()) <= LIKE), None)
+    most = max((one.gain for one in right), default=0.0)
+    return next((one for one in right if one.size * (most - one.gain) <= LIKE), None)
 
 
 def _status(fit: ReadingFit) -> int:

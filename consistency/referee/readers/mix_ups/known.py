@@ -47,6 +47,7 @@ class Guess:
     last: bool = False  # named only where nothing else fits: it has a fit of its own for each run
     fine: bool = True  # named where less than a decade is wrong too: no bias and no drift looks like it
     exact: bool = False  # named by its NEES alone, however little is wrong
+    volume: float = 0.0  # log of the factor of volumes of the truth, whose density it divides
 
 
 def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], worlds: bool = True) -> list[Guess]:
@@ -70,7 +71,9 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], worl
         return [*own, *_quaternion_states(runs, axes)]
     if kind == "spatial":
         own = [*_orders(convention), *_quaternions(), *scales, *_permuted(axes, 3), *_units(3, slice(3, 6))]
-        own += [_half_angles(), *_positions(3)]
+        words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
+        half = Guess(words, lambda p: _weighed(p, slice(3, 6), 2.0), exact=True)
+        own += [half, *_positions(3)]
     else:
         own = [*_sides(convention), *_headings(), *scales, *_permuted(axes, 3), *_units(2, slice(2, 3)), *_positions(2)]
     own.append(Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False))
@@ -115,12 +118,6 @@ def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> It
 
 def _diagonal(P: Array) -> Array:
     return np.diagonal(P, axis1=1, axis2=2)[:, :, None]
-
-
-def _half_angles() -> Guess:
-    """The vector part of a small quaternion is half its rotation vector."""
-    words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
-    return Guess(words, lambda p: _weighed(p, slice(3, 6), 2.0), exact=True)
 
 
 def _inverse(p: Poses) -> Poses:
@@ -284,20 +281,17 @@ def _headings() -> Iterator[Guess]:
     degrees = np.array([1.0, 1.0, DEGREE])
     remedy = "; multiply them by pi / 180"
     for of, names in OF.items():
-        change = partial(_scaled, names, degrees)
-        yield Guess(f"the headings of {of} are in degrees{remedy}", change, fine="truth" not in names)
-    for of in ("both files", "the estimates"):
-        change = partial(_with_variances, OF[of], degrees)
-        words = f"the headings of {of} and their variances are in degrees{remedy}"
-        yield Guess(words, change, fine=of == "the estimates")
+        volume = float(np.log(DEGREE)) if "truth" in names else 0.0
+        for what in ("", " and their variances"):
+            words = f"the headings of {of}{what} are in degrees{remedy}"
+            change = partial(_scaled, names, degrees, variances=bool(what))
+            yield Guess(words, change, fine="truth" not in names, volume=volume)
 
 
-def _with_variances(names: Sequence[str], factors: Array, p: Poses) -> Poses:
-    return _weighed(_scaled(names, factors, p), slice(2, 3), DEGREE)
-
-
-def _scaled(names: Sequence[str], factors: Array, p: Poses) -> Poses:
+def _scaled(names: Sequence[str], factors: Array, p: Poses, variances: bool = False) -> Poses:
     """Estimates and truth with the columns of ``names`` times factors, and headings within half a turn."""
+    if variances:
+        p = _weighed(p, slice(0, 3), factors)
     p = replace(p, estimate=p.estimate.copy(), truth=p.truth.copy())
     for name in names:
         getattr(p, name)[:] *= factors
@@ -325,16 +319,17 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
         "the positions of the estimates and their covariance are in millimetres; divide them by 1000",
         lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),
     )
-    for of in ("the truth", "the estimates"):
-        words = f"the positions of {of} are in millimetres; divide them by 1000"
-        yield Guess(words, _changed(OF[of], shrunk), fine=of != "the truth")
+    words = "the positions of {} are in millimetres; divide them by 1000"
+    yield Guess(words.format("the estimates"), _changed(["estimate"], shrunk))
+    volume = width * float(np.log(MILLI))
+    yield Guess(words.format("the truth"), _changed(["truth"], shrunk), fine=False, volume=volume)
 
 
 def _covariance(function: Callable[[Array], Array]) -> Change:
     return lambda p: replace(p, covariance=function(p.covariance))
 
 
-def _weighed(p: Poses, part: slice, factor: float) -> Poses:
+def _weighed(p: Poses, part: slice, factor: float | Array) -> Poses:
     scale = np.ones(p.covariance.shape[-1])
     scale[part] = factor
     return replace(p, covariance=p.covariance * scale[:, None] * scale)

@@ -54,11 +54,6 @@ class ReadingFit:
         right = distributions.chi2.ppf(0.5, np.append(self.n, np.ones(self.n)))
         return np.asarray(np.log10(np.maximum(nees, 1e-300) / right))
 
-    @property
-    def is_dummy(self) -> bool:
-        """Whether all components have one variance, which no filter has of positions and angles."""
-        return bool(np.ptp(self.sigma) <= 1e-9 * self.sigma.max())
-
     @cached_property
     def likelihood(self) -> float:
         """Mean log likelihood of an estimate, but for a constant."""
@@ -148,7 +143,9 @@ class ReadingFit:
 
     def _with_factor(self, group: list[int]) -> float:
         """Log likelihood that an estimate gains by a factor on some components, beside one on all."""
-        most = np.log(ANY if self.is_dummy else FACTOR)
+        most = np.log(FACTOR)
+        if np.ptp(self.sigma) <= 1e-9 * self.sigma.max():
+            most = np.log(ANY)
         f = np.exp(np.linspace(-most, most, 61))
         of_group = np.zeros_like(self.own)
         of_group[:, group] = self.own[:, group]

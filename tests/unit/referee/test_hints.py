@@ -14,8 +14,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.judge import judge as judge_record
+from consistency.referee.diagnostics import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
@@ -678,11 +677,11 @@ def test_causes_of_innovations(
     e, v = rng.normal(size=(40, 60, 2)), rng.normal(size=(40, 60, 3))
     P, dof = np.broadcast_to(np.eye(2), (40, 60, 2, 2)), np.full((40, 60), 2.0)
     record = Record("est", error=e, covariance=P, nis=nis_of(v), nis_dof=dof, optimal_gain=optimal)
-    verdict = judge_record(record)
+    verdict = judge(record)
     assert_named(verdict.causes, said)
     assert set(verdict.causes) <= set(verdict.reasons)
     wrong = replace(record, error=3.0 * e)
-    assert not any("after the update" in cause for cause in judge_record(wrong).causes)
+    assert not any("after the update" in cause for cause in judge(wrong).causes)
 
 
 @pytest.mark.parametrize("angle", [-2.0, 0.3])

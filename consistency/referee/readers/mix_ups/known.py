@@ -349,7 +349,7 @@ def _inverted(P: Array, part: list[int]) -> Array:
     """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
     out, block = np.full_like(P, np.nan), P[:, part][:, :, part]
     regular = np.flatnonzero(np.linalg.slogdet(block)[0])
-    out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])
+    out[np.ix_(regular, np.array(part), np.array(part))] = np.linalg.inv(block[regular])
     return out
 
 

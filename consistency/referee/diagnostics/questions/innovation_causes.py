@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.sample import innovations_of
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
 
@@ -20,17 +18,14 @@ AFTER_UPDATE = (
 )
 
 
-def innovation_causes(record: Record, nees_ratio: float) -> list[str]:
+def innovation_causes(nis: Array, dof: Array, nees_ratio: float) -> list[str]:
     """Hints on NIS of another number of components, or of residuals after the update; or none.
 
     Parameters
     ----------
+    nis, dof : (runs, steps), NaN where there is no innovation
     nees_ratio : mean NEES over its degrees of freedom; NaN where no errors are known
     """
-    nis_and_dof = innovations_of(record)
-    if nis_and_dof is None:
-        return []
-    nis, dof = nis_and_dof
     counted = np.isfinite(nis) & (dof > 0) & (nis > 0)
     values, stated = nis[counted], dof[counted]
     if not len(values):

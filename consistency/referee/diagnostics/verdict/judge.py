@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from consistency.referee.diagnostics.questions.innovation_causes import innovation_causes
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.sample import ATTITUDE
+from consistency.referee.diagnostics.records.sample import ATTITUDE, innovations_of
 from consistency.referee.diagnostics.verdict.answers import SHARES
 from consistency.referee.diagnostics.verdict.parts import Guess, Scale, Settings, Verdict
 from consistency.referee.diagnostics.verdict.verdict import DEFAULT, judge_alone
@@ -112,13 +112,13 @@ def _beside(verdict: Verdict, r: Record, world: Verdict | None, runs: int | None
         rejection = rejection_score(*r.rejections.of_runs(runs)[1:])
     first, *rest = verdict.reasons
     left_out = verdict.left_out_steps
-    scale = verdict.scale
-    nees_ratio = float("nan") if scale is None else scale.mean_anees / scale.dof
-    causes = (*r.causes, *innovation_causes(r, nees_ratio))
+    causes, scale, innovations = list(r.causes), verdict.scale, innovations_of(r)
+    if innovations is not None:
+        causes += innovation_causes(*innovations, float("nan") if scale is None else scale.mean_anees / scale.dof)
     return replace(
         verdict,
         reasons=(f"{first}; {r.caption}" if r.caption else first, *rest, *causes, *_other_ways(verdict, r)),
-        causes=causes,
+        causes=tuple(causes),
         convention=r.convention or None,
         align=(r.align or None) if r.convention else None,
         notes=tuple(r.notes),

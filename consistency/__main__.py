@@ -13,7 +13,7 @@ def main() -> Any:
 
 def _command() -> Any:
     gc.set_threshold(50_000, 20, 100)  # most of what is made lives as long as the modules that are imported
-    from consistency.referee.cli import main
+    from consistency.commands import main
 
     return main()
 

@@ -25,10 +25,10 @@ from consistency.bench.sweeps.rig import read_rig
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.characterising.bias import GRID
+from consistency.stereo.characterising.bias_map import GRID
 from consistency.stereo.characterising.boards import MODELS, find_corners, of_model
 from consistency.stereo.characterising.characterise import Characterisation
-from consistency.stereo.characterising.sensor_text import sensor_text
+from consistency.stereo.characterising.sensor_text import measured_sensor_toml
 from consistency.stereo.visual_odometry.features import opencv
 
 FINDINGS = ("chessboard-map", "chessboard-noise")
@@ -89,7 +89,7 @@ def beliefs(model: str, of: Characterisation) -> dict[str, cs.Scenario]:
     """The camera in the world of herath2007-stereo, and what a filter may believe of it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"lens-{model}.toml"
-        path.write_text(sensor_text(of), encoding="utf-8")
+        path.write_text(measured_sensor_toml(of), encoding="utf-8")
         rig = read_rig(path, cs.load_scenario("herath2007-stereo"))
     summary = f"herath2007-stereo with a camera that was calibrated with lens model '{model}'"
     full = rig.variant(f"lens-{model}", summary=f"{summary}; its noise and bias map believed")

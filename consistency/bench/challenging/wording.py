@@ -10,7 +10,7 @@ import numpy as np
 from consistency.bench.challenging.challenge import Challenge
 from consistency.bench.scenario import scenario_text
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.diagnostics.words.sentences import p_text
+from consistency.referee.diagnostics.words.numbers import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing

@@ -18,9 +18,9 @@ from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
 from consistency.bench.types import outcome
 from consistency.referee.diagnostics import Settings
-from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
+from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.verdict.parts import STATUSES
-from consistency.referee.diagnostics.words.sentences import plural
+from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.wording import listed
 from consistency.referee.errors import InputError
@@ -78,12 +78,10 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
     def track(name: str) -> Track:
         number, read = styles.setdefault(name, len(styles)), partial(record_of, results, name, steps)
         record = read()
-        verdict, ends = judge_runs(record, Settings(), design), record.ends
+        verdict = judge(record, Settings(), design)
         shown = record.of_runs(np.flatnonzero(record.run_numbers == shown_run))
         ratio = nis_ratio(record, verdict.runs)
-        del record  # its arrays are free before the maps are read
-        verdict = with_map(verdict, ends, Settings(), design)
-        return Track(name, number, f"{index}:{number}", verdict, ends.failures, shown, ratio, read)
+        return Track(name, number, f"{index}:{number}", verdict, record.failures, shown, ratio, read)
 
     tracks = tuple(track(name) for name in results.filters)
     return Study(

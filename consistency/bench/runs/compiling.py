@@ -81,7 +81,7 @@ def _compile(missing: Sequence[Need], jobs: int) -> None:
     )
     # processes start as copies of this one: in a thread beside others a lock may be held for ever
     may_fork = sys.platform == "linux" and threading.active_count() == 1
-    workers = min(jobs, len(shared)) if len(shared) > 1 and may_fork and not disk_cache.refusal() else 1
+    workers = min(jobs, len(shared)) if len(shared) > 1 and may_fork and not disk_cache.folder_fault() else 1
     seconds = _wall([need.outlook.seconds for need in missing], workers)
     with _processes(shared, workers if workers > 1 else 0) as links, progress.foreseen(_label(missing), seconds):
         _side_by_side(len(shared), links)

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from consistency.bench.scenario import ListedEffect, LocalBias, Scenario, UvdSensor, explain, read_table
-from consistency.bench.scenario.scenario import with_changes
+from consistency.bench.scenario.truth_and_belief import with_changes
 from consistency.bench.store.log import SensorFile
 from consistency.bench.sweeps.axes import Changes
 from consistency.referee.errors import InputError

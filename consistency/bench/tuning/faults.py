@@ -14,14 +14,14 @@ from scipy.stats import qmc
 
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
+from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.scenario import Scenario, misbelief
 from consistency.referee.diagnostics import Settings, Verdict
 from consistency.referee.diagnostics.verdict.answers import BIAS, SCALE
-from consistency.referee.diagnostics.words.sentences import short
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.system.progress import quiet
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import analyse
 
 LESS = 0.1  # of all standard deviations: what is of second order in the errors is then a hundredth
 FIT = 1.1  # NIS per degree of freedom within this factor of 1: innovations look right

@@ -12,7 +12,7 @@ import numpy as np
 
 from consistency.bench.scenario import Belief, scenario_text, toml_text
 from consistency.bench.scenario.toml_tables import SIGMA_UNITS
-from consistency.bench.store.folder_tables import write_folder
+from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.log import Log, sensor_text
 from consistency.bench.tuning.fit import LIMIT
 from consistency.bench.tuning.noise_groups import NoiseGroup, sigma_by_channel
@@ -21,7 +21,7 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.sentences import short
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.system.provenance import manifest_of
 
 TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}
@@ -205,7 +205,7 @@ def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
     world = tuning.parts.world
     origin = {"log": world.name, "log_sha256": world.sha256} if isinstance(world, Log) else {"scenario": world.name}
     manifest = manifest_of(KIND, wall=tuning.seconds, filters=[tuning.filter], **origin)
-    write_folder(out, {}, manifest, contents, overwrite)
+    write_tables(out, {}, manifest, contents, overwrite)
 
 
 def as_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:

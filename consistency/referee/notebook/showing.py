@@ -9,7 +9,7 @@ from typing import Any
 
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.records.record import numbered_axes
-from consistency.referee.diagnostics.words.sentences import plural
+from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Bullets, Facts
 from consistency.referee.document.verdict import summary
 from consistency.referee.show import as_html, text

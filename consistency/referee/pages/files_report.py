@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import of_both
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.words.sentences import plural
+from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Block, Chapter, Document, Facts, Text
 from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, SIGMAS, ZERO, Look, style
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
@@ -35,7 +35,7 @@ JOINT = Look("#333333", width=1.4)
 
 
 def compose_files(
-    records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str, manifest: Mapping[str, Any]
+    records: Sequence[Record], judged: Mapping[str, Verdict], title: str, manifest: Mapping[str, Any]
 ) -> Document:
     """The document that HTML and PDF show; a chapter for each of the records that has a verdict."""
     named = {record.name: record for record in records}
@@ -79,14 +79,14 @@ def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
     return Judged(title, "", runs, 0, clock_of(np.full(steps, np.nan)), np.arange(1, steps + 1), tracks, False)
 
 
-def _counts(record: Evidence, verdict: Verdict) -> str:
+def _counts(record: Record, verdict: Verdict) -> str:
     clock = clock_of(record.t)
     length = plural(verdict.steps, "step" if record.window is None else "window")
     size = f"{plural(verdict.runs, verdict.unit)} of {record.window if record.independent else length}"
     return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and len(record.t) > 1 else size
 
 
-def record_figures(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
+def record_figures(record: Record, verdict: Verdict) -> tuple[Figure, ...]:
     """Errors with their bounds, NEES, trajectory, coverage, and innovations; those that the record has."""
     if record.truth_covariance is not None:
         figures = record_figures(of_both(record), verdict)
@@ -97,7 +97,7 @@ def record_figures(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
     return tuple(figure for figure in found if figure is not None)
 
 
-def record_sheet(record: Evidence, verdict: Verdict | None = None) -> Sheet:
+def record_sheet(record: Record, verdict: Verdict | None = None) -> Sheet:
     """Errors with their bounds, trajectory, coverage, and with a ``verdict`` the NEES with its band, on one sheet.
 
     Raises
@@ -127,7 +127,7 @@ def unit_of(axis: str) -> tuple[str, float]:
     return ("m" if axis in METRES else DERIVED.get(axis[:-1], "") if axis[-1:] in METRES else "", 1.0)
 
 
-def _errors(record: Evidence) -> Figure | None:
+def _errors(record: Record) -> Figure | None:
     """Error of each component of one run with its 2-sigma bounds, as fig. 2b of Herath et al. (2007)."""
     if record.error is None or record.covariance is None:
         return None
@@ -152,7 +152,7 @@ def _errors(record: Evidence) -> Figure | None:
     return replace(figure, caption=figure.caption + clock.note)
 
 
-def _error_panel(record: Evidence, clock: Clock, row: int, others: list[int], i: int) -> Panel:
+def _error_panel(record: Record, clock: Clock, row: int, others: list[int], i: int) -> Panel:
     assert record.error is not None
     assert record.covariance is not None
     name = record.axes[i]
@@ -170,7 +170,7 @@ def _error_panel(record: Evidence, clock: Clock, row: int, others: list[int], i:
 # --- NEES -------------------------------------------------------------------------------------------
 
 
-def _nees(record: Evidence, verdict: Verdict) -> Figure | None:
+def _nees(record: Record, verdict: Verdict) -> Figure | None:
     """NEES of one run, or its average over runs, with the bands of a right estimator."""
     scale, location = verdict.scale, verdict.location
     if record.parts:  # of the whole no distribution is known
@@ -201,7 +201,7 @@ def _nees(record: Evidence, verdict: Verdict) -> Figure | None:
     return Figure("NEES", caption, (panel,), (Sheet((panel,), 2.2, keys=tuple(keys)),), tuple(keys))
 
 
-def _nees_of_windows(record: Evidence) -> Figure | None:
+def _nees_of_windows(record: Record) -> Figure | None:
     """NEES of each window, independent of the others."""
     if record.nees is None or not np.isfinite(record.nees).any():
         return None
@@ -226,7 +226,7 @@ def _nees_of_windows(record: Evidence) -> Figure | None:
 # --- coverage ---------------------------------------------------------------------------------------
 
 
-def observed_coverage(record: Evidence, p: Array) -> dict[str, Array]:
+def observed_coverage(record: Record, p: Array) -> dict[str, Array]:
     """Share of errors inside the interval that should hold them with probability ``p`` (N,), by component and jointly.
 
     Of all steps of all runs; -> (N,) each.
@@ -248,7 +248,7 @@ def _shares(values: Array, limits: Array) -> Array:
     return np.searchsorted(known, limits, side="right") / len(known) if len(known) else np.full(len(limits), np.nan)
 
 
-def _coverage(record: Evidence) -> Figure | None:
+def _coverage(record: Record) -> Figure | None:
     """Share of errors within an interval against the probability that it should hold them with."""
     p = np.linspace(0.0, 0.999, 200)
     found = observed_coverage(record, p)
@@ -275,7 +275,7 @@ def _coverage(record: Evidence) -> Figure | None:
 # --- innovations ------------------------------------------------------------------------------------
 
 
-def _innovations(record: Evidence, verdict: Verdict) -> Figure | None:
+def _innovations(record: Record, verdict: Verdict) -> Figure | None:
     """NIS over its degrees of freedom, averaged over runs."""
     if record.nis is None or record.nis_dof is None:
         return None

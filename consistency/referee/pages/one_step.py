@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.words.sentences import plural
+from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.colours import EXPECTED, SHADE, SIGMAS, ZERO, style
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Mark, Panel, Points, Rule, Sheet
 from consistency.referee.pages.judged import wide
@@ -17,16 +17,16 @@ from consistency.referee.pages.judged import wide
 EACH = replace(style(0), size=2.5, alpha=0.7)
 
 
-def has_one_step(record: Evidence) -> bool:
+def has_one_step(record: Record) -> bool:
     """Whether a curve along the steps would be a point, and one along the runs is not."""
     return len(record.t) == 1 and len(record.run_numbers) > 1
 
 
-def _axis(record: Evidence) -> Axis:
+def _axis(record: Record) -> Axis:
     return Axis("run", share="run", window=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
 
 
-def errors_of_runs(record: Evidence, units: Sequence[tuple[str, float]]) -> Figure:
+def errors_of_runs(record: Record, units: Sequence[tuple[str, float]]) -> Figure:
     """Error of each run with its 2-sigma bounds, a panel for each of the components that have ``units``."""
     assert record.error is not None
     assert record.covariance is not None
@@ -47,7 +47,7 @@ def errors_of_runs(record: Evidence, units: Sequence[tuple[str, float]]) -> Figu
     return figure_of_errors(record, caption, tuple(panels), keys)
 
 
-def figure_of_errors(record: Evidence, caption: str, panels: tuple[Panel, ...], keys: tuple[Key, ...]) -> Figure:
+def figure_of_errors(record: Record, caption: str, panels: tuple[Panel, ...], keys: tuple[Key, ...]) -> Figure:
     """Panels of the first components, side by side."""
     left_out, columns = len(record.axes) - len(panels), columns_of(len(panels))
     caption += f" {plural(left_out, 'further component')} not drawn." if left_out else ""
@@ -60,7 +60,7 @@ def columns_of(panels: int) -> int:
     return 2 if panels in (2, 4) else min(3, panels)
 
 
-def nees_of_runs(record: Evidence) -> Figure | None:
+def nees_of_runs(record: Record) -> Figure | None:
     """NEES of each run with the band of a right estimator."""
     if record.nees is None or not np.isfinite(record.nees).any():
         return None

@@ -5,7 +5,6 @@ Matches pass a ratio and a mutual test, an epipolar gate, and the circle over fo
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,9 +45,10 @@ def opencv() -> Any:
         OpenCV is not installed.
     """
     try:
-        return importlib.import_module("cv2")
+        import cv2
     except ImportError:
-        raise MissingPackageError(f"an image needs {remedy('vision')}") from None
+        raise MissingPackageError(f"an image needs {remedy('vision', package='opencv-python-headless')}") from None
+    return cv2
 
 
 def grey(image: Array, name: str = "image") -> Array:

@@ -24,6 +24,7 @@ from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
 from consistency.bench.store.results import open_results
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system.provenance import this_machine
+from consistency.types import Failure
 
 RUNS = 40
 HERE = {"cpu": "abacus", "blas": "beads"}
@@ -121,7 +122,7 @@ def test_a_run_that_kills_has_failed_and_no_other(
     outcomes = done(engine, work, retries)
     assert {run for run, outcome in outcomes.items() if outcome.failures} == set(killers)
     for run in killers:
-        assert outcomes[run].failures == (cs.types.Failure("still", run, 1, "killed"),)
+        assert outcomes[run].failures == (Failure("still", run, 1, "killed"),)
         assert outcomes[run].truth is not None
 
 

@@ -34,7 +34,7 @@ from consistency.bench.challenging.worlds import Choice, LogScale, Point, Space,
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.path import lap_length, planned_path
-from consistency.referee.cli import main
+from consistency.commands import main
 from consistency.referee.errors import InputError
 
 STEREO = cs.load_scenario("herath2007-stereo")

@@ -46,7 +46,7 @@ def world(linear: cs.Scenario) -> cs.Scenario:
 @pytest.fixture(scope="module")
 def filters(world: cs.Scenario) -> list[str | Still]:
     """One that is compiled, and one whose process ends in one run."""
-    doomed = cs.types.Control(*Simulated(world, SEED)(7).controls[0])
+    doomed = cs.Control(*Simulated(world, SEED)(7).controls[0])
     return ["kf", Still("still", KINDS["os._exit(3)"][0], doomed)]
 
 

@@ -36,10 +36,10 @@ from consistency.bench.runs.findings import Finding
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.results import read_results
 from consistency.referee.column_names import COVARIANCE
-from consistency.referee.diagnostics import Answer, Evidence, Interval, Settings, judge
+from consistency.referee.diagnostics import Answer, Interval, Record, Settings, judge
 from consistency.referee.diagnostics.verdict.answers import DIRECTION, STEP
 from consistency.referee.diagnostics.verdict.parts import STATUSES
-from consistency.referee.diagnostics.words.sentences import short
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.document.blocks import Document
 from consistency.referee.document.drawing import Figure, Intervals, Line, Points, Span, thin
 from consistency.referee.document.verdict import FURTHER, page, shown_inside
@@ -105,7 +105,7 @@ def drawn(seed: int, runs: int = 60, size: float = 1.0):
 
 def judged(track: Track, error, covariance, settings: Settings = SURE, **given) -> Track:
     """The track with the verdict on other errors in place of its own."""
-    evidence = Evidence(track.name, error, covariance, axes=("x", "y", "heading"), **given)
+    evidence = Record(track.name, error, covariance, axes=("x", "y", "heading"), **given)
     verdict = judge(evidence, settings)
     assert verdict.scale is not None
     assert verdict.location is not None
@@ -312,7 +312,7 @@ def test_a_verdict_without_figures_is_drawn_all_the_same(report, all_steps_faile
     def bare(track: Track) -> Track:
         v = replace(track.verdict, answers=(), **EMPTY)
         if all_steps_failed:
-            v = judge(Evidence(track.name, np.full((4, STEPS, 3), np.nan), np.full((4, STEPS, 3, 3), np.nan)))
+            v = judge(Record(track.name, np.full((4, STEPS, 3), np.nan), np.full((4, STEPS, 3, 3), np.nan)))
             v = replace(v, answers=())
             assert v.status == "failed"
             assert np.isnan(v.scale.inflation.value)
@@ -329,7 +329,7 @@ def test_a_verdict_without_figures_is_drawn_all_the_same(report, all_steps_faile
 
 def test_nees_alone_without_axes(report):
     (study,) = report.studies
-    whole = judge(Evidence("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3))
+    whole = judge(Record("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3))
     track = replace(study.tracks[0], verdict=whole)
     study = replace(study, tracks=(track,))
     (part,) = axes.forests(study)
@@ -483,7 +483,7 @@ def test_without_truth_only_a_declared_optimal_gain_is_put_to_the_test(report):
     nis, dof = rng.chisquare(4, (1, STEPS)), np.full((1, STEPS), 4)
 
     def by_nis(track: Track, size: float, optimal: bool) -> Track:
-        evidence = Evidence(track.name, nis=size * nis, nis_dof=dof, optimal_gain=optimal)
+        evidence = Record(track.name, nis=size * nis, nis_dof=dof, optimal_gain=optimal)
         return replace(track, verdict=judge(evidence, SURE))
 
     def text(*tracks: Track) -> str:
@@ -544,7 +544,7 @@ def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
     error, P = drawn(6, 24)
     lost = (Failure("any", 3, 9, "singular"),)
     late, early, whole = (
-        judge(Evidence("any", error[:runs], P[:runs], failures=failures))
+        judge(Record("any", error[:runs], P[:runs], failures=failures))
         for runs, failures in ((24, lost), (12, ()), (24, ()))
     )
     assert anees.common({"early": early, "late": late}) is late

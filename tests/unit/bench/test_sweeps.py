@@ -19,7 +19,7 @@ import pytest
 import consistency as cs
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.scenario import data_folder
-from consistency.bench.scenario.scenario import with_changes
+from consistency.bench.scenario.truth_and_belief import with_changes
 from consistency.bench.sweeps import cell as cells
 from consistency.bench.sweeps import running
 from consistency.bench.sweeps import sweep_folder as folders

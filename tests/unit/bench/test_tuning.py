@@ -27,10 +27,10 @@ from consistency.bench.tuning.result import Tuning, as_data, factor_text, lines
 from consistency.bench.tuning.scores import BeliefScorer, require_scorable, score_of
 from consistency.bench.tuning.split import part_of, parts_of
 from consistency.bench.tuning.tune import MOST_TOLERATED, tolerant
-from consistency.referee.cli import main
+from consistency.commands import main
 from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.sentences import short
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.geometry import pose_error
 from consistency.referee.geometry.conventions import planar_error
 

@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from consistency.referee.diagnostics import Comparison, Evidence, Interval, MapScore, Verdict, judge
+from consistency.referee.diagnostics import Comparison, Interval, MapScore, Record, Verdict, judge
 from consistency.referee.diagnostics.comparison import Difference
 from consistency.referee.diagnostics.verdict.answers import ABOUT, ALONE
 from consistency.referee.diagnostics.verdict.parts import JointScore, RejectionScore
@@ -158,7 +158,7 @@ def verdict_of(scale: float, name: str = "f", n: int = 2):
     rng = np.random.default_rng(5)
     error = scale * rng.standard_normal((60, 4, n))
     P = np.broadcast_to(np.eye(n), (60, 4, n, n))
-    return judge(Evidence(name, error=error, covariance=P, nees=(error**2).sum(-1), dof=n, axes=("x", "y")))
+    return judge(Record(name, error=error, covariance=P, nees=(error**2).sum(-1), dof=n, axes=("x", "y")))
 
 
 def test_every_view_takes_its_cells_from_the_verdict() -> None:

@@ -57,7 +57,7 @@ def backend_for(
 
         return Slurm(out.absolute().with_name(f".{out.absolute().name}.jobs"), options_of(slurm), jobs)
     except ImportError:
-        raise MissingPackageError(f"--backend {name} needs {remedy('cluster', own=ENGINES[name])}") from None
+        raise MissingPackageError(f"--backend {name} needs {remedy('cluster', package=ENGINES[name])}") from None
 
 
 def require_scheduler(name: str, scheduler: str | None, what: str) -> None:

@@ -128,7 +128,11 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
     left_out = set(found.left_out_steps)
     if record.align:
         left_out.update(record.left_out_steps)
-    causes = [*record.causes, *_innovation_causes(record, found)]
+    causes, nees_ratio = list(record.causes), float("nan")
+    if found.scale is not None:
+        nees_ratio = found.scale.mean_anees / found.scale.dof
+    if (innovations := nis_and_dof(record)) is not None:
+        causes += innovation_causes(*innovations, nees_ratio)
     fields = vars(found) | {"left_out_steps": tuple(sorted(left_out))}
     return Verdict(
         **fields,
@@ -140,16 +144,6 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
         causes=tuple(causes),
         **beside._asdict(),
     )
-
-
-def _innovation_causes(record: Record, found: Findings) -> list[str]:
-    innovations = nis_and_dof(record)
-    if innovations is None:
-        return []
-    nees_ratio = float("nan")
-    if found.scale is not None:
-        nees_ratio = found.scale.mean_anees / found.scale.dof
-    return innovation_causes(*innovations, nees_ratio)
 
 
 def _map_of(record: Record, settings: Settings | None) -> MapScore | None:

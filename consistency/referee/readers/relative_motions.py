@@ -7,6 +7,7 @@ A change of either world frame changes neither. Log(M D^-1) is the adjoint of it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -191,14 +192,13 @@ def _causes(
     def errors_without(change: Change) -> Pairs:
         found = []
         for s, p in zip(stretches, runs, strict=True):
-            q = change(p)
-            cross = None if s.cross is None else change(replace(p, covariance=s.cross)).covariance
-            s = replace(s, estimate=q.estimate, covariance=q.covariance, cross=cross, convention=q.convention)
-            try:
-                found.append(windows_of(replace(s, truth=q.truth), relative))
-            except InputError:  # no window fits
-                continue
-        return [(one.error, one.covariance) for one in found]
+            with np.errstate(invalid="ignore"), suppress(InputError):  # infinite covariances; no window fits
+                q = change(p)
+                cross = None if s.cross is None else change(replace(p, covariance=s.cross)).covariance
+                s = replace(s, estimate=q.estimate, covariance=q.covariance, cross=cross, convention=q.convention)
+                one = windows_of(replace(s, truth=q.truth), relative)
+                found.append((one.error, one.covariance))
+        return found
 
     return hints(name, axes, runs, judged=judged, errors_without=errors_without)
 

@@ -348,7 +348,8 @@ def _of_root(P: Array) -> Array:
 def _inverted(P: Array, part: list[int]) -> Array:
     """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
     out, block = np.full_like(P, np.nan), P[:, part][:, :, part]
-    regular = np.flatnonzero(np.linalg.slogdet(block)[0])
+    finite = np.flatnonzero(np.isfinite(block).all(axis=(1, 2)))
+    regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
     out[np.ix_(regular, np.array(part), np.array(part))] = np.linalg.inv(block[regular])
     return out
 

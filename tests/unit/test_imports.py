@@ -23,14 +23,14 @@ ROOTS = {"referee": 0, "bench": 1, "stereo": 2, "": 3}
 RANKS = {
     "referee": {
         "types": 0, "errors": 0, "defaults": 0, "column_names": 0,
-        "system.progress": 0, "system.atomic": 0, "system.stopping": 0,
+        "system.progress": 0, "system.atomic": 0, "system.stopping": 0, "system.shipped": 0,
         "extras": 1, "system.provenance": 1, "geometry": 1,
         "parsing": 1, "system.folders": 2,
         "diagnostics": 2, "readers": 3, "verdicts": 4, "document": 3, "show": 4, "pages": 5, "gating": 6, "notebook": 6,
         "fit_covariance": 6,
     },
     "bench": {
-        "types": 0, "shipped": 0, "models": 1, "scenario": 2, "protocols": 3, "simulation": 4, "filters": 4,
+        "types": 0, "models": 1, "scenario": 2, "protocols": 3, "simulation": 4, "filters": 4,
         "store.parquet": 3, "store.folder_tables": 4, "store.results_check": 4, "store.log_tables": 4,
         "store.journal": 5, "store.results": 5, "store.trial_rows": 6, "store.log": 8,
         "runs.memory_needed": 8, "runs.gather": 8,

@@ -18,7 +18,6 @@ from documents import parsed
 
 import consistency as cs
 from consistency.bench import filters
-from consistency.bench.shipped import summaries
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.commands.app import app
 from consistency.commands.registry import COMMANDS
@@ -32,6 +31,7 @@ from consistency.referee.extras import (
     require,
     requirements,
 )
+from consistency.referee.system.shipped import summaries
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]

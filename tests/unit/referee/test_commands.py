@@ -234,6 +234,23 @@ print(cs.anees.__name__, "run_trials" in dir(cs))
     assert (other, here) == ("ImportError", "anees True")
 
 
+def test_a_failed_import_is_explained_by_the_extra_that_has_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not by one that collects others."""
+    monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
+    for module, package, extra in (("joblib", "joblib", "bench"), ("yaml", "pyyaml", "vision")):
+        without(monkeypatch, module)
+        error = explained(ModuleNotFoundError(name=f"{module}.part"), "this")
+        assert str(error) == f"this needs {package}: pip install 'here[{extra}]'"
+        monkeypatch.undo()
+        monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
+
+
+def test_who_needs_no_extra_does_not_wait_for_the_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "requires", lambda _: pytest.fail("the metadata were read"))
+    require("this")
+    assert requirements() == []
+
+
 def test_another_module_that_is_missing_is_not_explained() -> None:
     assert explained(ModuleNotFoundError(name="no_such_module"), "this") is None
     assert explained(ModuleNotFoundError(), "this") is None

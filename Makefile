@@ -90,6 +90,7 @@ CORE := $(addprefix consistency/,__init__.py referee commands diagnostics.py err
 lint: .venv/.done
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 	$(BIN)/mypy
 	$(BIN)/mypy --python-version 3.10 --follow-imports silent $(CORE)
 

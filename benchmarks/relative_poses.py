@@ -20,8 +20,8 @@ from scipy import stats
 from scipy.linalg import expm
 from script_options import options_of
 
-from consistency.referee.diagnostics import Evidence, Verdict
-from consistency.referee.diagnostics.planning.number_of_runs import power_of
+from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.statistics.number_of_runs import power_of
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.geometry.groups import composed, propagated, to_left, vectors
 from consistency.referee.readers.formats.sheet import Places
@@ -115,7 +115,7 @@ def pose_stretch(rng: np.random.Generator, group: str, poses: int, apart: int, r
     )  # fmt: skip
 
 
-def recorded(stretches: list[Stretch], size: str, motions: bool) -> Evidence:
+def recorded(stretches: list[Stretch], size: str, motions: bool) -> Record:
     """Windows as ``consistency analyse --relative`` takes them."""
     axes = AXES["SE(2)" if stretches[0].d == 2 else "SE(3)"]
     relative = relative_of(size, motions)
@@ -123,7 +123,7 @@ def recorded(stretches: list[Stretch], size: str, motions: bool) -> Evidence:
     return relative_recording("log", "log", stretches, axes, range(len(axes)), relative)
 
 
-def verdict_on(record: Evidence) -> Verdict:
+def verdict_on(record: Record) -> Verdict:
     return analyse([record])["log"]
 
 

@@ -28,7 +28,7 @@ from .referee.diagnostics import anees as anees
 from .referee.diagnostics import anees_interval as anees_interval
 from .referee.diagnostics import nees as nees
 from .referee.diagnostics.records.record import Record as Record
-from .referee.diagnostics.verdict.parts import Verdict as Verdict
+from .referee.diagnostics.verdict.verdict import Verdict as Verdict
 from .referee.errors import InputError as InputError
 from .referee.fit_covariance.drives import Drive as Drive
 from .referee.fit_covariance.drives import drive_of as drive_of

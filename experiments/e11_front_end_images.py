@@ -18,7 +18,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.findings import OURS, command_line, sibling
-from consistency.referee.diagnostics import Evidence, Verdict, judge
+from consistency.referee.diagnostics import Record, Verdict, judge
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.types import Array
@@ -163,7 +163,7 @@ def halves(case: Case, rng: np.random.Generator) -> tuple[Array, Array]:
 
 def referee(errors: Array, covariances: Array) -> Verdict:
     """The bench's verdict with every motion as a run of one step."""
-    return judge(Evidence("motions", errors[:, None], covariances[:, None], axes=AXES))
+    return judge(Record("motions", errors[:, None], covariances[:, None], axes=AXES))
 
 
 def floored(errors: Array, covariances: Array) -> tuple[Array, Array]:

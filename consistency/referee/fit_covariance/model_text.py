@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.defaults import DETECT
-from consistency.referee.diagnostics.verdict.as_dictionary import flat, plain
-from consistency.referee.diagnostics.words.sentences import plural, short
+from consistency.referee.diagnostics.verdict.as_dictionary import plain
+from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Ratio
 from consistency.referee.fit_covariance.mean_by_motion import ByMotion
@@ -244,6 +244,6 @@ def data(model: NoiseModel) -> dict[str, Any]:
         "by_motion": None if model.by_motion is None else vars(model.by_motion),
         "growth": model.growth.power, "warnings": model.warnings,
         "second_correlation": None if second is None else second.correlation,
-        "second_size": None if second is None else second.size, "spans": spans, "referee": flat(model.verdict),
+        "second_size": None if second is None else second.size, "spans": spans, "referee": model.verdict.statistics,
     })  # fmt: skip
     return found

@@ -14,8 +14,7 @@ import numpy as np
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.questions.independence import ENOUGH, Independence, independence
 from consistency.referee.diagnostics.records.whitening import whiten
-from consistency.referee.diagnostics.words.numbers import plural
-from consistency.referee.diagnostics.words.sentences import p_text
+from consistency.referee.diagnostics.words.numbers import p_text, plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
 from consistency.referee.readers.formats.sheet import Places

@@ -73,16 +73,29 @@ def baseline(
         if record.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
         failures[each], axes[each] = len(record.failures), tuple(record.axes)
-        own = record if record.unshown else record.as_runs
+        own = record
+        if not record.unshown:
+            own = record.as_runs
         world = own.in_world
         filters[each] = summary(cast(Array, own.nees), own.dof, world.error, world.covariance, own.run_numbers)
-    trials = source.trials if truth is None else (_digest(truth), None)
-    return Baseline(name, source.scenario, trials, filters, failures, axes, None if first is None else first.option)
+    trials = source.trials
+    if truth is not None:
+        trials = (_digest(truth), None)
+    return Baseline(name, source.scenario, trials, filters, failures, axes, _option(first))
+
+
+def _option(skip: Skip | None) -> str | None:
+    """Value of the option that leaves these steps out."""
+    if skip is None:
+        return None
+    return skip.option
 
 
 def _digest(truth: Path) -> str:
-    digest = hashlib.sha256()
-    for path in [truth] if truth.is_file() else sorted(path for path in truth.rglob("*") if path.is_file()):
+    digest, paths = hashlib.sha256(), [truth]
+    if not truth.is_file():
+        paths = sorted(path for path in truth.rglob("*") if path.is_file())
+    for path in paths:
         with path.open("rb") as file:
             own = hashlib.sha256()
             for piece in iter(lambda: file.read(2**20), b""):
@@ -144,16 +157,17 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
             if key not in data:
                 raise ValueError(f"key '{key}': missing")
         scenario, origin, left_out = data["scenario"], data["origin"], data.get("skip")  # files written before lack it
-        if not isinstance(scenario, str | None) or not isinstance(left_out, str | None):
-            raise ValueError(f"key '{'skip' if isinstance(scenario, str | None) else 'scenario'}': not a text")
+        for key, value in (("scenario", scenario), ("skip", left_out)):
+            if not isinstance(value, str | None):
+                raise ValueError(f"key '{key}': not a text")
         if not isinstance(origin, list) or len(origin) != 2:
             raise ValueError("key 'origin': not a list of two")
         if not isinstance(data["filters"], dict):
             raise ValueError("key 'filters': not a table")
         rows = {name: _filter_of(row, f"filters.{name}") for name, row in data["filters"].items()}
-    filters = {name: row[0] for name, row in rows.items()}
-    failures = {name: row[1] for name, row in rows.items()}
-    axes = {name: row[2] for name, row in rows.items()}
+    filters, failures, axes = {}, {}, {}
+    for name, row in rows.items():
+        filters[name], failures[name], axes[name] = row
     base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, axes, left_out)
     return require_skip(base, skip)
 
@@ -166,11 +180,13 @@ def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
     InputError
         They were not.
     """
-    first = skip_asked(skip)
-    asked = None if first is None else first.option
+    asked = _option(skip_asked(skip))
     if base.skip != asked:
-        own = "of all steps" if base.skip is None else f"with --skip {base.skip}"
-        wanted = "without --skip" if asked is None else f"with --skip {asked}"
+        own, wanted = f"with --skip {base.skip}", f"with --skip {asked}"
+        if base.skip is None:
+            own = "of all steps"
+        if asked is None:
+            wanted = "without --skip"
         raise InputError(f"{base.name}: was written {own}; write it again {wanted}, or compare by the same steps")
     return base
 
@@ -211,7 +227,10 @@ def _known(table: Any, place: str, keys: Sequence[str], optional: Sequence[str] 
 
 def _list(values: Any, place: str, longest: int | None = None) -> list[Any]:
     if not isinstance(values, list) or (longest is not None and len(values) > longest):
-        raise ValueError(f"key '{place}': not a list" + ("" if longest is None else f" of at most {longest}"))
+        most = ""
+        if longest is not None:
+            most = f" of at most {longest}"
+        raise ValueError(f"key '{place}': not a list{most}")
     return values
 
 
@@ -225,5 +244,8 @@ def _numbers(values: Any, place: str, longest: int | None = None) -> list[float 
 
 def _whole(value: Any, place: str, least: int, end: int | None = None) -> int:
     if type(value) is not int or value < least or (end is not None and value >= end):
-        raise ValueError(f"key '{place}': not a whole number from {least}" + (f" to below {end}" if end else ""))
+        below = ""
+        if end:
+            below = f" to below {end}"
+        raise ValueError(f"key '{place}': not a whole number from {least}{below}")
     return value

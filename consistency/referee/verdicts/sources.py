@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from consistency.referee.diagnostics import Record, Settings, Verdict
+from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.records.skipping import Skip
-from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.options import settings_of, skip_asked
 
@@ -67,21 +66,17 @@ def analyse(
     InputError
         Unknown filter, a confidence outside (0, 1), or nothing is left.
     """
-    source = source_of(results)
-    design = source.design() if settings is None and confidence is None else None
-    settings = settings_of(confidence) if settings is None else settings
+    source, design = source_of(results), None
+    if settings is None:
+        settings = settings_of(confidence)
+        if confidence is None:
+            design = source.design()
     first, verdicts = skip_asked(skip), {}
     for name in filters or source.filters:
-        verdict, ends = _of_poses(_record(source.record(name), first, optimal_gain), settings, design)
-        verdicts[name] = with_map(verdict, ends, settings, design)
+        record = source.record(name)
+        if first is not None:
+            record = record.without_first(first)
+        if optimal_gain:
+            record = replace(record, optimal_gain=True)
+        verdicts[name] = judge(record, settings, design)
     return verdicts
-
-
-def _record(record: Record, first: Skip | None, optimal_gain: bool) -> Record:
-    record = record if first is None else record.without_first(first)
-    return replace(record, optimal_gain=True) if optimal_gain else record
-
-
-def _of_poses(record: Record, settings: Settings, design: Design | None) -> tuple[Verdict, Record]:
-    """A verdict without the maps; the arrays are free before those are read."""
-    return judge_runs(record, settings, design), record.ends

@@ -16,7 +16,7 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.sentences import p_text
+from consistency.referee.diagnostics.words.numbers import p_text
 from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole

@@ -21,8 +21,7 @@ from consistency.bench.store.results import open_results
 from consistency.referee.column_names import OWN_COVARIANCE
 from consistency.referee.diagnostics import Interval, Settings, judge, map_score, sequential_design
 from consistency.referee.diagnostics.questions.scale import ratio_interval
-from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
-from consistency.referee.diagnostics.verdict.parts import MapScore
+from consistency.referee.diagnostics.verdict.verdict import MapScore
 from consistency.referee.document.map import map_text
 from consistency.referee.document.verdict import document
 from consistency.referee.gating.checked_arrays import record_of_filter
@@ -174,7 +173,7 @@ def test_until_decided_says_both(uvd: cs.Scenario) -> None:
 
 def test_a_look_scores_the_maps_of_its_own_runs(results: cs.Results) -> None:
     record, design = record_of(results, "ekf-uvd"), sequential_design(3, max_runs=12)
-    v = with_map(judge_runs(record, Settings(), design), record.ends, Settings(), design)
+    v = judge(record, Settings(), design)
     assert (v.runs, v.map.runs) == (12, 12)
     planned = replace(results, manifest=results.manifest | {"until_decided": {"dof": 3, "max_runs": 12}})
     assert analyse(planned, ["ekf-uvd"])["ekf-uvd"].runs == 12

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from consistency.referee.diagnostics import Evidence, compare, judge, summary
+from consistency.referee.diagnostics import Record, compare, judge, summary
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 
@@ -38,7 +38,7 @@ def nees(runs, factor=1.0):
 def nees_with(p, runs):
     """NEES just so much too large that the verdict's p value is p."""
     def excess(log_factor):
-        return np.log(judge(Evidence("", nees=nees(runs, np.exp(log_factor)), dof=3)).p_value / p)
+        return np.log(judge(Record("", nees=nees(runs, np.exp(log_factor)), dof=3)).p_value / p)
     return nees(runs, np.exp(optimize.brentq(excess, 0.01, 1.5)))
 
 

@@ -16,7 +16,7 @@ from documents import blocks
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
-from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.geometry.groups import composed, matrices, propagated, to_left
@@ -122,7 +122,7 @@ def test_declared_windows_are_runs(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
 
 
-def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Evidence:
+def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Record:
     """Independent windows of poses, by declaration only; true errors are 3 times what is stated."""
     runs = [pose_stretch(rng, "SE(2)", steps + 1, 5, 9.0, run) for run in range(windows // steps)]
     return world.relative_recording(
@@ -360,7 +360,7 @@ def test_a_real_sequence_from_images_to_windows(
 
 def test_the_example_of_the_manual(inside: Path) -> None:
     (example,) = (block.text for block in blocks("docs/files.md", "python") if "wheels" in block.text)
-    names: dict[str, Evidence] = {}
+    names: dict[str, Record] = {}
     exec(example, names)
     verdict = cs.judge(names["record"])
     assert (verdict.runs, verdict.unit, verdict.status) == (60, "window", "consistent")

@@ -55,7 +55,7 @@ def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> ByMotion:
         least, most = (np.quantile(sizes[1], at) for at in (0.5 / BINS, 1.0 - 0.5 / BINS))
         if by == "turn" or most >= VARIES * least:
             for scale in range(len(SCALES)):
-                p = max(p_value_of(now, pieces, of, scale) for pieces, of in zip(both, bins, strict=True))
+                p = max(dependence_p_value(now, pieces, of, scale) for pieces, of in zip(both, bins, strict=True))
                 found.append((p, by, scale, sizes[0], bins[0]))
     p, by, scale, size, of = min(found, key=lambda each: each[0])
     values, error = _by_bin(now, of, scale)
@@ -71,7 +71,7 @@ def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> ByMotion:
     return dependence
 
 
-def p_value_of(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) -> float:
+def dependence_p_value(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) -> float:
     """p-value of one scale in all bins, by a score test; errors are of ``windows``, and motions ``pieces``.
 
     Each drive has constants of its own. The scores of blocks of windows, in all bins but the first, are compared with

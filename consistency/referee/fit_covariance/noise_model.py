@@ -37,7 +37,7 @@ from consistency.referee.fit_covariance.motions import record_of_motions, stretc
 from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
 from consistency.referee.fit_covariance.refusals import RotationGrowth, require_poses, require_sound, rotation_growth
 from consistency.referee.fit_covariance.slip import BY_TURN
-from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, intervals, jitter_of
+from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, jitter_of, variance_intervals
 from consistency.referee.geometry.groups import matrices
 from consistency.referee.readers.relative_motions import Stretch
 from consistency.referee.types import Array
@@ -194,7 +194,7 @@ def fit_covariance(
     spans = _spans(folds, drives, windows, planar, not is_half)
     record = record_of_motions(stretches_of(drives, windows, folds), windows.axes)
     fitted = windows.of(~np.isin(windows.drive, folds[0].judged)) if held_out not in (None, HALF) else windows
-    per_m, per_rad = intervals(noise, fitted)
+    per_m, per_rad = variance_intervals(noise, fitted)
     judged = sorted({int(i) for fold in folds for i in fold.judged})
     return NoiseModel(
         name=name, span=over.option, noise=noise, per_m=per_m, per_rad=per_rad, spans=spans, record=record,

@@ -178,7 +178,7 @@ def _constants(squares: Array, stated: Array, counts: Array) -> Array:
     return out
 
 
-def intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
+def variance_intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
     """Intervals of the variances a metre and a radian, from the jackknife over drives or blocks of windows."""
     now = noise.mean.applied(windows)
     error, F, floor = now.errors, fitted_terms(now, noise.mean_fit), noise.floor

@@ -15,7 +15,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan, Ratio, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
-from consistency.referee.fit_covariance.mean_by_motion import SCALES, _by_bin, mean_by_motion, p_value_of
+from consistency.referee.fit_covariance.mean_by_motion import SCALES, _by_bin, dependence_p_value, mean_by_motion
 from consistency.referee.fit_covariance.model_text import correction, noise_lines, sentence
 from consistency.referee.fit_covariance.motion_windows import (
     ROUNDED,
@@ -199,7 +199,7 @@ def test_noise_of_the_way_by_which_windows_are_divided_is_not_a_dependence(rng: 
     now = noise.mean.applied(w)
     size = ways(now.pieces).sum(axis=1)
     thirds = np.searchsorted(np.quantile(size, [1 / 3, 2 / 3]), size, side="right")
-    assert p_value_of(now, now.pieces, thirds, 0) < 1e-3
+    assert dependence_p_value(now, now.pieces, thirds, 0) < 1e-3
     assert mean_by_motion(noise, w).p_value > 0.01  # fails in 1 %
 
 

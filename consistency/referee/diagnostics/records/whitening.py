@@ -55,7 +55,7 @@ def _less(value: Array, a: list[Array], b: list[Array]) -> Array:
     total = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=False):
         total = total + x * y
-    return value - total
+    return np.asarray(value - total)
 
 
 def _whiten_matrix_by_matrix(error: Array, covariance: Array) -> Array:

@@ -11,7 +11,7 @@ from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.records.skipping import Skip
 from consistency.referee.errors import InputError
 from consistency.referee.extras import outside
-from consistency.referee.verdicts.options import settings_of, skip_asked
+from consistency.referee.verdicts.command_settings import settings_of, skip_asked
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics import Design

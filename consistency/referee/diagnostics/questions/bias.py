@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.records.large_arrays import blocks
+from consistency.referee.diagnostics.records.large_arrays import block_slices
 from consistency.referee.diagnostics.records.whitening import all_finite
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array, Indices
@@ -74,7 +74,7 @@ class StepMoments(NamedTuple):
 def step_moments(whitened: Array) -> StepMoments:
     """Moments of whitened errors (runs, steps, n)."""
     runs, steps = whitened.shape[:2]
-    N, mean, S = zip(*(_moments(whitened[:, here]) for here in blocks(steps, runs)), strict=True)
+    N, mean, S = zip(*(_moments(whitened[:, here]) for here in block_slices(steps, runs)), strict=True)
     return StepMoments(np.concatenate(N), np.concatenate(mean), np.concatenate(S))
 
 

@@ -267,7 +267,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows, about = _measured(options, seed)
     seconds = round(time.monotonic() - started, 1)
     table = document(rows, about, seed=seed, wall_time_s=seconds)
-    if options.module and options.out is not None:
+    if (options.module or options.only) and options.out is not None:
         table = merged(json.loads(options.out.read_text(encoding="utf-8")), rows, about)
     if options.out is not None:
         options.out.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
@@ -317,7 +317,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
         quick=(False, "fewer gates of fewer rows, with fresh random numbers"),
         out=(Path, "JSON file to write"),
         docs=(Path, "document whose table to replace"),
-        only=("", "rows whose world or question contains this text"),
+        only=("", "rows whose world or question contains this text, put into --out"),
         module=(str, "rows of this module alone, put into --out", {"action": "append", "choices": MODULES}),
         gates=(10**9, "of a row, at most"),
         seed=(int, None),

@@ -29,12 +29,12 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.mean_by_motion import mean_by_motion
+from consistency.referee.fit_covariance.motion_windows import PLANE, SPACE, DriveWindows, cut_windows, span_of
 from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.persistence import doubts, persistent
-from consistency.referee.fit_covariance.refusals import growth_of, require_sound
+from consistency.referee.fit_covariance.refusals import require_sound, rotation_growth
 from consistency.referee.fit_covariance.slip import BY_TURN
 from consistency.referee.fit_covariance.white_noise import fit_noise, intervals, terms_of
-from consistency.referee.fit_covariance.windows import PLANE, SPACE, Windows, span_of, windows_of
 from consistency.referee.geometry.groups import composed, matrices, vectors
 from consistency.referee.types import Array
 
@@ -168,7 +168,7 @@ def recovery(rng: np.random.Generator, world: World, number: int, draws: int) ->
     ratios, covered, whole = np.empty((draws, 2 * n)), np.empty((draws, 2 * n), bool), np.empty((draws, n))
     main, best = np.zeros(2 * n), np.zeros(2 * n)
     for k in range(draws):
-        windows = windows_of(drives(rng, number, world), span_of(SPAN))
+        windows = cut_windows(drives(rng, number, world), span_of(SPAN))
         F = terms_of(windows.pieces)
         own = np.diagonal(F.mean(axis=0), axis1=1, axis2=2)  # (2 n, n)
         main += theta * own[np.arange(2 * n), np.arange(2 * n) % n] / np.tile(theta @ own, 2) / draws
@@ -271,7 +271,7 @@ CASES = (
 )
 
 
-def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, float, str]:
+def told(rng: np.random.Generator, case: Case, fresh: DriveWindows) -> tuple[str, float, str]:
     """Status, true ratio of the exported model on ``fresh`` drives, and the reason of a refusal or first warning.
 
     The parts of :func:`consistency.fit_covariance` that decide, without those that describe.
@@ -280,7 +280,7 @@ def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, flo
     judged = [drive(rng, case.later, f"judged {i}", case.length) for i in range(case.judged)]
     names, every = ",".join(each.name for each in judged) or None, [*made, *judged]
     try:
-        windows = windows_of(every, span_of(SPAN))
+        windows = cut_windows(every, span_of(SPAN))
         require_sound(every, windows, False, True)
         noise, folds = folds_of(every, windows, names, case.correct)
     except InputError as error:
@@ -290,7 +290,7 @@ def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, flo
     status = decided(
         judged_by(folds, windows, len(every), case.fitted > 1).status, any(each.decides for each in lasting), depends
     )
-    growth = growth_of(every, windows, False, noise.mean)
+    growth = rotation_growth(every, windows, False, noise.mean)
     warnings = doubts(noise, windows, growth, lasting)
     nees = noise.nees(fresh)[0]
     means = [nees[fresh.drive == i].mean() for i in range(FRESH)]
@@ -306,7 +306,7 @@ def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         if only not in case.name:
             continue
         rng = np.random.default_rng([seed, 100 + number])
-        fresh = windows_of([drive(rng, case.later, f"fresh {i}", SHORT) for i in range(FRESH)], span_of(SPAN))
+        fresh = cut_windows([drive(rng, case.later, f"fresh {i}", SHORT) for i in range(FRESH)], span_of(SPAN))
         found = [told(rng, case, fresh) for _ in range(draws)]
         ratio = np.array([each[1] for each in found])
         outside = (ratio < 1 / DETECT) | (ratio > DETECT)
@@ -352,7 +352,7 @@ def motion_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         rng, found = np.random.default_rng([seed, 500 + number]), []
         for _ in range(draws):
             made = drives(rng, count, world, SHORT)
-            windows = windows_of(made, span_of(span))
+            windows = cut_windows(made, span_of(span))
             found.append(mean_by_motion(fit_noise(windows), windows))
         hits, p = sum(each.is_found for each in found), np.array([each.p_value for each in found])
         low, high = binomial_interval(hits, draws, 1.0 - 2 * SURE / tests)

@@ -23,7 +23,7 @@ from script_options import options_of
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.statistics.number_of_runs import power_of
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
-from consistency.referee.geometry.groups import carried, composed, to_left, vectors
+from consistency.referee.geometry.groups import composed, propagated, to_left, vectors
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.windows import relative_of
@@ -87,7 +87,7 @@ def drive(rng: np.random.Generator, group: str, steps: int, ratio: float = 1.0, 
 def motion_stretch(log: Log, run: int = 0) -> Stretch:
     """The log as a file of motions, with their covariances in the default convention."""
     kind, start = DECLARED[log.group], np.eye(log.truth.shape[-1])[None]
-    P = carried(np.linalg.inv(to_left(log.motions, kind)), log.covariance)
+    P = propagated(np.linalg.inv(to_left(log.motions, kind)), log.covariance)
     rows = np.arange(len(log.truth))
     return Stretch(
         run, "motions", Places(lambda row: f"row {row}", rows), DT * rows,
@@ -110,8 +110,8 @@ def pose_stretch(rng: np.random.Generator, group: str, poses: int, apart: int, r
     cross[1:] = J[:-1] @ (MEMORY * S) @ np.swapaxes(J[1:], 1, 2)
     rows = np.arange(poses)
     return Stretch(
-        run, "poses", Places(lambda row: f"row {row}", rows), DT * apart * rows, vectors(T), carried(J, S), cross, rows,
-        vectors(truth), DECLARED[group],
+        run, "poses", Places(lambda row: f"row {row}", rows), DT * apart * rows, vectors(T), propagated(J, S), cross,
+        rows, vectors(truth), DECLARED[group],
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from consistency.bench.runs.findings import OURS, script, sibling
 from consistency.referee.diagnostics import Record, Settings, detectable_ratio, judge
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure
-from consistency.stereo.visual_odometry import (
+from consistency.vision import (
     RelativePose,
     StereoRig,
     refine_reprojection,

@@ -14,7 +14,6 @@ import grimp
 import pytest
 
 import consistency
-from consistency.referee.extras import OUTSIDE, outside
 
 PACKAGE = Path(consistency.__file__).parent
 SETTINGS = PACKAGE.parent / "pyproject.toml"
@@ -86,13 +85,8 @@ def test_no_two_modules_import_each_other() -> None:
     assert len(graph) > 300
     assert acyclic(graph)
     assert not acyclic(
-        graph | {"consistency.bench.scenario.toml_tables": {"consistency.bench.scenario.sensor_view"}}
+        graph | {"consistency.bench.scenario.tables.toml_tables": {"consistency.bench.scenario.tables.sensor_view"}}
     )  # negative control
-
-
-@pytest.mark.parametrize("name", OUTSIDE)
-def test_what_the_referee_calls_by_name_is_there(name: str) -> None:
-    assert callable(outside(name))
 
 
 def test_the_page_of_the_house_has_its_table() -> None:
@@ -176,29 +170,29 @@ def test_the_package_itself_loads_nothing_heavy() -> None:
 
 def test_engines_of_clusters_are_loaded_when_they_are_chosen() -> None:
     engines = {"dask", "distributed", "submitit"}
-    choose = "import consistency.bench.runs.montecarlo\nfrom consistency.bench.runs.backends import choosing\n"
-    choose += "choosing.backend_for({!r})"
+    choose = "import consistency.bench.runs.montecarlo\n"
+    choose += "from consistency.bench.runs.backends.choosing import executor_for\n"
+    choose += "with executor_for({!r}): pass"
     assert not loaded(choose.format("local")) & engines
     assert loaded(choose.format("dask")) & engines == {"dask", "distributed"}
     assert loaded(choose.format("slurm")) & engines == {"submitit"}
 
 
-@pytest.mark.parametrize("package", ["consistency", "consistency.stereo.visual_odometry"])
-def test_a_new_session_lists_the_public_names(package: str) -> None:
+def test_a_new_session_lists_the_public_names() -> None:
     """``dir``, and so tab completion, without loading what the names stand for."""
-    code = f"import sys, {package} as package; print(*dir(package)); print(*sys.modules)"
+    code = "import sys, consistency; print(*dir(consistency)); print(*sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     names, modules_ = (set(line.split()) for line in out.stdout.splitlines())
-    expected = {
-        "consistency": {"analyse", "run_trials", "Verdict"},
-        "consistency.stereo.visual_odometry": {"relative_motion"},
-    }
-    assert expected[package] <= names
-    assert not modules_ & {"numpy", "cv2"}
+    assert {"analyse", "run_trials", "Verdict"} <= names
+    assert "numpy" not in modules_
+
+
+def test_vision_needs_opencv_for_images_alone() -> None:
+    assert not loaded("import consistency.vision") & {"cv2", "numba", "pandas", "matplotlib"}
 
 
 def test_the_help_loads_nothing_heavy() -> None:
-    modules_ = loaded("from consistency.referee.cli.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
+    modules_ = loaded("from consistency.commands.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
     assert "typer" in modules_
     assert not modules_ & {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "bokeh"}
 

@@ -288,8 +288,8 @@ def design_of(results: Tables) -> Design | None:
         raise InputError(f"manifest.json: key 'until_decided': {error}") from None
 
 
-def source_of(results: Tables | str | Path) -> Source:
-    """Results of a run, in memory or in a folder, as a source of records.
+def results_source(results: Tables | str | Path) -> Source:
+    """Return results of a run, in memory or in a folder, as a source of records.
 
     Raises
     ------

@@ -11,8 +11,8 @@ from scipy import special, stats
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.white_noise import Noise, fit_noise
-from consistency.referee.fit_covariance.windows import BLOCKS, ENOUGH, Windows
+from consistency.referee.fit_covariance.motion_windows import BLOCKS, ENOUGH, DriveWindows
+from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise
 from consistency.referee.readers.runs_to_record import listed
 from consistency.referee.types import Array, Indices
 
@@ -24,11 +24,11 @@ HALF = "half"
 class Fold:
     """A fit to some drives or first halves, and what it is judged by."""
 
-    noise: Noise
+    noise: WhiteNoise
     judged: Indices  # drives
     since: Array  # (drives,), row from which a window may be judged; 0 where the whole drive is
 
-    def judges(self, windows: Windows) -> Array:
+    def judges(self, windows: DriveWindows) -> Array:
         """Which windows chose nothing of this fit, (W,)."""
         return np.asarray(np.isin(windows.drive, self.judged) & (windows.first >= self.since[windows.drive]))
 
@@ -61,7 +61,7 @@ class Ratio:
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedSpan:
     """What the windows of one span show."""
 
     span: str
@@ -81,8 +81,12 @@ class Judged:
 
 
 def folds_of(
-    drives: Sequence[Drive], windows: Windows, held_out: str | None, correct: bool | str, jitter: Array | float = 0.0
-) -> tuple[Noise, list[Fold]]:
+    drives: Sequence[Drive],
+    windows: DriveWindows,
+    held_out: str | None,
+    correct: bool | str,
+    jitter: Array | float = 0.0,
+) -> tuple[WhiteNoise, list[Fold]]:
     """The fit that is handed out, and those that are judged.
 
     Parameters
@@ -119,7 +123,7 @@ def folds_of(
     return noise, [Fold(noise, judged, none)]
 
 
-def judged_by(folds: Sequence[Fold], windows: Windows, drives: int, general: bool) -> Judged:
+def judged_by(folds: Sequence[Fold], windows: DriveWindows, drives: int, general: bool) -> JudgedSpan:
     """Ratios of the windows of a span, each by the fit that it did not choose; of the whole and of each axis."""
     parts = []
     for fold in folds:
@@ -132,7 +136,7 @@ def judged_by(folds: Sequence[Fold], windows: Windows, drives: int, general: boo
         by_drive[i] = values[drive == i].mean(axis=0)
     n = values.shape[1] - 1
     ratios = [ratio_of(by_drive[:, k], values[:, k], general, counts * (1 if k else n)) for k in range(values.shape[1])]
-    return Judged(windows.span.option, ratios[0], tuple(ratios[1:]), by_drive)
+    return JudgedSpan(windows.span.option, ratios[0], tuple(ratios[1:]), by_drive)
 
 
 def ratio_of(by_drive: Array, values: Array, general: bool = True, dof: Array | None = None) -> Ratio:

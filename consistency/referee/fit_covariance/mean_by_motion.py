@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from consistency.referee.fit_covariance.motion_windows import DriveWindows, blocks_of, rotation_vectors, ways
 from consistency.referee.fit_covariance.slip import held_out_gain
-from consistency.referee.fit_covariance.systematic_errors import design_of
-from consistency.referee.fit_covariance.white_noise import Noise
-from consistency.referee.fit_covariance.windows import Windows, blocks_of, turns, ways
+from consistency.referee.fit_covariance.systematic_errors import error_derivatives
+from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.types import Array, Indices
 
 SURE = 0.01  # chance to find a dependence where there is none, all questions together
@@ -41,7 +41,7 @@ class ByMotion:
         return self.p_value <= SURE and self.share >= LEAST
 
 
-def mean_by_motion(noise: Noise, windows: Windows) -> ByMotion:
+def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> ByMotion:
     """The dependence with the smallest p-value, which is times the number of questions.
 
     Windows are divided once by the estimated and once by the true motion, and both must show it: the noise of a motion
@@ -71,13 +71,13 @@ def mean_by_motion(noise: Noise, windows: Windows) -> ByMotion:
     return dependence
 
 
-def p_value_of(windows: Windows, pieces: Array, bins: Indices, scale: int) -> float:
+def p_value_of(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) -> float:
     """p-value of one scale in all bins, by a score test; errors are of ``windows``, and motions ``pieces``.
 
     Each drive has constants of its own. The scores of blocks of windows, in all bins but the first, are compared with
     their scatter (Hotelling 1931).
     """
-    X, names = design_of(pieces), np.unique(windows.drive)
+    X, names = error_derivatives(pieces), np.unique(windows.drive)
     y, own, Z = _weighted(windows, X, X[:, :, [scale]] * (bins[:, None] == np.arange(1, BINS))[:, None, :])
     scores = []
     for name in names:
@@ -98,9 +98,9 @@ def p_value_of(windows: Windows, pieces: Array, bins: Indices, scale: int) -> fl
     return float(stats.f.sf(T2 * (G - q) / (q * (G - 1)), q, G - q))
 
 
-def _by_bin(windows: Windows, bins: Indices, scale: int) -> tuple[Array, Array]:
+def _by_bin(windows: DriveWindows, bins: Indices, scale: int) -> tuple[Array, Array]:
     """What a scale is more in each bin, (BINS,), and mean errors (W, n) by its differences; 0 where nothing tells."""
-    X = design_of(windows.pieces)
+    X = error_derivatives(windows.pieces)
     Z = X[:, :, [scale]] * (bins[:, None] == np.arange(BINS))[:, None, :]
     squares = (Z**2).sum(axis=(0, 1))
     Z = Z * (squares > UNTOLD * squares.sum())
@@ -109,7 +109,7 @@ def _by_bin(windows: Windows, bins: Indices, scale: int) -> tuple[Array, Array]:
     return values, Z @ (values - squares @ values / squares.sum())
 
 
-def _weighted(windows: Windows, *designs: Array) -> list[Array]:
+def _weighted(windows: DriveWindows, *designs: Array) -> list[Array]:
     """Errors (W, n, 1) and their derivatives (W, n, p), in units of the root mean square of each axis."""
     error = windows.errors[..., None]
     return [each / np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-150) for each in (error, *designs)]
@@ -117,5 +117,5 @@ def _weighted(windows: Windows, *designs: Array) -> list[Array]:
 
 def _size(pieces: Array, by: str) -> Array:
     """Sum of the angles of the pieces of each window, rad, or of their ways, m: (W,)."""
-    each = np.linalg.norm(turns(pieces), axis=-1) if by == "turn" else ways(pieces)
+    each = np.linalg.norm(rotation_vectors(pieces), axis=-1) if by == "turn" else ways(pieces)
     return np.asarray(each.sum(axis=1))

@@ -11,8 +11,8 @@ from consistency.referee.column_names import COVARIANCE
 from consistency.referee.diagnostics import Record
 from consistency.referee.fit_covariance.covariance_ratios import Fold
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.windows import Windows
-from consistency.referee.geometry.groups import carried, composed, to_left, vectors
+from consistency.referee.fit_covariance.motion_windows import DriveWindows
+from consistency.referee.geometry.groups import composed, propagated, to_left, vectors
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.windows import Relative
@@ -21,7 +21,7 @@ CONVENTIONS = {3: "so2", 6: "so3"}  # the defaults of files, so that they are re
 HEAD = ("run", "step", "t", "x", "y", "heading")
 
 
-def stretches_of(drives: Sequence[Drive], windows: Windows, folds: Sequence[Fold]) -> list[tuple[str, Stretch]]:
+def stretches_of(drives: Sequence[Drive], windows: DriveWindows, folds: Sequence[Fold]) -> list[tuple[str, Stretch]]:
     """Name and rows of each stretch of neighbouring windows that are judged; a window left out begins another."""
     found: list[tuple[str, Stretch]] = []
     for fold in folds:
@@ -29,7 +29,7 @@ def stretches_of(drives: Sequence[Drive], windows: Windows, folds: Sequence[Fold
         corrected = fold.noise.mean.applied(some)
         D = corrected.motions
         kind = CONVENTIONS[len(some.axes)]
-        P = carried(np.linalg.inv(to_left(D, kind)), fold.noise.covariance(corrected.pieces))
+        P = propagated(np.linalg.inv(to_left(D, kind)), fold.noise.covariance(corrected.pieces))
         begins = np.flatnonzero((np.diff(some.drive) != 0) | (some.first[1:] != some.last[:-1])) + 1
         for part in np.split(np.arange(len(D)), begins):
             if not len(part):
@@ -47,7 +47,7 @@ def stretches_of(drives: Sequence[Drive], windows: Windows, folds: Sequence[Fold
     return found
 
 
-def record_of(stretches: Sequence[tuple[str, Stretch]], axes: Sequence[str]) -> Record:
+def record_of_motions(stretches: Sequence[tuple[str, Stretch]], axes: Sequence[str]) -> Record:
     """The record that ``analyse --motions --relative 1`` has of the written files."""
     one = Relative(1.0, "step", motions=True, independent=True)
     names = ("x", "y", "heading") if len(axes) == 3 else axes

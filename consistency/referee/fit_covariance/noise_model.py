@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,30 @@ from scipy import stats
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, Fold, Judged, Ratio, folds_of, judged_by
+from consistency.referee.fit_covariance.covariance_ratios import (
+    DECIDE,
+    HALF,
+    Fold,
+    JudgedSpan,
+    Ratio,
+    folds_of,
+    judged_by,
+)
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.mean_by_motion import ByMotion, mean_by_motion
-from consistency.referee.fit_covariance.motions import record_of, stretches_of
+from consistency.referee.fit_covariance.motion_windows import (
+    ENOUGH,
+    PIECES,
+    DriveWindows,
+    cut_windows,
+    span_of,
+    windows_at,
+)
+from consistency.referee.fit_covariance.motions import record_of_motions, stretches_of
 from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
-from consistency.referee.fit_covariance.refusals import Growth, growth_of, require_poses, require_sound
+from consistency.referee.fit_covariance.refusals import RotationGrowth, require_poses, require_sound, rotation_growth
 from consistency.referee.fit_covariance.slip import BY_TURN
-from consistency.referee.fit_covariance.white_noise import Noise, fit_noise, intervals, jitter_of
-from consistency.referee.fit_covariance.windows import ENOUGH, PIECES, Windows, span_of, windows_at, windows_of
+from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, intervals, jitter_of
 from consistency.referee.geometry.groups import matrices
 from consistency.referee.readers.relative_motions import Stretch
 from consistency.referee.types import Array
@@ -39,23 +53,23 @@ class NoiseModel:
 
     name: str
     span: str  # 1m, 2s, 100
-    noise: Noise
+    noise: WhiteNoise
     per_m: tuple[Interval, ...]  # (n,), variances a metre
     per_rad: tuple[Interval, ...]  # (n,)
-    spans: tuple[Judged, ...]  # the first is that of the fit
+    spans: tuple[JudgedSpan, ...]  # the first is that of the fit
     record: Record = field(repr=False)  # judged motions, each a run
     verdict: Verdict = field(repr=False)  # of the referee on these motions
     fitted_drives: tuple[str, ...]
     judged_drives: tuple[str, ...]
     held_out: str  # "in turn", "half" or names
     counts: Mapping[str, int]  # windows, and those left out: long, still, jumps
-    growth: Growth  # of the squared rotation error over the span
+    growth: RotationGrowth  # of the squared rotation error over the span
     warnings: tuple[str, ...]
     lasting: tuple[Lasting, ...]  # errors that differ between drives
     by_motion: ByMotion | None  # whether the mean depends on the motion; None where it is left in
     second: Second | None  # errors of the second estimator
     drives: tuple[Drive, ...] = field(repr=False)
-    windows: Windows = field(repr=False)
+    windows: DriveWindows = field(repr=False)
     folds: tuple[Fold, ...] = field(repr=False)
     is_planar: bool
 
@@ -104,10 +118,14 @@ class NoiseModel:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        return _shown("page", "plot", self, path)
+        from consistency.referee.fit_covariance.page import plot_noise
+
+        return plot_noise(self, path)
 
     def __repr__(self) -> str:
-        return f"<NoiseModel {self.name}: {_shown('wording', 'sentence', self)}>"
+        from consistency.referee.fit_covariance.model_text import sentence
+
+        return f"<NoiseModel {self.name}: {sentence(self)}>"
 
 
 def decided(status: str, doubted: bool, depends: bool) -> str:
@@ -121,11 +139,6 @@ def decided(status: str, doubted: bool, depends: bool) -> str:
     if depends:
         return "inconsistent"
     return "undecided" if doubted else status
-
-
-def _shown(module: str, function: str, *arguments: Any) -> Any:
-    """Result of a function that draws or describes, whose module is loaded here."""
-    return getattr(import_module(f"consistency.referee.fit_covariance.{module}"), function)(*arguments)
 
 
 def fit_covariance(
@@ -167,19 +180,19 @@ def fit_covariance(
     if by_turn and not correct:
         raise InputError("--by-turn is a correction; leave --no-correct out")
     require_poses(drives)
-    windows = windows_of(drives, over, planar)
+    windows = cut_windows(drives, over, planar)
     require_sound(drives, windows, planar, correct)
     correction = BY_TURN if by_turn else correct
     jitter = jitter_of(fit_noise(windows, correction), drives, windows, planar)
     noise, folds = folds_of(drives, windows, held_out, correction, jitter)
-    growth, lasting = growth_of(drives, windows, planar, noise.mean), persistent(noise, windows)
+    growth, lasting = rotation_growth(drives, windows, planar, noise.mean), persistent(noise, windows)
     is_half = held_out == HALF or (held_out is None and len(drives) == 1)
     if cautious is not None:
         factor = caution(judged_by(folds, windows, len(drives), not is_half).whole, cautious)
         noise = replace(noise, factor=factor)
         folds = [replace(fold, noise=replace(fold.noise, factor=factor)) for fold in folds]
     spans = _spans(folds, drives, windows, planar, not is_half)
-    record = record_of(stretches_of(drives, windows, folds), windows.axes)
+    record = record_of_motions(stretches_of(drives, windows, folds), windows.axes)
     fitted = windows.of(~np.isin(windows.drive, folds[0].judged)) if held_out not in (None, HALF) else windows
     per_m, per_rad = intervals(noise, fitted)
     judged = sorted({int(i) for fold in folds for i in fold.judged})
@@ -239,7 +252,7 @@ def evenly(motion: Array, pieces: int) -> Array:
     return np.repeat(root, pieces, axis=0)
 
 
-def _matrices(motion: ArrayLike, noise: Noise) -> Array:
+def _matrices(motion: ArrayLike, noise: WhiteNoise) -> Array:
     values = np.atleast_2d(np.asarray(motion, float))
     width = 3 if len(noise.axes) == 3 else 7
     if values.ndim != 2 or values.shape[1] != width or not np.isfinite(values).all():
@@ -261,8 +274,8 @@ def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
 
 
 def _spans(
-    folds: Sequence[Fold], drives: Sequence[Drive], windows: Windows, planar: bool, general: bool
-) -> tuple[Judged, ...]:
+    folds: Sequence[Fold], drives: Sequence[Drive], windows: DriveWindows, planar: bool, general: bool
+) -> tuple[JudgedSpan, ...]:
     found = []
     for times in SPANS:
         some = windows if times == 1 else windows_at(drives, windows, windows.span.size * times, planar)
@@ -277,7 +290,7 @@ def _spans(
     return tuple(found)
 
 
-def error_windows(model: NoiseModel, judged: Judged) -> Windows:
+def error_windows(model: NoiseModel, judged: JudgedSpan) -> DriveWindows:
     found = windows_at(model.drives, model.windows, span_of(judged.span).size, model.is_planar)
     assert found is not None
     return model.noise.mean.applied(found)

@@ -13,11 +13,11 @@ from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, ZERO, solid, style
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, Span
-from consistency.referee.fit_covariance.covariance_ratios import Judged
+from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan
+from consistency.referee.fit_covariance.model_text import noise_document
+from consistency.referee.fit_covariance.motion_windows import span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
 from consistency.referee.fit_covariance.white_noise import nees_of
-from consistency.referee.fit_covariance.windows import span_of
-from consistency.referee.fit_covariance.wording import document
 from consistency.referee.pages.write_pages import plotted
 
 SHOWN = 3  # spans with a panel of errors
@@ -25,13 +25,13 @@ WIDTH, HEIGHT = 3.0, 2.7  # inches, of a panel
 CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 
 
-def page(model: NoiseModel, with_pictures: bool) -> Document:
-    said = document(model)
-    blocks: tuple[Block, ...] = figures(model) if with_pictures else ()
+def noise_page(model: NoiseModel, with_pictures: bool) -> Document:
+    said = noise_document(model)
+    blocks: tuple[Block, ...] = noise_figures(model) if with_pictures else ()
     return Document(said.title, "", (Chapter("pictures", "Pictures", "pictures", blocks),), said.opening, said.data)
 
 
-def figures(model: NoiseModel) -> tuple[Figure, ...]:
+def noise_figures(model: NoiseModel) -> tuple[Figure, ...]:
     captions = (
         (
             "Errors of motions",
@@ -56,13 +56,13 @@ def panels(model: NoiseModel) -> tuple[tuple[Panel, ...], ...]:
     return tuple(_errors(model, judged) for judged in model.spans[:SHOWN]), (*growth, _drives(model))
 
 
-def plot(model: NoiseModel, path: str | Path | None) -> Any:
+def plot_noise(model: NoiseModel, path: str | Path | None) -> Any:
     """All panels in one figure of Matplotlib; see :meth:`NoiseModel.plot`."""
     errors, rest = panels(model)
     return plotted(Sheet((*errors, *rest), 5.0, columns=3), path)
 
 
-def _errors(model: NoiseModel, judged: Judged) -> Panel:
+def _errors(model: NoiseModel, judged: JudgedSpan) -> Panel:
     windows = error_windows(model, judged)
     error, C = windows.errors, model.noise.covariance(windows.pieces).mean(axis=0)[:2, :2]
     values, vectors = np.linalg.eigh(C)

@@ -11,10 +11,10 @@ from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.refusals import Growth
-from consistency.referee.fit_covariance.systematic_errors import design_of
-from consistency.referee.fit_covariance.white_noise import Noise
-from consistency.referee.fit_covariance.windows import ENOUGH, Windows, in_plane
+from consistency.referee.fit_covariance.motion_windows import ENOUGH, DriveWindows, in_plane
+from consistency.referee.fit_covariance.refusals import RotationGrowth
+from consistency.referee.fit_covariance.systematic_errors import error_derivatives
+from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.readers.relative_motions import BENT
 from consistency.referee.types import Array
@@ -44,7 +44,7 @@ class Lasting:
         return self.term in TERMS[:2] or self.share >= MOST
 
 
-def doubts(noise: Noise, windows: Windows, growth: Growth, lasting: Sequence[Lasting]) -> list[str]:
+def doubts(noise: WhiteNoise, windows: DriveWindows, growth: RotationGrowth, lasting: Sequence[Lasting]) -> list[str]:
     """Sentences on errors that outlast a window or (:func:`persistent`) a drive, and on angles beyond first order."""
     found = []
     if growth.persists:
@@ -66,7 +66,7 @@ def doubts(noise: Noise, windows: Windows, growth: Growth, lasting: Sequence[Las
     ]
 
 
-def persistent(noise: Noise, windows: Windows) -> tuple[Lasting, ...]:
+def persistent(noise: WhiteNoise, windows: DriveWindows) -> tuple[Lasting, ...]:
     """Terms that differ between drives by more than white noise, from ``ENOUGH`` drives on.
 
     Each drive has means of its own, by generalised least squares; their differences are compared with their errors by
@@ -77,7 +77,7 @@ def persistent(noise: Noise, windows: Windows) -> tuple[Lasting, ...]:
         return ()
     found: dict[str, Lasting] = {}
     now = noise.mean.applied(windows)
-    effect = (design_of(now.pieces) ** 2).mean(axis=0)  # (n, p), of a term of 1 on the mean square of an axis
+    effect = (error_derivatives(now.pieces) ** 2).mean(axis=0)  # (n, p), of a term of 1 on the mean square of an axis
     stated = np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0)
     own = [_means(noise, now.of(windows.drive == name)) for name in names]
     for term in range(own[0][0].shape[0]):
@@ -98,9 +98,9 @@ def persistent(noise: Noise, windows: Windows) -> tuple[Lasting, ...]:
     return tuple(found.values())
 
 
-def _means(noise: Noise, windows: Windows) -> tuple[Array, Array]:
+def _means(noise: WhiteNoise, windows: DriveWindows) -> tuple[Array, Array]:
     """Scale, turn and drift (p,) that a drive has beyond the mean of all, and their variances; infinite if unknown."""
-    C, X, e = noise.covariance(windows.pieces), design_of(windows.pieces), windows.errors
+    C, X, e = noise.covariance(windows.pieces), error_derivatives(windows.pieces), windows.errors
     solved = np.linalg.solve(C, np.concatenate([X, e[..., None]], axis=-1))
     H = (np.swapaxes(X, 1, 2) @ solved[..., :-1]).sum(axis=0)
     g = (np.swapaxes(X, 1, 2) @ solved[..., -1:]).sum(axis=0)[:, 0]
@@ -127,7 +127,9 @@ class Second(NamedTuple):
         return np.asarray(self.size > 1.0 / SHARED)
 
 
-def errors_of_second(noise: Noise, windows: Windows, drives: Sequence[Drive], second: Sequence[Drive]) -> Second:
+def errors_of_second(
+    noise: WhiteNoise, windows: DriveWindows, drives: Sequence[Drive], second: Sequence[Drive]
+) -> Second:
     """Errors of another estimator beside the corrected ones.
 
     Raises

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.motion_windows import ROUNDED, STILL, DriveWindows, windows_at
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, none_of
-from consistency.referee.fit_covariance.windows import ROUNDED, STILL, Windows, windows_at
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.types import Array
 
@@ -32,7 +32,7 @@ LIVE = "record the live odometry, before loops are closed or a map corrects it"
 
 
 @dataclass(frozen=True)
-class Growth:
+class RotationGrowth:
     """Power of the span with which the squared rotation error grows; NaN where drives are too short to tell."""
 
     power: float
@@ -86,7 +86,7 @@ def _are_increments(T: Array, other: Array) -> bool:
     return bool(alike.sum() > 0.5 * moves.sum() and own.sum() < steps.sum() / SCALE)
 
 
-def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, correct: bool) -> None:
+def require_sound(drives: Sequence[Drive], windows: DriveWindows, planar: bool, correct: bool) -> None:
     """Refuse drives that no white noise describes.
 
     Raises
@@ -101,7 +101,7 @@ def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, corre
             "model without them is none of this odometry; if the clocks of estimates and truth differ, give their "
             "--time-offset S, or 'estimate'; otherwise mend the jumps, or state them as failures of the odometry"
         )
-    growth = growth_of(drives, windows, planar, none_of(windows))  # a map leaves no mean to correct
+    growth = rotation_growth(drives, windows, planar, none_of(windows))  # a map leaves no mean to correct
     rounding = float(np.sqrt((windows.errors[:, windows.d :] ** 2).sum(axis=1).mean()))
     if growth.shrinks and rounding < ROUNDED:
         raise InputError(
@@ -134,7 +134,7 @@ def require_sound(drives: Sequence[Drive], windows: Windows, planar: bool, corre
         raise InputError(f"{shown}: loops are closed, or a map is used, so that there are no increments; {LIVE}")
 
 
-def body_turn(windows: Windows) -> tuple[float, float, float]:
+def body_turn(windows: DriveWindows) -> tuple[float, float, float]:
     """Angle of the constant turn B with M = B^-1 D B that fits best, rad (Wahba 1965), and the share that it explains.
 
     The share is of squared errors of positions, beyond what the means explain; then the chance that independent errors
@@ -160,14 +160,14 @@ def body_turn(windows: Windows) -> tuple[float, float, float]:
     return float(np.arccos(np.clip(cosine, -1.0, 1.0))), 1.0 - after / before if before > 0 else 0.0, chance
 
 
-def _squared(windows: Windows) -> float:
+def _squared(windows: DriveWindows) -> float:
     """Sum of squared errors of positions that the means leave."""
     d = windows.d
     corrected = fit_mean(windows).applied(windows)
     return float(((corrected.motions[:, :d, d] - windows.true[:, :d, d]) ** 2).sum())
 
 
-def growth_of(drives: Sequence[Drive], windows: Windows, planar: bool, mean: Mean) -> Growth:
+def rotation_growth(drives: Sequence[Drive], windows: DriveWindows, planar: bool, mean: Mean) -> RotationGrowth:
     """Weighted least squares of the logarithms of mean squares and spans.
 
     A mean square of W windows has a relative variance of 2 / W; errors of several spans depend on each other, which
@@ -183,14 +183,14 @@ def growth_of(drives: Sequence[Drive], windows: Windows, planar: bool, mean: Mea
         squares.append(float((error**2).sum(axis=1).mean()))
         counts.append(len(some.drive))
     if len(spans) < 3:
-        return Growth(float("nan"), float("nan"))
+        return RotationGrowth(float("nan"), float("nan"))
     x, y, weight = np.log(spans), np.log(np.maximum(squares, 1e-300)), 0.5 * np.array(counts, float)
     x = x - (weight * x).sum() / weight.sum()
     information = float((weight * x**2).sum())
-    return Growth(float((weight * x * y).sum()) / information, float(np.sqrt(2.0 / information)))
+    return RotationGrowth(float((weight * x * y).sum()) / information, float(np.sqrt(2.0 / information)))
 
 
-def revisits(drives: Sequence[Drive], windows: Windows) -> tuple[float, float]:
+def revisits(drives: Sequence[Drive], windows: DriveWindows) -> tuple[float, float]:
     """Rotation error between two passes of a place over that of windows of ten spans; NaN where there are no passes.
 
     Also the chance that white noise has as little: passes are ``FAR`` spans of the way apart, so that it has twice the

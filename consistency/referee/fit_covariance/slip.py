@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.fit_covariance.systematic_errors import carriers, design_of, fit_mean
-from consistency.referee.fit_covariance.windows import Windows, lengthened, turns, ways
+from consistency.referee.fit_covariance.motion_windows import DriveWindows, lengthened, rotation_vectors, ways
+from consistency.referee.fit_covariance.systematic_errors import carriers, error_derivatives, fit_mean
 from consistency.referee.types import Array
 
 BY_TURN = "by turn"  # a correction with a way by turn
@@ -15,7 +15,7 @@ ROUNDS = 4  # of slip and mean in turn
 APART = 1e-3  # of the squared effect of a slip that a mean must leave, so that both are told from each other
 
 
-def fit_slip(windows: Windows) -> float:
+def fit_slip(windows: DriveWindows) -> float:
     """Way that a turn adds, m a rad; 0 where it cannot be told from a scale of the way, or of turns."""
     slip = 0.0
     for _ in range(ROUNDS):
@@ -23,7 +23,7 @@ def fit_slip(windows: Windows) -> float:
         mean = fit_mean(longer)
         now = mean.applied(longer)
         error, effect = now.errors, effect_of(now.pieces)
-        both = np.concatenate([design_of(now.pieces), effect[..., None], error[..., None]], axis=-1)
+        both = np.concatenate([error_derivatives(now.pieces), effect[..., None], error[..., None]], axis=-1)
         both = (both / np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-150)[:, None]).reshape(error.size, -1)
         X, both = both[:, :-2], both[:, -2:]
         effect, error = (both - X @ np.linalg.lstsq(X, both, rcond=None)[0]).T
@@ -36,14 +36,14 @@ def fit_slip(windows: Windows) -> float:
 def effect_of(pieces: Array) -> Array:
     """Derivative (W, n) of the errors by the way that a radian of turn adds."""
     d, way = pieces.shape[-1] - 1, ways(pieces)
-    turn = np.linalg.norm(turns(pieces), axis=-1)
+    turn = np.linalg.norm(rotation_vectors(pieces), axis=-1)
     local = np.zeros((*way.shape, 3 if d == 2 else 6))
     along = np.swapaxes(pieces[..., :d, :d], -1, -2) @ pieces[..., :d, d, None]
     local[..., :d] = along[..., 0] * (turn / np.where(way > 0, way, np.inf))[..., None]
     return np.asarray((carriers(pieces)[:, 1:] @ local[..., None]).sum(axis=1)[..., 0])
 
 
-def held_out_gain(windows: Windows, blocks: list[Array]) -> float:
+def held_out_gain(windows: DriveWindows, blocks: list[Array]) -> float:
     """Share of the squared error of positions that a slip takes out of the blocks that chose nothing of it."""
     squares = np.zeros(2)
     for block in blocks:

@@ -10,7 +10,15 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.fit_covariance.windows import BLOCKS, Windows, blocks_of, lengthened, rests, turns, ways
+from consistency.referee.fit_covariance.motion_windows import (
+    BLOCKS,
+    DriveWindows,
+    blocks_of,
+    lengthened,
+    rests,
+    rotation_vectors,
+    ways,
+)
 from consistency.referee.geometry.groups import adjoint, inverse
 from consistency.referee.types import Array
 
@@ -42,7 +50,7 @@ class Mean:
         """Motions (W, P, d + 1, d + 1) with this mean taken out."""
         d, pieces = pieces.shape[-1] - 1, lengthened(pieces, self.slip)
         way, out = ways(pieces), np.array(pieces)
-        angle = self.turn * turns(pieces) + way[..., None] * np.asarray(self.drift)
+        angle = self.turn * rotation_vectors(pieces) + way[..., None] * np.asarray(self.drift)
         out[..., :d, d] *= self.way
         if d == 2:
             c, s = np.cos(angle[..., 0]), np.sin(angle[..., 0])
@@ -51,7 +59,7 @@ class Mean:
             out[..., :3, :3] = Rotation.from_rotvec(angle.reshape(-1, 3)).as_matrix().reshape(*out.shape[:2], 3, 3)
         return out
 
-    def applied(self, windows: Windows) -> Windows:
+    def applied(self, windows: DriveWindows) -> DriveWindows:
         return replace(windows, pieces=self.corrected(windows.pieces))
 
 
@@ -75,7 +83,7 @@ class MeanFit:
         return self.instruments == FORWARD and bool(abs(self.turns[1] - self.turns[0]) > OPEN)
 
 
-def fit_mean(windows: Windows, covariance: Array | None = None, start: Mean | None = None) -> Mean:
+def fit_mean(windows: DriveWindows, covariance: Array | None = None, start: Mean | None = None) -> Mean:
     """Mean by generalised least squares.
 
     Parameters
@@ -89,7 +97,7 @@ def fit_mean(windows: Windows, covariance: Array | None = None, start: Mean | No
     return mean
 
 
-def choose_mean(windows: Windows, covariance: Array | None = None, start: Mean | None = None) -> MeanFit:
+def choose_mean(windows: DriveWindows, covariance: Array | None = None, start: Mean | None = None) -> MeanFit:
     """The mean that holds whether the odometry's noise is in the estimated motion or in the true one.
 
     Errors in variables (Fuller 1987, "Measurement Error Models"): least squares on the estimated motion is right where
@@ -120,7 +128,7 @@ def choose_mean(windows: Windows, covariance: Array | None = None, start: Mean |
     return MeanFit(means[0], whole, low, high, free, used[0], turns, strength, lasts)
 
 
-class Moments(NamedTuple):
+class InstrumentMoments(NamedTuple):
     """Z' C^-1 X (W, p, p) and Z' C^-1 e (W, p) of instruments, derivatives and errors; Z and X (W, n, p) whitened."""
 
     A: Array
@@ -129,10 +137,12 @@ class Moments(NamedTuple):
     X: Array
 
 
-def moments_of(windows: Windows, mean: Mean, covariance: Array | None, *instruments: str) -> list[Moments]:
+def moments_of(
+    windows: DriveWindows, mean: Mean, covariance: Array | None, *instruments: str
+) -> list[InstrumentMoments]:
     """Moments with each kind of instruments, at a mean."""
     now = mean.applied(windows)
-    error, design = now.errors, design_of(now.pieces)
+    error, design = now.errors, error_derivatives(now.pieces)
     square = (error**2).mean(axis=0)
     P = np.diag(np.maximum(square, 1e-12 * square.max() + 1e-100))[None] if covariance is None else covariance
     whiten = np.linalg.inv(np.linalg.cholesky(P))
@@ -140,15 +150,17 @@ def moments_of(windows: Windows, mean: Mean, covariance: Array | None, *instrume
     for each in instruments:
         Z = X
         if each == BACKWARD:
-            Z = whiten @ design_of(windows.true_pieces)
+            Z = whiten @ error_derivatives(windows.true_pieces)
         elif each == NEIGHBOURS:
             Z = whiten @ _of_neighbours(now)
         back = np.swapaxes(Z, -1, -2)
-        found.append(Moments(back @ X, (back @ y)[..., 0], Z, X))
+        found.append(InstrumentMoments(back @ X, (back @ y)[..., 0], Z, X))
     return found
 
 
-def _estimate(windows: Windows, near: Mean, moments: Moments, free: Array | None = None) -> tuple[Mean, Array, Array]:
+def _estimate(
+    windows: DriveWindows, near: Mean, moments: InstrumentMoments, free: Array | None = None
+) -> tuple[Mean, Array, Array]:
     """The mean after a step of Gauss and Newton, and intervals (p,) from the scatter between blocks of what it leaves.
 
     Parameters
@@ -173,14 +185,14 @@ def _estimate(windows: Windows, near: Mean, moments: Moments, free: Array | None
     return mean, value - reach, value + reach
 
 
-def _of_neighbours(windows: Windows) -> Array:
+def _of_neighbours(windows: DriveWindows) -> Array:
     """Derivatives of the windows before and after, (W, n, p), less what is next to this one: its ends may be shared."""
     early, late = np.array(windows.pieces), np.array(windows.pieces)
     early[:, -GAP:] = late[:, :GAP] = np.eye(windows.d + 1)
-    return sum_of_neighbours(windows, design_of(early), design_of(late))
+    return sum_of_neighbours(windows, error_derivatives(early), error_derivatives(late))
 
 
-def sum_of_neighbours(windows: Windows, before: Array, after: Array) -> Array:
+def sum_of_neighbours(windows: DriveWindows, before: Array, after: Array) -> Array:
     """Sum of a value of the window before and another of the one after, each (W, ...); 0 where there is none."""
     second = np.flatnonzero((windows.first[1:] == windows.last[:-1]) & (np.diff(windows.drive) == 0)) + 1
     out = np.zeros_like(before)
@@ -195,7 +207,7 @@ def _solved(A: Array, b: Array) -> Array:
     return np.asarray((np.linalg.lstsq(A / np.outer(size, size), (b.T / size).T, rcond=WEAK**2)[0].T / size).T)
 
 
-def _strength(moments: Moments) -> float:
+def _strength(moments: InstrumentMoments) -> float:
     """First-stage F, the smallest of all coefficients: how well an instrument, beside the others, predicts the motion.
 
     Robust to unequal variances of windows (White 1980).
@@ -211,7 +223,7 @@ def _strength(moments: Moments) -> float:
     return float(min(min(found), 1e100) ** 2)
 
 
-def _lasts(corrected: Windows) -> bool:
+def _lasts(corrected: DriveWindows) -> bool:
     """Whether rotation errors of windows one or two apart correlate positively; jitter of their ends does not."""
     error = corrected.errors[:, corrected.d :]
     error = error / np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-300)
@@ -223,17 +235,17 @@ def _lasts(corrected: Windows) -> bool:
     return any(found)
 
 
-def none_of(windows: Windows) -> Mean:
+def none_of(windows: DriveWindows) -> Mean:
     """The mean that corrects nothing."""
     return Mean(drift=(0.0,) * (1 if windows.d == 2 else 3))
 
 
-def design_of(pieces: Array) -> Array:
+def error_derivatives(pieces: Array) -> Array:
     """Derivative (W, n, 2 + 1) or (W, n, 2 + 3) of the errors by scale of the way, scale of the turn, and drift."""
     W, P, m, _ = pieces.shape
     d, n = m - 1, 3 if m == 3 else 6
     A = carriers(pieces)[:, 1:]
-    way, turn = ways(pieces), turns(pieces)
+    way, turn = ways(pieces), rotation_vectors(pieces)
     local = np.zeros((W, P, n, n - d + 2))
     # at the end of its piece, a longer way is an error along R' t
     R = pieces[..., :d, :d]

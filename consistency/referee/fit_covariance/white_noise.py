@@ -15,6 +15,14 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.motion_windows import (
+    DriveWindows,
+    blocks_of,
+    lengthened,
+    rotation_vectors,
+    ways,
+    windows_at,
+)
 from consistency.referee.fit_covariance.slip import BY_TURN, fit_slip
 from consistency.referee.fit_covariance.systematic_errors import (
     NEIGHBOURS,
@@ -25,7 +33,6 @@ from consistency.referee.fit_covariance.systematic_errors import (
     none_of,
     sum_of_neighbours,
 )
-from consistency.referee.fit_covariance.windows import Windows, blocks_of, lengthened, turns, ways, windows_at
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
@@ -35,7 +42,7 @@ SHORTER = (8.0, 4.0, 2.0, 1.0)  # parts of the span, whose errors tell jitter of
 
 
 @dataclass(frozen=True)
-class Noise:
+class WhiteNoise:
     """Cov e = sum over pieces of A diag(per_m |way| + per_rad |turn|) A', and the floor; n axes."""
 
     axes: tuple[str, ...]
@@ -51,14 +58,14 @@ class Noise:
         theta = np.concatenate([self.per_m, self.per_rad])
         return np.asarray(self.factor * (np.tensordot(theta, terms_of(pieces), (0, 1)) + np.diag(self.floor)))
 
-    def nees(self, windows: Windows) -> tuple[Array, Array]:
+    def nees(self, windows: DriveWindows) -> tuple[Array, Array]:
         """NEES over dof (W,), and of each axis alone (W, n), of windows whose motions are not corrected yet."""
         corrected = self.mean.applied(windows)
         error, C = corrected.errors, self.covariance(corrected.pieces)
         return nees_of(error, C) / error.shape[1], error**2 / np.diagonal(C, axis1=1, axis2=2)
 
 
-def fit_noise(windows: Windows, correct: bool | str = True, jitter: Array | float = 0.0) -> Noise:
+def fit_noise(windows: DriveWindows, correct: bool | str = True, jitter: Array | float = 0.0) -> WhiteNoise:
     """Mean and noise of windows, each given the other in turn; the mean is of BY_TURN, too, if this is ``correct``.
 
     Parameters
@@ -93,10 +100,10 @@ def fit_noise(windows: Windows, correct: bool | str = True, jitter: Array | floa
             mean = found.whole if left > 1 else found.mean
     assert theta is not None
     n = len(windows.axes)
-    return Noise(windows.axes, mean, theta[:n], theta[n:], floor, mean_fit=found)
+    return WhiteNoise(windows.axes, mean, theta[:n], theta[n:], floor, mean_fit=found)
 
 
-def fitted_terms(windows: Windows, mean: MeanFit | None) -> Array:
+def fitted_terms(windows: DriveWindows, mean: MeanFit | None) -> Array:
     """Terms (W, 2 n, n, n) that variances are fitted to, of windows whose motions are corrected.
 
     Where turns are measured with noise, an error is large where its own noise makes |turn| large, so that the turns of
@@ -133,7 +140,7 @@ def least_of(error: Array) -> Array:
     return out
 
 
-def jitter_of(noise: Noise, drives: Sequence[Drive], windows: Windows, planar: bool) -> Array:
+def jitter_of(noise: WhiteNoise, drives: Sequence[Drive], windows: DriveWindows, planar: bool) -> Array:
     """Variance that both ends of a motion add to its error, (n,), where shorter windows show it; 0 otherwise.
 
     The mean square error of windows of several lengths is what the noise says, times a factor, and a constant.
@@ -171,7 +178,7 @@ def _constants(squares: Array, stated: Array, counts: Array) -> Array:
     return out
 
 
-def intervals(noise: Noise, windows: Windows) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
+def intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
     """Intervals of the variances a metre and a radian, from the jackknife over drives or blocks of windows."""
     now = noise.mean.applied(windows)
     error, F, floor = now.errors, fitted_terms(now, noise.mean_fit), noise.floor
@@ -195,7 +202,7 @@ def terms_of(pieces: Array) -> Array:
     The noise of a piece stands half at each of its ends (trapezoidal rule), and is carried to the end of the window.
     """
     A = carriers(pieces)
-    sizes = np.stack([ways(pieces), np.linalg.norm(turns(pieces), axis=-1)], axis=1)  # (W, 2, P)
+    sizes = np.stack([ways(pieces), np.linalg.norm(rotation_vectors(pieces), axis=-1)], axis=1)  # (W, 2, P)
     share = np.zeros((*sizes.shape[:2], sizes.shape[2] + 1))
     share[..., :-1] += 0.5 * sizes
     share[..., 1:] += 0.5 * sizes

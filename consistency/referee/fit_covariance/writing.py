@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.extras import is_installed
+from consistency.referee.fit_covariance.model_text import correction, data, noise_document
+from consistency.referee.fit_covariance.motion_windows import PIECES, ways
 from consistency.referee.fit_covariance.motions import write_motions
 from consistency.referee.fit_covariance.noise_model import NoiseModel
-from consistency.referee.fit_covariance.page import page
-from consistency.referee.fit_covariance.windows import PIECES, ways
-from consistency.referee.fit_covariance.wording import correction, data, document
+from consistency.referee.fit_covariance.page import noise_page
 from consistency.referee.show import as_html, as_json
 from consistency.referee.system.folders import write_folder
 from consistency.referee.system.provenance import manifest_of
@@ -30,8 +30,8 @@ def write_model(model: NoiseModel, folder: Path, overwrite: bool = False) -> lis
         The folder exists or cannot be written.
     """
     texts = snippets(model)
-    texts["verdict.json"] = as_json.render(document(model)) + "\n"
-    texts["report.html"] = as_html.render(page(model, with_pictures=is_installed("plot")))
+    texts["verdict.json"] = as_json.render(noise_document(model)) + "\n"
+    texts["report.html"] = as_html.render(noise_page(model, with_pictures=is_installed("plot")))
     names: list[str] = []
 
     def contents(at: Path) -> None:

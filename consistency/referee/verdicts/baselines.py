@@ -23,7 +23,7 @@ from consistency.referee.system.folders import writing
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 from consistency.referee.types import Array
 from consistency.referee.verdicts.command_settings import skip_asked
-from consistency.referee.verdicts.sources import Results, Source, source_of
+from consistency.referee.verdicts.sources import Source, source_of
 
 HIGHEST_DOF = 1000  # of an error in a baseline
 FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")
@@ -47,7 +47,7 @@ class Baseline:
 
 
 def baseline(
-    of: Source | Sequence[Record] | Results | str | Path,
+    of: Source | Sequence[Record],
     name: str = "results",
     skip: str | float | Skip | None = None,
     truth: Path | None = None,
@@ -56,7 +56,7 @@ def baseline(
 
     Parameters
     ----------
-    of : results of ``consistency.run_trials``, a folder of them, or a sequence of records
+    of : records, or a source of them
     truth : file, or folder of them, beside which the estimates were read; the same trials have the same
 
     Raises
@@ -104,17 +104,16 @@ def _digest(truth: Path) -> str:
     return digest.hexdigest()
 
 
-def write_baseline(of: Results | Baseline, path: Path, overwrite: bool = False) -> None:
-    """Keep a :class:`Baseline`, or the one of results, as a small JSON file, for version control.
+def write_baseline(base: Baseline, path: Path, overwrite: bool = False) -> None:
+    """Keep a baseline as a small JSON file, for version control.
 
     Raises
     ------
     InputError
-        The file exists or cannot be written, or the results have no truth.
+        The file exists or cannot be written.
     """
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
-    base = of if isinstance(of, Baseline) else baseline(of, str(path))
     data = manifest_of(
         kind="baseline",
         scenario=base.scenario,
@@ -139,19 +138,17 @@ def is_baseline(path: Path) -> bool:
 
 
 def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baseline:
-    """A results folder, or a file of :func:`write_baseline`.
+    """Read a file of :func:`write_baseline`.
 
     Parameters
     ----------
-    skip : first steps to leave out; of a file those that it was written without
+    skip : first steps that it was written without
 
     Raises
     ------
     InputError
-        Neither, or damaged.
+        It is no baseline, is damaged, or was written with other first steps.
     """
-    if path.is_dir():
-        return baseline(path, str(path), skip)
     data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")

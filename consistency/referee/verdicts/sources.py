@@ -4,29 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.records.skipping import Skip
 from consistency.referee.errors import InputError
-from consistency.referee.extras import outside
 from consistency.referee.verdicts.command_settings import settings_of, skip_asked
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics import Design
-
-
-class Results(Protocol):
-    """Results of filters of the bench, in memory or in a folder, as ``consistency.run_trials`` returns them."""
-
-    @property
-    def filters(self) -> list[str]:
-        """Names."""
-
-    @property
-    def batches(self) -> Callable[..., Any]:
-        """Reads the rows of a table, some at a time."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +28,10 @@ class Source:
     unfinished: str = ""  # number of runs, where some are missing
 
 
-def source_of(of: Source | Sequence[Record] | Results | str | Path) -> Source:
-    """Records, or results of the bench, in memory or in a folder, as a source."""
+def source_of(of: Source | Sequence[Record]) -> Source:
+    """Return records as a source."""
     if isinstance(of, Source):
         return of
-    if not isinstance(of, list | tuple):
-        source: Source = outside("results")(of)
-        return source
     named: dict[str, Record] = {record.name: record for record in of}
 
     def record(name: str) -> Record:
@@ -60,7 +43,7 @@ def source_of(of: Source | Sequence[Record] | Results | str | Path) -> Source:
 
 
 def analyse(
-    results: Source | Sequence[Record] | Results | str | Path,
+    results: Source | Sequence[Record],
     filters: Sequence[str] | None = None,
     confidence: float | None = None,
     settings: Settings | None = None,
@@ -71,7 +54,7 @@ def analyse(
 
     Parameters
     ----------
-    results : of ``consistency.run_trials``, a folder of them, or a sequence of records
+    results : records, or a source of them; :func:`consistency.analyse` also takes results of the bench
     confidence : 1 less the false-alarm rate of a verdict, in place of ``settings``
     settings : what to ask; the defaults of :class:`Settings` where None. Results of a run until decided are then
         judged as that run was.

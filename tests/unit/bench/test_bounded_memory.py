@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 
 import consistency as cs
+from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Record, Settings, judge, summary
@@ -22,7 +23,6 @@ from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
-from consistency.referee.verdicts.sources import analyse
 
 STEPS = 200
 RUNS = 4000
@@ -124,7 +124,7 @@ print(most() - before)
 READ = "from consistency.bench.store.results import open_results\n"
 WORK = {
     "analyse": READ
-    + "from consistency.referee.verdicts.sources import analyse\nwork = lambda f: analyse(open_results(f))",
+    + "from consistency.bench.runs.analyse_results import analyse\nwork = lambda f: analyse(open_results(f))",
     "report": "from consistency.bench.pages.build import build_report as work",
     "baseline": "from consistency.referee.verdicts.baselines import read_baseline as work",
 }

@@ -27,7 +27,7 @@ from consistency.bench.scenario.effects import EFFECTS
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import open_results
 from consistency.bench.types import Info, Observation
-from consistency.referee.cli.app import app
+from consistency.commands.app import app
 from consistency.referee.diagnostics import clustered_share, rejection_score
 from consistency.referee.document.blocks import Name, Table
 from consistency.referee.document.verdict import document

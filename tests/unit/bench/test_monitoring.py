@@ -15,6 +15,7 @@ import pytest
 from matplotlib import image
 
 import consistency as cs
+from consistency.bench.runs.results_to_records import innovations_of
 from consistency.referee.document.blocks import Document
 from consistency.referee.document.monitor import monitor_document
 from consistency.referee.errors import InputError
@@ -160,16 +161,16 @@ def test_results_of_a_run(tmp_path: Path) -> None:
     scenario = cs.load_scenario("linear-gaussian").variant("short", truth__steps=30)
     results = cs.run_trials(scenario, ["kf"], runs=2, seed=1)
     results.write(tmp_path / "out")
-    log = read_innovations(tmp_path / "out", "kf", 1)
+    log = innovations_of(tmp_path / "out", "kf", 1)
     rows = results.estimates.query("run == 1")
     np.testing.assert_array_equal(log.nis, rows["nis"])
     np.testing.assert_array_equal(log.dof, rows["nis_dof"])
     np.testing.assert_array_equal(log.step, np.arange(1, 31))
     assert log.name == "kf"
     with pytest.raises(InputError, match=r"holds more than one run \(0, 1\)"):
-        read_innovations(tmp_path / "out")
+        innovations_of(tmp_path / "out", None, None)
     with pytest.raises(InputError, match="--filter ukf-uvd: is not in"):
-        read_innovations(tmp_path / "out", "ukf-uvd")
+        innovations_of(tmp_path / "out", "ukf-uvd", None)
     assert watch(log, make_monitor("optimal")).monitor.innovations == int((rows["nis_dof"] > 0).sum())
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import consistency as cs
-from consistency.referee.cli.app import app
+from consistency.commands.app import app
 from consistency.referee.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.imperfect_truth import residuals_of_fit
 from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import (

@@ -50,7 +50,7 @@ def said(folder: Path, code: str) -> str:
 
 def test_commands_on_files(folder: Path) -> None:
     code = """
-from consistency.referee.cli import main
+from consistency.commands import main
 
 def run(*words):
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
@@ -71,7 +71,7 @@ print("runs" in run("plan", "--dof", "3"))
 def test_a_verdict_loads_what_it_needs(folder: Path) -> None:
     """Not readers of other files, nor questions that are not asked."""
     code = """
-from consistency.referee.cli import main
+from consistency.commands import main
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
     main(["analyse", "est.csv", "--truth", "truth.csv"])
@@ -117,7 +117,7 @@ except InputError as error:
 
 
 REPORT = """
-from consistency.referee.cli import main
+from consistency.commands import main
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as err:
     try:
@@ -131,7 +131,7 @@ print(status, err.getvalue().splitlines()[-1])
 def test_a_report_without_its_packages(folder: Path) -> None:
     status, _, line = said(folder, REPORT.format(out="look") + LOADED).partition(" ")
     assert status == "1"
-    told = "consistency: the interactive page and the PDF need matplotlib, bokeh, jinja2, typst: pip install "
+    told = "consistency: the interactive page and the PDF need bokeh, jinja2, matplotlib, typst: pip install "
     assert line.startswith(told)
     assert {path.name for path in (folder / "look").iterdir()} == {"manifest.json", "report.html", "verdict.json"}
     page = (folder / "look" / "report.html").read_text("utf-8")

@@ -27,7 +27,7 @@ from consistency.referee.diagnostics import (
 )
 from consistency.referee.diagnostics.questions.lost_runs import lost_evidence, lost_of
 from consistency.referee.diagnostics.statistics.number_of_runs import share_limit
-from consistency.referee.gating.watch import Watch, watching
+from consistency.referee.gating.watch import RunningTest, watching
 from consistency.referee.types import Array, Failure
 from consistency.testing import InsufficientTrials, assert_consistent
 
@@ -209,10 +209,10 @@ def test_a_gate_asks_for_runs_that_exclude_the_share(rng: np.random.Generator) -
 def test_a_marker_may_ask(rng: np.random.Generator) -> None:
     error = independent(rng, 110, 6, 3)
     entries: list[Any] = []
-    with watching(Watch({"lost": 0.01}, keep=entries.append)), pytest.raises(InsufficientTrials):
+    with watching(RunningTest({"lost": 0.01}, keep=entries.append)), pytest.raises(InsufficientTrials):
         assert_consistent(error, identities(error), false_alarm=SURE)
     assert entries[0].lost == 0.01
-    with watching(Watch({"lost": 0.01}, budget=1e-3, keep=entries.append)), pytest.raises(InsufficientTrials):
+    with watching(RunningTest({"lost": 0.01}, budget=1e-3, keep=entries.append)), pytest.raises(InsufficientTrials):
         assert_consistent(error, identities(error))
     assert entries[1].lost == 0.01
     assert entries[1].needed == 299

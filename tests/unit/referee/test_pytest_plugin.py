@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from consistency.referee.diagnostics import gate_runs
-from consistency.referee.gating.session import refusal
+from consistency.referee.gating.session import path_fault
 from consistency.referee.gating.watch import FIRST, final_rate, in_place_rate
 
 SAMPLES = '''
@@ -211,9 +211,9 @@ def test_a_folder_without_leave_is_refused(tmp_path: Path, monkeypatch: pytest.M
     def refuse(**_: Any) -> None:
         raise PermissionError(13, "Permission denied")
 
-    assert refusal(tmp_path / "gates.json") == ""
+    assert path_fault(tmp_path / "gates.json") == ""
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
-    assert "cannot be written (Permission denied); name another file" in refusal(tmp_path / "gates.json")
+    assert "cannot be written (Permission denied); name another file" in path_fault(tmp_path / "gates.json")
 
 
 # --- runs to simulate ----------------------------------------------------------------------------

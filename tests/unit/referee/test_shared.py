@@ -12,7 +12,7 @@ from recorded import read_recordings
 from scipy.linalg import block_diag
 
 import consistency as cs
-from consistency.referee.diagnostics import Record, judge
+from consistency.referee.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import (
     KINDS,
     VAGUE,
@@ -83,7 +83,7 @@ def test_other_drives_decide(ratio: float) -> None:
     record = without_shared(
         drives("by-vector", rng, ratio=ratio), fit_record(drives("by-vector", rng, runs=400), "by-vector"), "by-vector"
     )
-    verdict = judge(record, cs.diagnostics.Settings(false_alarm=1e-6))
+    verdict = judge(record, Settings(false_alarm=1e-6))
     assert ("scale" in verdict.faults) == (ratio > 1.0)
     assert not set(verdict.faults) & set(BIAS)
 

@@ -17,8 +17,8 @@ from consistency.referee.document.blocks import Heading, Table
 from consistency.referee.document.drawing import Bars, Figure, Line, Points, Stems
 from consistency.stereo.pages import images
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Tracks
-from consistency.stereo.rendered_images.protocols import Stops, wall_texture
 from consistency.stereo.rendered_images.scene import Layer, Scene
+from consistency.stereo.rendered_images.stops import Stops, wall_texture
 
 pytest.importorskip("cv2")
 

@@ -15,7 +15,7 @@ from consistency.bench.pages.build import build_report
 from consistency.bench.pages.sections import first_order as first_order_section
 from consistency.bench.pages.sections import shares
 from consistency.stereo.pages import scenes
-from consistency.stereo.visual_odometry import RelativePose
+from consistency.vision import RelativePose
 
 rigs = experiment("published_rig")
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -12,23 +14,21 @@ from consistency.bench.models.stereo import project, triangulate_jacobian
 from consistency.bench.pages.exhibits import extra_table
 from consistency.bench.pages.report_input import Report
 from consistency.bench.types import Gaussian
+from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import Look, style
-from consistency.referee.document.drawing import Axis, Bars, Figure, Key, Line, Panel, Points, Sheet, xy
-from consistency.referee.pages.section import Part, Section
+from consistency.referee.show.painting import add_legend, canvas, path, points, stroke
 from consistency.referee.types import Array
 
-NOISE = Part("distributions", "What eq. 21 does to Gaussian pixels (fig. 12)", "Stereo noise")
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
 FILE = "fig12.parquet"
 POINT, FOCAL = (10.0, 1.0), 150.0  # m, px: Herath et al. (2007) sec. 4.5
 SIGMA_U, SIGMA_D = 1.34, 0.65  # px, ibid.
 COLUMNS = ["baseline", "x", "y", "u", "d"]
-DRAWN, BINS = 1500, 60
+DRAWN, BINS = 1000, 60
 SAMPLES, DOTS = Look("#c4c4c4"), Look("#555555", size=1.0, alpha=0.6)
 LINEAR, FITTED = replace(style(0), width=1.4), replace(style(1), width=1.4)
-KEYS = (
-    Key("samples", SAMPLES, "band"), Key("linearised Gaussian", LINEAR),
-    Key("Gaussian with the samples' moments", FITTED),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Distribution:
     fitted_density: Array
 
 
-def read(report: Report) -> tuple[Distribution, ...] | None:
-    """One record a baseline; None where the file does not exist.
+def read(report: Report) -> tuple[Distribution, ...]:
+    """One record a baseline; none where the file does not exist.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def read(report: Report) -> tuple[Distribution, ...] | None:
     """
     table = extra_table(report.folder / FILE, COLUMNS)
     if table is None:
-        return None
+        return ()
     parts = (part for _, part in table.groupby("baseline", sort=True))
     return tuple(_distribution(float(part["baseline"].iloc[0]), part) for part in parts)
 
@@ -118,29 +118,24 @@ def _ellipse(gaussian: Gaussian) -> Array:
     return np.asarray(gaussian.mean + 2.0 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
-def figures(distributions: tuple[Distribution, ...]) -> tuple[Figure, ...]:
+def stereo_noise(report: Report) -> tuple[Figure, ...]:
     """For each baseline samples with two ellipses, and the histogram of x with two densities."""
-    return tuple(_figure(distribution) for distribution in distributions)
+    return tuple(Figure(f"Baseline {d.baseline:g} m", caption(d), (partial(_draw, d),)) for d in read(report))
 
 
-def _figure(d: Distribution) -> Figure:
-    name = f"baseline {d.baseline:g} m"
-    x = Axis("x (m)", window=d.window[0], share=name)
-    cloud = Panel(
-        x, Axis("y (m)", window=d.window[1]),
-        (Points(*xy(d.points), DOTS, whole=True), Line(*xy(d.linear_ellipse), LINEAR, path=True),
-         Line(*xy(d.fitted_ellipse), FITTED, path=True)),
-        f"Samples in x and y, {name}", height=320,
-    )  # fmt: skip
-    tips = (("x", "@left{0.00} to @right{0.00} m"), ("density", "@height{0.0000}"))
-    histogram = Panel(
-        x, Axis("density of x (1/m)", "density (1/m)", start=0.0),
-        (Bars(d.edges, d.density, SAMPLES, tips), Line(d.grid, d.linear_density, LINEAR),
-         Line(d.grid, d.fitted_density, FITTED)),
-        f"Distribution of x, {name}", height=320,
-    )  # fmt: skip
-    panels = (cloud, histogram)
-    return Figure(name.capitalize(), caption(d), panels, (Sheet(panels, 2.5, keys=KEYS),), KEYS, layout="pair")
+def _draw(d: Distribution) -> Drawing:
+    figure, (cloud, histogram) = canvas(2.0, 2, 2)
+    points(cloud, d.points[:, 0], d.points[:, 1], DOTS, limit=DRAWN)
+    cloud.set(xlabel="x (m)", ylabel="y (m)", xlim=d.window[0], ylim=d.window[1])
+    histogram.stairs(d.density, d.edges, fill=True, color=SAMPLES.colour, label="samples")
+    for look, outline, density, label in (
+        (LINEAR, d.linear_ellipse, d.linear_density, "linearised Gaussian"),
+        (FITTED, d.fitted_ellipse, d.fitted_density, "Gaussian with the samples' moments"),
+    ):
+        path(cloud, outline, look)
+        histogram.plot(d.grid, density, label=label, **stroke(look))
+    histogram.set(xlabel="x (m)", ylabel="density (1/m)", xlim=d.window[0])
+    return add_legend(figure)
 
 
 def caption(d: Distribution) -> str:
@@ -152,6 +147,3 @@ def caption(d: Distribution) -> str:
         f"y = 1 m ({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the "
         f"samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
     )
-
-
-SECTION = Section(NOISE, read, figures)

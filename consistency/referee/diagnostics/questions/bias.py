@@ -49,7 +49,9 @@ def t_squared(whitened: Array, known: StepMoments | None = None) -> tuple[Array,
     T^2 (N - n) / (n (N - 1)) is F(n, N - n) distributed (Anderson 2003, Theorem 5.2.2). NaN where fewer
     than n + 1 runs are left. ``known`` are the moments, if already computed.
     """
-    N, mean, S = step_moments(whitened) if known is None else known
+    if known is None:
+        known = step_moments(whitened)
+    N, mean, S = known
     n = whitened.shape[-1]
     statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
     good = n + 1 <= N

@@ -36,7 +36,9 @@ def outliers(whitened: Array, known: StepMoments | None = None) -> Outlier:
     whitened : (runs, steps, n), NaN where a run has no value
     known : moments of ``whitened``, if already computed
     """
-    N, mean, S = step_moments(whitened) if known is None else known
+    if known is None:
+        known = step_moments(whitened)
+    N, mean, S = known
     n = whitened.shape[-1]
     usable = np.flatnonzero(n + 3 <= N)
     usable = usable[np.linalg.det(S[usable]) > 0]

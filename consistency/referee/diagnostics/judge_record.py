@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.judging.status import deciding_axis
+from consistency.referee.diagnostics.questions.innovation_causes import innovation_causes
+from consistency.referee.diagnostics.questions.innovations import nis_and_dof
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
@@ -126,15 +128,20 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
     left_out = set(found.left_out_steps)
     if record.align:
         left_out.update(record.left_out_steps)
+    causes, nees_ratio = list(record.causes), float("nan")
+    if found.scale is not None:
+        nees_ratio = found.scale.mean_anees / found.scale.dof
+    if (innovations := nis_and_dof(record)) is not None:
+        causes += innovation_causes(*innovations, nees_ratio)
     fields = vars(found) | {"left_out_steps": tuple(sorted(left_out))}
     return Verdict(
         **fields,
-        reasons=(sentence, *figures, *record.causes, *other_ways(found.status, record)),
+        reasons=(sentence, *figures, *causes, *other_ways(found.status, record)),
         axis=deciding_axis(found),
         convention=convention,
         align=align,
         notes=tuple(record.notes),
-        causes=tuple(record.causes),
+        causes=tuple(causes),
         **beside._asdict(),
     )
 

@@ -64,16 +64,16 @@ def profile_intervals(score: Callable[[Array], Array], best: Array, curvature: A
     return intervals
 
 
-def _farthest(i: int, side: float, depth: Callable[[Array], float], guess: Array, low: Array, high: Array) -> float:
+def _farthest(i: int, side: float, depth: Callable[[Any], float], guess: Array, low: Array, high: Array) -> float:
     """Return the largest (``side`` 1) or smallest (-1) coordinate ``i`` of the points at a depth of 1 at most."""
-    options = {
+    options: dict[str, Any] = {
         "initial_tr_radius": FIRST_RADIUS,
         "final_tr_radius": LAST_RADIUS,
         "maxfev": MOST_SETTINGS,
         "scale": False,
     }
     found: Any = minimize(
-        lambda u: -side * u[i],
+        lambda u: -side * float(u[i]),
         guess,
         method="COBYQA",
         bounds=list(zip(low, high, strict=True)),

@@ -13,11 +13,12 @@ from pathlib import Path
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
-from consistency.bench.store.journal import Busy, Journal, unfinished_of
+from consistency.bench.store.journal import Busy, Journal
 from consistency.bench.sweeps.cell import CellResult, run_cell
 from consistency.bench.sweeps.plan import Sweep
 from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
 from consistency.referee.errors import InputError
+from consistency.referee.system.folders import unfinished_of
 from consistency.referee.system.progress import say
 
 LOOKED_AT = 400  # cells whose kernels are compiled ahead, 10 ms each; cells of one grid differ little

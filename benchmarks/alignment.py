@@ -23,7 +23,7 @@ import numpy as np
 from scipy import signal, stats
 from script_options import options_of
 
-from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
+from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.clock_offset import clocks_and_frames
@@ -197,9 +197,9 @@ def verdict(runs: Sequence[Poses], mode: str) -> Verdict:
     return judge(evidence(found, shift), Settings(FALSE_ALARM))
 
 
-def evidence(found: Aligned, shift: float) -> Evidence:
+def evidence(found: Aligned, shift: float) -> Record:
     error = np.stack([p.errors(shift) for p in found.runs])
-    return Evidence(
+    return Record(
         "bench",
         error,
         np.stack([p.covariance for p in found.runs]),

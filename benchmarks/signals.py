@@ -32,7 +32,7 @@ WORLD = "linear-gaussian"
 SCRIPT = """
 import sys
 import numpy as np
-import consistency.referee.cli as cli
+import consistency.commands as cli
 import consistency.bench.filters as filters
 from consistency.__main__ import main
 from consistency.bench.types import Gaussian

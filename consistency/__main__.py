@@ -25,7 +25,7 @@ class Command(threading.Thread):
 
     def run(self) -> None:
         gc.set_threshold(50_000, 20, 100)  # most of what is made lives as long as the modules that are imported
-        from consistency.referee.cli import main  # slow to load
+        from consistency.commands import main  # slow to load
 
         try:
             self.status = main()

@@ -17,12 +17,13 @@ from joblib.externals.loky import Future, ProcessPoolExecutor
 from joblib.externals.loky.backend import get_context
 
 from consistency.bench.filters import get_filter
+from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.scenario import Scenario, data_folder, load_scenario
-from consistency.bench.store.folder_tables import write_folder
+from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding, outcome
@@ -35,7 +36,6 @@ from consistency.referee.system.folders import require_free
 from consistency.referee.system.progress import quiet, say
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.system.stopping import end_with_parent, link_to_parent
-from consistency.referee.verdicts.sources import analyse
 
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 WAITING = 30.0  # seconds between lines on a process that is waited for
@@ -108,7 +108,7 @@ class Study:
             text = json.dumps([asdict(finding) for finding in findings], indent=2, ensure_ascii=False)
             (folder / "findings.json").write_text(text + "\n", encoding="utf-8")
 
-        write_folder(out, {}, manifest, contents, overwrite)
+        write_tables(out, {}, manifest, contents, overwrite)
 
 
 # --- the scripts -----------------------------------------------------------------------------

@@ -22,7 +22,6 @@ from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import Design, Record, Verdict, look, sequential_design, speaks
 from consistency.referee.diagnostics.questions.scale import FEW
-from consistency.referee.diagnostics.verdict.judge import of_look, with_map
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
 from consistency.referee.types import Array
@@ -116,8 +115,7 @@ def _look(design: Design, record: Record, runs: int, spent: float | None) -> Ver
     some = record.first_runs(runs)
     if runs != design.max_runs and not speaks(design, some, spent):
         return None
-    verdict = of_look(look(design, some, spent), runs, record, design)
-    return with_map(verdict, record.ends, design.settings, design)
+    return look(design, some, spent)
 
 
 def _rounds(

@@ -11,7 +11,7 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
+from consistency.referee.diagnostics.records.large_arrays import by_runs
 from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.diagnostics.statistics.log_ratio import Contrast, contrast, margin
 from consistency.referee.types import Array, Indices
@@ -98,23 +98,23 @@ def summary(
     nees: Array,
     dof: int,
     error: Array | None = None,
-    covariance: Array | Symmetric | None = None,
+    covariance: Array | None = None,
     runs: Indices | None = None,
 ) -> RunSummary:
     """One row for each run, from NEES (runs, steps) and, where known, error and covariance."""
     means, _ = run_means(nees)
     squared = covered = np.empty((len(nees), 0))
     if error is not None and covariance is not None:
-        both = by_runs(_squared_and_covered, np.asarray(nees), np.asarray(error), Symmetric.of(covariance))
+        both = by_runs(_squared_and_covered, np.asarray(nees), np.asarray(error), np.asarray(covariance))
         squared, covered = both[:, 0], both[:, 1]
     return RunSummary(np.arange(len(nees)) if runs is None else runs, dof, means / dof, squared, covered)
 
 
-def _squared_and_covered(nees: Array, error: Array, covariance: Symmetric) -> Array:
+def _squared_and_covered(nees: Array, error: Array, covariance: Array) -> Array:
     """Mean squared error and share of steps within 2 sigma of each axis, (runs, 2, n)."""
     counted = np.isfinite(nees)
     with np.errstate(invalid="ignore"):  # a variance below zero covers nothing
-        sigma = np.sqrt(covariance.variances)
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     inside = np.abs(np.where(counted[..., None], error, 0.0)) <= 2.0 * np.where(counted[..., None], sigma, 0.0)
     count = counted.sum(axis=1)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):

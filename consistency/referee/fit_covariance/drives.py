@@ -26,6 +26,7 @@ from consistency.referee.readers.file_kinds import (
 )
 from consistency.referee.readers.formats.sheet import refuse
 from consistency.referee.readers.formats.table import table_poses
+from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import NamedPoses, truth_at
 from consistency.referee.types import Array, Indices
@@ -72,15 +73,24 @@ def read_drives(
         raise InputError(f"{path}: no such file")
     if r.time_offset not in (None, "estimate") and not isinstance(r.time_offset, (int, float)):
         raise InputError(f"--time-offset {r.time_offset}: must be a number of seconds, or 'estimate'")
-    found = [(each, _matrices(each, r)) for each in _poses(path, r)]
-    if r.time_offset != "estimate":
-        return [_drive(each, T, float(r.time_offset or 0.0)) for each, T in found]
-    shift = clock_offset([(each.poses, T) for each, T in found])
-    return [replace(_drive(each, T, shift), shift=shift) for each, T in found]
+    found = list(_poses(path, r))
+    require_radians(str(path), [each.poses for each in found])
+    estimated = [_estimated(each, r) for each in found]
+    is_estimated = r.time_offset == "estimate"
+    if is_estimated:
+        shift = clock_offset([(each.poses, T) for each, T in zip(found, estimated, strict=True)])
+    else:
+        shift = float(r.time_offset or 0.0)
+    return [_drive(each, T, shift, is_estimated) for each, T in zip(found, estimated, strict=True)]
 
 
 def drive_of(
-    name: str, estimate: Array, truth: Array, t: Array | None = None, row: Indices | None = None, motions: bool = False
+    name: str,
+    estimate: Array,
+    truth: Array,
+    t: Array | None = None,
+    row: Indices | None = None,
+    motions: bool = False,
 ) -> Drive:
     """A drive of arrays.
 
@@ -101,30 +111,32 @@ def drive_of(
     if not (np.isfinite(estimate).all() and np.isfinite(truth).all()):
         raise InputError(f"{name}: a pose is not finite; leave such rows out")
     T = matrices(estimate)
-    rows = np.arange(len(T)) if row is None else row
-    return Drive(
-        name, np.full(len(T), np.nan) if t is None else np.asarray(t, float), rows,
-        composed(T) if motions else T, matrices(truth),
-    )  # fmt: skip
+    if t is None:
+        t = np.full(len(T), np.nan)
+    if row is None:
+        row = np.arange(len(T))
+    return Drive(name, np.asarray(t, float), row, composed(T) if motions else T, matrices(truth))
 
 
 def _poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
     kind = kind_of(path, r)
     if not is_bag(path) and path.is_dir() and not trajectory_files(path):
-        yield from _of_folder(path, r)
+        yield from _tables(path, r)
     elif kind is None or not kind.poses or is_solution(path):
         raise unknown_kind(path, (*TABLES, *ARCHIVES, ".bag", *TRAJECTORIES), "estimates=poses, truth=true_poses")
     else:
         yield from function_at(kind.poses)(path, r)
 
 
-def _of_folder(folder: Path, r: Reading) -> Iterator[NamedPoses]:
+def _tables(folder: Path, r: Reading) -> Iterator[NamedPoses]:
     """Tables of a folder, one for each drive, with truths of the same names in another."""
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in TABLES or is_plane(path))
     if not files:
         raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
     for path in files:
-        truth = r.truth / path.name if r.truth is not None and r.truth.is_dir() and not is_drive(r.truth) else r.truth
+        truth = r.truth
+        if truth is not None and truth.is_dir() and not is_drive(truth):
+            truth = truth / path.name
         if truth is not None and not truth.exists():
             raise InputError(f"--truth {r.truth}: holds no file '{path.name}' for {path}")
         for name, poses, clock in table_poses(path, replace(r, truth=truth)):
@@ -132,7 +144,7 @@ def _of_folder(folder: Path, r: Reading) -> Iterator[NamedPoses]:
             yield NamedPoses(stem if name == path.stem else f"{stem}, {name}", poses, clock)
 
 
-def _matrices(read: NamedPoses, r: Reading) -> Array:
+def _estimated(read: NamedPoses, r: Reading) -> Array:
     """Estimated poses, (N, d + 1, d + 1)."""
     finite = np.isfinite(read.poses.estimate).all(axis=1)
     what = "the pose is not finite; end the drive before it, or leave the row out"
@@ -141,13 +153,16 @@ def _matrices(read: NamedPoses, r: Reading) -> Array:
     return composed(T) if r.motions else T
 
 
-def _drive(read: NamedPoses, T: Array, shift: float) -> Drive:
+def _drive(read: NamedPoses, T: Array, shift: float, is_estimated: bool) -> Drive:
+    """The drive where its truth is known, with ``shift`` s added to its times."""
     name, poses, clock = read
     t = poses.t + shift
     known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
-    if len(known.rows) < 2:
+    rows = known.rows
+    if len(rows) < 2:
         raise InputError(
-            f"{name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t is "
+            f"{name}: {len(rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t is "
             f"{t[0]:.15g} to {t[-1]:.15g}, but {poses.true_t[0]:.15g} to {poses.true_t[-1]:.15g} in the truth"
         )
-    return Drive(name, clock[known.rows] + shift, known.rows, T[known.rows], matrices(known.truth))
+    estimated_shift = shift if is_estimated else 0.0
+    return Drive(name, clock[rows] + shift, rows, T[rows], matrices(known.truth), estimated_shift)

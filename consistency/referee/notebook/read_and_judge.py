@@ -10,13 +10,13 @@ from typing import Any, cast
 from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics import judge as judge_record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.numpy_archive import record_of_arrays
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.read_files import read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
 from consistency.referee.verdicts.options import settings_of, skip_asked
-from consistency.referee.verdicts.sources import analyse
 
 
 def read(
@@ -165,5 +165,6 @@ def judge(
     elif not isinstance(record, Record):
         raise InputError("covariances: needed beside errors, (runs, steps, n, n); or deviations, (runs, steps, n)")
     record = record.without_first(skip_asked(skip))
-    verdict = analyse([record], settings=settings_of(**settings), optimal_gain=optimal_gain)[record.name]
-    return replace(verdict, record=record)
+    if optimal_gain:
+        record = replace(record, optimal_gain=True)
+    return judge_record(record, settings_of(**settings), keep_record=True)

@@ -14,10 +14,9 @@ import numpy as np
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.questions.independence import ENOUGH, Independence, independence
 from consistency.referee.diagnostics.records.whitening import whiten
-from consistency.referee.diagnostics.words.numbers import plural
-from consistency.referee.diagnostics.words.sentences import p_text
+from consistency.referee.diagnostics.words.numbers import p_text, plural
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
+from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
 from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.runs_to_record import Track, assemble
 from consistency.referee.readers.truth_matching import common_times
@@ -117,7 +116,7 @@ def _of_motions(s: Stretch, T: Array, first: Indices, last: Indices) -> Array:
     rows = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes) + first[window] + 1
     own = to_left(inverse(T[rows - 1]) @ T[rows], s.convention)
     J = adjoint(inverse(T[last[window]]) @ T[rows]) @ own
-    return np.asarray(np.add.reduceat(carried(J, s.covariance[rows]), np.cumsum(sizes) - sizes))
+    return np.asarray(np.add.reduceat(propagated(J, s.covariance[rows]), np.cumsum(sizes) - sizes))
 
 
 def _of_poses(s: Stretch, T: Array, D: Array, first: Indices, last: Indices, relative: Relative) -> Array:
@@ -133,7 +132,7 @@ def _of_poses(s: Stretch, T: Array, D: Array, first: Indices, last: Indices, rel
     J = np.concatenate([-adjoint(inverse(D)) @ start, end], axis=-1)
     cross = s.cross[last]
     joint = np.block([[s.covariance[first], cross], [np.swapaxes(cross, -1, -2), s.covariance[last]]])
-    return carried(J, joint)
+    return propagated(J, joint)
 
 
 def relative_recording(

@@ -28,6 +28,7 @@ from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork
 from consistency.bench.store.results import open_results
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system.provenance import this_machine
+from consistency.types import Failure
 
 RUNS = 40
 HERE = {"cpu": "abacus", "blas": "beads"}
@@ -133,7 +134,7 @@ def test_a_run_that_kills_has_failed_and_no_other(work: TrialWork, killers: tupl
     outcomes = done(executor, work)
     assert {run for run, outcome in outcomes.items() if outcome.failures} == set(killers)
     for run in killers:
-        assert outcomes[run].failures == (cs.types.Failure("still", run, 1, "its worker died (Killed)"),)
+        assert outcomes[run].failures == (Failure("still", run, 1, "its worker died (Killed)"),)
         assert outcomes[run].truth is not None
         assert Counter(executor.sent)[(run,)] >= 2, "by itself, and alone"
 

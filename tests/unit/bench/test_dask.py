@@ -48,7 +48,7 @@ def world(xyz: cs.Scenario) -> cs.Scenario:
 @pytest.fixture(scope="module")
 def filters(world: cs.Scenario) -> list[str | Still]:
     """One that is compiled, and one whose process ends in one run."""
-    doomed = cs.types.Control(*Simulated(world, SEED)(7).controls[0])
+    doomed = cs.Control(*Simulated(world, SEED)(7).controls[0])
     return ["ekf-xyz", Still("still", KINDS["os._exit(3)"][0], doomed)]
 
 

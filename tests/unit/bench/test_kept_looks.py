@@ -104,14 +104,14 @@ def test_ctrl_c_keeps_what_is_finished(
     """While runs are done, and while a look is taken after the last of them."""
     with monkeypatch.context() as patch:
         if look:
-            of_look = sequential.of_look
+            look_at = sequential.look
 
-            def pressed(verdict: Any, runs: int, record: Record, design: Any) -> Any:
-                if runs == 20:
+            def pressed(design: Any, record: Record, spent: float | None) -> Any:
+                if len(record.run_numbers) == 20:
                     raise KeyboardInterrupt
-                return of_look(verdict, runs, record, design)
+                return look_at(design, record, spent)
 
-            patch.setattr(sequential, "of_look", pressed)
+            patch.setattr(sequential, "look", pressed)
         else:
             stop_at(14, KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):

@@ -37,7 +37,7 @@ while True:
 """
 COMMAND = """
 import ctypes, os, sys, time
-import consistency.referee.cli as cli
+import consistency.commands as cli
 from consistency.__main__ import main
 sys.argv = ["consistency", {word!r}]
 cli.main = lambda: exec({work!r}, globals())
@@ -111,13 +111,13 @@ def test_the_command_line_never_ends_its_caller(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A notebook or a test that calls ``main`` gets SystemExit, and its handlers stay."""
-    from consistency.referee.cli import main
+    from consistency.commands import main
 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     before = [signal.getsignal(number) for number in STOPS]
-    monkeypatch.setattr(sys.modules["consistency.referee.cli.app"], "app", interrupted)
+    monkeypatch.setattr(sys.modules["consistency.commands.app"], "app", interrupted)
     with pytest.raises(SystemExit) as end:
         main(["list", "--json"])
     assert end.value.code == 130

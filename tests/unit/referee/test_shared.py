@@ -12,7 +12,7 @@ from recorded import read_recordings
 from scipy.linalg import block_diag
 
 import consistency as cs
-from consistency.referee.diagnostics import Evidence, judge
+from consistency.referee.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import (
     KINDS,
     VAGUE,
@@ -32,7 +32,7 @@ FLOOR = np.array([0.1, 0.2, 0.05])
 THETA = np.array([0.5, -0.3, 0.2])
 
 
-def drives(kind: str, rng: np.random.Generator, runs: int = RUNS, ratio: float = 1.0) -> Evidence:
+def drives(kind: str, rng: np.random.Generator, runs: int = RUNS, ratio: float = 1.0) -> Record:
     """Errors with a shared part, of the covariance P and a floor, on straight paths of different speeds."""
     t = np.arange(STEPS) * 0.5
     speed = rng.uniform(1.0, 2.0, (runs, 1))
@@ -41,7 +41,7 @@ def drives(kind: str, rng: np.random.Generator, runs: int = RUNS, ratio: float =
     g = {"by-vector": np.ones((runs, STEPS)), "by-time": np.tile(t, (runs, 1)), "by-distance": speed * t}[kind]
     noise = rng.normal(size=(runs, STEPS, N)) @ np.linalg.cholesky(ratio * (P + np.diag(FLOOR**2))).T
     covariances = np.broadcast_to(P, (runs, STEPS, N, N))
-    return Evidence("est", g[..., None] * THETA + noise, covariances, path=path, t=7.0 + t, axes=("x", "y", "z"))
+    return Record("est", g[..., None] * THETA + noise, covariances, path=path, t=7.0 + t, axes=("x", "y", "z"))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -83,7 +83,7 @@ def test_other_drives_decide(ratio: float) -> None:
     record = without_shared(
         drives("by-vector", rng, ratio=ratio), fit_record(drives("by-vector", rng, runs=400), "by-vector"), "by-vector"
     )
-    verdict = judge(record, cs.diagnostics.Settings(false_alarm=1e-6))
+    verdict = judge(record, Settings(false_alarm=1e-6))
     assert ("scale" in verdict.faults) == (ratio > 1.0)
     assert not set(verdict.faults) & set(BIAS)
 
@@ -168,13 +168,13 @@ def test_what_does_not_go_together_is_said(options: dict[str, object], said: str
 
 def test_windows_and_records_that_have_nothing_to_fit() -> None:
     record = drives("by-time", np.random.default_rng())
-    windows = Evidence("est", record.error, record.covariance, window="10 s", t=record.t)
+    windows = Record("est", record.error, record.covariance, window="10 s", t=record.t)
     with pytest.raises(cs.InputError, match="--shared by-time: windows of 10 s are alike; take by-vector"):
         growth(windows, "by-time")
     with pytest.raises(cs.InputError, match="--shared by-time: est has no times"):
-        growth(Evidence("est", record.error, record.covariance, t=np.full(STEPS, np.nan)), "by-time")
+        growth(Record("est", record.error, record.covariance, t=np.full(STEPS, np.nan)), "by-time")
     with pytest.raises(cs.InputError, match="needs errors with covariances of all components; est has none"):
-        growth(Evidence("est", nees=np.ones((3, 4)), dof=2), "by-vector")
-    two = Evidence("est", np.ones((1, 4, 2)), np.broadcast_to(np.eye(2), (1, 4, 2, 2)))
+        growth(Record("est", nees=np.ones((3, 4)), dof=2), "by-vector")
+    two = Record("est", np.ones((1, 4, 2)), np.broadcast_to(np.eye(2), (1, 4, 2, 2)))
     with pytest.raises(cs.InputError, match="est has 2 components, what is shared has 3"):
         without_shared(two, fit_record(record, "by-vector"), "by-vector")

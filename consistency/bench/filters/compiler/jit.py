@@ -91,12 +91,12 @@ class Kernel:
         content = self._contents[signature]
         is_shared = content.unknown is None
         is_ready = signature in self._entries or (
-            is_shared and disk_cache.read(disk_cache.place(content.key)) is not None
+            is_shared and disk_cache.read_code(disk_cache.code_path(content.key)) is not None
         )
         return Outlook(content.key, is_ready, is_shared, disk_cache.seconds_for(self._size(content)))
 
     def _content(self, signature: tuple[Any, ...]) -> Content:
-        jitable.register()
+        jitable.register_jitables()
         return Content(self.function, signature)
 
     def _size(self, content: Content) -> float:
@@ -110,14 +110,14 @@ class Kernel:
         entry = numba.njit(**OPTIONS)(self.function)
         if content.unknown is not None:
             return self._compiled(entry, signature, content)
-        path = disk_cache.place(content.key)
-        if not self._load(entry, disk_cache.read(path, tell=True)):
+        path = disk_cache.code_path(content.key)
+        if not self._load(entry, disk_cache.read_code(path, tell=True)):
             with disk_cache.one_at_a_time(path):
-                if not self._load(entry, disk_cache.read(path)):
+                if not self._load(entry, disk_cache.read_code(path)):
                     self._compiled(entry, signature, content)
                     result = entry.overloads[signature]
                     if not result.library.has_dynamic_globals and not result.lifted:  # no address of this process
-                        disk_cache.write(path, serialize.dumps(result._reduce()))  # type: ignore[no-untyped-call]
+                        disk_cache.write_code(path, serialize.dumps(result._reduce()))  # type: ignore[no-untyped-call]
         return entry
 
     def _compiled(self, entry: Any, signature: tuple[Any, ...], content: Content) -> Any:

@@ -63,7 +63,7 @@ def _quantiles(confidence: float, s: int, m: int) -> tuple[float, ...]:
     return 0.0, *map(float, 2.0 * special.gammaincinv(0.5 * s * np.arange(1, m + 1), confidence))
 
 
-def kept(kind: str, y: Array, S: Array, s: int, limits: Limits) -> Array:
+def kept_observations(kind: str, y: Array, S: Array, s: int, limits: Limits) -> Array:
     """Which observations (m,) a guard of this kind keeps, of an innovation y (s m,) with covariance S (s m, s m).
 
     Raises
@@ -92,7 +92,7 @@ def distance(y: Array, S: Array, rows: Indices) -> float:
     return float(white @ white)
 
 
-def given(y: Array, S: Array, rows: Indices, known: Indices) -> float:
+def conditional_distance(y: Array, S: Array, rows: Indices, known: Indices) -> float:
     """Squared distance of ``rows`` after an update with the rows ``known``."""
     W = np.linalg.solve(S[np.ix_(known, known)], S[np.ix_(known, rows)]).T
     left, among = y[rows] - W @ y[known], S[np.ix_(rows, rows)] - W @ S[np.ix_(known, rows)]
@@ -134,12 +134,16 @@ def best_supported(y: Array, S: Array, s: int, own: Array, candidates: Indices, 
     best: tuple[int, float, list[int]] = (0, 0.0, [])
     for i in candidates:
         support = [
-            int(j) for j in candidates if j == i or given(y, S, rows_of([j], s), rows_of([i], s)) <= limits.support
+            int(j)
+            for j in candidates
+            if j == i or conditional_distance(y, S, rows_of([j], s), rows_of([i], s)) <= limits.support
         ]
         if (len(support), -own[i]) > (best[0], -best[1]):
             best = (len(support), own[i], support)
     low = best[2]
     rescued = [
-        int(j) for j in candidates if j not in low and given(y, S, rows_of([j], s), rows_of(low, s)) <= limits.own
+        int(j)
+        for j in candidates
+        if j not in low and conditional_distance(y, S, rows_of([j], s), rows_of(low, s)) <= limits.own
     ]
     return np.array(low + rescued, np.int64)

@@ -72,4 +72,4 @@ def _executor(
 
         return SlurmExecutor(out.absolute().with_name(f".{out.absolute().name}.jobs"), options_of(slurm), jobs)
     except ImportError:
-        raise MissingPackageError(f"--backend {name} needs {remedy('cluster', own=ENGINES[name])}") from None
+        raise MissingPackageError(f"--backend {name} needs {remedy('cluster', package=ENGINES[name])}") from None

@@ -9,17 +9,20 @@ from scipy.linalg import solve_triangular
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.questions.scale import ratio_interval
-from consistency.referee.diagnostics.records.record import JointNees
+from consistency.referee.diagnostics.records.large_arrays import by_runs
+from consistency.referee.diagnostics.records.record import JointNees, Record
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import kolmogorov
 from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
-from consistency.referee.diagnostics.verdict.parts import JointScore, MapScore, Settings
+from consistency.referee.diagnostics.verdict.parts import JointScore
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.diagnostics.verdict.verdict import MapScore, Verdict
 from consistency.referee.types import Array, Indices
 
 POSE, POINT = 3, 3  # degrees of freedom of a pose in the plane, and of a landmark in space
 
 
-def map_score(run: Indices, nees: Array, dof: int = POINT) -> MapScore:
+def map_score(run: Indices, nees: Array, dof: int = POINT, verdict: Verdict | None = None) -> MapScore:
     """Mean NEES over ``dof`` of landmarks (M,), with an interval from the spread between their runs (M,).
 
     Landmarks of one run share the error of its pose, so each run counts once, by the mean of its landmarks.
@@ -28,7 +31,21 @@ def map_score(run: Indices, nees: Array, dof: int = POINT) -> MapScore:
     _, place = np.unique(run[judged], return_inverse=True)
     counts = np.bincount(place)
     means = np.bincount(place, nees[judged]) / np.maximum(counts, 1) / dof
-    return MapScore(ratio_interval(means, dof), len(counts), int(judged.sum()), int((~judged).sum()))
+    return MapScore(ratio_interval(means, dof), len(counts), int(judged.sum()), int((~judged).sum()), verdict)
+
+
+def last_nees(record: Record) -> Array | None:
+    """The last NEES that each run has, (runs,), NaN where it has none; None without NEES."""
+    if record.nees is None:
+        return None
+    return by_runs(_last_of_runs, record.nees)
+
+
+def _last_of_runs(nees: Array) -> Array:
+    if not nees.size:
+        return np.full(len(nees), np.nan)
+    step = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
+    return np.asarray(nees[np.arange(len(nees)), step])
 
 
 def joint_nees(error: Array, covariance: Array, dof: int = POINT) -> Array:

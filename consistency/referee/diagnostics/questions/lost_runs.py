@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.planning.e_process import ever
-from consistency.referee.diagnostics.planning.number_of_runs import lost_runs, share_limit
 from consistency.referee.diagnostics.questions.scale import run_means
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.parts import EarlyEnds, Lost, Settings
+from consistency.referee.diagnostics.statistics.e_process import ever
+from consistency.referee.diagnostics.statistics.number_of_runs import lost_runs, share_limit
+from consistency.referee.diagnostics.verdict.parts import EarlyEnds, Lost
+from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.types import Array
 
 PARTS = np.array([0.0, 0.125, 0.25, 0.5])  # of the share in question: what the bet takes the true share to be
@@ -42,7 +43,7 @@ def lost_evidence(is_lost: Array, share: float) -> Array:
     return np.asarray(np.exp(np.minimum(special.logsumexp(np.cumsum(gains, axis=0), axis=1) - np.log(len(q)), 700.0)))
 
 
-def lost_of(evidence: Record, nees: Array, dof: int, settings: Settings, any_time: bool = False) -> Lost | None:
+def lost_of(record: Record, nees: Array, dof: int, settings: Settings, any_time: bool = False) -> Lost | None:
     """Lost runs among those that failed or have a NEES, and the share not excluded; None without such a run.
 
     Parameters
@@ -52,8 +53,8 @@ def lost_of(evidence: Record, nees: Array, dof: int, settings: Settings, any_tim
         at the rate / (i (i + 1))
     """
     means, counts = run_means(nees)
-    numbers = np.asarray(evidence.run_numbers)
-    failed = np.isin(numbers, [f.run for f in evidence.failures])
+    numbers = np.asarray(record.run_numbers)
+    failed = np.isin(numbers, [f.run for f in record.failures])
     there = failed | (counts > 0)
     runs = int(there.sum())
     if not runs:

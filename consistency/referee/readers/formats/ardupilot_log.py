@@ -121,7 +121,9 @@ def _loaded(path: Path, wanted: dict[str, list[str]]) -> tuple[dict[str, list[di
     try:
         from pymavlink.DFReader import DFReader_binary
     except ImportError:
-        raise MissingPackageError(f"{path}: a log of ArduPilot needs {remedy('ardupilot')}") from None
+        raise MissingPackageError(
+            f"{path}: a log of ArduPilot needs {remedy('ardupilot', package='pymavlink')}"
+        ) from None
     if not is_file(path):
         raise InputError(f"{path}: no such file")
     with reading(path), path.open("rb") as file:

@@ -156,7 +156,7 @@ def _opened(bag: Path) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise MissingPackageError(f"{bag}: a ROS bag needs {remedy('ros')}") from None
+        raise MissingPackageError(f"{bag}: a ROS bag needs {remedy('ros', package='rosbags')}") from None
     with reading(bag, "cannot be read as a ROS bag, damaged or cut short"):
         reader = AnyReader([bag], default_typestore=get_typestore(Stores.LATEST))
         reader.open()

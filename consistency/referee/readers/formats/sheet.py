@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.extras import outside, require
+from consistency.referee.extras import require
 from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.referee.readers.formats.text_blocks import Block, blocks
 from consistency.referee.types import Array, Indices
@@ -169,7 +169,9 @@ def read_sheet(path: Path) -> TableRows:
         if not is_file(path):
             raise InputError(f"{path}: no such file")
         require(f"{path}: Parquet", "parquet")
-        columns, rows = outside("columns")(path, "cannot be read as Parquet")
+        from consistency.referee.readers.formats.parquet_file import read_columns
+
+        columns, rows = read_columns(path, "cannot be read as Parquet")
         sheet = TableRows(path, columns, np.arange(rows), "row")
     elif path.suffix.lower() in (".jsonl", ".ndjson"):
         from consistency.referee.readers.formats.json_lines import read_json_lines

@@ -278,13 +278,13 @@ class ReadingFit:
 
 def _status(fit: ReadingFit) -> int:
     """0 where the NEES is shown to be consistent, 1 where it may be, 2 where it is not."""
+    from consistency.referee.diagnostics import judge
     from consistency.referee.diagnostics.records.record import Record
-    from consistency.referee.diagnostics.verdict.verdict import judge_alone
 
     nees = np.full((len(fit.whitened), max(map(len, fit.whitened))), np.nan)
     for row, w in zip(nees, fit.whitened, strict=True):
         row[: len(w)] = np.square(w).sum(axis=1)
-    return {"consistent": 0, "undecided": 1}.get(judge_alone(Record("", nees=nees, dof=fit.n)).status, 2)
+    return {"consistent": 0, "undecided": 1}.get(judge(Record("", nees=nees, dof=fit.n)).status, 2)
 
 
 def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:

@@ -27,10 +27,10 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     on_body,
 )
-from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.mix_ups import hints as readers_hints
 from consistency.referee.readers.mix_ups.hints import FACTOR, ReadingFit, fit_of, hints, turns
 from consistency.referee.readers.mix_ups.known import _ned
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, _singular
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array

@@ -80,7 +80,7 @@ def first_trials(worlds: Iterable[tuple[Filter, Scenario]]) -> Iterator[Wanted]:
 def _compile(missing: Sequence[Need], jobs: int) -> None:
     shared = [need for need in missing if need.outlook.is_shared]
     workers = min(jobs, len(shared))
-    if disk_cache.refusal():
+    if disk_cache.folder_fault():
         workers = 1
     with progress.foreseen(_label(missing), _wall([need.outlook.seconds for need in missing], max(workers, 1))):
         if workers > 1:

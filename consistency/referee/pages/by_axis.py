@@ -143,7 +143,7 @@ def _coverage_window(intervals: list[Interval]) -> tuple[float, float]:
 def caption(study: Judged, found: tuple[Forest, ...]) -> str:
     """What the panels show."""
     parts, tracks = {forest.name for forest in found}, study.tracks
-    text = "By axis of the pose. Covariance ratio: 1 is right (line), above is overconfident; log axis."
+    text = "Covariance ratio: 1 is right (line), above is overconfident; log axis."
     if any(t.verdict.location is not None and t.verdict.location.since is not None for t in tracks):
         text += " Ratio and bias are those since the step that the verdict names."
     if any(track.verdict.axes is not None and track.verdict.axes.largest is not None for track in tracks):

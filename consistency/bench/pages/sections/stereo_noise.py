@@ -135,7 +135,7 @@ def caption(d: Distribution) -> str:
     outside = 1.0 - d.inside.mean()
     beyond = f" {100 * outside:.1f} % of the samples lie beyond the axes." if outside >= 0.0005 else ""
     return (
-        f"Baseline {d.baseline:g} m: {len(d.samples)} samples of eq. 21 within the search range, for a point at "
+        f"{len(d.samples)} samples of eq. 21 within the search range, for a point at "
         f"x = 10 m, y = 1 m ({len(d.drawn)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m "
         f"from the samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
     )

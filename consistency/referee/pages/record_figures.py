@@ -348,7 +348,7 @@ def _coverage(record: Evidence) -> Picture | None:
         axes.set(xlabel="stated probability", ylabel="share of errors inside", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
 
     caption = (
-        "Coverage: share of errors inside the interval that should hold them with the stated probability, over all "
+        "Share of errors inside the interval that should hold them with the stated probability, over all "
         "steps of all runs. On the diagonal the covariance is right; below it is overconfident, above conservative."
     )
     return Picture("Coverage", caption, (paint,), height=2.1)

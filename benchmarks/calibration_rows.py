@@ -76,9 +76,9 @@ def document(rows: Sequence[Row], about: dict[str, str], **facts: Any) -> dict[s
 
 
 def merged(table: dict[str, Any], rows: Sequence[Row], about: dict[str, str]) -> dict[str, Any]:
-    """A table with these rows in place of its own on the same questions."""
-    asked = {row.question for row in rows}
-    others = [row for row in rows_of(table) if row.question not in asked]
+    """A table with these rows in place of its own on the same questions in the same worlds."""
+    asked = {(row.question, row.world) for row in rows}
+    others = [row for row in rows_of(table) if (row.question, row.world) not in asked]
     facts = {key: table[key] for key in ("seed", "wall_time_s")}
     return document([*others, *rows], table["worlds"] | table["questions"] | about, **facts)
 

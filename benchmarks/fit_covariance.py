@@ -15,6 +15,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -29,12 +30,11 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.mean_by_motion import mean_by_motion
+from consistency.referee.fit_covariance.motion_windows import PLANE, SPACE, DriveWindows, cut_windows, span_of
 from consistency.referee.fit_covariance.noise_model import decided
-from consistency.referee.fit_covariance.persistence import doubts, persistent
-from consistency.referee.fit_covariance.refusals import growth_of, require_sound
-from consistency.referee.fit_covariance.slip import BY_TURN
+from consistency.referee.fit_covariance.persistence import doubts, persistent_errors
+from consistency.referee.fit_covariance.refusals import require_sound, rotation_growth
 from consistency.referee.fit_covariance.white_noise import fit_noise, intervals, terms_of
-from consistency.referee.fit_covariance.windows import PLANE, SPACE, Windows, span_of, windows_of
 from consistency.referee.geometry.groups import composed, matrices, vectors
 from consistency.referee.types import Array
 
@@ -168,12 +168,12 @@ def recovery(rng: np.random.Generator, world: World, number: int, draws: int) ->
     ratios, covered, whole = np.empty((draws, 2 * n)), np.empty((draws, 2 * n), bool), np.empty((draws, n))
     main, best = np.zeros(2 * n), np.zeros(2 * n)
     for k in range(draws):
-        windows = windows_of(drives(rng, number, world), span_of(SPAN))
+        windows = cut_windows(drives(rng, number, world), span_of(SPAN))
         F = terms_of(windows.pieces)
         own = np.diagonal(F.mean(axis=0), axis1=1, axis2=2)  # (2 n, n)
         main += theta * own[np.arange(2 * n), np.arange(2 * n) % n] / np.tile(theta @ own, 2) / draws
         best += within_at_best(theta, F) / draws
-        found = [each for part in intervals(fit_noise(windows), windows) for each in part]
+        found = intervals(fit_noise(windows), windows)
         fitted = np.array([each.value for each in found])
         ratios[k], whole[k] = fitted / theta, fitted @ own / (theta @ own)
         covered[k] = [each.holds(true) for each, true in zip(found, theta, strict=True)]
@@ -241,7 +241,7 @@ class Case:
     judged: int = 0
     times: float = 1.0  # variance of the judged drives over that of the fitted ones
     length: float = SHORT  # m
-    correct: bool | str = True
+    by_turn: bool = False
 
     @property
     def later(self) -> World:
@@ -263,7 +263,7 @@ CASES = (
     Case("right, 10 drives of 250 m", World(), 10, length=250.0),
     Case("right in space, 10 drives of 250 m", ROADS[2][1], 10, length=250.0),
     Case("way by turn, -0.4 m a rad", World(slip=-0.4)),
-    Case("way by turn, corrected", World(slip=-0.4), correct=BY_TURN),
+    Case("way by turn, corrected", World(slip=-0.4), by_turn=True),
     Case("one drive, halves", World(), 1),
     Case("loops closed", World(closed=True)),
     Case("one camera, x2.2", World(metric=2.2)),
@@ -271,7 +271,7 @@ CASES = (
 )
 
 
-def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, float, str]:
+def told(rng: np.random.Generator, case: Case, fresh: DriveWindows) -> tuple[str, float, str]:
     """Status, true ratio of the exported model on ``fresh`` drives, and the reason of a refusal or first warning.
 
     The parts of :func:`consistency.fit_covariance` that decide, without those that describe.
@@ -280,17 +280,16 @@ def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, flo
     judged = [drive(rng, case.later, f"judged {i}", case.length) for i in range(case.judged)]
     names, every = ",".join(each.name for each in judged) or None, [*made, *judged]
     try:
-        windows = windows_of(every, span_of(SPAN))
-        require_sound(every, windows, False, True)
-        noise, folds = folds_of(every, windows, names, case.correct)
+        windows = cut_windows(every, span_of(SPAN))
+        require_sound(windows, True)
+        noise, folds = folds_of(windows, names, partial(fit_noise, by_turn=case.by_turn))
     except InputError as error:
         return "refused", np.nan, str(error)
-    lasting = persistent(noise, windows)
+    lasting = persistent_errors(noise, windows)
     depends = mean_by_motion(noise, windows).is_found
-    status = decided(
-        judged_by(folds, windows, len(every), case.fitted > 1).status, any(each.decides for each in lasting), depends
-    )
-    growth = growth_of(every, windows, False, noise.mean)
+    judged_status = judged_by(folds, windows, case.fitted > 1).status
+    status = decided(judged_status, any(each.decides for each in lasting), depends)
+    growth = rotation_growth(windows, noise.mean)
     warnings = doubts(noise, windows, growth, lasting)
     nees = noise.nees(fresh)[0]
     means = [nees[fresh.drive == i].mean() for i in range(FRESH)]
@@ -306,7 +305,7 @@ def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         if only not in case.name:
             continue
         rng = np.random.default_rng([seed, 100 + number])
-        fresh = windows_of([drive(rng, case.later, f"fresh {i}", SHORT) for i in range(FRESH)], span_of(SPAN))
+        fresh = cut_windows([drive(rng, case.later, f"fresh {i}", SHORT) for i in range(FRESH)], span_of(SPAN))
         found = [told(rng, case, fresh) for _ in range(draws)]
         ratio = np.array([each[1] for each in found])
         outside = (ratio < 1 / DETECT) | (ratio > DETECT)
@@ -352,7 +351,7 @@ def motion_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         rng, found = np.random.default_rng([seed, 500 + number]), []
         for _ in range(draws):
             made = drives(rng, count, world, SHORT)
-            windows = windows_of(made, span_of(span))
+            windows = cut_windows(made, span_of(span))
             found.append(mean_by_motion(fit_noise(windows), windows))
         hits, p = sum(each.is_found for each in found), np.array([each.p_value for each in found])
         low, high = binomial_interval(hits, draws, 1.0 - 2 * SURE / tests)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 from script_options import options_of
 
 from consistency.referee.fit_covariance.drives import Drive
+from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of
 from consistency.referee.fit_covariance.systematic_errors import MeanFit
 from consistency.referee.fit_covariance.white_noise import fit_noise, jitter_of
-from consistency.referee.fit_covariance.windows import span_of, windows_at, windows_of
 from consistency.referee.geometry.groups import composed, matrices
 from consistency.referee.types import Array
 
@@ -108,9 +108,9 @@ def drives(rng: np.random.Generator, side: Side) -> list[Drive]:
 def fitted(rng: np.random.Generator, side: Side) -> tuple[MeanFit, float]:
     """The mean, and the ratio of true to stated covariance at 20 spans of other drives."""
     made, others = drives(rng, side), drives(rng, side)
-    windows = windows_of(made, span_of("1m"))
-    noise = fit_noise(windows, jitter=jitter_of(fit_noise(windows), made, windows, False))
-    judged = windows_at(others, windows, float(LONG), False)
+    windows = cut_windows(made, span_of("1m"))
+    noise = fit_noise(windows, jitter=jitter_of(fit_noise(windows), windows))
+    judged = replace(windows, drives=tuple(others)).over(float(LONG))
     assert judged is not None
     assert noise.mean_fit is not None
     nees = noise.nees(judged)[0]
@@ -159,7 +159,7 @@ def drift_rows(draws: int, seed: int, only: str) -> bool:
             continue
         said = 0
         for draw in range(draws):
-            windows = windows_of(drives(np.random.default_rng([seed, 1000 + number, draw]), side), span_of("1m"))
+            windows = cut_windows(drives(np.random.default_rng([seed, 1000 + number, draw]), side), span_of("1m"))
             fit = fit_noise(windows).mean_fit
             said += fit is not None and fit.is_open
         held &= said >= MADE * draws

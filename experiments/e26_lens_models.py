@@ -25,10 +25,10 @@ from consistency.bench.scenario import PicturedSensor, UvdSensor
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.characterising.bias import GRID
+from consistency.stereo.characterising.bias_map import GRID
 from consistency.stereo.characterising.boards import MODELS, find_corners, of_model
 from consistency.stereo.characterising.characterise import Characterisation
-from consistency.stereo.characterising.sensor_text import believed
+from consistency.stereo.characterising.sensor_text import believed_sensor
 from consistency.stereo.visual_odometry.cameras.opencv import opencv
 
 FINDINGS = ("chessboard-map", "chessboard-noise")
@@ -122,7 +122,7 @@ def with_camera(world: cs.Scenario, camera: PicturedSensor) -> cs.Scenario:
 
 def beliefs(model: str, of: Characterisation) -> dict[str, cs.Scenario]:
     """The camera in the world of herath2007-stereo, and what a filter may believe of it."""
-    rig = with_camera(cs.load_scenario("herath2007-stereo"), believed(of))
+    rig = with_camera(cs.load_scenario("herath2007-stereo"), believed_sensor(of))
     summary = f"herath2007-stereo with a camera that was calibrated with lens model '{model}'"
     full = rig.variant(f"lens-{model}", summary=f"{summary}; its noise and bias map believed")
     alone = rig.variant(

@@ -16,6 +16,7 @@ from consistency.bench.challenging.worlds import Point, Space, require_right_bel
 from consistency.bench.filters import get_filter
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
+from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.montecarlo import resolve_filters, run_trials
 from consistency.bench.scenario import Scenario, load_scenario
 from consistency.referee.column_names import POSE
@@ -23,8 +24,7 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.diagnostics import Settings, Verdict, gate_runs
 from consistency.referee.diagnostics.verdict.answers import JOINT, SCALE
 from consistency.referee.errors import InputError
-from consistency.referee.verdicts.options import refused
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.command_settings import refused
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
 SIZE_QUESTIONS = (*SCALE, JOINT, "outliers")  # what a confirmation needs a fault in: errors that are too large

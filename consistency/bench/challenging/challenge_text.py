@@ -10,13 +10,13 @@ import numpy as np
 from consistency.bench.challenging.challenge import Challenge
 from consistency.bench.scenario import scenario_text
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.diagnostics.words.sentences import p_text
+from consistency.referee.diagnostics.words.numbers import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
 
 
-def lines(outcome: Challenge, out: Path) -> list[str]:
+def challenge_lines(outcome: Challenge, out: Path) -> list[str]:
     """What to print; ``out`` is the file that was written, if the filter was found overconfident."""
     plan, verdict = outcome.plan, outcome.verdict
     name = outcome.filter
@@ -50,7 +50,7 @@ def command(outcome: Challenge, out: Path) -> str:
     return f"consistency run {out} --filter {outcome.filter} --runs {outcome.plan.runs} --seed {seed} --out results"
 
 
-def as_data(outcome: Challenge, out: Path) -> dict[str, Any]:
+def challenge_data(outcome: Challenge, out: Path) -> dict[str, Any]:
     plan, verdict, space = outcome.plan, outcome.verdict, outcome.space
     search_seed, confirm_seed = plan.seeds
     return {

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor, misbelief
-from consistency.bench.scenario.scenario import with_changes
+from consistency.bench.scenario.truth_and_belief import with_changes
 from consistency.bench.simulation.variation import (
     SHAPES,
     Changes,

@@ -19,7 +19,7 @@ from consistency.bench.filters import get_filter
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.runs.sequential import plan_of
 from consistency.bench.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
-from consistency.bench.scenario.scenario import unknown, with_changes
+from consistency.bench.scenario.truth_and_belief import unknown, with_changes
 from consistency.bench.sweeps.axes import QUANTITIES, Axis, is_number, leaves, require_key
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, POWER

@@ -10,7 +10,7 @@ from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import values_of
 from consistency.bench.sweeps.regime import Regime
 from consistency.referee.diagnostics.verdict.parts import STATUSES
-from consistency.referee.diagnostics.words.sentences import short
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.document.blocks import Block, Cell, Column, Status, Table, Text, table
 from consistency.referee.document.wording import NONE
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from consistency.bench.scenario import Scenario
-from consistency.bench.store.folder_tables import write_folder
+from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellOutcome, CellResult, plain_numbers, result_from
@@ -138,7 +138,7 @@ class SweepFolder:
         manifest = manifest_of(kind=KIND, sweep=describe(self.sweep))
         if not self.path.exists():
             try:
-                write_folder(self.path, {}, manifest)
+                write_tables(self.path, {}, manifest)
                 return
             except InputError:
                 if not self.path.exists():
@@ -178,7 +178,7 @@ class SweepFolder:
             seed=self.sweep.seed_of(work.cell), result=plain_numbers(outcome.result),
             scenario=work.cell.scenario.model_dump(mode="json"),
         )  # fmt: skip
-        write_folder(
+        write_tables(
             self.place(work), {}, manifest,
             lambda at: outcome.runs.to_csv(at / "runs.csv", index=False, float_format="%.6g"), overwrite=True,
         )  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from consistency.bench.filters import get_filter
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
+from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import Belief, Scenario, load_scenario
 from consistency.bench.store.log import Log
@@ -25,7 +26,6 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import quiet
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import analyse
 
 OTHER_STARTS = (10.0, 0.1, 100.0)  # common factors to begin with where a run fails at the one that the data ask for
 MOST_TOLERATED = 1.1  # ratio of true to stated covariance: what a verdict may excuse as the uncertainty of a fit

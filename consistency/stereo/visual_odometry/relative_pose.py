@@ -12,7 +12,7 @@ import numpy as np
 
 from consistency.referee import geometry
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import carried
+from consistency.referee.geometry.groups import propagated
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras import array_checks
 from consistency.stereo.visual_odometry.cameras.input_errors import GimbalLockError
@@ -140,7 +140,7 @@ def invert(pose: RelativePose, S: Array) -> tuple[RelativePose, Array]:
     J[:3, :3] = -pose.R.T
     J[:3, 3:] = -pose.R.T @ cross_matrix(pose.t) @ angular(pose)
     J[3:, 3:] = -np.linalg.inv(angular(inverse)) @ pose.R.T @ angular(pose)
-    return inverse, carried(J, S)
+    return inverse, propagated(J, S)
 
 
 def cross_matrix(v: Array) -> Array:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.trial_work import TrialWork as Runs
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal, Unfinished
@@ -225,18 +225,16 @@ def test_a_cell_that_was_done_after_the_sweep_began(at: Path, monkeypatch: pytes
     assert len(done) == 2
 
 
-def test_the_backend_does_the_runs(at: Path) -> None:
+def test_the_executor_does_the_runs(at: Path) -> None:
     done: list[int] = []
 
-    class Backend:
-        def prepare(self, work: Runs, run: int, /) -> None:
-            LocalThreads(1).prepare(work, run)
+    class Noted(ThreadPoolExecutor):
+        def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+            done.extend(arguments[1])
+            return super().submit(function, *arguments, **options)
 
-        def outcomes(self, work: Runs, runs: Sequence[int], /) -> Iterator[RunOutcome]:
-            done.extend(runs)
-            yield from LocalThreads(1).outcomes(work, runs)
-
-    run_sweep(grid(at), at / "out", backend=Backend())
+    with Noted(1) as executor:
+        run_sweep(grid(at), at / "out", executor=executor)
     assert done == [*range(14)] * 3
 
 

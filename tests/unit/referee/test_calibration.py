@@ -59,7 +59,7 @@ def test_the_documentation_shows_it() -> None:
     assert calibration_rows.markdown(TABLE) in (ROOT / "docs/referee.md").read_text(encoding="utf-8")
 
 
-def test_rows_of_one_module_take_the_place_of_their_questions() -> None:
+def test_rows_of_one_module_take_the_place_of_their_questions_in_their_worlds() -> None:
     old = ROWS[0]
     new = replace(old, world="a new world", question="a new question", gates=7, found=1)
     table = calibration_rows.merged(TABLE, [new], {"a new world": "it", "a new question": "asked"})
@@ -69,6 +69,8 @@ def test_rows_of_one_module_take_the_place_of_their_questions() -> None:
     again = calibration_rows.merged(table, [replace(new, found=2)], {})
     assert [row.found for row in calibration_rows.rows_of(again) if row.question == new.question] == [2]
     assert again["worlds"] == table["worlds"]
+    beside = calibration_rows.merged(TABLE, [replace(new, question=old.question)], {"a new world": "it"})
+    assert [row for row in calibration_rows.rows_of(beside) if row.world != "a new world"] == list(ROWS)
 
 
 def test_every_question_and_world_of_the_table_is_explained() -> None:

@@ -13,28 +13,34 @@ from fit_covariance import OWN_CONSTANTS, World, drives, matrices_of
 import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.clocks import clock_offset
-from consistency.referee.fit_covariance.covariance_ratios import Judged, Ratio, ratio_of
+from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan, Ratio, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
-from consistency.referee.fit_covariance.mean_by_motion import SCALES, _by_bin, mean_by_motion, p_value_of
-from consistency.referee.fit_covariance.noise_model import decided
-from consistency.referee.fit_covariance.refusals import require_poses
-from consistency.referee.fit_covariance.slip import BY_TURN, effect_of, fit_slip, held_out_gain
-from consistency.referee.fit_covariance.systematic_errors import Mean, design_of
-from consistency.referee.fit_covariance.white_noise import fit_noise
-from consistency.referee.fit_covariance.windows import (
+from consistency.referee.fit_covariance.mean_by_motion import (
+    SCALES,
+    held_out_gain,
+    mean_by_motion,
+    p_value_of,
+    values_by_bin,
+)
+from consistency.referee.fit_covariance.model_text import correction, noise_lines, sentence
+from consistency.referee.fit_covariance.motion_windows import (
     ROUNDED,
     blocks_of,
+    cut_windows,
     lengthened,
+    rotation_vectors,
     span_of,
-    turns,
     ways,
-    windows_of,
 )
-from consistency.referee.fit_covariance.wording import correction, lines, sentence
+from consistency.referee.fit_covariance.noise_model import decided
+from consistency.referee.fit_covariance.refusals import require_poses
+from consistency.referee.fit_covariance.systematic_errors import Mean, fit_slip, jacobian, jacobian_of_mean
+from consistency.referee.fit_covariance.white_noise import fit_noise
 from consistency.referee.fit_covariance.writing import toml
 from consistency.referee.geometry.groups import composed, inverse, vectors
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.places import Places
+from consistency.referee.readers.truth_matching import Manifold, Poses, unstated
 from consistency.referee.types import Array
 
 SPAN = "10m"
@@ -61,22 +67,22 @@ def paced(rng: np.random.Generator, noise: float, number: int = 5) -> list[Drive
 
 @pytest.mark.parametrize("world", [World(), World(*SPACE)], ids=["plane", "space"])
 def test_effect_of_a_slip_is_its_derivative(world: World, rng: np.random.Generator) -> None:
-    w = windows_of(drives(rng, 1, world, 300.0), span_of(SPAN))
+    w = cut_windows(drives(rng, 1, world, 300.0), span_of(SPAN))
     w = replace(w, true=w.motions)
     less, more = (replace(w, pieces=lengthened(w.pieces, slip)).errors for slip in (-1e-6, 1e-6))
-    np.testing.assert_allclose((less - more) / 2e-6, effect_of(w.pieces), atol=1e-6)
+    np.testing.assert_allclose((less - more) / 2e-6, jacobian(w.pieces)[..., -1], atol=1e-6)
     longer = lengthened(w.pieces, 0.1)
-    np.testing.assert_allclose(ways(longer), ways(w.pieces) + 0.1 * np.linalg.norm(turns(w.pieces), axis=-1))
-    np.testing.assert_allclose(turns(longer), turns(w.pieces))
+    np.testing.assert_allclose(ways(longer), ways(w.pieces) + 0.1 * np.linalg.norm(rotation_vectors(w.pieces), axis=-1))
+    np.testing.assert_allclose(rotation_vectors(longer), rotation_vectors(w.pieces))
     assert ways(lengthened(w.pieces, -1e3)).min() == 0.0
 
 
 def test_a_known_slip_is_recovered_and_corrected(rng: np.random.Generator) -> None:
     """With hardly any noise: the corrected motion is the true one."""
     quiet = World((1e-10, 1e-10, 1e-12), (1e-12,) * 3, slip=-0.1)
-    w = windows_of(drives(rng, 2, quiet, 400.0), span_of(SPAN))
+    w = cut_windows(drives(rng, 2, quiet, 400.0), span_of(SPAN))
     assert fit_slip(w) == pytest.approx(-0.1, rel=1e-3)
-    noise = fit_noise(w, BY_TURN)
+    noise = fit_noise(w, by_turn=True)
     assert noise.mean.slip == pytest.approx(-0.1, rel=1e-3)
     assert noise.mean.way == pytest.approx(1.0, abs=1e-3)
     assert np.abs(noise.mean.applied(w).errors).max() < 1e-3
@@ -85,14 +91,14 @@ def test_a_known_slip_is_recovered_and_corrected(rng: np.random.Generator) -> No
     piece = matrices_of(np.array([[1.0, 0.0, -0.5]]))[None]
     corrected = Mean(2.0, 0.9, (0.1,), slip=-0.2).corrected(piece)
     assert ways(corrected)[0, 0] == pytest.approx(2.0 * (1.0 - 0.2 * 0.5))
-    assert turns(corrected)[0, 0, 0] == pytest.approx(0.9 * -0.5 + 0.1 * 0.9)
+    assert rotation_vectors(corrected)[0, 0, 0] == pytest.approx(0.9 * -0.5 + 0.1 * 0.9)
 
 
 def test_a_slip_keeps_the_floor_and_the_evidence(rng: np.random.Generator) -> None:
-    w = windows_of(drives(rng, 2, World(slip=-0.2), 300.0), span_of(SPAN))
-    noise = fit_noise(w, BY_TURN, np.array([1.0, 2.0, 3.0]))
+    w = cut_windows(drives(rng, 2, World(slip=-0.2), 300.0), span_of(SPAN))
+    noise = fit_noise(w, by_turn=True, jitter=np.array([1.0, 2.0, 3.0]))
     assert noise.floor.tolist() == [1.0, 2.0, 3.0]
-    alone = fit_noise(replace(w, pieces=lengthened(w.pieces, noise.mean.slip)), True, noise.floor)
+    alone = fit_noise(w.lengthened(noise.mean.slip), jitter=noise.floor)
     assert noise.mean_fit is not None
     assert alone.mean_fit is not None
     np.testing.assert_array_equal(noise.mean_fit.low, alone.mean_fit.low)
@@ -103,15 +109,15 @@ def test_a_straight_drive_tells_no_slip(rng: np.random.Generator) -> None:
     steps = np.tile([0.5, 0.0, 0.0], (1200, 1))
     noisy = steps + rng.normal(size=steps.shape) * [0.02, 0.0, 0.0]
     T, M = (composed(matrices_of(each)) for each in (noisy, steps))
-    assert fit_slip(windows_of([Drive("a", np.arange(1200.0), np.arange(1200), T, M)], span_of(SPAN))) == 0.0
+    assert fit_slip(cut_windows([Drive("a", np.arange(1200.0), np.arange(1200), T, M)], span_of(SPAN))) == 0.0
 
 
 def test_slip_that_helps_nothing_gains_nothing(rng: np.random.Generator) -> None:
-    w = windows_of(drives(rng, 5, length=300.0), span_of(SPAN))
+    w = cut_windows(drives(rng, 5, length=300.0), span_of(SPAN))
     assert held_out_gain(w, blocks_of(w.drive)) < 0.05
     quiet = World((1e-10, 1e-10, 1e-12), (1e-12,) * 3, slip=0.1)
     opposite = [*drives(rng, 1, quiet, 300.0), *drives(rng, 1, replace(quiet, slip=-0.1), 300.0)]
-    w = windows_of(opposite, span_of(SPAN))
+    w = cut_windows(opposite, span_of(SPAN))
     assert held_out_gain(w, [np.flatnonzero(w.drive == i) for i in range(2)]) < 0.0
 
 
@@ -154,10 +160,10 @@ def test_a_way_by_turn_is_found_named_and_corrected(rng: np.random.Generator) ->
 def test_a_scale_that_depends_on_the_turn_has_its_values(scale: int, rng: np.random.Generator) -> None:
     """Planted in thirds of the windows: x1, x1.1 and x1.2 of either scale."""
     made = drives(rng, 4, World((1e-6, 1e-6, 1e-8), (1e-9,) * 3), 500.0)
-    w = windows_of(made, span_of(SPAN))
-    size = np.linalg.norm(turns(w.pieces), axis=-1).sum(axis=1)
+    w = cut_windows(made, span_of(SPAN))
+    size = np.linalg.norm(rotation_vectors(w.pieces), axis=-1).sum(axis=1)
     thirds = np.searchsorted(np.quantile(size, [1 / 3, 2 / 3]), size, side="right")
-    e = w.errors + 0.1 * thirds[:, None] * design_of(w.pieces)[:, :, scale]
+    e = w.errors + 0.1 * thirds[:, None] * jacobian_of_mean(w.pieces)[:, :, scale]
     noise = replace(fit_noise(w), mean=Mean())
     found = mean_by_motion(noise, replace(w, true=w.motions @ spatial.exp(e)))
     assert (found.scale, found.by) == (SCALES[scale], "turn")
@@ -168,10 +174,10 @@ def test_a_scale_that_depends_on_the_turn_has_its_values(scale: int, rng: np.ran
 
 def test_a_scale_of_all_windows_that_is_not_corrected_is_no_spread(rng: np.random.Generator) -> None:
     """A tenth of the way is 15 sigma, which would be a share of 200; noise alone makes 0.02 of it on average."""
-    w = windows_of(drives(rng, 5, World(), 400.0), span_of(SPAN))
+    w = cut_windows(drives(rng, 5, World(), 400.0), span_of(SPAN))
     noise, thirds = replace(fit_noise(w), mean=Mean()), np.arange(len(w.drive)) % 3
-    w = replace(w, true=w.motions @ spatial.exp(w.errors + 0.1 * design_of(w.pieces)[:, :, 0]))
-    values, error = _by_bin(w, thirds, 0)
+    w = replace(w, true=w.motions @ spatial.exp(w.errors + 0.1 * jacobian_of_mean(w.pieces)[:, :, 0]))
+    values, error = values_by_bin(w, thirds, 0)
     np.testing.assert_allclose(values, 0.1, atol=0.01)  # 10 standard errors
     assert np.abs(error).max() < 0.1
     found = mean_by_motion(noise, w)
@@ -182,9 +188,9 @@ def test_a_scale_of_all_windows_that_is_not_corrected_is_no_spread(rng: np.rando
 def test_a_scale_that_depends_on_the_way(rng: np.random.Generator) -> None:
     """Over seconds, with three speeds: x1 at the lowest and x1.1 at the highest."""
     made = paced(rng, 0.01)
-    w = windows_of(made, span_of("20s"))
+    w = cut_windows(made, span_of("20s"))
     fast = ways(w.pieces).sum(axis=1) > 15.0
-    e = w.errors + 0.1 * fast[:, None] * design_of(w.pieces)[:, :, 0]
+    e = w.errors + 0.1 * fast[:, None] * jacobian_of_mean(w.pieces)[:, :, 0]
     found = mean_by_motion(replace(fit_noise(w), mean=Mean()), replace(w, true=w.motions @ spatial.exp(e)))
     assert (found.is_found, found.scale, found.by, found.gain) == (True, SCALES[0], "way", 0.0)
     assert found.values[0] == pytest.approx(1.0, abs=0.02)
@@ -194,7 +200,7 @@ def test_a_scale_that_depends_on_the_way(rng: np.random.Generator) -> None:
 def test_noise_of_the_way_by_which_windows_are_divided_is_not_a_dependence(rng: np.random.Generator) -> None:
     """By the estimated way, a window that errs forward is a longer one; by the true way it is not."""
     made = paced(rng, 1.0)
-    w = windows_of(made, span_of("20s"))
+    w = cut_windows(made, span_of("20s"))
     noise = fit_noise(w)
     now = noise.mean.applied(w)
     size = ways(now.pieces).sum(axis=1)
@@ -208,14 +214,14 @@ def test_constants_of_each_drive_are_no_dependence() -> None:
     found = 0
     for seed in range(10):
         made = drives(np.random.default_rng([7, seed]), 4, World(scale=0.05, turn=0.05, drift=2e-3), 300.0)
-        w = windows_of(made, span_of(SPAN))
+        w = cut_windows(made, span_of(SPAN))
         found += mean_by_motion(fit_noise(w), w).p_value < 0.01
     assert found < 3
 
 
 def test_pieces_of_the_true_motion(rng: np.random.Generator) -> None:
     made = drives(rng, 2, length=200.0)
-    w = windows_of(made, span_of(SPAN)).of(np.arange(0, 38, 3))
+    w = cut_windows(made, span_of(SPAN)).of(np.arange(0, 38, 3))
     np.testing.assert_allclose(replace(w, pieces=w.true_pieces).errors, 0.0, atol=1e-9)
 
 
@@ -225,7 +231,7 @@ def test_pieces_of_the_true_motion(rng: np.random.Generator) -> None:
 def test_an_undecided_axis_makes_it_undecided_and_is_named(rng: np.random.Generator) -> None:
     axes = (RIGHT, RIGHT, OPEN)
     assert OPEN.status == "undecided"
-    judged = Judged(SPAN, RIGHT, axes, np.ones((1, 4)))
+    judged = JudgedSpan(SPAN, RIGHT, axes, np.ones((1, 4)))
     assert judged.status == "undecided"
     assert replace(judged, axes=(RIGHT, replace(RIGHT, low=1.2, high=1.6), OPEN)).status == "inconsistent"
     assert replace(judged, whole=replace(RIGHT, low=1.2, high=1.6)).status == "overconfident"
@@ -260,6 +266,12 @@ def test_the_mean_of_logarithms_of_few_degrees_of_freedom(rng: np.random.Generat
 # --- clocks ---------------------------------------------------------------------------------------------
 
 
+def bare(t: Array, estimate: Array, true_t: Array, truth: Array, manifold: Manifold, max_dt: float) -> Poses:
+    """Poses without covariances."""
+    place, P = Places("row {}".format, np.arange(len(t))), unstated(len(t), 3 if manifold == "planar" else 6)
+    return Poses(place, t, estimate, *P, true_t, truth, manifold, "left", max_dt)
+
+
 def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> list[tuple[Poses, Array]]:
     """Poses whose timestamps are ``late`` s early, in a world of their own, of a vehicle that does not move evenly."""
     found = []
@@ -267,7 +279,7 @@ def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> 
         t = np.cumsum(0.4 + 0.3 * np.sin(0.3 * np.arange(len(drive.t))))
         place = matrices_of(np.full((1, 3 if drive.d == 2 else 6), 0.7))
         E, M = vectors(place @ drive.estimate), vectors(drive.truth)
-        poses = Poses.bare(None, t - late, E, t, M, "planar" if drive.d == 2 else "spatial", 0.02)  # type: ignore[arg-type]
+        poses = bare(t - late, E, t, M, "planar" if drive.d == 2 else "spatial", 0.02)
         found.append((poses, place @ drive.estimate))
     return found
 
@@ -284,7 +296,7 @@ def test_an_offset_of_clocks_is_found_from_motions(
 
 def test_an_offset_that_nothing_tells_is_refused() -> None:
     M = np.column_stack([np.arange(300.0), np.zeros((300, 2))])
-    poses = Poses.bare(None, np.arange(300.0), M, np.arange(300.0), M, "planar", 0.5)  # type: ignore[arg-type]
+    poses = bare(np.arange(300.0), M, np.arange(300.0), M, "planar", 0.5)
     with pytest.raises(InputError, match="--time-offset estimate: the motions do not tell it"):
         clock_offset([(poses, matrices_of(M))])
 
@@ -304,8 +316,8 @@ def test_the_command_reads_an_offset_that_is_estimated(tmp_path: Path, rng: np.r
     np.testing.assert_array_equal(found[2].truth, fixed[2].truth)
     assert fixed[0].shift == 0.0
     model = cs.fit_covariance(found, SPAN)
-    assert f"clocks: {found[0].shift:.3g} s are added to the timestamps" in "\n".join(lines(model))
-    assert "clocks" not in "\n".join(lines(replace(model, drives=tuple(fixed))))
+    assert f"clocks: {found[0].shift:.3g} s are added to the timestamps" in "\n".join(noise_lines(model))
+    assert "clocks" not in "\n".join(noise_lines(replace(model, windows=replace(model.windows, drives=tuple(fixed)))))
     with pytest.raises(InputError, match="--time-offset fast: must be a number of seconds, or 'estimate'"):
         cs.read_drives(tmp_path / "est", reading=replace(given, time_offset="fast"))
     whole = [cs.read_drives(tmp_path / "est", reading=replace(given, time_offset=one))[0].t[0] for one in (1, 1.0)]
@@ -361,6 +373,33 @@ def test_a_scale_that_is_not_metric_is_not_taken_for_increments(rng: np.random.G
         cs.fit_covariance(drives(rng, 2, World(metric=2.2)), SPAN)
 
 
+@pytest.mark.parametrize("side", ["estimates", "truth"])
+@pytest.mark.parametrize("kind", ["npz", "csv", "folder"])
+def test_headings_in_degrees_are_refused(kind: str, side: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    """Those of unwrapped radians are read, though they are beyond a turn."""
+    drive = drives(rng, 1, length=300.0)[0]
+    rows = {"estimates": vectors(drive.estimate), "truth": vectors(drive.truth)}
+
+    def read() -> list[Drive]:
+        if kind == "npz":
+            np.savez(tmp_path / "a.npz", t=drive.t, **rows)
+            return cs.read_drives(tmp_path / "a.npz")
+        paths = {each: tmp_path / each / "a.csv" for each in rows}
+        for each, path in paths.items():
+            path.parent.mkdir(exist_ok=True)
+            table = np.column_stack([drive.t, rows[each]])
+            np.savetxt(path, table, delimiter=",", header="t,x,y,heading", comments="", fmt="%.12g")
+        if kind == "csv":
+            return cs.read_drives(paths["estimates"], paths["truth"])
+        return cs.read_drives(tmp_path / "estimates", tmp_path / "truth")
+
+    rows[side][:, 2] += 6.0 * np.pi
+    assert len(read()) == 1
+    rows[side][:, 2] = np.rad2deg(rows[side][:, 2] - 6.0 * np.pi)
+    with pytest.raises(InputError, match=rf"headings of the {side} .* seem to be in degrees; write headings in rad"):
+        read()
+
+
 @pytest.mark.parametrize("size", [1e-12, 1e-9, 1e-5])
 def test_rotations_equal_to_rounding_are_no_closed_loops(size: float, rng: np.random.Generator) -> None:
     """Headings of the truth, rounded to a step of ``size``; positions err as they did."""
@@ -371,7 +410,7 @@ def test_rotations_equal_to_rounding_are_no_closed_loops(size: float, rng: np.ra
         made.append(drive_of(drive.name, E, M, drive.t))
     with pytest.raises(InputError, match=r"rotations of estimate and truth differ by .* as by rounding"):
         cs.fit_covariance(made, SPAN)
-    assert windows_of(made, span_of(SPAN)).jumps == 0
+    assert cut_windows(made, span_of(SPAN)).jumps == 0
     assert size < ROUNDED
 
 

@@ -72,7 +72,7 @@ class UvdEffect(ListedEffect):
 EFFECTS: dict[str, type[ListedEffect]] = {}  # by kind
 
 
-def register(effect: type[E]) -> type[E]:
+def register_effect(effect: type[E]) -> type[E]:
     """Decorator that makes the kind of an effect known to scenarios."""
     EFFECTS[effect.model_fields["kind"].default] = effect
     return effect

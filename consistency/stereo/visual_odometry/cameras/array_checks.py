@@ -14,7 +14,7 @@ ORTHONORMAL = 1e-6  # largest entry of R'R - I: a calibration file has about tha
 LARGEST = 1e75  # of a number: fourth powers of coordinates are still finite
 
 
-def rows(name: str, value: Any, width: int) -> Array:
+def checked_rows(name: str, value: Any, width: int) -> Array:
     """``value`` as floats of shape (N, width).
 
     Raises

@@ -7,7 +7,7 @@ import numpy as np
 from consistency.referee.types import Array
 
 
-def inverse(C: Array) -> tuple[Array, Array]:
+def symmetric_inverses(C: Array) -> tuple[Array, Array]:
     """Inverses (..., m, m) of symmetric matrices, and which of them are positive definite (...).
 
     What stands for the inverse of one that is not means nothing. Three rows go by cofactors, which takes a third of

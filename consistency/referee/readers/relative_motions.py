@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.questions.independence import ENOUGH, Independence, independence
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.words.numbers import p_text, plural
@@ -140,7 +140,7 @@ def _of_poses(s: Stretch, T: Array, D: Array, first: Indices, last: Indices, rel
 
 def relative_recording(
     name: str, file: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
-) -> Evidence:
+) -> Record:
     """The windows of some runs of one estimator as a recording, whose steps are windows.
 
     Parameters

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.records.large_arrays import of_runs
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, asymmetric, classify
 from consistency.referee.diagnostics.statistics.nees import nees
@@ -59,7 +59,7 @@ def assemble(
     convention: str = "",
     notes: Sequence[str] = (),
     may_end: bool = False,
-) -> Evidence:
+) -> Record:
     """Assemble tracks on the common steps, find failures, and leave out exactly known starts.
 
     Parameters
@@ -107,7 +107,7 @@ def assemble(
         return out
 
     arrays: dict[str, Any] = {key: grid(key) for key in ARRAYS}
-    return Evidence(
+    return Record(
         name, runs=np.array([part.run for part in parts], dtype=np.int64), t=t, nees=grid("nees"),
         dof=len(axes) if arrays["error"] is not None else 0, axes=axes, failures=tuple(failures),
         convention=convention, notes=tuple(notes), times=grid("t"), **arrays,

@@ -111,7 +111,9 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
         )  # fmt: skip
     causes = []
     if convention == "vector":
-        remedy = "add --error so2, if these are x, y, heading" if declared and n == 3 else "wrap it to [-pi, pi]"
+        remedy = "wrap it to [-pi, pi]"
+        if declared and n == 3:
+            remedy = "add --error so2, if these are x, y, heading"
         gap = np.where(there[..., None], truth - estimates, np.nan)
         causes = turns(path.stem, axes, gap, covariances, remedy)
     definition = PLANAR[declared] if declared else ""
@@ -139,7 +141,9 @@ def _beside(path: Path, place: Places, estimate: Array, truth: Array, known: Arr
     """Estimates (T, n) of one run and their truth where it is ``known``, without covariances, in the plane."""
     steps, n = estimate.shape
     t = np.arange(float(steps))
-    true_t, truth = (t, truth) if known.all() else (t[known], truth[known])
+    true_t = t
+    if not known.all():
+        true_t, truth = t[known], truth[known]
     return Poses(
         place, t, estimate, *unstated(steps, n), true_t, truth, "planar", "left", 0.0, files=(path, path),
         numbered=True, clock=clock[:steps],

@@ -22,6 +22,7 @@ from consistency.referee.readers.formats.file_kinds import (
     unknown_kind,
 )
 from consistency.referee.readers.formats.table import read_tables
+from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.kinds import Found, kind_of
 from consistency.referee.readers.places import refuse
@@ -70,7 +71,9 @@ def read_drives(
         raise InputError(f"{path}: no such file")
     if r.time_offset not in (None, "estimate") and not isinstance(r.time_offset, (int, float)):
         raise InputError(f"--time-offset {r.time_offset}: must be a number of seconds, or 'estimate'")
-    found = [(each, _matrices(each, r)) for each in _poses(path, r)]
+    poses = _poses(path, r)
+    require_radians(str(path), poses)
+    found = [(each, _matrices(each, r)) for each in poses]
     if r.time_offset != "estimate":
         return [_drive(each, T, float(r.time_offset or 0.0)) for each, T in found]
     shift = clock_offset(found)
@@ -99,11 +102,11 @@ def drive_of(
     if not (np.isfinite(estimate).all() and np.isfinite(truth).all()):
         raise InputError(f"{name}: a pose is not finite; leave such rows out")
     T = matrices(estimate)
-    rows = np.arange(len(T)) if row is None else row
-    return Drive(
-        name, np.full(len(T), np.nan) if t is None else np.asarray(t, float), rows,
-        composed(T) if motions else T, matrices(truth),
-    )  # fmt: skip
+    if t is None:
+        t = np.full(len(T), np.nan)
+    if row is None:
+        row = np.arange(len(T))
+    return Drive(name, np.asarray(t, float), row, composed(T) if motions else T, matrices(truth))
 
 
 def _poses(path: Path, r: Reading) -> list[Poses]:
@@ -139,7 +142,9 @@ def _of_folder(folder: Path, r: Reading) -> list[Poses]:
         raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
     found = []
     for path in files:
-        truth = r.truth / path.name if r.truth is not None and r.truth.is_dir() and not is_drive(r.truth) else r.truth
+        truth = r.truth
+        if truth is not None and truth.is_dir() and not is_drive(truth):
+            truth = truth / path.name
         if truth is not None and not truth.exists():
             raise InputError(f"--truth {r.truth}: holds no file '{path.name}' for {path}")
         stem = path.name.split(".")[0]

@@ -129,11 +129,13 @@ def _require_different(file: str, tracks: Sequence[Track]) -> None:
 
 
 def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
-    """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so already."""
+    """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so, nor one triangle alone."""
     out = np.empty(covariance.shape)
     with np.errstate(invalid="ignore"):  # of infinite ones
         for piece in of_runs(out):
             P = covariance[piece]
+            if np.triu(P, 1).any() != np.tril(P, -1).any():
+                P = np.where(P == 0, np.swapaxes(P, -1, -2), P)
             rows = Places(place, np.arange(piece.start, piece.stop))
             what = "the covariance is not symmetric; write P = (P + P') / 2"
             refuse(asymmetric(P, ROUNDED), rows.__getitem__, what)

@@ -18,7 +18,6 @@ from documents import parsed
 
 import consistency as cs
 from consistency.bench import filters
-from consistency.bench.shipped import summaries
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.commands.app import app
 from consistency.commands.registry import COMMANDS
@@ -32,6 +31,7 @@ from consistency.referee.extras import (
     require,
     requirements,
 )
+from consistency.referee.system.shipped import summaries
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -108,10 +108,10 @@ def test_the_core_is_small() -> None:
 @pytest.mark.usefixtures("nowhere")
 def test_a_sentence_names_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     require("this", "bench", "report")
-    without(monkeypatch, "numba", "tomli_w", "bokeh")
+    without(monkeypatch, "numba", "tomli_w", "typst")
     with pytest.raises(MissingPackageError) as refusal:
         require("this", "bench", "report")
-    assert str(refusal.value) == "this needs numba, tomli-w, bokeh: pip install numba tomli-w bokeh"
+    assert str(refusal.value) == "this needs numba, tomli-w, typst: pip install numba tomli-w typst"
     assert isinstance(refusal.value, ImportError)
     assert isinstance(refusal.value, cs.InputError)
     assert extras.is_installed("ros")
@@ -190,9 +190,9 @@ def test_the_place_that_it_came_from(
     monkeypatch.setattr(metadata, "distribution", lambda name: found.get(name) or installed(name))
     words = [word.replace("{at}", str(place)) for word in expected]
     assert extras._from_origin(("bench", "plot")) == words
-    without(monkeypatch, "bokeh")
-    expected = [word.replace("bench,plot", "report") for word in words] or ["bokeh"]
-    assert shlex.split(remedy("report")) == ["bokeh:", "pip", "install", *expected]
+    without(monkeypatch, "typst")
+    expected = [word.replace("bench,plot", "report") for word in words] or ["typst"]
+    assert shlex.split(remedy("report")) == ["typst:", "pip", "install", *expected]
 
 
 def test_no_text_installs_from_an_index() -> None:
@@ -234,6 +234,23 @@ print(cs.anees.__name__, "run_trials" in dir(cs))
     assert (other, here) == ("ImportError", "anees True")
 
 
+def test_a_failed_import_is_explained_by_the_extra_that_has_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not by one that collects others."""
+    monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
+    for module, package, extra in (("joblib", "joblib", "bench"), ("yaml", "pyyaml", "vision")):
+        without(monkeypatch, module)
+        error = explained(ModuleNotFoundError(name=f"{module}.part"), "this")
+        assert str(error) == f"this needs {package}: pip install 'here[{extra}]'"
+        monkeypatch.undo()
+        monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
+
+
+def test_who_needs_no_extra_does_not_wait_for_the_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "requires", lambda _: pytest.fail("the metadata were read"))
+    require("this")
+    assert requirements() == []
+
+
 def test_another_module_that_is_missing_is_not_explained() -> None:
     assert explained(ModuleNotFoundError(name="no_such_module"), "this") is None
     assert explained(ModuleNotFoundError(), "this") is None
@@ -248,7 +265,7 @@ def test_a_command_without_its_packages(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Whatever its options are; its help is there."""
-    module = "bokeh" if name == "report" else "numba"
+    module = "typst" if name == "report" else "numba"
     without(monkeypatch, module)
     err = refused(capsys, name, "--no-such-option")
     assert err.startswith(f"consistency: '{name}' needs {module}: pip install ")
@@ -262,7 +279,7 @@ def test_a_command_without_its_packages(
 def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     before, _ = consistency(capsys, "--help")
     assert "[bench]" not in before
-    without(monkeypatch, "numba", "bokeh")
+    without(monkeypatch, "numba", "typst")
     after, _ = consistency(capsys, "--help")
     lines = dict(re.findall(r"^  ([a-z-]+) +(\S.*)$", after, re.MULTILINE))
     assert set(COMMANDS) <= set(lines)
@@ -270,7 +287,7 @@ def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pyt
         mark = f"[{','.join(row.extras)}] " if row.extras else ""
         assert lines[name].startswith(mark), name
         assert row.extras or not lines[name].startswith("[")
-    assert "[report,bench,vision]: needs bokeh, numba: pip install " in after
+    assert "[report,bench,vision]: needs typst, numba: pip install " in after
     assert consistency(capsys, "-h")[0] == after
 
 

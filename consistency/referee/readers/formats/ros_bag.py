@@ -22,8 +22,8 @@ from consistency.referee.readers.formats.pose_rows import POSE
 from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.formats.tum import UNIT, SpaceRun, poses_of, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.relative_motions import MARGINAL
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
+from consistency.referee.readers.windows import MARGINAL
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance

@@ -332,7 +332,7 @@ def _innovations(e: Estimator) -> Record:
 
 def _windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:
     """The record of motions over windows."""
-    from consistency.referee.readers.relative_motions import Stretch, relative_recording
+    from consistency.referee.readers.pipeline.relative_motions import Stretch, relative_recording
 
     if e.stated != WHOLE:
         raise InputError(f"{e.path}: --relative needs covariances of whole poses; here parts are stated apart")

@@ -10,13 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.pages.report_input import Report
 from consistency.bench.scenario import data_folder
 from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.document.blocks import Block, Cell, Column, Details, Facts, Table, Text
-from consistency.referee.pages.section import Part, Section
 
-REFEREE = Part("calibration", "How far the referee can be trusted", "The referee")
 NAME = "calibration.json"
 CONFIDENCE = 0.99  # of the interval of a measured share
 HEADS = ("World", "What it is")
@@ -90,10 +87,6 @@ class Calibration:
         return [Promise(str(key[0]), tuple(rates)) for key, rates in found.items()]
 
 
-def read(_: Report) -> Calibration | None:
-    return calibration()
-
-
 def calibration(path: Path | None = None) -> Calibration | None:
     """The table of ``path``, or the shipped one; None where there is none."""
     path = path or shipped()
@@ -122,7 +115,11 @@ def _rates(rows: Iterable[dict[str, Any]]) -> Iterable[Rate]:
         )  # fmt: skip
 
 
-def show(c: Calibration) -> tuple[Block, ...]:
+def calibration_rates() -> tuple[Block, ...]:
+    """The promises of the referee, and how often they were kept; nothing where no table is shipped."""
+    c = calibration()
+    if c is None:
+        return ()
     promises = Table(COLUMNS, groups(c), "Promises of the referee, and how often they were kept", style="grouped")
     worlds = Facts(tuple((name, about.replace("`", "")) for name, about in c.worlds.items()), HEADS, "4cm")
     return Text(text(c)), promises, Details("Worlds", (worlds,))
@@ -164,6 +161,3 @@ def text(c: Calibration) -> str:
         f"Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees of freedom where not said otherwise, seed "
         f"{c.seed}), with exact binomial intervals. A promise is broken where the whole interval is on its wrong side."
     )
-
-
-SECTION = Section(REFEREE, read, show)

@@ -1,8 +1,19 @@
-"""Tables with a row for each filter of a study, where they apply; and what is said where the truth is not known."""
+"""The sections of a study in their order; those that are a table with a row for each filter stand here.
+
+A section is a function from a study to blocks: none where it does not apply. A new one is written here, or in a file
+of its own if it is long, and named in :data:`SECTIONS`.
+"""
 
 from __future__ import annotations
 
-from consistency.bench.pages.report_input import Study, as_given
+from collections.abc import Callable
+
+from consistency.bench.pages.report_input import Study
+from consistency.bench.pages.sections.anees import anees_curves
+from consistency.bench.pages.sections.innovations import innovations
+from consistency.bench.pages.sections.nees_distribution import nees_distribution
+from consistency.bench.pages.sections.pose_errors import pose_errors
+from consistency.bench.pages.sections.world import world_map
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Text, table
 from consistency.referee.document.guard import COLUMNS as GUARD_COLUMNS
 from consistency.referee.document.guard import rejection_cells
@@ -11,7 +22,8 @@ from consistency.referee.document.map import map_cells
 from consistency.referee.document.verdict import BRIEF, FILTER, cells, columns
 from consistency.referee.document.verdict import FURTHER as FURTHER_COLUMNS
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
-from consistency.referee.pages.section import STUDY, Section
+from consistency.referee.pages.by_axis import by_axis
+from consistency.referee.pages.questions import diagnosis
 
 OF_FURTHER = (
     "Noncredibility index and inclination (Li & Zhao 2006): 0 dB is credible, 10 dB a covariance wrong by a factor "
@@ -52,7 +64,7 @@ def further(study: Study) -> tuple[Block, ...]:
     heads, whole = (FILTER, *columns(FURTHER_COLUMNS)), len(study.tracks) <= LONG
     rows = [(Name(track.name, track.look), *cells(FURTHER_COLUMNS, track.verdict)) for track in study.tracks]
     label = f"Further figures of {study.name}"
-    return Heading("Further figures", 4), table(heads, rows, label, caption=OF_FURTHER, apart=True, whole=whole)
+    return Heading("Further figures", 4), table(heads, rows, label, caption=OF_FURTHER, whole=whole)
 
 
 def own_errors(study: Study) -> tuple[Block, ...]:
@@ -65,8 +77,8 @@ def own_errors(study: Study) -> tuple[Block, ...]:
             rows.append(("", f"{ADDITIVE}, additive", *cells(BRIEF, world)))
     heads, title = (FILTER, Column("Error", width="2.4fr"), *columns(BRIEF)), "Errors of their own"
     label = f"Own errors of {study.name}"
-    shown = table(heads, rows, label, caption=of_own_errors(study), apart=True, whole=True)
-    return (Heading(title, 4, title), shown) if rows else ()
+    shown = table(heads, rows, label, caption=of_own_errors(study), whole=True)
+    return (Heading(title, 4), shown) if rows else ()
 
 
 def of_own_errors(study: Study) -> str:
@@ -88,8 +100,8 @@ def maps(study: Study) -> tuple[Block, ...]:
     rows = [(Name(track.name, track.look), *map_cells(of)) for track, of in scores]
     sentences = [f"Map of {track.name}: {of.verdict.reasons[0]}." for track, of in scores if of.verdict is not None]
     heads, label = (FILTER, *MAP_COLUMNS), f"Maps of {study.name}"
-    shown = table(heads, rows, label, caption=OF_MAPS, apart=True, whole=True)
-    return Heading("Map", 4, "Map"), shown, *map(Text, sentences)
+    shown = table(heads, rows, label, caption=OF_MAPS, whole=True)
+    return Heading("Map", 4), shown, *map(Text, sentences)
 
 
 def rejections(study: Study) -> tuple[Block, ...]:
@@ -97,10 +109,11 @@ def rejections(study: Study) -> tuple[Block, ...]:
     scores = [(track, track.verdict.rejection) for track in study.tracks]
     rows = [(Name(track.name, track.look), *rejection_cells(r)) for track, r in scores if r is not None]
     heads, title = (FILTER, *GUARD_COLUMNS), "Rejected observations"
-    shown = table(heads, rows, f"{title} of {study.name}", caption=OF_REJECTIONS, apart=True, whole=True)
-    return (Heading(title, 4, title), shown) if rows else ()
+    shown = table(heads, rows, f"{title} of {study.name}", caption=OF_REJECTIONS, whole=True)
+    return (Heading(title, 4), shown) if rows else ()
 
 
-NO_TRUTH, FURTHER, OWN_ERRORS, MAPS, REJECTIONS = (
-    Section(STUDY, as_given, show) for show in (without_truth, further, own_errors, maps, rejections)
-)
+SECTIONS: tuple[Callable[[Study], tuple[Block, ...]], ...] = (
+    anees_curves, without_truth, world_map, pose_errors, innovations, diagnosis, by_axis, nees_distribution, further,
+    own_errors, maps, rejections,
+)  # fmt: skip

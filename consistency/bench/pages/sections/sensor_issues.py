@@ -5,17 +5,20 @@ Among them a constant bias of disparity, and what a filter makes of it that beli
 
 from __future__ import annotations
 
+from functools import partial
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, groups, listing, section, several, single
-from consistency.referee.document.blocks import Table
+from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, groups, listing, several, single
+from consistency.referee.document.blocks import Figure, Table
 from consistency.referee.document.colours import COLOURS, EXPECTED, Look, style
-from consistency.referee.document.drawing import Axis, Figure, Key, Line, Panel, Points, Rule
-from consistency.referee.pages.section import Part
-from consistency.referee.types import Array
+from consistency.referee.show.painting import curve, edges, log_axis, stroke
 
-SENSOR = Part("sensor-issues", "The stereo sensor: biases and practical issues", "Sensor issues")
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 DOF = 3.0
 ROWS = 4  # of a map that are drawn at most
 MAP = ("u", "v", "bias_d")
@@ -48,46 +51,48 @@ def shares(beliefs: pd.DataFrame) -> Table:
 
 
 def over_steps(curves: pd.DataFrame) -> Figure:
-    tips, keys, lines = (("step", "@x"), ("ANEES", "@y{0.00}")), [], []
-    for k, (belief, part) in enumerate(groups(curves, "belief")):
-        lines.append(Line(part["step"].to_numpy(), part["nees"].to_numpy(), style(k), tips=tips))
-        keys.append(Key(belief, style(k)))
-    panel = Panel(
-        Axis("step", share="step"), Axis("ANEES", log=True), (Rule("y", DOF, EXPECTED), *lines), "ANEES over steps"
-    )
+    """ANEES over steps for each belief."""
+
+    def paint(axes: Axes) -> None:
+        axes.axhline(DOF, **stroke(EXPECTED))
+        for k, (belief, part) in enumerate(groups(curves, "belief")):
+            curve(axes, part["step"].to_numpy(), part["nees"].to_numpy(), style(k), belief)
+        axes.set(xlabel="step", ylabel="ANEES")
+        log_axis(axes, "y")
+
     caption = "Average NEES of ekf-uvd over steps, by what is true and believed; the line is at 3, which is right."
-    return single("ANEES by belief", caption, panel, tuple(keys))
+    return single("ANEES by belief", caption, paint)
 
 
 def of_map(nodes: pd.DataFrame) -> Figure:
-    keys, panel = _rows(nodes)
+    """Bias of disparity along rows of the image."""
     caption = (
         "The bias of disparity that makes up the pooled standard deviation of the chapter, by place in the image; "
         "as Herath et al. (2007) fig. 8. Rows above the middle mirror those below."
     )
-    return single("Bias of disparity", caption, panel, keys)
+    return single("Bias of disparity", caption, partial(_draw_rows, nodes))
 
 
-def _rows(
-    nodes: pd.DataFrame, title: str = "", window: tuple[float, float] | None = None
-) -> tuple[tuple[Key, ...], Panel]:
+def _draw_rows(nodes: pd.DataFrame, axes: Axes) -> None:
     """A line over u for each row of nodes; of many rows, for some from the middle down."""
     chosen = np.unique(nodes["v"])
     if len(chosen) > ROWS:
         below = chosen[chosen >= 0.0]
         chosen = below[np.linspace(0, len(below) - 1, ROWS).round().astype(int)]
-    marks: list[Line | Points | Rule] = [Rule("y", 0.0, EXPECTED)]
-    keys = []
+    axes.axhline(0.0, **stroke(EXPECTED))
     for k, v in enumerate(chosen):
         part = nodes[nodes["v"] == v].sort_values("u")
-        u, bias = part["u"].to_numpy(), part["bias_d"].to_numpy()
-        marks += [Line(u, bias, style(k)), Points(u, bias, style(k), tips=(("u", "@x{0}"), ("bias", "@y{0.00} px")))]
-        keys.append(Key(f"v = {v:.0f} px", style(k), marked=True))
-    alt = f"Bias of disparity over the image {title}".strip()
-    return tuple(keys), Panel(Axis("u (px)"), Axis("bias of d (px)", window=window), tuple(marks), alt, title=title)
+        draw_marked(axes, part["u"], part["bias_d"], style(k), f"v = {v:.0f} px")
+    axes.set(xlabel="u (px)", ylabel="bias of d (px)")
+
+
+def draw_marked(axes: Axes, x: pd.Series, y: pd.Series, look: Look, label: str = "") -> None:
+    """A line with a marker at each of its points."""
+    axes.plot(x.to_numpy(), y.to_numpy(), label=label, marker=look.marker, markersize=3.0, **stroke(look))
 
 
 def survivors(filters: pd.DataFrame) -> Table:
+    """Each filter with noise and with a bias."""
     heads = {
         "filter": ("Filter", ""), "status_noise": ("White noise", STATUS), "anees_noise": ("Mean NEES", ".2f"),
         "status_bias": ("A bias of that size, believed to be such noise", STATUS), "anees_bias": ("Mean NEES", ".2f"),
@@ -119,13 +124,19 @@ def sensors(rows: pd.DataFrame) -> Table:
 
 
 def lens_maps(nodes: pd.DataFrame) -> Figure:
+    """Bias of disparity with each lens model."""
     reach = 1.15 * max(float(nodes["bias_d"].abs().max()), 0.1)
-    drawn = [_rows(part, f"lens model: {model}", (-reach, reach)) for model, part in groups(nodes, "model")]
+
+    def draw_model(model: str, part: pd.DataFrame, axes: Axes) -> None:
+        _draw_rows(part, axes)
+        axes.set(title=f"lens model: {model}", ylim=(-reach, reach))
+
     caption = (
         "Bias of disparity that is shown with each lens model, along the rows of nodes; zero where none is shown, and "
         "at nodes of which nothing is known. Rows of the models differ by some pixels."
     )
-    return several("Bias of disparity by lens model", caption, [panel for _, panel in drawn], drawn[-1][0])
+    paints = [partial(draw_model, model, part) for model, part in groups(nodes, "model")]
+    return several("Bias of disparity by lens model", caption, paints)
 
 
 def outcomes(rows: pd.DataFrame) -> Table:
@@ -137,20 +148,22 @@ def outcomes(rows: pd.DataFrame) -> Table:
 def first_run(steps: pd.DataFrame) -> Figure:
     """Errors with 2-sigma bounds, as fig. 10."""
     x = steps["step"].to_numpy()
-    panels = []
-    for name, unit in POSE:
-        tips = (("step", "@x"), ("error", f"@y{{0.000}} {unit}"), ("2 sigma", f"@bound{{0.000}} {unit}"))
+
+    def draw_error(name: str, unit: str, axes: Axes) -> None:
         bound = SIGMAS * steps[f"sigma_{name}"].to_numpy()
-        line = Line(x, steps[name].to_numpy(), ERROR, tips=tips, bound=bound)
-        y = Axis(f"{name} error ({unit})", f"{name} error\n({unit})")
-        panels.append(Panel(Axis("step", share="step"), y, (line, Rule("y", 0.0, EXPECTED)), f"Error of {name}"))
+        axes.axhline(0.0, **stroke(EXPECTED))
+        edges(axes, x, np.column_stack([-bound, bound]), BOUND, "2-sigma bounds")
+        curve(axes, x, steps[name].to_numpy(), ERROR, "error")
+        axes.set(xlabel="step", ylabel=f"{name} error ({unit})")
+
     caption = (
         "Errors of the pose in the first run, with the filter's own 2-sigma bounds; as Herath et al. (2007) fig. 10."
     )
-    return several("Errors and bounds", caption, panels, (Key("error", ERROR), Key("2-sigma bounds", BOUND)))
+    return several("Errors and bounds", caption, [partial(draw_error, *of) for of in POSE], 1.5)
 
 
 def guards(rows: pd.DataFrame) -> Table:
+    """Each filter behind each guard."""
     heads = {
         "filter": ("Filter", ""), "guard": ("Guard", ""), "rmse_ratio": ("RMSE over clean", ".2f"),
         "clean": ("Clean", STATUS), "clean_anees": ("Mean NEES", ".2f"), "guarded": ("Guarded", STATUS),
@@ -161,30 +174,22 @@ def guards(rows: pd.DataFrame) -> Table:
 
 
 def lenses(rows: pd.DataFrame) -> Figure:
-    keys, heading, nees = [], list[Line | Points](), list[Line | Points]()
-    cases = rows.groupby(["filter", "k1"], sort=False)
-    for k, (case, part) in enumerate(cases):
-        name, k1 = case
-        x, look = part["degrees"].to_numpy(), style(k)
-        heading += _marked(x, part["rmse_heading_deg"], look, "@y{0.00} deg")
-        nees += _marked(x, part["anees"], look, "@y{0.0}")
-        keys.append(Key(f"{name}, k1 left over {k1:g}", look, marked=True))
-    x_axis = Axis("field of view (degrees)", share="view")
-    y_axes = [Axis(label, log=True, digits=(1, 2, 5)) for label in ("RMSE of heading (deg)", "mean NEES")]
-    panels = (
-        Panel(x_axis, y_axes[0], tuple(heading), "Heading over the view"),
-        Panel(x_axis, y_axes[1], (Rule("y", 3.0, EXPECTED), *nees), "Mean NEES over the view"),
-    )
+    """Heading and mean NEES over the field of view."""
+
+    def draw_column(column: str, label: str, axes: Axes) -> None:
+        for k, ((name, k1), part) in enumerate(rows.groupby(["filter", "k1"], sort=False)):
+            draw_marked(axes, part["degrees"], part[column], style(k), f"{name}, k1 left over {k1:g}")
+        if column == "anees":
+            axes.axhline(DOF, **stroke(EXPECTED))
+        axes.set(xlabel="field of view (degrees)", ylabel=label)
+        log_axis(axes, "y")
+
     caption = (
         "Accuracy of the heading and consistency over the field of view across the image, with a perfect rectification "
         "and with one that leaves a radial distortion, opposite in both cameras; sec. 4.1. The line is at 3."
     )
-    return several("Field of view", caption, panels, tuple(keys))
-
-
-def _marked(x: Array, y: pd.Series, look: Look, tip: str) -> list[Line | Points]:
-    """A line with a marker at each of its points."""
-    return [Line(x, y.to_numpy(), look), Points(x, y.to_numpy(), look, tips=(("value", tip),))]
+    columns = (("rmse_heading_deg", "RMSE of heading (deg)"), ("anees", "mean NEES"))
+    return several("Field of view", caption, [partial(draw_column, *column) for column in columns])
 
 
 def of_lenses(rows: pd.DataFrame) -> Table:
@@ -198,14 +203,17 @@ def of_lenses(rows: pd.DataFrame) -> Table:
 
 
 def counts(rows: pd.DataFrame) -> Figure:
-    x, panels = rows["count"].to_numpy(), []
-    for column, label, tip in (("rmse_position_m", "RMSE of position (m)", "@y{0.000} m"),
-                               ("rmse_heading_deg", "RMSE of heading (deg)", "@y{0.00} deg")):  # fmt: skip
-        axis = Axis("features at a time", log=True, digits=(1, 2, 4, 8), share="count")
-        marks = tuple(_marked(x, rows[column], style(0), tip))
-        panels.append(Panel(axis, Axis(label, log=True, digits=(1, 2, 5)), marks, f"{label} over features"))
+    """Errors over the number of features."""
+
+    def draw_column(column: str, label: str, axes: Axes) -> None:
+        draw_marked(axes, rows["count"], rows[column], style(0))
+        axes.set(xlabel="features at a time", ylabel=label)
+        log_axis(axes, "x")
+        log_axis(axes, "y")
+
     caption = "Errors of parked-ekf-uvd over the number of features that are tracked at a time; sec. 4.2."
-    return several("Errors over the number of features", caption, panels, ())
+    columns = (("rmse_position_m", "RMSE of position (m)"), ("rmse_heading_deg", "RMSE of heading (deg)"))
+    return several("Errors over the number of features", caption, [partial(draw_column, *of) for of in columns])
 
 
 def of_counts(rows: pd.DataFrame) -> Table:
@@ -247,4 +255,3 @@ EXHIBITS = (
     Exhibit(("near-far-mix",), "near-far-mix: near and far features",
             (Source("near_far_mix", NUMBERS, TEXTS, outcomes, NO_GUARD),)),
 )  # fmt: skip
-SECTION = section(SENSOR, EXHIBITS)

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import pandas as pd
-
 from consistency.bench.pages.exhibits import extra_table
 from consistency.bench.pages.report_input import Report
 from consistency.referee.document.blocks import Block, Cell, Column, Small, Stack, Status, table
 from consistency.referee.document.wording import brief
-from consistency.referee.pages.section import Part, Section
 
-FILTERS = Part("filters", "Filters side by side", "Filters")
 FILE = "filters.parquet"
 NUMBERS = ["anees", "rmse", "map_nees", "joint_nees", "cost", "failures", "runs", "false_alarm"]
 NAMES = ["filter", "realisable", "error", "status", "diagnosis", "map_status", "map_diagnosis", "scenario"]
@@ -31,12 +27,11 @@ COLUMNS = (
 )
 
 
-def read(report: Report) -> pd.DataFrame | None:
-    """The table of the folder; None where the file does not exist."""
-    return extra_table(report.folder / FILE, NUMBERS, NAMES, MISSING)
-
-
-def show(filters: pd.DataFrame) -> tuple[Block, ...]:
+def filters_table(report: Report) -> tuple[Block, ...]:
+    """The table of the folder; nothing where the file does not exist."""
+    filters = extra_table(report.folder / FILE, NUMBERS, NAMES, MISSING)
+    if filters is None:
+        return ()
     first = filters.iloc[0]
     rows = [_row(values) for values in filters.to_dict("records")]
     caption = (
@@ -63,6 +58,3 @@ def _row(values: dict[Any, Any]) -> tuple[Cell, ...]:
 
 def _brief(diagnosis: str) -> str:
     return "; ".join(diagnosis.split("; ")[:CLAUSES])
-
-
-SECTION = Section(FILTERS, read, show)

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
+from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import EXPECTED, solid
-from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, dodge
-from consistency.referee.pages.judged import Estimator, Judged
-from consistency.referee.pages.section import STUDY, Section
-from consistency.referee.types import Array
+from consistency.referee.pages.judged import Judged
+from consistency.referee.show.painting import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
 
 Interval = tuple[float, float, float]  # value, low, high; the ends may be infinite
 Row = tuple[str, tuple[Interval | None, ...]]  # an axis, and an interval or None for each filter
@@ -28,51 +32,66 @@ class Forest:
 
     name: str
     label: str  # of the axis with its unit
-    form: str  # of a number
     expected: float
     window: tuple[float, float]  # drawn range
     log: bool
     rows: tuple[Row, ...]
 
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Names of the rows that hold something."""
-        return tuple(label for label, intervals in self.rows if any(intervals))
+
+def by_axis(study: Judged) -> tuple[Figure, ...]:
+    """A panel for each quantity, in which each axis has a row; nothing where no filter has any."""
+    found = forests(study)
+    if not found:
+        return ()
+    labels = row_labels(found)
+
+    def draw() -> Drawing:
+        height = 0.5 + len(labels) * (0.13 + 0.07 * len(study.tracks))
+        figure, panels = canvas(height, len(found), len(found))
+        for axes, forest in zip(panels, found, strict=True):
+            _draw_forest(axes, study, forest, labels)
+        for axes in panels[1:]:
+            axes.set_yticklabels([])
+        return add_legend(figure)
+
+    return (Figure("By axis", caption(study, found), (draw,), level=4),)
 
 
-@dataclass(frozen=True)
-class ByAxis:
-    """Quantities that a filter of the study has; at least one."""
-
-    study: Judged
-    forests: tuple[Forest, ...]
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Names of all rows, in one order."""
-        names = dict.fromkeys(name for forest in self.forests for name, _ in forest.rows)
-        return tuple(sorted(names, key=lambda name: name == WHOLE))
+def row_labels(found: tuple[Forest, ...]) -> tuple[str, ...]:
+    """Names of all rows, in one order, the whole last."""
+    names = dict.fromkeys(name for forest in found for name, _ in forest.rows)
+    return tuple(sorted(names, key=lambda name: name == WHOLE))
 
 
-def read(study: Judged) -> ByAxis | None:
-    """The intervals of the verdicts; None where no filter has any."""
-    all_forests = forests(study)
-    return ByAxis(study, all_forests) if all_forests else None
+def _draw_forest(axes: Axes, study: Judged, forest: Forest, labels: tuple[str, ...]) -> None:
+    """Intervals of all filters, one beside the other in the row of each axis."""
+    axes.set(xlabel=forest.label, xlim=forest.window)
+    name_rows(axes, labels)
+    axes.axvline(forest.expected, **stroke(EXPECTED))
+    slots = len(study.tracks)
+    for slot, track in enumerate(study.tracks):
+        rows = [(labels.index(label), own) for label, row in forest.rows if (own := row[slot]) is not None]
+        if rows:
+            places = np.array([place + dodge(slot, slots) for place, _ in rows])
+            look = replace(solid(track.look), size=3.2, width=1.1)
+            intervals(axes, places, np.array([own for _, own in rows]), look, track.name, track.tag)
+    if forest.log:
+        log_axis(axes, "x")
 
 
 def forests(study: Judged) -> tuple[Forest, ...]:
     """Covariance ratio, bias and coverage by axis; those that no filter has are left out."""
     kinds = (
-        ("ratio", "covariance ratio (truth / stated)", ".3g", 1.0, _ratio_window, True, _ratios),
-        ("bias", "mean error (stated sigma)", "+.2f", 0.0, _bias_window, False, _biases),
-        ("coverage", "within 2 sigma (%)", ".0f", 100.0 * TWO_SIGMA, _coverage_window, False, _coverages),
+        ("ratio", "ratio (truth / stated)", 1.0, _ratio_window, True, _ratios),
+        ("bias", "mean error (stated sigma)", 0.0, _bias_window, False, _biases),
+        ("coverage", "within 2 sigma (%)", 100.0 * TWO_SIGMA, _coverage_window, False, _coverages),
     )
     result = []
-    for name, label, form, expected, window, log, intervals_of in kinds:
+    for name, label, expected, window, log, intervals_of in kinds:
         rows = _rows(study, intervals_of)
         if rows:
-            intervals = [i for _, row in rows for i in row if i is not None]
-            result.append(Forest(name, label, form, expected, window(intervals), log, rows))
+            known = [interval for _, row in rows for interval in row if interval is not None]
+            result.append(Forest(name, label, expected, window(known), log, rows))
     return tuple(result)
 
 
@@ -121,49 +140,9 @@ def _coverage_window(intervals: list[Interval]) -> tuple[float, float]:
     return max(min(low for _, low, _ in intervals) - 5.0, -3.0), 103.0
 
 
-def figures(by_axis: ByAxis) -> tuple[Figure, ...]:
-    """A panel for each quantity; on paper the rows of all panels stand in one line."""
-    study = by_axis.study
-    panels = tuple(_panel(study, forest, forest.labels) for forest in by_axis.forests)
-    aligned = tuple(_panel(study, forest, by_axis.labels, "axis of the pose") for forest in by_axis.forests)
-    marked = tuple(replace(key, look=solid(key.look)) for key in study.keys(marked=True))
-    sheet = Sheet(aligned, 0.55 + len(by_axis.labels) * (0.12 + 0.08 * len(study.tracks)), keys=marked)
-    keys = (Key("expected", EXPECTED), *study.keys())
-    return (Figure("By axis", caption(by_axis), panels, (sheet,), keys, layout="three", level=4),)
-
-
-def _panel(study: Judged, forest: Forest, labels: tuple[str, ...], share: str = "") -> Panel:
-    marks = [
-        mark
-        for slot, track in enumerate(study.tracks)
-        if (mark := _intervals(forest, labels, track, slot, len(study.tracks))) is not None
-    ]
-    return Panel(
-        Axis(forest.label, log=forest.log, window=forest.window),
-        Axis("", rows=labels, share=share),
-        (Rule("x", forest.expected, EXPECTED), *marks),
-        f"{forest.label} of {study.name} by axis",
-        height=70 + len(labels) * (14 + 13 * len(study.tracks)),
-    )
-
-
-def _intervals(forest: Forest, labels: tuple[str, ...], track: Estimator, slot: int, slots: int) -> Intervals | None:
-    """Intervals of the filter in one slot of each row."""
-    named_intervals = [(label, interval) for label, row in forest.rows if (interval := row[slot]) is not None]
-    if not named_intervals:
-        return None
-    value, low, high = np.array([interval for _, interval in named_intervals]).T
-    y: Array = np.array([labels.index(label) for label, _ in named_intervals]) + dodge(slot, slots)
-    text = [f"{v:{forest.form}} [{a:{forest.form}}, {b:{forest.form}}]" for _, (v, a, b) in named_intervals]
-    tips = (("axis", "@axis"), (forest.label, "@text"))
-    look = replace(track.look, size=5.0, width=1.3)
-    columns = {"axis": [label for label, _ in named_intervals], "text": text}
-    return Intervals(y, value, low, high, look, track.owner, tips, columns)
-
-
-def caption(by_axis: ByAxis) -> str:
+def caption(study: Judged, found: tuple[Forest, ...]) -> str:
     """What the panels show."""
-    parts, tracks = {forest.name for forest in by_axis.forests}, by_axis.study.tracks
+    parts, tracks = {forest.name for forest in found}, study.tracks
     text = "By axis of the pose. Covariance ratio: 1 is right (line), above is overconfident; log axis."
     if any(t.verdict.location is not None and t.verdict.location.since is not None for t in tracks):
         text += " Ratio and bias are those since the step that the verdict names."
@@ -177,6 +156,3 @@ def caption(by_axis: ByAxis) -> str:
         f"{text} Bars: 95 % intervals, of ratio and bias for all axes at once, of coverage exact for each axis; an "
         "arrow goes on beyond the drawn range. The questions decide, not the bars."
     )
-
-
-SECTION = Section(STUDY, read, figures)

@@ -22,7 +22,7 @@ from consistency.referee.fit_covariance.refusals import RotationGrowth
 from consistency.referee.fit_covariance.systematic_errors import FORWARD, jacobian_of_mean, normal_equations
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.geometry.groups import inverse, log
-from consistency.referee.readers.relative_motions import BENT
+from consistency.referee.readers.pipeline.relative_motions import BENT
 from consistency.referee.types import Array, Indices
 
 SURE = 0.01  # chance to name a term where there is none, all terms together

@@ -86,10 +86,11 @@ bench: .venv/.done
 	$(BIN)/python benchmarks/bench.py
 
 # the types of the core are also checked for Python 3.10
-CORE := $(addprefix consistency/,referee doors.py testing.py pytest_plugin.py)
+CORE := $(addprefix consistency/,__init__.py referee commands diagnostics.py errors.py testing.py pytest_plugin.py)
 lint: .venv/.done
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 	$(BIN)/mypy
 	$(BIN)/mypy --python-version 3.10 --follow-imports silent $(CORE)
 

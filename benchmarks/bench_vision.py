@@ -13,16 +13,11 @@ from bench_trials import SEED, Work, interleaved
 
 from consistency.bench.runs.findings import sibling
 from consistency.referee.errors import InputError
-from consistency.referee.shipped import data_folder
-from consistency.stereo.visual_odometry import (
-    register_svd,
-    registration_covariance,
-    triangulate,
-    triangulation_covariance,
-)
+from consistency.referee.system.shipped import data_folder
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.registration import rigid_motions
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
+from consistency.vision import register_svd, registration_covariance, triangulate, triangulation_covariance
 
 rigs = sibling(str(data_folder("experiments") / "README.md"), "published_rig")
 

@@ -35,7 +35,7 @@ from script_options import options_of
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
-from consistency.referee.diagnostics import Evidence, Settings, Verdict, e_process, follow, judge, sequential_design
+from consistency.referee.diagnostics import Record, Settings, Verdict, e_process, follow, judge, sequential_design
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.types import Array
 
@@ -125,14 +125,14 @@ def judged(case: Case, numbers: Sequence[int], seed: int) -> list[Outcome]:
 
 
 def _at_once(case: Case, gate_of: Growing) -> Outcome:
-    evidence = Evidence("gate", **vars(gate_of(case.runs)))
+    evidence = Record("gate", **vars(gate_of(case.runs)))
     return _outcome(judge(evidence, Settings(case.false_alarm, DETECT, POWER)), case.runs)
 
 
 def _until_decided(case: Case, gate_of: Growing) -> Outcome:
     """The verdict of ``--until-decided``, and the runs it took."""
     design = sequential_design(ANY[case.world].dof or DOF, DETECT, case.false_alarm, POWER, MOST)
-    return _outcome(*follow(design, lambda runs: Evidence("gate", **vars(gate_of(runs)))))
+    return _outcome(*follow(design, lambda runs: Record("gate", **vars(gate_of(runs)))))
 
 
 def _betting(case: Case, gate_of: Growing) -> Outcome:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from calibration_gates import row
 
-from consistency.referee.diagnostics import Evidence, JointNees, Verdict, judge
+from consistency.referee.diagnostics import JointNees, Record, Verdict, judge
 from consistency.referee.types import Array
 
 LANDMARKS, POSE = 12, 3
@@ -56,7 +56,7 @@ def verdict(rng: np.random.Generator, runs: int, ratio: float = 1.0, whole: bool
     parts = np.square(w).reshape(runs, -1, 3).sum(axis=-1)
     joint = JointNees(parts[:, 0], parts[:, 1:].sum(axis=1), np.full(runs, 3 * LANDMARKS), parts[:, 1:])
     covariance = np.broadcast_to(P, (*error.shape, 3)).copy()
-    return judge(Evidence("map", error, covariance, landmarks=np.arange(LANDMARKS), joint=joint))
+    return judge(Record("map", error, covariance, landmarks=np.arange(LANDMARKS), joint=joint))
 
 
 def _covariance(rng: np.random.Generator) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from calibration_gates import row, stationary
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics import Evidence, judge
+from consistency.referee.diagnostics import Record, judge
 from consistency.referee.diagnostics.planning.single_log import in_pieces
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import SPATIAL
@@ -38,13 +38,13 @@ ABOUT = {
 }
 
 
-def log_of(rng: np.random.Generator, constant: float, ratio: float) -> Evidence:
+def log_of(rng: np.random.Generator, constant: float, ratio: float) -> Record:
     e = np.sqrt(1.0 - constant) * stationary(rng.standard_normal((STEPS, DOF)), RHO)
     e = np.sqrt(ratio) * (e + np.sqrt(constant) * rng.standard_normal((1, DOF)))
-    return Evidence("log", e[None], np.broadcast_to(np.eye(DOF), (1, STEPS, DOF, DOF)))
+    return Record("log", e[None], np.broadcast_to(np.eye(DOF), (1, STEPS, DOF, DOF)))
 
 
-def study_of(rng: np.random.Generator, convention: str) -> Evidence:
+def study_of(rng: np.random.Generator, convention: str) -> Record:
     """Errors of one study under every convention, of which one is right; the first is the default of files."""
     e = SIGMA * rng.standard_normal((RUNS * POSES, 6))
     estimate = np.column_stack([rng.normal(0, 20, (len(e), 3)), Rotation.random(len(e), random_state=rng).as_quat()])
@@ -53,8 +53,8 @@ def study_of(rng: np.random.Generator, convention: str) -> Evidence:
     records = {}
     for kind in SPATIAL:
         error = spatial_error(true, estimate, kind).reshape(RUNS, POSES, 6)
-        records[kind] = Evidence("est", error, P, nees(error, P), 6, convention=kind)
-    return Evidence("est", records["so3"].error, P, records["so3"].nees, 6, convention="so3", guesses=records)
+        records[kind] = Record("est", error, P, nees(error, P), 6, convention=kind)
+    return Record("est", records["so3"].error, P, records["so3"].nees, 6, convention="so3", guesses=records)
 
 
 def applied(pose: Array, e: Array, convention: str) -> Array:

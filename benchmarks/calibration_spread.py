@@ -15,7 +15,7 @@ import numpy as np
 from calibration_gates import row
 from scipy import special, stats
 
-from consistency.referee.diagnostics import Evidence, judge, ratio_interval
+from consistency.referee.diagnostics import Record, judge, ratio_interval
 from consistency.referee.diagnostics.comparison import RunSummary, compare
 from consistency.referee.diagnostics.questions import scale
 from consistency.referee.diagnostics.verdict.answers import SHARES
@@ -119,11 +119,11 @@ def run_means(rng: np.random.Generator, n: int, group: int, share: float, size: 
     return np.asarray((mixed + np.where(constant, rng.chisquare(group, size), 0.0)) / n)
 
 
-def _evidence(rng: np.random.Generator, n: int, group: int, share: float, runs: int) -> Evidence:
+def _evidence(rng: np.random.Generator, n: int, group: int, share: float, runs: int) -> Record:
     error = rng.standard_normal((runs, GATE_STEPS, n))
     constant = rng.random(runs) < share
     error[constant, :, :group] = rng.standard_normal((int(constant.sum()), 1, group))
-    return Evidence("spread", error=error, covariance=np.broadcast_to(np.eye(n), (*error.shape, n)))
+    return Record("spread", error=error, covariance=np.broadcast_to(np.eye(n), (*error.shape, n)))
 
 
 def _misses_coverage(rng: np.random.Generator, runs: int) -> bool:

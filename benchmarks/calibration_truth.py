@@ -12,7 +12,7 @@ import numpy as np
 from calibration_gates import row, stationary
 from scipy import optimize
 
-from consistency.referee.diagnostics import Evidence, judge
+from consistency.referee.diagnostics import Record, judge
 from consistency.referee.types import Array
 
 RUNS, STEPS, DOF = 50, 20, 3
@@ -44,7 +44,7 @@ def covariance(rng: np.random.Generator) -> Array:
     return np.asarray(A @ A.T / DOF + 0.3 * np.eye(DOF))
 
 
-def gate(rng: np.random.Generator, kind: str, s: float, ratio: float, errors: str | None) -> Evidence:
+def gate(rng: np.random.Generator, kind: str, s: float, ratio: float, errors: str | None) -> Record:
     """Errors of 50 runs with covariances P, and those of the truth beside them."""
     P, Q = covariance(rng), covariance(rng)
     Q *= optimize.brentq(lambda c: np.trace(np.linalg.solve(P + c * Q, c * Q)) / DOF - s, 1e-6, 1e6)
@@ -53,9 +53,7 @@ def gate(rng: np.random.Generator, kind: str, s: float, ratio: float, errors: st
         + errors_of_truth(rng, kind) @ np.linalg.cholesky(Q).T
     )
     shape = (RUNS, STEPS, DOF, DOF)
-    return Evidence(
-        "gate", e, np.broadcast_to(P, shape), truth_covariance=np.broadcast_to(Q, shape), truth_errors=errors
-    )
+    return Record("gate", e, np.broadcast_to(P, shape), truth_covariance=np.broadcast_to(Q, shape), truth_errors=errors)
 
 
 def errors_of_truth(rng: np.random.Generator, kind: str) -> Array:

@@ -14,8 +14,8 @@ import numpy as np
 from calibration_cases import DETECT, FALSE_ALARM, POWER
 from calibration_gates import row, shared
 
-from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.referee.diagnostics.planning.number_of_runs import pilot_plan
+from consistency.referee.diagnostics import Record, Settings, Verdict, judge
+from consistency.referee.diagnostics.planning.pilot import pilot_plan
 from consistency.referee.diagnostics.questions.innovations import whiteness
 from consistency.referee.diagnostics.questions.scale import scale_test
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
@@ -117,7 +117,7 @@ def verdict_of(rng: np.random.Generator, squares: Array, n: int, settings: Setti
     error = np.sqrt(squares)[:, None, None] * rng.standard_normal((runs, steps, n))
     if not white:
         error = np.repeat(error, ALIKE, axis=1)
-    return judge(Evidence("uneven", error, shared(np.eye(n), error)), settings)
+    return judge(Record("uneven", error, shared(np.eye(n), error)), settings)
 
 
 def _allowed(quick: bool, seed: int) -> Iterator[dict[str, Any]]:

@@ -27,7 +27,7 @@ from calibration_gates import (
 )
 from scipy import special
 
-from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics import Record
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.formats.numpy_archive import steps_of
 from consistency.referee.readers.runs_to_record import Track, assemble, symmetric
@@ -214,7 +214,7 @@ def left_poses(draw: Draw) -> tuple[Array, Array, Array]:
     return truth, _composed(truth, _se2_exp(-error)), covariance
 
 
-def recorded(truth: Array, estimate: Array, covariance: Array) -> Evidence:
+def recorded(truth: Array, estimate: Array, covariance: Array) -> Record:
     """What ``analyse --error left`` makes of poses, without the way through a file."""
     error, columns = planar_error(truth, estimate, "left"), np.arange(truth.shape[1])
     tracks = []

@@ -26,8 +26,8 @@ from consistency.bench.simulation import World
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.residuals import residuals_of
-from consistency.stereo.characterising.sensor_text import believed
+from consistency.stereo.characterising.log_residuals import residuals_of
+from consistency.stereo.characterising.sensor_text import believed_sensor
 
 SCENARIO = "herath2007-stereo"
 EVERYTHING = (1e-6, 1e6)  # px: a search range that leaves nothing out
@@ -103,7 +103,7 @@ def missed(of: Characterisation, scenario: Scenario, truth: Real) -> list[str]:
 def bias_rms(of: Characterisation, truth: Real) -> Array:
     """Root mean square error of what is believed of the bias of u, v, d, over the places of the observations, px."""
     u, v = of.kept.ideal[:, 0], of.kept.ideal[:, 1]
-    bias = believed(of).bias
+    bias = believed_sensor(of).bias
     found = np.zeros((len(u), 3)) if bias is None else bias.at(u, v)
     true = np.zeros((len(u), 3)) if truth.bias is None else truth.bias.at(u, v)
     return np.asarray(np.sqrt(np.mean((found - true) ** 2, axis=0)))

@@ -20,11 +20,11 @@ from scipy import stats
 from scipy.linalg import expm
 from script_options import options_of
 
-from consistency.referee.diagnostics import Evidence, Verdict
-from consistency.referee.diagnostics.planning.number_of_runs import power_of
+from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.statistics.number_of_runs import power_of
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
-from consistency.referee.geometry.groups import carried, composed, to_left, vectors
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.geometry.groups import composed, propagated, to_left, vectors
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.windows import relative_of
 from consistency.referee.types import Array
@@ -87,7 +87,7 @@ def drive(rng: np.random.Generator, group: str, steps: int, ratio: float = 1.0, 
 def motion_stretch(log: Log, run: int = 0) -> Stretch:
     """The log as a file of motions, with their covariances in the default convention."""
     kind, start = DECLARED[log.group], np.eye(log.truth.shape[-1])[None]
-    P = carried(np.linalg.inv(to_left(log.motions, kind)), log.covariance)
+    P = propagated(np.linalg.inv(to_left(log.motions, kind)), log.covariance)
     rows = np.arange(len(log.truth))
     return Stretch(
         run, "motions", Places(lambda row: f"row {row}", rows), DT * rows,
@@ -110,12 +110,12 @@ def pose_stretch(rng: np.random.Generator, group: str, poses: int, apart: int, r
     cross[1:] = J[:-1] @ (MEMORY * S) @ np.swapaxes(J[1:], 1, 2)
     rows = np.arange(poses)
     return Stretch(
-        run, "poses", Places(lambda row: f"row {row}", rows), DT * apart * rows, vectors(T), carried(J, S), cross, rows,
-        vectors(truth), DECLARED[group],
+        run, "poses", Places(lambda row: f"row {row}", rows), DT * apart * rows, vectors(T), propagated(J, S), cross,
+        rows, vectors(truth), DECLARED[group],
     )  # fmt: skip
 
 
-def recorded(stretches: list[Stretch], size: str, motions: bool) -> Evidence:
+def recorded(stretches: list[Stretch], size: str, motions: bool) -> Record:
     """Windows as ``consistency analyse --relative`` takes them."""
     axes = AXES["SE(2)" if stretches[0].d == 2 else "SE(3)"]
     relative = relative_of(size, motions)
@@ -123,7 +123,7 @@ def recorded(stretches: list[Stretch], size: str, motions: bool) -> Evidence:
     return relative_recording("log", "log", stretches, axes, range(len(axes)), relative)
 
 
-def verdict_on(record: Evidence) -> Verdict:
+def verdict_on(record: Record) -> Verdict:
     return analyse([record])["log"]
 
 

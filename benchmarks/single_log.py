@@ -20,7 +20,7 @@ from calibration_gates import stationary
 from scipy import stats
 from script_options import options_of
 
-from consistency.referee.diagnostics import Evidence, Settings, judge
+from consistency.referee.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.planning.single_log import within
 from consistency.referee.types import Array
 
@@ -76,7 +76,7 @@ def decided(draws: int, seed: int) -> Iterator[tuple[str, bool]]:
                 log = np.sqrt(ratio) * errors(rng, rho, length * pilot.pieces, n)
                 cut = log.reshape(pilot.pieces, length, n)
                 P = np.broadcast_to(np.eye(n), (*cut.shape, n))
-                verdict = judge(Evidence("log", cut, P), SETTINGS)
+                verdict = judge(Record("log", cut, P), SETTINGS)
                 faults += bool(verdict.faults)
                 if verdict.status in counts:
                     counts[verdict.status] += 1

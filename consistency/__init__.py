@@ -1,9 +1,62 @@
 """The filter-consistency test bench: do the errors of an estimator have the covariance that it states?"""
 
-from consistency.doors import DOORS, open_doors
-from consistency.referee.extras import lazy_names
+from importlib import import_module
+from typing import Any
 
-open_doors()
+# where each public name stands; it is loaded when it is first used, so that `import consistency` and `--help` stay
+# fast, and the core works without the packages of the bench. __init__.pyi has the same names for type checkers.
+_MODULES = {
+    "Alarm": "referee.diagnostics",
+    "Control": "bench.types",
+    "Drive": "referee.fit_covariance.drives",
+    "Finding": "bench.types",
+    "Gaussian": "bench.types",
+    "Info": "bench.types",
+    "InputError": "referee.errors",
+    "Log": "bench.store.log",
+    "Monitor": "referee.diagnostics",
+    "NoiseModel": "referee.fit_covariance.noise_model",
+    "Observation": "bench.types",
+    "Record": "referee.diagnostics.records.record",
+    "Results": "bench.store.results",
+    "Scenario": "bench.scenario",
+    "Study": "bench.runs.findings",
+    "Trial": "bench.types",
+    "Tuning": "bench.tuning.result",
+    "Verdict": "referee.diagnostics.verdict.verdict",
+    "analyse": "bench.runs.analyse_results",
+    "anees": "referee.diagnostics",
+    "anees_interval": "referee.diagnostics",
+    "drive_of": "referee.fit_covariance.drives",
+    "filter_names": "bench.filters",
+    "fit_covariance": "referee.fit_covariance.noise_model",
+    "get_filter": "bench.filters",
+    "guarded": "bench.filters.compiled",
+    "judge": "referee.notebook.read_and_judge",
+    "load_scenario": "bench.scenario",
+    "nees": "referee.diagnostics",
+    "read": "referee.notebook.read_and_judge",
+    "read_drives": "referee.fit_covariance.drives",
+    "read_log": "bench.store.log",
+    "read_results": "bench.store.results",
+    "run_trials": "bench.runs.montecarlo",
+    "scenario_names": "bench.scenario",
+    "simulate": "bench.simulation",
+    "tune": "bench.tuning.tune",
+}
 
-# the names stand in __init__.pyi; each is loaded on first use, so that `import consistency` and `--help` stay fast
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__, DOORS)
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"No consistency attribute {name}")
+    from consistency.referee.extras import explained_import
+
+    with explained_import(f"consistency.{name}"):
+        return getattr(import_module(f"consistency.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+__all__ = sorted(_MODULES)

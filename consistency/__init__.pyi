@@ -3,6 +3,7 @@
 from .bench.filters import filter_names as filter_names
 from .bench.filters import get_filter as get_filter
 from .bench.filters.compiled import guarded as guarded
+from .bench.runs.analyse_results import analyse as analyse
 from .bench.runs.findings import Study as Study
 from .bench.runs.montecarlo import run_trials as run_trials
 from .bench.scenario import Scenario as Scenario
@@ -27,7 +28,7 @@ from .referee.diagnostics import anees as anees
 from .referee.diagnostics import anees_interval as anees_interval
 from .referee.diagnostics import nees as nees
 from .referee.diagnostics.records.record import Record as Record
-from .referee.diagnostics.verdict.parts import Verdict as Verdict
+from .referee.diagnostics.verdict.verdict import Verdict as Verdict
 from .referee.errors import InputError as InputError
 from .referee.fit_covariance.drives import Drive as Drive
 from .referee.fit_covariance.drives import drive_of as drive_of
@@ -36,4 +37,3 @@ from .referee.fit_covariance.noise_model import NoiseModel as NoiseModel
 from .referee.fit_covariance.noise_model import fit_covariance as fit_covariance
 from .referee.notebook.read_and_judge import judge as judge
 from .referee.notebook.read_and_judge import read as read
-from .referee.verdicts.sources import analyse as analyse

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from _pytest.reports import TestReport  # public under the name of pytest from 7.0 on
 
-from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, refusal, to_property
-from consistency.referee.gating.watch import DEFAULTS, Entry, Watch, current, in_place_rate, watching
+from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, path_fault, to_property
+from consistency.referee.gating.watch import DEFAULTS, Entry, RunningTest, current, in_place_rate, watching
 
 NAME = "consistency-gates"
 MARKER = (
@@ -43,7 +43,7 @@ def pytest_configure(config: pytest.Config) -> None:
     report = config.getoption("--consistency-report")
     path = None if report is None else config.invocation_params.dir / report
     worker = hasattr(config, "workerinput")
-    if path is not None and not worker and (why := refusal(path)):
+    if path is not None and not worker and (why := path_fault(path)):
         raise pytest.UsageError(why)
     config.pluginmanager.register(Gates(config, runs, path, _budget(config), worker), NAME)
 
@@ -116,7 +116,9 @@ class Gates:
 
     @pytest.hookimpl(hookwrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, Any, None]:
-        with watching(Watch(budget=self.budget, tests=self.collected, keep=lambda entry: self._keep(item, entry))):
+        with watching(
+            RunningTest(budget=self.budget, tests=self.collected, keep=lambda entry: self._keep(item, entry))
+        ):
             yield
 
     @pytest.hookimpl(tryfirst=True)
@@ -159,9 +161,9 @@ class Gates:
             if session.exitstatus == pytest.ExitCode.OK:
                 session.exitstatus = pytest.ExitCode.TESTS_FAILED
         if self.path is not None and not self.config.option.collectonly:
-            from consistency.referee.gating.report import write
+            from consistency.referee.gating.report import write_gates
 
-            write(self.ledger, self.path)
+            write_gates(self.ledger, self.path)
 
     def _fail(self, nodeid: str, location: tuple[str, int | None, str], text: str) -> None:
         """Report a test as failed that has passed before its gates could be judged."""
@@ -174,10 +176,10 @@ class Gates:
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         if self.ledger.tests:
-            from consistency.referee.gating.report import lines
+            from consistency.referee.gating.report import gate_lines
 
             terminalreporter.section("consistency gates")
-            for line in lines(self.ledger):
+            for line in gate_lines(self.ledger):
                 terminalreporter.write_line(line)
             if self.path is not None:
                 terminalreporter.write_line(f"report in {self.path}")

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from consistency.referee.diagnostics import Comparison, Record, Settings, Verdict, gate_runs, judge
 from consistency.referee.diagnostics.comparison import FEWEST
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.gating.comparing import Sides, of_arrays, of_filters
-from consistency.referee.gating.input_checks import checked, of_results, planned_dof, shares
+from consistency.referee.gating.candidates import Sides, of_arrays, of_filters
+from consistency.referee.gating.checked_arrays import planned_dof, rate_shares, record_of_checked, record_of_filter
 from consistency.referee.gating.watch import (
     DEFAULTS,
     Entry,
@@ -27,8 +27,9 @@ from consistency.referee.gating.watch import (
 )
 
 if TYPE_CHECKING:
+    from consistency.bench.store.results import Tables
     from consistency.referee.verdicts.baselines import Baseline
-    from consistency.referee.verdicts.sources import Results
+    from consistency.referee.verdicts.sources import Source
 
 
 class ConsistencyError(AssertionError):
@@ -51,7 +52,7 @@ class InsufficientTrials(ValueError):
 
 
 def assert_consistent(
-    errors: ArrayLike | Results | None = None,
+    errors: ArrayLike | Tables | None = None,
     covariances: ArrayLike | None = None,
     *,
     deviations: ArrayLike | None = None,
@@ -133,11 +134,11 @@ def assert_consistent(
     }  # fmt: skip
     if filter is not None or hasattr(errors, "estimates"):
         _refuse(arrays, "results bring their own")
-        record = of_results(cast("Results", errors), filter, name, skip)
+        record = record_of_filter(_source(errors), filter, name, skip)
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
-        record = checked(
+        record = record_of_checked(
             name or "the estimator", cast(ArrayLike, errors), **arrays, subsets=subsets, optimal_gain=optimal_gain,
             skip=skip,
         )  # fmt: skip
@@ -150,7 +151,7 @@ def assert_consistent(
 
     def needed(rate: float) -> int:
         return gate_runs(
-            planned_dof(record), demand.detect, rate / shares(record), demand.power, demand.allow, demand.lost
+            planned_dof(record), demand.detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
         )
 
     result = _settle("assert_consistent", record, demand, look, needed)
@@ -159,7 +160,7 @@ def assert_consistent(
 
 
 def assert_not_worse(
-    errors_a: ArrayLike | Results | None = None,
+    errors_a: ArrayLike | Tables | None = None,
     covariances_a: ArrayLike | None = None,
     errors_b: ArrayLike | None = None,
     covariances_b: ArrayLike | None = None,
@@ -168,7 +169,7 @@ def assert_not_worse(
     deviations_b: ArrayLike | None = None,
     filter: str | None = None,
     than: str | None = None,
-    reference: Results | Baseline | str | Path | None = None,
+    reference: Tables | Baseline | str | Path | None = None,
     nees_a: ArrayLike | None = None,
     nees_b: ArrayLike | None = None,
     dof: int | None = None,
@@ -218,7 +219,7 @@ def assert_not_worse(
     }  # fmt: skip
     if filter is not None or hasattr(errors_a, "estimates"):
         _refuse(arrays, "results bring their own; the reference is named by than and reference")
-        sides = of_filters(cast("Results", errors_a), filter, than, reference, name, skip)
+        sides = of_filters(_source(errors_a), filter, than, _baseline(reference, skip), name, skip)
     else:
         if than is not None or reference is not None:
             raise ValueError("than and reference need results in place of errors_a")
@@ -295,7 +296,7 @@ def _settle(
         if result.verdict is None:
             text = few_to_compare(gate, record.name, runs, least, demand)
         else:
-            each = replace(demand, false_alarm=demand.false_alarm / shares(record))
+            each = replace(demand, false_alarm=demand.false_alarm / rate_shares(record))
             text = undecided_text(gate, record.name, result.reasons[0], least, dof, each)
             text += _marker_text(dof, runs)
         raise InsufficientTrials(text, least, runs, result.verdict)
@@ -342,7 +343,7 @@ def _entry(
         gate=gate, name=record.name, outcome=outcome, p_value=plain(result.p_value),
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
         in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
-        runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=shares(record),
+        runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=rate_shares(record),
         detect=demand.detect, power=demand.power, allow=demand.allow, lost=demand.lost,
         late={} if late is None else _summary(late), statistics=statistics, **fields,
     )  # fmt: skip
@@ -361,6 +362,29 @@ def _summary(look: _Look) -> dict[str, Any]:
         "subset": v.subset, "faults": v.faults,
     })  # fmt: skip
     return summary | rest
+
+
+def _source(results: Any) -> Source:
+    """Results of the bench as a source of records."""
+    if not hasattr(results, "batches"):
+        raise ValueError("filter names one in the results of consistency.run_trials; give those in place of errors")
+    from consistency.bench.runs.results_to_records import results_source
+
+    return results_source(results)
+
+
+def _baseline(reference: Tables | Baseline | str | Path | None, skip: int | str | None) -> Baseline | None:
+    """Reference of a comparison: a baseline, its file, or results of the bench in memory or in a folder."""
+    from consistency.referee.verdicts.baselines import Baseline, baseline, read_baseline
+
+    if reference is None or isinstance(reference, Baseline):
+        return reference
+    if isinstance(reference, str | Path) and not Path(reference).is_dir():
+        return read_baseline(Path(reference), skip)
+    from consistency.bench.runs.results_to_records import results_source
+
+    name = str(reference) if isinstance(reference, str | Path) else "results"
+    return baseline(results_source(reference), name, skip)
 
 
 def _refuse(arrays: Mapping[str, Any], why: str) -> None:

@@ -16,14 +16,9 @@ import consistency as cs
 from consistency.bench.runs.findings import OURS, script, sibling
 from consistency.referee.diagnostics import chi2_mean_interval
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import (
-    register_svd,
-    registration_covariance,
-    triangulate,
-    triangulation_covariance,
-)
 from consistency.stereo.visual_odometry.registration import rigid_motions
 from consistency.stereo.visual_odometry.relative_pose import euler_angles
+from consistency.vision import register_svd, registration_covariance, triangulate, triangulation_covariance
 
 rigs = sibling(__file__, "published_rig")
 

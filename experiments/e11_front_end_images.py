@@ -18,11 +18,13 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.findings import OURS, command_line, sibling
-from consistency.referee.diagnostics import Evidence, Verdict, judge
+from consistency.referee.diagnostics import Record, Verdict, judge
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import (
+from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion, diagonal_covariances
+from consistency.stereo.visual_odometry.shared import SHARED, fit_shared, sensitivities
+from consistency.vision import (
     RelativePose,
     StereoRig,
     refine_reprojection,
@@ -31,8 +33,6 @@ from consistency.stereo.visual_odometry import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion, diagonal
-from consistency.stereo.visual_odometry.shared import SHARED, fit_shared, sensitivities
 
 if TYPE_CHECKING:
     import front_end_data as data
@@ -100,7 +100,7 @@ def simulated(rig: StereoRig, m: RelativeMotion, estimator: str, printed: bool, 
         d = uv[:, 0] - uv[:, 2] - (rig.K_left[0, 2] - rig.K_right[0, 2])
         clear &= d > CLEAR * np.hypot(s[:, 0], s[:, 2])
     uv0, uv1, sigma0, sigma1 = (values[clear] for values in (m.uv0, m.uv1, sigma0, sigma1))
-    S0, S1 = diagonal(sigma0), diagonal(sigma1)
+    S0, S1 = diagonal_covariances(sigma0), diagonal_covariances(sigma1)
 
     def pose_of(uv0: Array, uv1: Array) -> tuple[RelativePose, Array]:
         if estimator == "reprojection":
@@ -130,7 +130,7 @@ def figures(cases: dict[str, Case], shown: dict[str, Simulated]) -> dict[str, by
     for name, case in cases.items():
         m = case.motions[0]
         out[f"fig24-{name}.png"] = drawings.matches_png(
-            case.image, m.uv0[m.inliers, :2], diagonal(m.sigma0[m.inliers, :2])
+            case.image, m.uv0[m.inliers, :2], diagonal_covariances(m.sigma0[m.inliers, :2])
         )
         sim = shown[name]
         out[f"fig25-{name}.png"] = drawings.samples_png(sim.samples, sim.centre, sim.S)
@@ -147,7 +147,13 @@ def halves(case: Case, rng: np.random.Generator) -> tuple[Array, Array]:
         order = rng.permutation(np.flatnonzero(m.inliers))
         one, two = (
             refine_reprojection(
-                case.rig, m.uv0[i], m.uv1[i], m.pose, diagonal(m.sigma0[i]), diagonal(m.sigma1[i]), robust="cauchy"
+                case.rig,
+                m.uv0[i],
+                m.uv1[i],
+                m.pose,
+                diagonal_covariances(m.sigma0[i]),
+                diagonal_covariances(m.sigma1[i]),
+                robust="cauchy",
             )
             for i in (order[::2], order[1::2])
         )
@@ -157,7 +163,7 @@ def halves(case: Case, rng: np.random.Generator) -> tuple[Array, Array]:
 
 def referee(errors: Array, covariances: Array) -> Verdict:
     """The bench's verdict with every motion as a run of one step."""
-    return judge(Evidence("motions", errors[:, None], covariances[:, None], axes=AXES))
+    return judge(Record("motions", errors[:, None], covariances[:, None], axes=AXES))
 
 
 def floored(errors: Array, covariances: Array) -> tuple[Array, Array]:

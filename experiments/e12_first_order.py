@@ -14,10 +14,10 @@ import pandas as pd
 
 import consistency as cs
 from consistency.bench.runs.findings import OURS, script, sibling
-from consistency.referee.diagnostics import Evidence, Settings, detectable_ratio, judge
+from consistency.referee.diagnostics import Record, Settings, detectable_ratio, judge
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure
-from consistency.stereo.visual_odometry import (
+from consistency.vision import (
     RelativePose,
     StereoRig,
     refine_reprojection,
@@ -68,7 +68,7 @@ class Errors:
     failures: tuple[Failure, ...] = ()
 
     def row(self) -> dict[str, object]:
-        evidence = Evidence(self.name, self.error[:, None], self.covariance[:, None], failures=self.failures)
+        evidence = Record(self.name, self.error[:, None], self.covariance[:, None], failures=self.failures)
         verdict = judge(evidence, Settings(false_alarm=ALARM))
         dof = self.error.shape[1]
         return {

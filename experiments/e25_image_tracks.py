@@ -20,8 +20,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
-from consistency.stereo.rendered_images.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, joined
-from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand
+from consistency.stereo.rendered_images.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, join_tracks
 from consistency.stereo.rendered_images.stages import (
     KnownDisparity,
     KnownProjection,
@@ -29,7 +28,8 @@ from consistency.stereo.rendered_images.stages import (
     Spread,
     TrackResidual,
 )
-from consistency.stereo.visual_odometry.features import opencv
+from consistency.stereo.rendered_images.stops import Stops, pose_at, stand
+from consistency.stereo.visual_odometry.cameras.opencv import opencv
 
 drives = sibling(__file__, "image_drives")
 
@@ -198,7 +198,7 @@ def experiment_1(study: cs.Study) -> list[cs.Finding]:
     def once(step: float) -> Callable[[np.random.Generator], Tracks]:
         return lambda rng: drives.drive(chain, camera, drives.office(rng), rng, IMAGES, step)
 
-    moving, still = (joined(repeated(study, ROBOTS, 10, once(step))) for step in (STEP, 0.0))
+    moving, still = (join_tracks(repeated(study, ROBOTS, 10, once(step))) for step in (STEP, 0.0))
     study.tables["images_exp1"] = pd.concat(
         [by_frame(part, name) for part, name in ((moving, "moving"), (still, "at rest"))]
     )
@@ -315,7 +315,7 @@ def budget(study: cs.Study) -> list[cs.Finding]:
     for number, (name, chain, camera, shake) in enumerate(cases):
         tracks = {
             "standing": stand(chain, camera, stops, generator(study, 30, number), study.workers),
-            "moving": joined(
+            "moving": join_tracks(
                 repeated(study, WALLS // 2, 300 + number, partial(drives.retreat, chain, camera, Stops(), shake=shake))
             ),
         }

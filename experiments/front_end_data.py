@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.types import Array
 from consistency.stereo.frontend.dataset_truth import read_truth
 from consistency.stereo.frontend.planar_log import relative
-from consistency.stereo.visual_odometry import RelativePose, StereoRig, relative_motion
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_opencv
-from consistency.stereo.visual_odometry.motion import RelativeMotion
 from consistency.stereo.visual_odometry.odometry import visual_odometry
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.relative_pose import angular
 from consistency.stereo.visual_odometry.sequence import read_image, read_sequence
+from consistency.vision import RelativePose, StereoRig, relative_motion
 
 KITTI, EUROC, MINNIE = "kitti06_f0-50", "euroc_static", "minnie_quad"
 MINNIE_K = np.array([[1018.6, 0.0, 956.501], [0.0, 1018.6, 617.314], [0.0, 0.0, 1.0]])  # px, of the .meta files

@@ -35,7 +35,7 @@ from consistency.stereo.frontend.planar_log import (
     relative,
     robot_axes,
 )
-from consistency.stereo.visual_odometry.sequence import read_table
+from consistency.stereo.visual_odometry.sequence import read_number_table
 
 if TYPE_CHECKING:
     import kitti07_log as conversion
@@ -94,7 +94,7 @@ def read_factors(factors: Path, poses: Path, calibration: Path, truth: Path | No
 
 def read_columns(path: Path, columns: int) -> Array:
     """A table of ``columns`` finite numbers a line."""
-    table = read_table(path, None, f"must hold {columns} finite numbers a line")
+    table = read_number_table(path, None, f"must hold {columns} finite numbers a line")
     if table.shape[1] != columns:
         raise InputError(f"{path}: must hold {columns} finite numbers a line, not {table.shape[1]}")
     return table

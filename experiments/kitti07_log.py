@@ -22,7 +22,7 @@ from consistency.referee.types import Array
 from consistency.stereo.frontend.planar_log import CAMERA
 from consistency.stereo.visual_odometry import tracks
 from consistency.stereo.visual_odometry.common_motion import screened
-from consistency.stereo.visual_odometry.sequence import read_table
+from consistency.stereo.visual_odometry.sequence import read_number_table
 from consistency.stereo.visual_odometry.tracks import PIXELS
 
 SIGMA_V, SIGMA_OMEGA = 0.5, 0.05  # m/s, rad/s: white noise that the course added to the velocities
@@ -91,7 +91,7 @@ def read_recording(path: Path, truth: Path) -> Recording:
     """
     with reading(path, "is not an archive of tracks"), np.load(path) as archive:
         data = {name: np.asarray(archive[name]) for name in archive.files}
-    rows = read_table(truth, None, "is not a table of finite numbers")
+    rows = read_number_table(truth, None, "is not a table of finite numbers")
     if rows.shape[1] not in (12, 13) or len(rows) < 2:
         raise InputError(f"{truth}: must hold 12 numbers a line, or a time and 12, for two frames or more")
     frames = len(rows)

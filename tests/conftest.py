@@ -27,7 +27,8 @@ settings.load_profile("bench")
 # those with slow tests.
 LONGER = {
     "action", "alignment", "apart", "bags", "batches", "bench", "blas", "both_errors", "bounded_memory", "ceiling",
-    "challenging", "comparison", "compiling", "compiling_once", "content", "conventions", "core_commands", "core_gates",
+    "challenging", "commands_on_results", "comparison",
+    "compiling", "compiling_once", "content", "conventions", "core_commands", "core_gates",
     "dask", "declared_gain", "fit_command",
     "effects", "ending", "extending", "extending_report", "filters_table", "findings", "frontend_experiment",
     "frontend_motion", "frontend_rigs", "gather", "guards", "heat", "hints", "ideal", "imaging_chain",

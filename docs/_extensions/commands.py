@@ -9,7 +9,7 @@ import sys
 from outside import FOLDER, write_changed
 from sphinx.application import Sphinx
 
-GENERATOR = [sys.executable, "-m", "typer", "consistency.referee.cli", "utils", "docs", "--name", "consistency"]
+GENERATOR = [sys.executable, "-m", "typer", "consistency.commands", "utils", "docs", "--name", "consistency"]
 OPTION = re.compile(r"(?<![`\w\-\[])--[a-z][a-z-]*")  # in a sentence, where two hyphens would become a dash
 EXAMPLES = re.compile(r"\x08?\n?Examples:\n((?:  .*\n)+)")
 INDEX = """# Command line

@@ -9,7 +9,7 @@ from the map that ships with the bench (the densest landmarks, the smaller noise
 import matplotlib.pyplot as plt
 from matplotlib.colors import LogNorm
 
-from consistency.sweeps.regime import read_regime
+from consistency.sweeps import read_regime
 
 FILTERS = ("ekf-uvd", "ukf-uvd", "parked-ekf-uvd")
 

@@ -9,7 +9,7 @@ filters and worlds.
 
 import matplotlib.pyplot as plt
 
-from consistency.sweeps.regime import read_regime
+from consistency.sweeps import read_regime
 
 FILTERS = ("ekf-uvd", "ukf-uvd", "parked-ekf-uvd")
 

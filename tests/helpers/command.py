@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from consistency.referee.cli import main
+from consistency.commands import main
 
 
 def consistency(capsys: pytest.CaptureFixture[str], *words: str | Path, status: int = 0) -> tuple[str, str]:

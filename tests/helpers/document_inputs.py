@@ -42,7 +42,7 @@ NOT_RUN = [
     ("docs/files.md", "consistency analyse est.tum", "tests/oracle/test_gtsam_windows.py has such marginals"),
     ("docs/files.md", "joint = marginals", "tests/oracle/test_gtsam_windows.py does the same"),
     ("docs/fit-covariance.md", "consistency", "needs real drives; unit/referee/test_fit_command.py simulates"),
-    ("docs/front-end.md", "from consistency.vision.shared", "tests/unit/stereo/test_vision_shared.py has its inputs"),
+    ("docs/front-end.md", "import fit_shared", "tests/unit/stereo/test_vision_shared.py has its inputs"),
     ("docs/front-end.md", "python experiments/e11", REAL),
     ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/bench/test_guards.py runs such"),
     ("docs/kitti07.md", "", REAL),
@@ -303,11 +303,12 @@ def names_of(page: str, folder: Path) -> dict[str, Any]:
     """Variables that the code of a page does not make itself."""
     world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
     if page == "docs/gates.md":
-        from consistency.referee.verdicts.baselines import write_baseline
+        from consistency.bench.runs.results_to_records import results_source
+        from consistency.referee.verdicts.baselines import baseline, write_baseline
         from consistency.testing import assert_not_worse
 
         done = cs.run_trials(world, ["ekf-uvd", "ekf-xyz"], runs=60, seed=5, jobs=1)
-        write_baseline(done, folder / "baseline.json")
+        write_baseline(baseline(results_source(done)), folder / "baseline.json")
         e, covariance = RNG.normal(size=(200, 20, 3)), np.broadcast_to(np.eye(3), (200, 20, 3, 3))
         arrays = dict.fromkeys(("errors_new", "errors_old"), e) | dict.fromkeys(
             ("covariances_new", "covariances_old"), covariance

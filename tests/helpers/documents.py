@@ -124,7 +124,7 @@ def parsed(words: list[str], whole: bool = True) -> tuple[str, dict[str, Any]]:
     """
     import typer
 
-    from consistency.referee.cli.app import app
+    from consistency.commands.app import app
 
     root: Any = typer.main.get_command(app)
     name, *arguments = words

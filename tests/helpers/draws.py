@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
+from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.types import Array
 
 
@@ -43,7 +43,7 @@ def identities(error: Array) -> Array:
 
 def verdict_on(error: Array, covariance: Array | None = None, **settings: Any) -> Verdict:
     """The verdict on errors with covariance I, or the one given."""
-    return judge(Evidence("f", error, identities(error) if covariance is None else covariance), Settings(**settings))
+    return judge(Record("f", error, identities(error) if covariance is None else covariance), Settings(**settings))
 
 
 def errs_at_most(rate: float, draws: int, errs: Callable[[], Any], sure: float = 1e-5) -> bool:

@@ -24,7 +24,7 @@ from scipy.io import savemat
 import consistency as cs
 from consistency.bench.store.log import read_log
 from consistency.bench.store.trial_rows import Rejected, noted_table
-from consistency.referee.cli import main
+from consistency.commands import main
 from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Failure

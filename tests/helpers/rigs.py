@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.referee.geometry import rotation
-from consistency.stereo.visual_odometry import RelativePose, StereoRig
+from consistency.vision import RelativePose, StereoRig
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 RIG = StereoRig(K, K, rotation(0.04, 0.016, 0.014), [0.385, 0.007, 0.0], (640, 480))

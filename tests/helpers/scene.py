@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import RelativePose, StereoRig
+from consistency.vision import RelativePose, StereoRig
 
 SIZE = (480, 320)  # px
 F, BASELINE = 320.0, 0.2  # px, m

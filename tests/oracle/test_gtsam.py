@@ -27,7 +27,7 @@ gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install
 
 from consistency.bench.filters.external import gtsam_factors  # noqa: E402
 from consistency.bench.filters.external.gtsam import FixedLag, Incremental, WholeTrialSmoother  # noqa: E402
-from consistency.bench.filters.external.gtsam_factors import PlanarStereo, factor, landmark_key, pose_key  # noqa: E402
+from consistency.bench.filters.external.gtsam_factors import PlanarStereo, custom_factor, landmark_key, pose_key  # noqa: E402
 
 Small = Callable[..., cs.Scenario]
 NAMES = ("gtsam-batch-uvd", "gtsam-lag-uvd", "gtsam-map-uvd")
@@ -212,7 +212,7 @@ class LinearWorld:
             J = [-turn @ F, turn] if step > 1 else [turn]
             return turn @ (after - ahead - F @ (before - at)), J
 
-        return factor([pose_key(k) for k in (step - 1, step) if k > 0], sigmas, error)
+        return custom_factor([pose_key(k) for k in (step - 1, step) if k > 0], sigmas, error)
 
     def placed(self, label: int, pose: Array, z: Array) -> Array:
         self.origins[label] = self.problem.landmarks[label]
@@ -236,7 +236,7 @@ class LinearWorld:
                 J.append(block)
             return np.concatenate(gaps), J
 
-        return factor([pose_key(step), *map(landmark_key, labels)], sigmas, error)
+        return custom_factor([pose_key(step), *map(landmark_key, labels)], sigmas, error)
 
     def point(self, label: int, landmark: Gaussian) -> Gaussian:
         return landmark
@@ -271,7 +271,7 @@ class BlindWorld(PlanarStereo):
         if step < 4:
             return super().sight(step, observation)
         keys = [pose_key(step), *(landmark_key(int(label)) for label in observation.landmarks)]
-        return factor(keys, np.ones(3), lambda values: (np.zeros(3), [np.zeros((3, 3)) for _ in values]))
+        return custom_factor(keys, np.ones(3), lambda values: (np.zeros(3), [np.zeros((3, 3)) for _ in values]))
 
 
 def test_what_cannot_be_solved_is_a_result_with_step_and_reason(sparse: cs.Scenario) -> None:

@@ -18,7 +18,7 @@ from consistency.bench.filters.compiled import Compiled, problem_of
 from consistency.bench.filters.compiler.jit import Kernel
 from consistency.bench.filters.guard import kernel_rules, plain_rules
 from consistency.bench.filters.guard.guard_part import guard_part, keep_agreeing
-from consistency.bench.filters.guard.plain_rules import KINDS, kept, limits_of
+from consistency.bench.filters.guard.plain_rules import KINDS, kept_observations, limits_of
 from consistency.bench.filters.kernel import loop
 from consistency.bench.filters.kernel.part_functions import make_watch
 from consistency.bench.filters.stepping import step_through
@@ -104,7 +104,7 @@ def test_decisions_are_those_of_the_definitions(kind: str, rng: np.random.Genera
         step = Step(rng, int(rng.integers(1, 7)), int(rng.integers(2, 4)))
         expected = ORACLES[kind](step)
         limits = limits_of(SETTINGS, step.s, step.m)
-        assert np.flatnonzero(kept(kind, step.y, step.S, step.s, limits)).tolist() == expected
+        assert np.flatnonzero(kept_observations(kind, step.y, step.S, step.s, limits)).tolist() == expected
         assert np.flatnonzero(by_kernel(kind, step)).tolist() == expected
         sizes.add(step.m - len(expected))
     assert {0, 1, 2} <= sizes  # cases in which something happened
@@ -118,7 +118,7 @@ def test_a_search_that_is_cut_short_is_so_at_the_same_node(
         monkeypatch.setattr(module, "MOST_NODES", nodes)
     for _ in range(40):
         step = Step(rng, 6, 3)
-        plain = kept("joint", step.y, step.S, 3, limits_of(SETTINGS, 3, 6))
+        plain = kept_observations("joint", step.y, step.S, 3, limits_of(SETTINGS, 3, 6))
         assert plain.tolist() == by_kernel("joint", step).tolist()
 
 
@@ -129,7 +129,7 @@ def test_a_covariance_that_is_not_definite_ends_the_run(rng: np.random.Generator
     watch: Any = make_watch(guard, 3, 2, 2, 2)
     assert not keep_agreeing(guard, 3, 2, step.y, step.S, watch)
     with pytest.raises(np.linalg.LinAlgError):
-        kept("gate", step.y, step.S, 3, limits_of(SETTINGS, 3, 2))
+        kept_observations("gate", step.y, step.S, 3, limits_of(SETTINGS, 3, 2))
 
 
 # --- kernels -----------------------------------------------------------------------------------------

@@ -126,8 +126,8 @@ def test_a_parked_landmark_has_the_derivatives_it_says(small: Small, tilted: dic
 
     _, J, by_shift = seen(y, clone, pose)
     assert close(J, along(lambda y: seen(y, clone, pose)[0], y))
-    assert close(by_shift, along(lambda xi: seen(y, inverse_range.moved(clone, xi), pose)[0], np.zeros(3)))
-    assert close(-by_shift, along(lambda xi: seen(y, clone, inverse_range.moved(pose, xi))[0], np.zeros(3)))
+    assert close(by_shift, along(lambda xi: seen(y, inverse_range.moved_pose(clone, xi), pose)[0], np.zeros(3)))
+    assert close(-by_shift, along(lambda xi: seen(y, clone, inverse_range.moved_pose(pose, xi))[0], np.zeros(3)))
     assert not close(by_shift, 0.0 * by_shift, 1e-3)
 
 
@@ -136,13 +136,15 @@ def test_the_left_jacobian_is_that_of_exp_up_to_the_third_order() -> None:
     gaps = []
     for size in (0.2, 0.1):
         xi = size * np.array([0.8, -0.6, 0.5])
-        ahead = along(lambda error, xi=xi: inverse_range.moved(pose, xi + error), np.zeros(3))
-        left = along(lambda error, xi=xi: inverse_range.moved(inverse_range.moved(pose, xi), error), np.zeros(3))
+        ahead = along(lambda error, xi=xi: inverse_range.moved_pose(pose, xi + error), np.zeros(3))
+        left = along(
+            lambda error, xi=xi: inverse_range.moved_pose(inverse_range.moved_pose(pose, xi), error), np.zeros(3)
+        )
         gaps.append(np.abs(ahead - left @ inverse_range.left_jacobian(xi)).max())
     assert gaps[0] < 1e-3
     assert gaps[1] < gaps[0] / 6.0
     assert close(
-        along(lambda error: inverse_range.moved(pose, error), np.zeros(3)),
+        along(lambda error: inverse_range.moved_pose(pose, error), np.zeros(3)),
         np.linalg.inv(inverse_range.shift_matrix(pose)),
         1e-7,
     )
@@ -168,7 +170,7 @@ def test_the_bias_is_that_of_quadrature(sensor: Any) -> None:
     u, v = np.meshgrid(nodes * sensor.sigma[0], nodes * sensor.sigma[1], indexing="ij")
     weight = np.outer(weights, weights).ravel() / (2.0 * np.pi)
     steps = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=1)
-    said = inverse_range.bias(Z, sensor)
+    said = inverse_range.conversion_bias(Z, sensor)
     for i in range(len(Z)):
         values = inverse_range.converted(Z[i] + steps, sensor)[0]
         exact = weight @ values - inverse_range.converted(Z[i][None], sensor)[0][0]
@@ -199,7 +201,7 @@ def charted(rng: np.random.Generator, size: float) -> tuple[Array, Array]:
 def test_a_chart_has_the_derivatives_it_says(rng: np.random.Generator, chart: str, on: int) -> None:
     """Errors about the moved poses are those on the left; J_l is that of SE(2) to second order."""
     poses, xi = charted(rng, 0.01)
-    function = inverse_range.apart if chart == "apart" else partial(inverse_range.chained, on=on)
+    function = inverse_range.poses_moved if chart == "apart" else partial(inverse_range.chained, on=on)
     moved, C = function(poses, xi)
 
     def error(flat: Array) -> Array:
@@ -224,7 +226,7 @@ def test_the_motion_between_two_poses_of_a_chain_hangs_on_its_own_error(rng: np.
         return np.append(turn @ (moved[4, :2] - moved[3, :2]), moved[4, 2] - moved[3, 2])
 
     assert close(between(xi), between(other), 1e-12)
-    apart = [inverse_range.apart(poses, errors)[0] for errors in (xi, other)]
+    apart = [inverse_range.poses_moved(poses, errors)[0] for errors in (xi, other)]
     gaps = [np.hypot(*(moved[4, :2] - moved[3, :2])) for moved in apart]
     assert abs(gaps[0] - gaps[1]) > 1e-3
 
@@ -232,10 +234,13 @@ def test_the_motion_between_two_poses_of_a_chain_hangs_on_its_own_error(rng: np.
 def test_a_robot_moved_by_the_noise_of_its_last_motion_keeps_its_older_error() -> None:
     """T_true = Exp(xi) Exp(nu) T: about Exp(nu) T the error is xi, and was xi + nu about T to first order."""
     xi, nu, pose = np.array([0.05, -0.08, 0.1]), np.array([0.1, 0.2, 0.3]), np.array([2.0, -1.0, 0.7])
-    poses, C = inverse_range.apart(np.array([pose, pose]), np.array([nu, nu]), recency=True)
-    assert close(inverse_range.moved(poses[-1], C[3:, 3:] @ xi), inverse_range.moved(inverse_range.moved(pose, nu), xi))
-    turned = inverse_range.moved(poses[-1], C[:3, :3] @ xi)  # a clone has no motion of its own
-    assert not close(turned, inverse_range.moved(poses[-1], xi), 1e-3)
+    poses, C = inverse_range.poses_moved(np.array([pose, pose]), np.array([nu, nu]), recency=True)
+    assert close(
+        inverse_range.moved_pose(poses[-1], C[3:, 3:] @ xi),
+        inverse_range.moved_pose(inverse_range.moved_pose(pose, nu), xi),
+    )
+    turned = inverse_range.moved_pose(poses[-1], C[:3, :3] @ xi)  # a clone has no motion of its own
+    assert not close(turned, inverse_range.moved_pose(poses[-1], xi), 1e-3)
 
 
 def test_the_covariance_of_a_pose_is_that_of_its_exponential() -> None:
@@ -246,16 +251,16 @@ def test_the_covariance_of_a_pose_is_that_of_its_exponential() -> None:
     grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3)
     weight = np.einsum("i,j,k", weights, weights, weights).ravel() / weights.sum() ** 3
     M = inverse_range.shift_matrix(pose)
-    errors = np.array([inverse_range.moved(pose, M @ root @ x) - pose for x in grid])
+    errors = np.array([inverse_range.moved_pose(pose, M @ root @ x) - pose for x in grid])
     exact = (weight[:, None] * errors).T @ errors
-    said, size = inverse_range.moments(C), np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
+    said, size = inverse_range.pose_moments(C), np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
     assert np.abs((said - exact) / size).max() < 0.02 < 0.05 < np.abs((C - exact) / size).max()
     kernel = C.copy()
     bend(kernel)
     assert close(kernel, said, 1e-15)
     on_a_line = np.outer([1.0, 2.0, 0.0], [1.0, 2.0, 0.0]) + np.diag([0.0, 0.0, 0.1])
     bend(kernel := on_a_line.copy())
-    assert np.array_equal(kernel, inverse_range.moments(on_a_line))
+    assert np.array_equal(kernel, inverse_range.pose_moments(on_a_line))
     assert np.array_equal(kernel, on_a_line)  # without full rank, as after the first step
 
 

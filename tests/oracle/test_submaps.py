@@ -10,7 +10,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters.stepping import step_through
-from consistency.bench.filters.textbook.submaps import SubmapKalman, joined
+from consistency.bench.filters.textbook.submaps import SubmapKalman, joined_map
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
@@ -62,7 +62,7 @@ def test_a_landmark_is_in_the_map_once(small: Small) -> None:
     for k in range(1, 31):
         state, _ = filter_.update(filter_.predict(state, trial.control(k)), trial.observation(k))
     assert state.steps == 30 - STEPS
-    whole = joined(state)
+    whole = joined_map(state)
     assert len(set(whole.landmarks)) == len(whole.landmarks) == (len(whole.x) - 3) // 3
     assert set(whole.landmarks) == set(trial.landmark[: trial.first[30]].tolist())
     assert set(state.large.landmarks) & set(state.small.landmarks)

@@ -10,7 +10,7 @@ from rigs import MOTION, RIG
 from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 
-from consistency.stereo.visual_odometry import (
+from consistency.vision import (
     RelativePose,
     refine_reprojection,
     register_horn,

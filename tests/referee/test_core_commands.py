@@ -11,7 +11,7 @@ from typing import Any
 import inputs
 import pytest
 
-from consistency.referee.cli import main
+from consistency.commands import main
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from typing import Any
 import inputs
 import pytest
 
-from consistency.referee.cli import main
+from consistency.commands import main
 
 GOLDENS = Path(__file__).with_name("goldens.json")
 COMMANDS = {

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from own_process import BEGUN
 
-from consistency.referee.cli import main
+from consistency.commands import main
 
 
 @pytest.fixture(autouse=True)

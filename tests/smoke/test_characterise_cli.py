@@ -15,10 +15,10 @@ import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.scenario import Belief, PicturedSensor, read_table
 from consistency.bench.store.log import SensorFile, read_log
-from consistency.referee.cli.app import main
+from consistency.commands.app import main
 from consistency.stereo.characterising.characterise import characterise
-from consistency.stereo.characterising.residuals import Residuals
-from consistency.stereo.characterising.sensor_text import believed, sensor_text
+from consistency.stereo.characterising.log_residuals import Residuals
+from consistency.stereo.characterising.sensor_text import believed_sensor, measured_sensor_toml
 
 
 def run(*arguments: object) -> int:
@@ -99,9 +99,9 @@ def test_growth_and_bias_are_read_back_as_they_were_found(tmp_path: Path, rng: n
     data = Residuals(r, ideal, np.arange(n) // 20, np.arange(n) % 20, np.zeros(n, bool))
     of = characterise(data, sensor, "here", miss=1e-6)
     path = tmp_path / "sensor.toml"
-    path.write_text(sensor_text(of))
+    path.write_text(measured_sensor_toml(of))
     read = read_table(path, SensorFile)
-    assert read.belief() == believed(of).belief()
+    assert read.belief() == believed_sensor(of).belief()
     assert read.motion is None
     at = read.sigma[2] * read.disparity_growth.ratio_at(of.growth.nodes)
     assert np.allclose(at, [s.value for s in of.growth.sigma], rtol=1e-3)

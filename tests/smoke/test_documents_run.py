@@ -22,7 +22,7 @@ import pytest
 import scene
 from documents import PAGES, SHELL, Block, Command, blocks, typed
 
-from consistency.referee.cli import main
+from consistency.commands import main
 
 pytestmark = pytest.mark.slow
 

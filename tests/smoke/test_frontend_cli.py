@@ -12,7 +12,7 @@ import pytest
 import scene
 from own_process import consistency
 
-from consistency.stereo.visual_odometry import RelativePose
+from consistency.vision import RelativePose
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 

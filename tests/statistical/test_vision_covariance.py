@@ -13,7 +13,8 @@ import pytest
 from rigs import RIG
 from scipy import stats
 
-from consistency.stereo.visual_odometry import (
+from consistency.stereo.visual_odometry.registration import rigid_motions
+from consistency.vision import (
     RelativePose,
     refine_reprojection,
     register_svd,
@@ -22,7 +23,6 @@ from consistency.stereo.visual_odometry import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.visual_odometry.registration import rigid_motions
 
 pytestmark = pytest.mark.slow
 

@@ -23,7 +23,7 @@ import typer
 from documents import ROOT
 
 from consistency.bench.runs.findings import sibling
-from consistency.referee.cli.app import app
+from consistency.commands.app import app
 
 pytest.importorskip("yaml", reason="PyYAML (the extra vision) is not installed")
 import action

@@ -48,12 +48,12 @@ def test_the_command_of_the_document_works(copy: Path) -> None:
     """One new file and one row; it is in the help, reads files, and loads nothing heavy before it is called."""
     module, row = code("Add a command")
     assert row.count("\n") == 1
-    (copy / "consistency/referee/cli/worst.py").write_text(module, encoding="utf-8")
+    (copy / "consistency/commands/worst.py").write_text(module, encoding="utf-8")
     first = "    # the laboratory\n"
-    changed(copy / "consistency/referee/cli/commands.py", first, f"{row.rstrip()},\n{first}")
+    changed(copy / "consistency/commands/registry.py", first, f"{row.rstrip()},\n{first}")
     told = python(
         copy,
-        "import sys\nfrom consistency.referee.cli import main\n"
+        "import sys\nfrom consistency.commands import main\n"
         "try:\n    main(['worst', '--help'])\nfinally:\n    print('numpy' in sys.modules)",
         imports="",
     )
@@ -61,7 +61,7 @@ def test_the_command_of_the_document_works(copy: Path) -> None:
     assert told.stdout.splitlines()[-1] == "False"
     done = python(
         copy,
-        "from consistency.referee.cli import main\nmain(['worst', 'est.csv', '--truth', 'truth.csv', '--state', 'a'])",
+        "from consistency.commands import main\nmain(['worst', 'est.csv', '--truth', 'truth.csv', '--state', 'a'])",
     )
     assert done.stdout == "est: run 7, mean NEES 49\n", done.stderr
 
@@ -91,13 +91,13 @@ def test_the_question_of_the_document_is_asked(copy: Path) -> None:
         """
 import numpy as np
 from scipy import stats
-from consistency.referee.diagnostics import Evidence, judge
+from consistency.referee.diagnostics import Record, judge
 
 n = 200
 size = np.sqrt(stats.chi2.ppf((np.arange(n) + 0.5) / n, 1))  # errors of a right estimator by their size
 for order in (np.arange(n), np.arange(n) * 37 % n):
     error = (size * np.resize([1, -1, -1, 1], n))[order].reshape(n, 1, 1)
-    v = judge(Evidence("f", error=error, covariance=np.ones((n, 1, 1, 1)), nees=error[..., 0] ** 2, dof=1))
+    v = judge(Record("f", error=error, covariance=np.ones((n, 1, 1, 1)), nees=error[..., 0] ** 2, dof=1))
     print(v.faults, v.reasons[0], "trend" in [a["question"] for a in v.statistics["answers"]])
 """,
     )
@@ -115,27 +115,28 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
     (module,) = code("Add a renderer")
     (copy / "consistency/referee/show/as_csv.py").write_text(module, encoding="utf-8")
     words = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a", "--report", "out.csv"]
-    done = python(copy, f"from consistency.referee.cli import main\nmain({words})")
+    done = python(copy, f"from consistency.commands import main\nmain({words})")
     assert done.stdout.endswith("out.csv\n"), done.stderr
     heads, cells = (copy / "out.csv").read_text().splitlines()
     assert heads == "filter,verdict,ANEES,true / stated,RMSE m,RMSE deg,NIS/dof,failed"
     assert cells.startswith("est,overconfident,29.00,")
-    refusal = (
-        "from pathlib import Path\nfrom consistency.referee.gating.session import refusal\nprint(refusal(Path('a.b')))"
-    )
+    imports = "from pathlib import Path\nfrom consistency.referee.gating.session import path_fault"
+    refusal = f"{imports}\nprint(path_fault(Path('a.b')))"
     assert ".csv" in python(copy, refusal).stdout
 
 
 def test_the_kind_of_files_of_the_document_is_read(copy: Path) -> None:
     """One file and a row; what is refused of it is refused, and what is broken is said."""
-    module, row = code("Add a kind of files")
+    module, load, row = code("Add a kind of files")
     (copy / "consistency/referee/readers/formats/run_lines.py").write_text(module, encoding="utf-8")
-    last = ")  # fmt: skip\nSUFFIXES"
-    changed(copy / "consistency/referee/readers/file_kinds.py", last, f"    {row.strip()},\n{last}")
+    kinds = copy / "consistency/referee/readers/pipeline/kinds.py"
+    changed(kinds, "KINDS = (", f"{load}\n\nKINDS = (")
+    last = ")\n\n\ndef kind_of"
+    changed(kinds, last, f"    {row.strip()},\n{last}")
     lines = [f'{{"errors": [[{run}], [{run}]], "covariances": [[[1]], [[1]]]}}' for run in (3, 7)]
     (copy / "est.runs").write_text("\n".join(lines), encoding="utf-8")
     (copy / "bad.runs").write_text("\n".join([*lines, "{}"]), encoding="utf-8")
-    call = "from consistency.referee.cli import main\nmain({})"
+    call = "from consistency.commands import main\nmain({})"
     assert "overconfident  29.00" in python(copy, call.format(["analyse", "est.runs"])).stdout
     refused = python(copy, call.format(["analyse", "est.runs", "--truth", "truth.csv"])).stderr
     assert "--truth: does not go with est.runs" in refused
@@ -147,7 +148,7 @@ def test_a_default_stands_once(copy: Path) -> None:
     changed(copy / "consistency/referee/defaults.py", "FALSE_ALARM = 0.05", "FALSE_ALARM = 0.037")
     asked = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a"]
     for words in (asked, ["analyse", "--help"]):
-        assert "0.037" in python(copy, f"from consistency.referee.cli import main\nmain({words})").stdout
+        assert "0.037" in python(copy, f"from consistency.commands import main\nmain({words})").stdout
     gate = "import consistency as cs\nprint(cs.judge(cs.read('est.csv', truth='truth.csv', state='a')).statistics)"
     assert "0.037" in python(copy, gate).stdout
 

@@ -1,4 +1,4 @@
-"""Imports flow one way: one table of ranks, read off the sources with ``ast``."""
+"""Imports flow one way, as import-linter reads in pyproject.toml; what is loaded is seen in a new process."""
 
 from __future__ import annotations
 
@@ -6,52 +6,18 @@ import ast
 import runpy
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Set
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+import grimp
 import pytest
 
 import consistency
-from consistency.referee.extras import OUTSIDE, outside
 
 PACKAGE = Path(consistency.__file__).parent
+SETTINGS = PACKAGE.parent / "pyproject.toml"
 SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((PACKAGE.parent / folder).glob("*.py"))]
-
-# A root may import roots of lower rank, a room itself and rooms of lower rank in its root; rooms of equal rank do not
-# know each other. Rooms whose modules have ranks of their own ("room.module") keep the direction inside, too.
-ROOTS = {"referee": 0, "bench": 1, "stereo": 2, "": 3}
-RANKS = {
-    "referee": {
-        "types": 0, "errors": 0, "defaults": 0, "column_names": 0,
-        "system.progress": 0, "system.atomic": 0, "system.stopping": 0,
-        "extras": 1, "system.provenance": 1, "geometry": 1, "shipped": 1,
-        "parsing": 1, "system.folders": 2,
-        "diagnostics": 2, "readers": 3, "verdicts": 4, "document": 3, "show": 4, "pages": 5, "gating": 6, "notebook": 6,
-        "fit_covariance": 6, "cli": 7,
-    },
-    "bench": {
-        "types": 0, "models": 1, "scenario": 2, "protocols": 3, "simulation": 4, "filters": 4,
-        "store.parquet": 3, "store.folder_tables": 4, "store.results_check": 4, "store.log_tables": 4,
-        "store.journal": 5, "store.results": 5, "store.trial_rows": 6, "store.log": 8,
-        "runs.memory_needed": 8, "runs.gather": 8,
-        "runs.isolation": 8, "runs.compiling": 8, "runs.trial_work": 9, "runs.backends": 10,
-        "runs.campaign": 10, "runs.montecarlo": 11, "runs.results_to_records": 8, "runs.run_scores": 9,
-        "runs.sequential": 12, "runs.findings": 13,
-        "sweeps": 14, "challenging": 14, "tuning": 14, "pages": 15, "cli": 16,
-    },
-    "stereo": {"visual_odometry": 0, "rendered_images": 1, "frontend": 2, "characterising": 3, "pages": 4, "cli": 5},
-    "": {"doors": 0, "testing": 1, "pytest_plugin": 1, "__main__": 1},
-}  # fmt: skip
-ONLY = {  # all that these may import of ours
-    "diagnostics": {"types", "geometry", "errors", "defaults", "extras", "diagnostics"},  # names on first use
-    "document": {"types", "geometry", "errors", "diagnostics", "document"},
-    "show": {"types", "diagnostics", "document", "show"},
-}
-ARRAYS = {"diagnostics", "document"}  # rooms that need these alone
-OF_ARRAYS = {"numpy", "scipy"} | sys.stdlib_module_names
-DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}
-PAINTERS = {"show"}
 IN_EXPERIMENTS = {"consistency", "numpy", "pandas", "scipy"}
 # what the bench sets beside ours, and an experiment on images, which draws them
 OTHERS = {
@@ -67,60 +33,10 @@ def imported(source: str) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "relative imports hide the room"
-            room = node.module.split(".")[0] == "consistency" and node.module.count(".") < 3  # or a module in one
-            yield from {f"{node.module}.{alias.name}" if room else node.module for alias in node.names}
+            yield str(node.module)
 
 
-def imported_modules(source: str, known: Set[str]) -> set[str]:
-    """Those of the ``known`` modules that a source imports, wherever in it."""
-    found = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            inside = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= inside & known or {str(node.module)}
-    return found & known
-
-
-def place(parts: Sequence[str]) -> tuple[str, str]:
-    """Root, and key of its ranks: the room, or room and module where modules have ranks."""
-    root, parts = (parts[0], parts[1:]) if parts[0] in ROOTS else ("", parts)
-    inside = ".".join(parts[:2])
-    return root, inside if inside in RANKS[root] else ".".join(parts[:1])
-
-
-def below(other: tuple[str, str], mine: tuple[str, str]) -> bool:
-    """May a module at ``mine`` import one at ``other``?"""
-    if other[0] != mine[0]:
-        return ROOTS[other[0]] < ROOTS[mine[0]]
-    ranks = RANKS[mine[0]]
-    return other == mine or ranks.get(other[1], 99) < ranks.get(mine[1], -1)
-
-
-def complaints(at: str, source: str) -> list[str]:
-    """What a module at ``at`` ("referee.cli") imports and may not."""
-    found, mine = set(), place(at.split("."))
-    room = mine[1] if mine[0] == "referee" else ""
-    for name in imported(source):
-        top, *rest = name.split(".")
-        if top == "consistency":
-            other = place(rest) if rest else ("", "__init__")
-            if not below(other, mine) or (room in ONLY and other[1] not in ONLY[room]):
-                found.add(f"{at} imports {name}")
-        elif top in (DRAWING if room not in PAINTERS else ()) or (room in ARRAYS and top not in OF_ARRAYS):
-            found.add(f"{at} imports {top}")
-    return sorted(found)
-
-
-def modules() -> list[tuple[str, Path]]:
-    """Dotted name below the package and path of each module."""
-    paths = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
-    return [(".".join(path.relative_to(PACKAGE).with_suffix("").parts), path) for path in paths]
-
-
-def acyclic(graph: Mapping[str, set[str]]) -> bool:
+def acyclic(graph: Mapping[str, Set[str]]) -> bool:
     try:
         TopologicalSorter(graph).prepare()
     except CycleError:
@@ -128,104 +44,49 @@ def acyclic(graph: Mapping[str, set[str]]) -> bool:
     return True
 
 
-def test_every_room_has_a_rank() -> None:
-    for name, _ in modules():
-        root, room = place(name.removesuffix(".__init__").split("."))
-        inside = {
-            key.split(".")[0] for key in RANKS[root]
-        }  # their __init__.py has no rank and may import nothing of ours
-        assert room in RANKS[root] or (name.endswith(".__init__") and (not room or room in inside)), name
+def linted(settings: Path) -> subprocess.CompletedProcess[str]:
+    """What import-linter says of the package by these settings."""
+    code = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    command = [sys.executable, "-c", code, str(settings), "--no-cache"]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=PACKAGE.parent)
 
 
-def test_the_top_is_small() -> None:
-    assert len(list(PACKAGE.glob("*.py"))) <= 6
+def test_directions_between_roots_folders_and_layers() -> None:
+    done = linted(SETTINGS)
+    assert done.returncode == 0, done.stdout
 
 
-def test_no_two_rooms_import_each_other() -> None:
-    graph: dict[str, set[str]] = {}
-    for module, path in modules():
-        names = [name.split(".") for name in imported(path.read_text(encoding="utf-8"))]
-        mine = ".".join(module.split(".")[:2])
-        others = {".".join(parts[1:3]) for parts in names if parts[0] == "consistency" and len(parts) > 2}
-        graph.setdefault(mine, set()).update(others - {mine})
-    assert acyclic(graph)
-    assert not acyclic(graph | {"bench.store": {"bench.runs"}})  # negative control
+@pytest.mark.parametrize(
+    ("above", "below"),
+    [
+        ("consistency.referee", "consistency.bench"),
+        ("consistency.referee.diagnostics", "consistency.referee.readers"),
+        ("consistency.referee.diagnostics.judging", "consistency.referee.diagnostics.words"),
+        ("consistency.referee.diagnostics.records", "consistency.referee.diagnostics.statistics"),
+        ("consistency.bench.simulation", "consistency.bench.runs"),
+    ],
+)
+def test_a_direction_that_is_turned_is_reported(above: str, below: str, tmp_path: Path) -> None:
+    """Negative control: in truth the second imports the first."""
+    contract = f'name = "turned"\ntype = "layers"\nlayers = ["{above}", "{below}"]'
+    settings = tmp_path / "pyproject.toml"
+    settings.write_text(
+        f'[tool.importlinter]\nroot_package = "consistency"\n[[tool.importlinter.contracts]]\n{contract}\n'
+    )
+    done = linted(settings)
+    assert done.returncode == 1
+    assert "turned BROKEN" in done.stdout
 
 
 def test_no_two_modules_import_each_other() -> None:
-    """Wherever in them, for the type checker too; but a result shows itself by the module that shows results."""
-    paths = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in PACKAGE.rglob("*.py")}
-    paths = {name.removesuffix(".__init__"): path for name, path in paths.items()}
-    graph = {name: imported_modules(path.read_text(encoding="utf-8"), paths.keys()) for name, path in paths.items()}
-    graph["consistency.referee.diagnostics.verdict.parts"].remove(
-        "consistency.referee.diagnostics.verdict.as_dictionary"
-    )
-    graph["consistency.referee.fit_covariance.noise_model"] -= {
-        "consistency.referee.fit_covariance.page", "consistency.referee.fit_covariance.model_text",
-    }  # fmt: skip
+    """Wherever in them, for the type checker too."""
+    modules = grimp.build_graph("consistency", cache_dir=None)
+    graph = {name: modules.find_modules_directly_imported_by(name) for name in modules.modules}
+    assert len(graph) > 300
     assert acyclic(graph)
     assert not acyclic(
-        graph | {"consistency.bench.scenario.toml_tables": {"consistency.bench.scenario.sensor_view"}}
+        graph | {"consistency.bench.scenario.tables.toml_tables": {"consistency.bench.scenario.tables.sensor_view"}}
     )  # negative control
-
-
-@pytest.mark.parametrize(("module", "path"), modules(), ids=[name for name, _ in modules()])
-def test_a_room_imports_only_rooms_below_it(module: str, path: Path) -> None:
-    assert complaints(module.removesuffix(".__init__"), path.read_text(encoding="utf-8")) == []
-
-
-def not_of_the_textbook(source: str) -> list[str]:
-    """What a reference implementation imports of the filters beside others and the noise that all are told of."""
-    filters = "consistency.bench.filters"
-    found = [name for name in imported(source) if name.startswith(filters)]
-    return [name for name in found if not name.startswith((f"{filters}.textbook", f"{filters}.believed_noise"))]
-
-
-@pytest.mark.parametrize("path", sorted((PACKAGE / "bench/filters/textbook").glob("*.py")), ids=lambda path: path.stem)
-def test_the_textbook_knows_no_kernel(path: Path) -> None:
-    assert not_of_the_textbook(path.read_text(encoding="utf-8")) == []
-    assert not_of_the_textbook("from consistency.bench.filters.methods.ekf import parts") != []  # negative control
-
-
-FORBIDDEN = [
-    ("bench.filters", "from consistency.bench.simulation import simulate"),
-    ("bench.simulation", "import consistency.bench.filters.compiled"),
-    ("bench.simulation", "def f():\n    from consistency.bench import filters"),
-    ("bench.models", "from consistency.bench.scenario import Truth"),
-    ("bench.scenario", "import consistency as cs"),
-    ("bench.scenario", "from consistency.stereo.visual_odometry import relative_motion"),
-    ("referee.types", "from consistency.referee.errors import InputError"),
-    ("referee.diagnostics", "import pandas as pd"),
-    ("referee.diagnostics", "from matplotlib.axes import Axes"),
-    ("referee.diagnostics", "from consistency.bench.scenario import Belief"),
-    ("referee.diagnostics", "from consistency.referee.readers.read_files import read_recordings"),
-    ("referee.cli.judging", "def f():\n    from consistency.bench.store.results import open_results"),
-    ("referee.readers.formats.ros_bag", "import consistency.stereo.visual_odometry"),
-    ("bench.runs.montecarlo", "from consistency.bench.pages import write_reports"),
-    ("bench.runs.montecarlo", "import matplotlib.pyplot as plt"),
-    ("referee.gating", "from consistency.testing import assert_consistent"),
-    ("testing", "from consistency.pytest_plugin import Gates"),
-    ("bench.store.results", "if TYPE_CHECKING:\n    from consistency.bench.store.log import Log"),
-    ("bench.store.parquet", "from consistency.bench.store import storage"),
-    ("bench.store", "from consistency.bench.store.folder_tables import read_manifest"),
-    ("stereo.rendered_images", "from consistency.stereo.frontend.images_to_log import front_end"),
-    ("stereo.visual_odometry", "from consistency.stereo.rendered_images.chain import Chain"),
-    ("referee.document", "from consistency.referee.show.text import fragment"),
-    ("referee.document", "from consistency.referee.verdicts.options import settings_of"),
-    ("referee.document", "from rich.console import Console"),
-    ("referee.show", "from consistency.referee.system.provenance import manifest_of"),
-    ("stereo.visual_odometry", "from consistency.stereo.pages.images import IMAGES"),
-]
-
-
-@pytest.mark.parametrize(("module", "source"), FORBIDDEN)
-def test_a_forbidden_import_is_caught(module: str, source: str) -> None:
-    assert len(complaints(module, source)) == 1
-
-
-@pytest.mark.parametrize("name", OUTSIDE)
-def test_what_the_referee_calls_by_name_is_there(name: str) -> None:
-    assert callable(outside(name))
 
 
 def test_the_page_of_the_house_has_its_table() -> None:
@@ -288,7 +149,7 @@ def test_diagnostics_load_arrays_and_distributions_only() -> None:
     names = "import consistency.referee.diagnostics as d\n_ = [getattr(d, name) for name in d.__all__]"
     modules_ = loaded(names)
     assert {"numpy", "scipy"} <= modules_
-    assert not modules_ & {"pandas", "matplotlib", "numba", "pydantic", "joblib", "bokeh"}
+    assert not modules_ & {"pandas", "matplotlib", "numba", "pydantic", "joblib"}
 
 
 def test_gates_need_arrays_only() -> None:
@@ -302,38 +163,38 @@ def test_the_pytest_plugin_loads_nothing_heavy() -> None:
 
 
 def test_the_package_itself_loads_nothing_heavy() -> None:
-    heavy = {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "bokeh", "typer"}
+    heavy = {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "typer"}
     assert not loaded("import consistency") & heavy
     assert "numba" in loaded("import consistency; consistency.get_filter('ekf-uvd')")  # negative control
 
 
 def test_engines_of_clusters_are_loaded_when_they_are_chosen() -> None:
     engines = {"dask", "distributed", "submitit"}
-    choose = "import consistency.bench.runs.montecarlo\nfrom consistency.bench.runs.backends import choosing\n"
-    choose += "choosing.backend_for({!r})"
+    choose = "import consistency.bench.runs.montecarlo\n"
+    choose += "from consistency.bench.runs.backends.choosing import executor_for\n"
+    choose += "with executor_for({!r}): pass"
     assert not loaded(choose.format("local")) & engines
     assert loaded(choose.format("dask")) & engines == {"dask", "distributed"}
     assert loaded(choose.format("slurm")) & engines == {"submitit"}
 
 
-@pytest.mark.parametrize("package", ["consistency", "consistency.stereo.visual_odometry"])
-def test_a_new_session_lists_the_public_names(package: str) -> None:
+def test_a_new_session_lists_the_public_names() -> None:
     """``dir``, and so tab completion, without loading what the names stand for."""
-    code = f"import sys, {package} as package; print(*dir(package)); print(*sys.modules)"
+    code = "import sys, consistency; print(*dir(consistency)); print(*sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     names, modules_ = (set(line.split()) for line in out.stdout.splitlines())
-    expected = {
-        "consistency": {"analyse", "run_trials", "Verdict"},
-        "consistency.stereo.visual_odometry": {"relative_motion"},
-    }
-    assert expected[package] <= names
-    assert not modules_ & {"numpy", "cv2"}
+    assert {"analyse", "run_trials", "Verdict"} <= names
+    assert "numpy" not in modules_
+
+
+def test_vision_needs_opencv_for_images_alone() -> None:
+    assert not loaded("import consistency.vision") & {"cv2", "numba", "pandas", "matplotlib"}
 
 
 def test_the_help_loads_nothing_heavy() -> None:
-    modules_ = loaded("from consistency.referee.cli.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
+    modules_ = loaded("from consistency.commands.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
     assert "typer" in modules_
-    assert not modules_ & {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "bokeh"}
+    assert not modules_ & {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib"}
 
 
 def test_every_public_name_is_there() -> None:

@@ -15,10 +15,8 @@ import pytest
 from matplotlib.figure import Figure
 
 import consistency
-from consistency import testing
-from consistency.referee import diagnostics
-from consistency.referee.cli.commands import COMMANDS
-from consistency.stereo import visual_odometry
+from consistency import diagnostics, testing, vision
+from consistency.commands.registry import COMMANDS
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -150,7 +148,7 @@ def test_every_public_name_stands_in_the_reference() -> None:
     gates = [name for name, value in vars(testing).items() if getattr(value, "__module__", "") == testing.__name__]
     public = {f"consistency.{name}" for name in consistency.__all__}
     public |= {f"consistency.testing.{name}" for name in gates if not name.startswith("_")}
-    public |= {f"consistency.vision.{name}" for name in visual_odometry.__all__}
+    public |= {f"consistency.vision.{name}" for name in vision.__all__}
     at_top = {id(getattr(consistency, name)) for name in consistency.__all__}
     public |= {
         f"consistency.diagnostics.{name}"
@@ -251,7 +249,7 @@ def test_a_script_stands_by_itself_and_leaves_a_figure(script: Path) -> None:
     public = {
         "consistency",
         "consistency.diagnostics",
-        "consistency.sweeps.regime",
+        "consistency.sweeps",
         "consistency.vision",
     }
     assert set(modules) <= public

@@ -20,11 +20,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
-from consistency.referee.diagnostics import Evidence, Interval, Settings, Verdict, judge
+from consistency.referee.diagnostics import Interval, Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.questions.outliers import outliers
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import STATUSES
-from consistency.referee.diagnostics.words.sentences import off_by, p_text, plural, short
+from consistency.referee.diagnostics.words.numbers import off_by, p_text, plural, short
 from consistency.referee.types import Array, Failure
 
 SURE = 1e-5
@@ -124,11 +124,11 @@ def test_failures_are_failed_unless_a_fault_is_found(rng: np.random.Generator) -
     for ratio, status in ((1.0, "failed"), (4.0, "overconfident")):
         error = np.sqrt(ratio) * independent(rng, 60, 20, 3)
         error[3, 6:] = np.nan
-        verdict = judge(Evidence("f", error, identities(error), failures=broke), Settings(SURE))
+        verdict = judge(Record("f", error, identities(error), failures=broke), Settings(SURE))
         assert verdict.status == status
         assert "1 of 60 runs failed, first run 3 in step 7: LinAlgError: singular" in " ".join(verdict.reasons[:2])
     single = independent(rng, 1, 20, 3)
-    assert judge(Evidence("f", single, identities(single), failures=broke), Settings(SURE)).status == "failed"
+    assert judge(Record("f", single, identities(single), failures=broke), Settings(SURE)).status == "failed"
 
 
 def test_statuses_of_alarm_have_a_fault_and_the_others_none(rng: np.random.Generator) -> None:
@@ -199,7 +199,7 @@ def test_a_fault_from_the_start_has_no_date(rng: np.random.Generator) -> None:
 def test_the_chief_axis_has_the_name_it_was_given(rng: np.random.Generator) -> None:
     error = independent(rng, 61, 20, 3)
     error[..., 2] *= np.sqrt(3.0)
-    evidence = Evidence("f", error, identities(error), axes=["x", "y", "heading"])
+    evidence = Record("f", error, identities(error), axes=["x", "y", "heading"])
     verdict = judge(evidence, Settings(SURE))
     assert verdict.subset == "heading"
     assert "heading" in verdict.reasons[0]
@@ -329,7 +329,7 @@ def sentences(kind: Callable[..., Iterator[Array]]) -> list[tuple[str, int]]:
     for runs in RUNS:
         for error in kind(rng, runs):
             for settings in (Settings(), Settings(allow="conservative"), Settings(1e-4, tolerance=1.2)):
-                verdict = judge(Evidence("f", error, identities(error)), settings)
+                verdict = judge(Record("f", error, identities(error)), settings)
                 assert verdict.status in STATUSES
                 texts.append((verdict.reasons[0], runs))
     return texts
@@ -384,11 +384,11 @@ def test_correlations_that_look_the_same_are_not_named(rng: np.random.Generator)
     stated, true = (np.array([[1.0, c], [c, 1.0]]) for c in (0.68, 0.70))
     error = independent(rng, 4000, 40, 2) @ np.linalg.cholesky(true).T
     covariance = np.broadcast_to(stated, (4000, 40, 2, 2))
-    verdict = judge(Evidence("f", error, covariance), Settings())
+    verdict = judge(Record("f", error, covariance), Settings())
     assert "shape" in verdict.faults
     assert "correlation" not in verdict.reasons[0]
     error = independent(rng, 400, 40, 2) @ np.linalg.cholesky(np.array([[1.0, 0.9], [0.9, 1.0]])).T
-    far = judge(Evidence("f", error, covariance[:400]), Settings())
+    far = judge(Record("f", error, covariance[:400]), Settings())
     assert "correlation +0.90, stated +0.68" in far.reasons[0]
 
 
@@ -396,7 +396,7 @@ def test_one_run_that_failed_is_said_in_the_singular(rng: np.random.Generator) -
     error = independent(rng, 40, 10, 2)
     covariance = identities(error).copy()
     covariance[3, 4] = -np.eye(2)
-    verdict = judge(Evidence("f", error, covariance), Settings(SURE))
+    verdict = judge(Record("f", error, covariance), Settings(SURE))
     assert verdict.status == "failed"
     assert "1 of 40 runs has " in verdict.reasons[0]
 
@@ -447,14 +447,14 @@ def test_print_is_short(rng: np.random.Generator) -> None:
 def test_html_escapes_what_others_named(rng: np.random.Generator) -> None:
     hostile = "<script>alert('x')</script>&\""
     error = 3.0 * independent(rng, 20, 5, 2)
-    evidence = Evidence(hostile, error, identities(error), axes=["<b>x", "y&z"],
+    evidence = Record(hostile, error, identities(error), axes=["<b>x", "y&z"],
                         failures=(Failure("f", 1, 2, "<img src=x>"),))  # fmt: skip
     html = judge(evidence, Settings())._repr_html_()
     for bad in ("<script", "<b>x", "<img"):
         assert bad not in html
     assert escape(hostile) in html
     assert "&lt;b&gt;x" in html
-    assert html.count("<tr>") == html.count("</tr>") >= 5
+    assert html.count("<dt>") == html.count("</dt>") >= 5
 
 
 KEYS = {
@@ -478,13 +478,13 @@ def test_statistics_have_every_key_that_files_have_had(rng: np.random.Generator)
     P, nees = identities(error), np.square(error).sum(axis=-1)
     nis = {"nis": rng.chisquare(2, (40, 12)), "nis_dof": np.full((40, 12), 2)}
     cases: list[tuple[Verdict, set[str]]] = [
-        (judge(Evidence("f", error, P)), OF_ERRORS | OF_SHAPE),
-        (judge(Evidence("f", error + 1.0, P)), OF_ERRORS | OF_SHAPE | {"ratio_without_bias", "bias_axis"}),
-        (judge(Evidence("f", error, P), Settings(allow="conservative")), OF_ERRORS),
-        (judge(Evidence("f", error, P, **nis)), OF_ERRORS | OF_SHAPE | OF_INNOVATIONS),
-        (judge(Evidence("f", nees=nees, dof=3)), KEYS),
-        (judge(Evidence("f", **nis)), OF_ANY | OF_INNOVATIONS),
-        (judge(Evidence("f", **nis, optimal_gain=True)), OF_ANY | OF_INNOVATIONS),
+        (judge(Record("f", error, P)), OF_ERRORS | OF_SHAPE),
+        (judge(Record("f", error + 1.0, P)), OF_ERRORS | OF_SHAPE | {"ratio_without_bias", "bias_axis"}),
+        (judge(Record("f", error, P), Settings(allow="conservative")), OF_ERRORS),
+        (judge(Record("f", error, P, **nis)), OF_ERRORS | OF_SHAPE | OF_INNOVATIONS),
+        (judge(Record("f", nees=nees, dof=3)), KEYS),
+        (judge(Record("f", **nis)), OF_ANY | OF_INNOVATIONS),
+        (judge(Record("f", **nis, optimal_gain=True)), OF_ANY | OF_INNOVATIONS),
     ]
     for verdict, keys in cases:
         s = verdict.statistics
@@ -499,7 +499,7 @@ def test_statistics_are_the_numbers_of_the_arrays(rng: np.random.Generator) -> N
     """The flat names mean what they say: nothing swapped between the parts."""
     error = np.sqrt(1.3) * independent(rng, 40, 12, 3)
     nees = np.square(error).sum(axis=-1)
-    v = judge(Evidence("f", error, identities(error), axes=["x", "y", "heading"]), Settings(0.01))
+    v = judge(Record("f", error, identities(error), axes=["x", "y", "heading"]), Settings(0.01))
     s, means = v.statistics, nees.mean(axis=1)
     assert (s["false_alarm"], s["confidence"], s["runs"], s["steps"]) == (0.01, 0.99, 40, 12)
     assert s["mean_anees"] == pytest.approx(nees.mean())
@@ -606,28 +606,28 @@ def test_innovations_of_no_declared_gain_change_nothing(
     rng = np.random.default_rng(seed)
     error = np.sqrt(ratio) * independent(rng, runs, steps, 2)
     nis: dict[str, Any] = {"nis": size * rng.chisquare(2, (runs, steps)), "nis_dof": np.full((runs, steps), 2)}
-    alone = judge(Evidence("f", error, identities(error)))
-    beside = judge(Evidence("f", error, identities(error), **nis))
+    alone = judge(Record("f", error, identities(error)))
+    beside = judge(Record("f", error, identities(error), **nis))
     assert (alone.status, alone.faults, alone.answers) == (beside.status, beside.faults, beside.answers)
     assert alone.reasons[0] == beside.reasons[0]
     assert not beside.innovations.judged
-    only = judge(Evidence("f", **nis))
+    only = judge(Record("f", **nis))
     assert (only.status, only.answers) == ("undecided", ())
 
 
 def test_innovations_of_a_declared_gain_count(rng: np.random.Generator) -> None:
     error = independent(rng, 60, 20, 2)
     nis: dict[str, Any] = {"nis": 2.0 * rng.chisquare(2, (60, 20)), "nis_dof": np.full((60, 20), 2)}
-    verdict = judge(Evidence("f", error, identities(error), optimal_gain=True, **nis), Settings(SURE))
+    verdict = judge(Record("f", error, identities(error), optimal_gain=True, **nis), Settings(SURE))
     assert verdict.faults == ("innovation scale",)
     assert verdict.status == "inconsistent"
     assert verdict.reasons[0] == "inconsistent: innovations larger than stated"
-    only = judge(Evidence("f", optimal_gain=True, **nis), Settings(SURE))
+    only = judge(Record("f", optimal_gain=True, **nis), Settings(SURE))
     assert only.status == "overconfident"
     u = independent(rng, 60, 20, 2)
     u[:, 1:] = 0.6 * u[:, :-1] + 0.8 * u[:, 1:]
     correlated = judge(
-        Evidence("f", error, identities(error), innovations=u, innovation_covariances=identities(u), optimal_gain=True),
+        Record("f", error, identities(error), innovations=u, innovation_covariances=identities(u), optimal_gain=True),
         Settings(SURE),
     )
     assert "innovation whiteness" in correlated.faults
@@ -638,7 +638,7 @@ def test_innovations_of_a_declared_gain_count(rng: np.random.Generator) -> None:
 
 
 @st.composite
-def evidence(draw: Callable[..., Any]) -> Evidence:
+def evidence(draw: Callable[..., Any]) -> Record:
     """Errors of any finite kind: gaps, ragged ends, zeros, duplicates, unlike scales."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     runs, steps, n = draw(st.integers(1, 25)), draw(st.integers(1, 6)), draw(st.integers(1, 4))
@@ -668,13 +668,13 @@ def evidence(draw: Callable[..., Any]) -> Evidence:
             covariance[:, k] = 0.0
     nis, nis_dof = rng.chisquare(2, (runs, steps)), rng.integers(0, 3, (runs, steps))
     given_nis = draw(st.booleans())
-    return Evidence(
+    return Record(
         "f", error, covariance, nis=nis if given_nis else None, nis_dof=nis_dof if given_nis else None,
         optimal_gain=draw(st.booleans()),
     )  # fmt: skip
 
 
-def only_one_run_errs(evidence: Evidence) -> bool:
+def only_one_run_errs(evidence: Record) -> bool:
     """What the next test is for."""
     assert evidence.error is not None
     return int((np.nan_to_num(evidence.error) != 0.0).any(axis=(1, 2)).sum()) == 1
@@ -712,7 +712,7 @@ SETTINGS = st.sampled_from(
 
 
 @given(evidence(), SETTINGS)
-def test_there_is_a_verdict_on_anything(given_: Evidence, settings: Settings) -> None:
+def test_there_is_a_verdict_on_anything(given_: Record, settings: Settings) -> None:
     """Warnings are errors here. The status, the faults and the texts agree with each other."""
     assume(not only_one_run_errs(given_))
     verdict = judge(given_, settings)
@@ -723,5 +723,5 @@ def test_there_is_a_verdict_on_anything(given_: Evidence, settings: Settings) ->
     assert str(verdict)
     assert verdict._repr_html_()
     json.dumps(plain(verdict.statistics), allow_nan=False)
-    only = judge(Evidence("f", nees=np.square(given_.error).sum(axis=-1), dof=given_.error.shape[-1]), settings)
+    only = judge(Record("f", nees=np.square(given_.error).sum(axis=-1), dof=given_.error.shape[-1]), settings)
     assert only.status in STATUSES

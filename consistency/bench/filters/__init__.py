@@ -119,13 +119,13 @@ def get_filter(name: str) -> Any:
     if name not in MODULES:
         if "," in name:
             raise InputError(f"unknown filter '{name}'; give --filter once for each filter")
-        from consistency.bench.scenario.scenario import unknown
+        from consistency.bench.scenario.truth_and_belief import unknown
 
         raise InputError(unknown("filter", name, list(MODULES)))
     module, attribute, _ = MODULES[name]
     if (missing := _missing(module)) is not None:
         package, extra = missing
-        raise MissingPackageError(f"filter '{name}' needs {remedy(extra, own=package)}")
+        raise MissingPackageError(f"filter '{name}' needs {remedy(extra, package=package)}")
     return getattr(import_module(f"consistency.bench.filters.{module}"), attribute)
 
 

@@ -20,7 +20,7 @@ def jitable(function: F) -> F:
     return function
 
 
-def register() -> None:
+def register_jitables() -> None:
     """Tell Numba of what is jitable, before a kernel is compiled: Numba is slow to load, and verdicts do without it."""
     from numba.extending import register_jitable
 

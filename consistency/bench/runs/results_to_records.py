@@ -6,7 +6,6 @@ world. Maps are read when they are asked for.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -19,7 +18,7 @@ from consistency.bench.store.parquet import Columns
 from consistency.bench.store.results import JOINT, Tables, open_results
 from consistency.referee.column_names import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
 from consistency.referee.diagnostics import Design, JointNees, MapRecord, Record, Rejections, sequential_design
-from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
+from consistency.referee.diagnostics.records.large_arrays import by_runs
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, planar_error
 from consistency.referee.parsing import LARGEST_NUMBER, one_line
@@ -33,7 +32,7 @@ POINT = ("x", "y", "z")
 
 def records_of(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
     """A record for every filter of the results, or for those named, each read when it is asked for."""
-    steps = steps_of(results)
+    steps = longest_run(results)
     return (record_of(results, name, steps) for name in filters or results.filters)
 
 
@@ -49,10 +48,10 @@ def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Re
         raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
     broken = results.failures[results.failures["filter"] == filter_name]
     convention, runs = results.error_of(filter_name), results.runs_of(filter_name)
-    steps = steps_of(results) if steps is None else steps
+    steps = longest_run(results) if steps is None else steps
     shape = len(runs), steps
-    pose, covariance = np.full((*shape, 3), np.nan), Symmetric.filled(shape, 3)
-    own = None if convention == ADDITIVE else Symmetric.filled(shape, 3)
+    pose, covariance = np.full((*shape, 3), np.nan), np.full((*shape, 3, 3), np.nan)
+    own = None if convention == ADDITIVE else covariance.copy()
     nis, nis_dof = np.full(shape, np.nan), np.zeros(shape, np.int64)
     nees = np.full(shape, np.nan) if results.has_truth else None
     own_nees = None if own is None or nees is None else nees.copy()
@@ -101,9 +100,10 @@ def _places_of(runs: Indices, steps: int, batch: Columns) -> Any:
     return slice(int(at[0]), int(at[-1]) + 1) if len(at) and (np.diff(at) == 1).all() else at
 
 
-def _fill(covariance: Symmetric, at: Any, batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
+def _fill(covariance: Array, at: Any, batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
     for name, (i, j) in columns.items():
-        covariance.entry(i, j).reshape(-1)[at] = batch[name]
+        covariance.reshape(-1, 3, 3)[at, i, j] = batch[name]
+        covariance.reshape(-1, 3, 3)[at, j, i] = batch[name]
 
 
 def _require_own(batch: Columns, filter_name: str) -> None:
@@ -134,18 +134,18 @@ def _require_agreement(r: Record) -> None:
         )
 
 
-def _require_all(r: Record, column: str, covariance: Symmetric) -> None:
+def _require_all(r: Record, column: str, covariance: Array) -> None:
     """Refuse a missing NEES from the first step on whose covariance, of the filter's own error, has full rank."""
     if r.nees is None:
         return
     from consistency.bench.filters.kernel.linalg import definiteness  # loads Numba
 
-    steps = np.isfinite(covariance.entry(0, 0)).sum(axis=1)  # with an estimate, of each run
+    steps = np.isfinite(covariance[..., 0, 0]).sum(axis=1)  # with an estimate, of each run
     first = by_runs(_first_number, r.nees)
     missing = np.isfinite(r.nees).sum(axis=1) < steps - np.minimum(first, steps)
     for row in np.flatnonzero((first > 0) & (steps > 0)):  # the last step without a NEES before those with one
         last = min(int(first[row]), int(steps[row])) - 1
-        missing[row] |= definiteness(np.asarray(covariance[row, last])) == 1
+        missing[row] |= definiteness(covariance[row, last]) == 1
     if missing.any():
         run = r.run_numbers[int(np.argmax(missing))]
         raise InputError(
@@ -202,13 +202,14 @@ def map_of(
     if not sum(len(batch["run"]) for batch in batches):
         return None
     rows = {column: np.concatenate([batch.pop(column) for batch in batches]) for column in results.map_numbers}
-    entries = {place: rows.pop(name) for name, place in POINT_COVARIANCE.items()}
-    covariance = Symmetric([[entries[min(i, j), max(i, j)] for j in range(3)] for i in range(3)])
+    covariance = np.empty((len(rows["run"]), 3, 3))
+    for name, (i, j) in POINT_COVARIANCE.items():
+        covariance[:, i, j] = covariance[:, j, i] = rows.pop(name)
     error = _places(results, rows["landmark"])
     for i, axis in enumerate("xyz"):
         error[:, i] -= rows.pop(axis)
     joint = rows.get(JOINT)  # not kept in older folders
-    dof = 3 if any(covariance.entry(2, j).any() for j in range(3)) else 2
+    dof = 3 if covariance[:, 2].any() else 2
 
     def record(last: Array | None) -> Record | None:
         """The landmarks that are judged, in the place of steps; None where none is.
@@ -224,10 +225,9 @@ def map_of(
         labels, column = np.unique(rows["landmark"][some], return_inverse=True)
         nees = np.full((len(runs), len(labels)), np.nan)
         nees[row, column] = rows["nees"][some]
-        errors, covariances = np.full((*nees.shape, dof), np.nan), Symmetric.filled(nees.shape, dof)
+        errors, covariances = np.full((*nees.shape, dof), np.nan), np.full((*nees.shape, dof, dof), np.nan)
         errors[row, column] = error[some, :dof]
-        for i, j in itertools.combinations_with_replacement(range(dof), 2):
-            covariances.entry(i, j)[row, column] = covariance.entry(i, j)[some]
+        covariances[row, column] = covariance[some, :dof, :dof]
         common = np.isfinite(nees).all(axis=0)
         kept = common if common.any() else np.full(len(labels), True)
         at: Any = slice(None) if kept.all() else kept
@@ -270,7 +270,7 @@ def _places(results: Tables, labels: Indices) -> Array:
     return places
 
 
-def steps_of(results: Tables) -> int:
+def longest_run(results: Tables) -> int:
     """Steps of the longest run, failed steps counted."""
     last = int(results.failures["step"].max()) if len(results.failures) else 0
     for table in ("estimates", "truth"):
@@ -288,8 +288,8 @@ def design_of(results: Tables) -> Design | None:
         raise InputError(f"manifest.json: key 'until_decided': {error}") from None
 
 
-def source_of(results: Tables | str | Path) -> Source:
-    """Results of a run, in memory or in a folder, as a source of records.
+def results_source(results: Tables | str | Path) -> Source:
+    """Return results of a run, in memory or in a folder, as a source of records.
 
     Raises
     ------
@@ -297,7 +297,7 @@ def source_of(results: Tables | str | Path) -> Source:
         The folder is damaged; the records raise as :func:`record_of`.
     """
     tables = results if isinstance(results, Tables) else open_results(results)
-    m, steps = tables.manifest, cache(partial(steps_of, tables))
+    m, steps = tables.manifest, cache(partial(longest_run, tables))
     unfinished = "" if m.get("complete", True) else f"only {m['finished_runs']} of {m['runs']} runs are there"
     return Source(
         tables.filters, lambda name: record_of(tables, name, steps()), partial(design_of, tables), tables.has_truth,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.campaign import Campaign
-from consistency.bench.runs.montecarlo import run_trials, studied
+from consistency.bench.runs.montecarlo import run_trials, studied, workers_for
 from consistency.bench.runs.results_to_records import record_of, records_of
 from consistency.bench.runs.run_scores import run_means
-from consistency.bench.runs.trial_work import Backend
 from consistency.bench.scenario import Scenario, load_scenario
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.results import Results, StoredResults, Tables, open_results
@@ -23,11 +22,10 @@ from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import Design, Record, Verdict, look, sequential_design, speaks
 from consistency.referee.diagnostics.questions.scale import FEW
-from consistency.referee.diagnostics.verdict.judge import of_look, with_map
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
 from consistency.referee.types import Array
-from consistency.referee.verdicts.options import refused
+from consistency.referee.verdicts.command_settings import refused
 
 
 def run_until_decided(
@@ -47,7 +45,7 @@ def run_until_decided(
     out: str | Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    backend: Backend | None = None,
+    executor: Executor | None = None,
     journal: Journal | None = None,
 ) -> tuple[Results | StoredResults, dict[str, Verdict]]:
     """Simulate and judge at the inspections of a :class:`Design` until every filter is decided.
@@ -59,7 +57,7 @@ def run_until_decided(
 
     Parameters
     ----------
-    seed, jobs, timeout, previous, memory, out, resume, overwrite, backend : as for :func:`run_trials`. A look then
+    seed, jobs, timeout, previous, memory, out, resume, overwrite, executor : as for :func:`run_trials`. A look then
         holds the arrays of one filter in memory, and nothing else grows with the runs.
     journal : in place of ``out``: what keeps the finished runs while the results stay in memory. It may hold runs of
         the same scenario, filters and seed.
@@ -79,7 +77,7 @@ def run_until_decided(
     plan |= {} if lost is None else {"lost": lost}
     design, decided = plan_of(plan), dict[str, Verdict]()
     with studied(
-        scenario, filters, seed, backend or LocalThreads(jobs), timeout, memory,
+        scenario, filters, seed, workers_for(jobs, executor), timeout, memory,
         out=out, previous=previous, resume=resume, overwrite=overwrite, plan=plan, journal=journal,
     ) as campaign:  # fmt: skip
         _require_less(campaign, max_runs)
@@ -117,8 +115,7 @@ def _look(design: Design, record: Record, runs: int, spent: float | None) -> Ver
     some = record.first_runs(runs)
     if runs != design.max_runs and not speaks(design, some, spent):
         return None
-    verdict = of_look(look(design, some, spent), runs, record, design)
-    return with_map(verdict, record.ends, design.settings, design)
+    return look(design, some, spent)
 
 
 def _rounds(
@@ -173,7 +170,7 @@ def pilots_in_world(scenario: str, filters: Sequence[str], runs: int, seed: int)
 
 
 def pilots_of(results: Tables, filters: Sequence[str] | None = None) -> dict[str, tuple[Array, int]]:
-    """Pilots of :func:`consistency.referee.verdicts.options.plan`, of every filter or of those named."""
+    """Pilots of :func:`consistency.referee.verdicts.command_settings.plan`, of every filter or of those named."""
     return {of.name: (_pilot_means(of), of.t.size) for of in records_of(results, filters)}
 
 

@@ -1,31 +1,19 @@
 """Scenarios: a TOML file becomes a frozen record of what is true and what the filter believes.
 
 ``toml_tables`` reads files, ``sensor_view`` and ``sensor`` have the one definition of a sensor, ``truth`` what is the
-case. ``scenario`` sets a belief beside it, and makes a file of both. ``effects`` holds what a sensor does to an ideal
-observation: the keys of each effect and its ``apply``. Nothing here draws a trial; that is the simulation's.
+case. ``truth_and_belief`` sets a belief beside it, and makes a file of both. ``effects`` holds what a sensor does to an
+ideal observation: the keys of each effect and its ``apply``. Nothing here draws a trial; that is the simulation's.
 """
 
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
-from consistency.bench.scenario.scenario import (
-    Belief,
-    BelievedMotion,
-    GuardSettings,
-    Scenario,
-    SigmaPoints,
-    load_scenario,
-    misbelief,
-    scenario_names,
-    scenario_text,
-    toml_text,
-)
 from consistency.bench.scenario.sensor import (
     BelievedSensor,
     PicturedSensor,
     TrueSensor,
     UvdSensor,
 )
-from consistency.bench.scenario.sensor_view import PLANAR_SENSORS, Mount
-from consistency.bench.scenario.toml_tables import Count, Finite, Positive, Table, explain, read_table
+from consistency.bench.scenario.tables.sensor_view import PLANAR_SENSORS, Mount
+from consistency.bench.scenario.tables.toml_tables import Count, Finite, Positive, Table, explain, read_table
 from consistency.bench.scenario.truth import (
     AnnularLandmarks,
     Circle,
@@ -39,7 +27,19 @@ from consistency.bench.scenario.truth import (
     UniformLandmarks,
     Waypoints,
 )
-from consistency.referee.shipped import data_folder
+from consistency.bench.scenario.truth_and_belief import (
+    Belief,
+    BelievedMotion,
+    GuardSettings,
+    Scenario,
+    SigmaPoints,
+    load_scenario,
+    misbelief,
+    scenario_names,
+    scenario_text,
+    toml_text,
+)
+from consistency.referee.system.shipped import data_folder
 
 __all__ = [
     "PLANAR_SENSORS",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 TABLES = (".parquet", ".csv")  # the latter of logs alone
 
 
-def write_folder(
+def write_tables(
     folder: Path,
     tables: dict[str, pd.DataFrame],
     manifest: dict[str, Any],

@@ -24,8 +24,8 @@ from consistency.bench.scenario import (
     read_table,
     toml_text,
 )
-from consistency.bench.scenario.toml_tables import SIGMA_UNITS
-from consistency.bench.store.folder_tables import write_folder
+from consistency.bench.scenario.tables.toml_tables import SIGMA_UNITS
+from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.log_tables import read_table_file, require_format, table_file
 from consistency.bench.store.trial_rows import controls_table, observations_table, stacked_table, truth_columns
 from consistency.bench.types import Trial
@@ -149,7 +149,7 @@ def write_log(
             for name, table in tables.items():
                 table.to_csv(at / f"{name}.csv", index=False)
 
-    write_folder(folder, tables if form == "parquet" else {}, manifest, contents, overwrite)
+    write_tables(folder, tables if form == "parquet" else {}, manifest, contents, overwrite)
 
 
 def sensor_text(folder: Path, belief: Belief) -> str:

@@ -15,7 +15,8 @@ import pyarrow.parquet as pq
 
 from consistency.referee.column_names import COLUMNS, OWN_COVARIANCE
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import HUGE, LARGEST_NUMBER, MOST_DOF, WHOLE, is_file, one_line, reading, require_room
+from consistency.referee.parsing import HUGE, LARGEST_NUMBER, MOST_DOF, WHOLE, is_file, one_line, reading
+from consistency.referee.readers.formats.parquet_file import open_parquet
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
@@ -188,53 +189,12 @@ def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
     return file
 
 
-def open_parquet(path: Path, refusal: str = "cannot be read, damaged or cut short") -> Any:
-    """A Parquet file, opened and checked for the room that it takes; raises :class:`InputError`."""
-    with reading(path, refusal):
-        file = pq.ParquetFile(path, page_checksum_verification=True)
-        about = file.metadata
-        pages = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
-        require_room(path, max(pages, about.num_rows * about.num_columns * 8))
-        if about.num_rows != sum(about.row_group(k).num_rows for k in range(about.num_row_groups)):
-            raise ValueError("its numbers of rows do not agree")  # no checksum is over them
-    return file
-
-
 def read_frame(path: Path) -> pd.DataFrame:
     """Read a whole Parquet file of unknown columns, by columns alone; raises :class:`InputError`."""
     file = open_parquet(path)
     with reading(path):
         table: pd.DataFrame = _plain(file.read()).to_pandas()
         return table
-
-
-def read_columns(path: Path, refusal: str) -> tuple[dict[str, Array], int]:
-    """Read a whole Parquet file: its columns as arrays, and the number of rows.
-
-    Arrays are floats with NaN where a cell is empty, or objects with None there.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, or has a name of a column twice.
-    """
-    file = open_parquet(path, refusal)
-    with reading(path, refusal):
-        table = file.read()
-    names = table.column_names
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"{path}: column '{one_line(twice[0])}' is there twice")
-    with reading(path, refusal):
-        return {name: _cells(name, column) for name, column in zip(names, table.columns, strict=True)}, table.num_rows
-
-
-def _cells(name: str, column: Any) -> Array:
-    if pa.types.is_decimal(column.type):
-        column = column.cast(pa.float64())
-    if name != "filter" and (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
-        values: Array = column.to_numpy().astype(float)
-        return values
-    return np.fromiter(column.to_pylist(), object, len(column))
 
 
 def _plain(table: Any) -> Any:

@@ -14,7 +14,7 @@ import pandas as pd
 from pydantic import ValidationError
 
 from consistency.bench.scenario import Scenario, explain
-from consistency.bench.store.folder_tables import require_unchanged, write_folder
+from consistency.bench.store.folder_tables import require_unchanged, write_tables
 from consistency.bench.store.parquet import OPTIONAL, Columns, read_batches, read_parquet, require_table
 from consistency.bench.store.results_check import require_manifest, require_rows
 from consistency.referee.column_names import COLUMNS
@@ -143,13 +143,13 @@ class Results(Tables):
             yield {column: rows[column].to_numpy()[selection] for column in columns}
 
     def write(self, folder: Path, overwrite: bool = False, keep_others: bool = False) -> None:
-        """Write the folder at once, as :func:`write_folder`: it appears complete or not at all."""
+        """Write the folder at once, as :func:`write_tables`: it appears complete or not at all."""
         tables = {"estimates": self.estimates, "failures": self.failures}
         optional = {
             "truth": self.truth, "landmarks": self.landmarks, "map": self.map, "rejections": self.rejections,
         }  # fmt: skip
         tables |= {name: table for name, table in optional.items() if table is not None}
-        write_folder(folder, tables, self.manifest, overwrite=overwrite, keep_others=keep_others)
+        write_tables(folder, tables, self.manifest, overwrite=overwrite, keep_others=keep_others)
 
 
 @dataclass(frozen=True)

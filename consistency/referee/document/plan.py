@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from consistency.referee.diagnostics.words.sentences import percent
+from consistency.referee.diagnostics.words.numbers import percent
 
 
 def plan_lines(planned: dict[str, Any]) -> list[str]:

@@ -13,16 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.verdict.as_dictionary import whole
-from consistency.referee.diagnostics.words.sentences import (
-    UNCERTAIN,
-    p_text,
-    percent,
-    plain,
-    plural,
-    question_text,
-    short,
-)
+from consistency.referee.diagnostics.words.numbers import UNCERTAIN, p_text, percent, plural, ratio_text, short
+from consistency.referee.diagnostics.words.sentences import question_text
 from consistency.referee.document.blocks import (
     Block,
     Cell,
@@ -84,7 +76,7 @@ def factor(v: Verdict) -> Quantity:
 
 def true_over_stated(v: Verdict, whole: Quantity) -> Cell:
     """Ratio of true to stated covariance: of the axis that decides, with its name, or of the whole."""
-    return whole if v.axis is None else f"{plain(v.axis[1])} in {v.axis[0]}"
+    return whole if v.axis is None else f"{ratio_text(v.axis[1])} in {v.axis[0]}"
 
 
 def shown_inside(v: Verdict) -> Cell:
@@ -176,7 +168,7 @@ def page(inside: str) -> tuple[Measure, ...]:
         Measure(Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True), shown_inside),
         Measure(
             Column("Worst axis", "Worst\naxis", number=True),
-            lambda v: f"{v.worst_axis[0]}, {plain(v.worst_axis[1])}" if v.worst_axis else NONE,
+            lambda v: f"{v.worst_axis[0]}, {ratio_text(v.worst_axis[1])}" if v.worst_axis else NONE,
         ),
         Measure(Column("Mainly", number=True), lambda v: v.subset or NONE),
         Measure(
@@ -218,11 +210,11 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         value, low, high = s.inflation
         rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], true / stated"))
         if v.axis is not None:
-            rows.append(("decided by", f"{v.axis[0]}, {plain(v.axis[1])}"))
+            rows.append(("decided by", f"{v.axis[0]}, {ratio_text(v.axis[1])}"))
         elif (worst := v.worst_axis) is not None:
-            rows.append(("worst axis", f"{worst[0]}, {plain(worst[1])}"))
+            rows.append(("worst axis", f"{worst[0]}, {ratio_text(worst[1])}"))
         if s.within is not None:
-            rows.append(("within the log", f"{plain(s.within.ratio)}, if errors decorrelate as within it"))
+            rows.append(("within the log", f"{ratio_text(s.within.ratio)}, if errors decorrelate as within it"))
         ends = f"[{short(1 / shown.factor)}, {short(shown.factor)}]"
         rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)})"))
         if v.lost is not None:
@@ -269,7 +261,7 @@ def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = T
     blocks: list[Block] = [_overview(verdicts), *(Text(line) for line in _below(verdicts))]
     if reasons:
         blocks.append(Reasons(tuple(reason(v, name) for name, v in verdicts.items())))
-    return Document(title, "", (), tuple(blocks), {name: whole(v) for name, v in verdicts.items()})
+    return Document(title, "", (), tuple(blocks), {name: v.as_dictionary() for name, v in verdicts.items()})
 
 
 def _overview(verdicts: Mapping[str, Verdict]) -> Table:
@@ -290,7 +282,7 @@ def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
         lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
     if worst := [(name, *v.worst_axis) for name, v in verdicts.items() if v.worst_axis is not None]:
-        texts = "; ".join(f"{name} {axis}, {plain(ratio)}" for name, axis, ratio in worst)
+        texts = "; ".join(f"{name} {axis}, {ratio_text(ratio)}" for name, axis, ratio in worst)
         lines.append(f"ratio of the worst axis: {texts}")
     if maps := {name: v.map for name, v in verdicts.items() if v.map is not None}:
         from consistency.referee.document.map import map_lines

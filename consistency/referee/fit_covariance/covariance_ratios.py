@@ -12,7 +12,7 @@ from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.motion_windows import BLOCKS, ENOUGH, DriveWindows
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
-from consistency.referee.readers.runs_to_record import listed
+from consistency.referee.readers.places import listed
 from consistency.referee.types import Array, Indices
 
 DECIDE = 50  # windows that decide where drives are fewer than ENOUGH

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.extras import function_at
 from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.geometry.groups import composed, matrices
-from consistency.referee.readers.file_kinds import (
+from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
     TRAJECTORIES,
@@ -20,15 +18,15 @@ from consistency.referee.readers.file_kinds import (
     is_drive,
     is_plane,
     is_solution,
-    kind_of,
     trajectory_files,
     unknown_kind,
 )
-from consistency.referee.readers.formats.sheet import refuse
-from consistency.referee.readers.formats.table import table_poses
+from consistency.referee.readers.formats.table import read_tables
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.truth_matching import NamedPoses, truth_at
+from consistency.referee.readers.pipeline.kinds import Found, kind_of
+from consistency.referee.readers.places import refuse
+from consistency.referee.readers.truth_matching import Estimator, Poses, truth_at
 from consistency.referee.types import Array, Indices
 
 
@@ -73,24 +71,17 @@ def read_drives(
         raise InputError(f"{path}: no such file")
     if r.time_offset not in (None, "estimate") and not isinstance(r.time_offset, (int, float)):
         raise InputError(f"--time-offset {r.time_offset}: must be a number of seconds, or 'estimate'")
-    found = list(_poses(path, r))
-    require_radians(str(path), [each.poses for each in found])
-    estimated = [_estimated(each, r) for each in found]
-    is_estimated = r.time_offset == "estimate"
-    if is_estimated:
-        shift = clock_offset([(each.poses, T) for each, T in zip(found, estimated, strict=True)])
-    else:
-        shift = float(r.time_offset or 0.0)
-    return [_drive(each, T, shift, is_estimated) for each, T in zip(found, estimated, strict=True)]
+    poses = _poses(path, r)
+    require_radians(str(path), poses)
+    found = [(each, _matrices(each, r)) for each in poses]
+    if r.time_offset != "estimate":
+        return [_drive(each, T, float(r.time_offset or 0.0)) for each, T in found]
+    shift = clock_offset(found)
+    return [replace(_drive(each, T, shift), shift=shift) for each, T in found]
 
 
 def drive_of(
-    name: str,
-    estimate: Array,
-    truth: Array,
-    t: Array | None = None,
-    row: Indices | None = None,
-    motions: bool = False,
+    name: str, estimate: Array, truth: Array, t: Array | None = None, row: Indices | None = None, motions: bool = False
 ) -> Drive:
     """A drive of arrays.
 
@@ -118,51 +109,65 @@ def drive_of(
     return Drive(name, np.asarray(t, float), row, composed(T) if motions else T, matrices(truth))
 
 
-def _poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
-    kind = kind_of(path, r)
+def _poses(path: Path, r: Reading) -> list[Poses]:
+    """The poses of each drive, without covariances."""
     if not is_bag(path) and path.is_dir() and not trajectory_files(path):
-        yield from _tables(path, r)
-    elif kind is None or not kind.poses or is_solution(path):
-        raise unknown_kind(path, (*TABLES, *ARCHIVES, ".bag", *TRAJECTORIES), "estimates=poses, truth=true_poses")
-    else:
-        yield from function_at(kind.poses)(path, r)
+        return _of_folder(path, r)
+    kind = kind_of(path, r)
+    if kind is None or is_solution(path):
+        raise _no_poses(path)
+    return _of_one(path, kind.read(path, r, True))
 
 
-def _tables(folder: Path, r: Reading) -> Iterator[NamedPoses]:
+def _no_poses(path: Path) -> InputError:
+    return unknown_kind(path, (*TABLES, *ARCHIVES, ".bag", *TRAJECTORIES), "estimates=poses, truth=true_poses")
+
+
+def _of_one(path: Path, found: Found) -> list[Poses]:
+    """The runs of the one estimator of a file."""
+    if len(found) > 1:
+        raise InputError(f"{path}: holds several estimators in its column 'filter'; keep the rows of one")
+    (one,) = found
+    if not isinstance(one, Estimator):
+        raise _no_poses(path)
+    if one.innovations_alone:
+        raise InputError(f"{path}: needs --truth FILE, poses in any world")
+    return list(one.runs)
+
+
+def _of_folder(folder: Path, r: Reading) -> list[Poses]:
     """Tables of a folder, one for each drive, with truths of the same names in another."""
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in TABLES or is_plane(path))
     if not files:
         raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
+    found = []
     for path in files:
         truth = r.truth
         if truth is not None and truth.is_dir() and not is_drive(truth):
             truth = truth / path.name
         if truth is not None and not truth.exists():
             raise InputError(f"--truth {r.truth}: holds no file '{path.name}' for {path}")
-        for name, poses, clock in table_poses(path, replace(r, truth=truth)):
-            stem = path.name.split(".")[0]
-            yield NamedPoses(stem if name == path.stem else f"{stem}, {name}", poses, clock)
+        stem = path.name.split(".")[0]
+        for poses in _of_one(path, read_tables(path, replace(r, truth=truth), poses_alone=True)):
+            found.append(replace(poses, name=stem if poses.name == path.stem else f"{stem}, {poses.name}"))
+    return found
 
 
-def _estimated(read: NamedPoses, r: Reading) -> Array:
+def _matrices(poses: Poses, r: Reading) -> Array:
     """Estimated poses, (N, d + 1, d + 1)."""
-    finite = np.isfinite(read.poses.estimate).all(axis=1)
+    finite = np.isfinite(poses.estimate).all(axis=1)
     what = "the pose is not finite; end the drive before it, or leave the row out"
-    refuse(~finite, read.poses.place.__getitem__, what)
-    T = matrices(read.poses.estimate)
+    refuse(~finite, poses.place.__getitem__, what)
+    T = matrices(poses.estimate)
     return composed(T) if r.motions else T
 
 
-def _drive(read: NamedPoses, T: Array, shift: float, is_estimated: bool) -> Drive:
-    """The drive where its truth is known, with ``shift`` s added to its times."""
-    name, poses, clock = read
+def _drive(poses: Poses, T: Array, shift: float) -> Drive:
     t = poses.t + shift
     known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
-    rows = known.rows
-    if len(rows) < 2:
+    if len(known.rows) < 2:
         raise InputError(
-            f"{name}: {len(rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t is "
-            f"{t[0]:.15g} to {t[-1]:.15g}, but {poses.true_t[0]:.15g} to {poses.true_t[-1]:.15g} in the truth"
+            f"{poses.name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t "
+            f"is {t[0]:.15g} to {t[-1]:.15g}, but {poses.true_t[0]:.15g} to {poses.true_t[-1]:.15g} in the truth"
         )
-    estimated_shift = shift if is_estimated else 0.0
-    return Drive(name, clock[rows] + shift, rows, T[rows], matrices(known.truth), estimated_shift)
+    return Drive(poses.name, poses.seconds[known.rows] + shift, known.rows, T[known.rows], matrices(known.truth))

@@ -11,8 +11,8 @@ from consistency.referee.column_names import COVARIANCE
 from consistency.referee.diagnostics import Record
 from consistency.referee.fit_covariance.covariance_ratios import Fold
 from consistency.referee.fit_covariance.motion_windows import DriveWindows
-from consistency.referee.geometry.groups import carried, composed, to_left, vectors
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.geometry.groups import composed, propagated, to_left, vectors
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
@@ -41,7 +41,7 @@ def _stretch(run: int, windows: DriveWindows, C: Array) -> Stretch:
     n = len(windows.axes)
     convention = CONVENTIONS[n]
     D = windows.motions
-    P = carried(np.linalg.inv(to_left(D, convention)), C)
+    P = propagated(np.linalg.inv(to_left(D, convention)), C)
     start = np.eye(windows.d + 1)[None]
     rows = np.arange(len(D) + 1)
     places = Places(lambda row: f"{drive.name}, window {row}", rows)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.extras import is_installed
 from consistency.referee.fit_covariance.model_text import correction, data, noise_document
 from consistency.referee.fit_covariance.motion_windows import PIECES, ways
 from consistency.referee.fit_covariance.motions import write_motions
@@ -31,7 +30,7 @@ def write_model(model: NoiseModel, folder: Path, overwrite: bool = False) -> lis
     """
     texts = snippets(model)
     texts["verdict.json"] = as_json.render(noise_document(model)) + "\n"
-    texts["report.html"] = as_html.render(noise_page(model, with_pictures=is_installed("plot")))
+    texts["report.html"] = as_html.render(noise_page(model))
     names: list[str] = []
 
     def contents(at: Path) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Reason, Status, Table, table
-from consistency.referee.gating.session import Ledger, ending, outcome, wanted
+from consistency.referee.gating.session import Ledger, ending, outcome_text, wanted
 from consistency.referee.gating.watch import Entry
 from consistency.referee.show import rendered
 from consistency.referee.show.text import fragment
@@ -21,7 +21,7 @@ def _cells(e: Entry) -> dict[str, Cell]:
     low, high = (float("inf") if end is None else end for end in (low, high))
     p = "-" if e.p_value is None else f"{min(e.p_value, 1.0):.2g}" if e.p_value >= 1e-6 else "<1e-6"
     return {
-        "test": e.test, "gate": e.gate, "filter": e.name, "outcome": outcome(e), "verdict": Status(e.status),
+        "test": e.test, "gate": e.gate, "filter": e.name, "outcome": outcome_text(e), "verdict": Status(e.status),
         "p": p, "false-alarm rate": f"{e.false_alarm:.3g}", "runs": str(e.runs), "planned": str(e.needed),
         "true / stated": Quantity(
             value, (low, high), f" in {e.axis}" if e.axis else "", digits=".3g", is_factor=True
@@ -52,12 +52,12 @@ def _table(entries: Iterable[Entry], heads: tuple[str, ...]) -> Table:
     return table(columns, [tuple(map(_cells(e).__getitem__, heads)) for e in entries], "Gates")
 
 
-def lines(ledger: Ledger) -> list[str]:
+def gate_lines(ledger: Ledger) -> list[str]:
     """The summary for a terminal: a row a gate, and under it why it did not pass."""
     return [*fragment(_table(ledger.entries(), BRIEF)).split("\n"), ending(ledger)]
 
 
-def document(ledger: Ledger) -> Document:
+def gate_document(ledger: Ledger) -> Document:
     data = {
         "schema_version": 1,
         "kind": "gates",
@@ -69,6 +69,6 @@ def document(ledger: Ledger) -> Document:
     return Document("Consistency gates", f"{ending(ledger)}.", (), (_table(ledger.entries(), HEADS),), data)
 
 
-def write(ledger: Ledger, path: Path) -> None:
+def write_gates(ledger: Ledger, path: Path) -> None:
     """The whole file or none: written beside its place and renamed."""
-    write_whole(path, rendered(document(ledger), path).encode("utf-8"))
+    write_whole(path, rendered(gate_document(ledger), path).encode("utf-8"))

@@ -126,7 +126,7 @@ def ending(ledger: Ledger) -> str:
     return text
 
 
-def outcome(e: Entry) -> str:
+def outcome_text(e: Entry) -> str:
     """Also whether the test wanted the gate to fail."""
     return e.outcome + (" (expected)" if wanted(e) else "")
 
@@ -136,7 +136,7 @@ def wanted(e: Entry) -> bool:
     return e.outcome != "passed" and e.test_outcome == "passed"
 
 
-def refusal(path: Path) -> str:
+def path_fault(path: Path) -> str:
     """Why a report cannot be written there, and what to do; '' if it can."""
     if path.suffix.lower() not in FORMATS:
         return f"--consistency-report {path}: must end in {' or '.join(FORMATS)}"

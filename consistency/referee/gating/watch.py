@@ -104,7 +104,7 @@ class Terms:
 
 
 @dataclass
-class Watch:
+class RunningTest:
     """One running test: what its gates are told, and where their entries go."""
 
     marked: Mapping[str, Any] = field(default_factory=dict)  # of the marker, only what was said
@@ -115,16 +115,16 @@ class Watch:
     keep: Callable[[Entry], None] = lambda entry: None
 
 
-_watches: list[Watch] = []  # the running test is last; tests of a process run one after the other
+_watches: list[RunningTest] = []  # the running test is last; tests of a process run one after the other
 
 
-def current() -> Watch:
+def current() -> RunningTest:
     """The watch of the running test; outside a session one that tells nothing."""
-    return _watches[-1] if _watches else Watch()
+    return _watches[-1] if _watches else RunningTest()
 
 
 @contextlib.contextmanager
-def watching(watch: Watch) -> Iterator[None]:
+def watching(watch: RunningTest) -> Iterator[None]:
     """Make ``watch`` the current one."""
     _watches.append(watch)
     try:
@@ -174,7 +174,7 @@ def fault_text(gate: str, name: str, reasons: Sequence[str]) -> str:
     return "\n  - ".join([f"{gate}: {name} is {first}", *rest])
 
 
-def plan_command(dof: int, terms: Terms) -> str:
+def plan_invocation(dof: int, terms: Terms) -> str:
     return (
         f"consistency plan --dof {dof} --detect {terms.detect!r} --false-alarm {terms.false_alarm!r} "
         f"--power {terms.power!r}"
@@ -188,7 +188,7 @@ def undecided_text(gate: str, name: str, sentence: str, needed: int, dof: int, t
     larger = "a larger detect" if terms.lost is None else "a larger detect and a larger lost"
     return (
         f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for {larger}; the number that is enough "
-        f"however the steps depend on each other: {plan_command(dof, terms)}"
+        f"however the steps depend on each other: {plan_invocation(dof, terms)}"
     )
 
 

@@ -92,7 +92,7 @@ def to_left(T: Array, convention: str) -> Array:
     return out
 
 
-def carried(J: Array, P: Array) -> Array:
+def propagated(J: Array, P: Array) -> Array:
     """J P J', exactly symmetric, of (..., m, n) and (..., n, n)."""
     out = J @ P @ np.swapaxes(J, -1, -2)
     return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))

@@ -22,8 +22,8 @@ from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 from consistency.referee.types import Array
-from consistency.referee.verdicts.options import skip_asked
-from consistency.referee.verdicts.sources import Results, Source, source_of
+from consistency.referee.verdicts.command_settings import skip_asked
+from consistency.referee.verdicts.sources import Source, source_of
 
 HIGHEST_DOF = 1000  # of an error in a baseline
 FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")
@@ -47,7 +47,7 @@ class Baseline:
 
 
 def baseline(
-    of: Source | Sequence[Record] | Results | str | Path,
+    of: Source | Sequence[Record],
     name: str = "results",
     skip: str | float | Skip | None = None,
     truth: Path | None = None,
@@ -56,7 +56,7 @@ def baseline(
 
     Parameters
     ----------
-    of : results of ``consistency.run_trials``, a folder of them, or a sequence of records
+    of : records, or a source of them
     truth : file, or folder of them, beside which the estimates were read; the same trials have the same
 
     Raises
@@ -73,16 +73,29 @@ def baseline(
         if record.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
         failures[each], axes[each] = len(record.failures), tuple(record.axes)
-        own = record if record.unshown else record.as_runs
+        own = record
+        if not record.unshown:
+            own = record.as_runs
         world = own.in_world
         filters[each] = summary(cast(Array, own.nees), own.dof, world.error, world.covariance, own.run_numbers)
-    trials = source.trials if truth is None else (_digest(truth), None)
-    return Baseline(name, source.scenario, trials, filters, failures, axes, None if first is None else first.option)
+    trials = source.trials
+    if truth is not None:
+        trials = (_digest(truth), None)
+    return Baseline(name, source.scenario, trials, filters, failures, axes, _option(first))
+
+
+def _option(skip: Skip | None) -> str | None:
+    """Value of the option that leaves these steps out."""
+    if skip is None:
+        return None
+    return skip.option
 
 
 def _digest(truth: Path) -> str:
-    digest = hashlib.sha256()
-    for path in [truth] if truth.is_file() else sorted(path for path in truth.rglob("*") if path.is_file()):
+    digest, paths = hashlib.sha256(), [truth]
+    if not truth.is_file():
+        paths = sorted(path for path in truth.rglob("*") if path.is_file())
+    for path in paths:
         with path.open("rb") as file:
             own = hashlib.sha256()
             for piece in iter(lambda: file.read(2**20), b""):
@@ -91,17 +104,16 @@ def _digest(truth: Path) -> str:
     return digest.hexdigest()
 
 
-def write_baseline(of: Results | Baseline, path: Path, overwrite: bool = False) -> None:
-    """Keep a :class:`Baseline`, or the one of results, as a small JSON file, for version control.
+def write_baseline(base: Baseline, path: Path, overwrite: bool = False) -> None:
+    """Keep a baseline as a small JSON file, for version control.
 
     Raises
     ------
     InputError
-        The file exists or cannot be written, or the results have no truth.
+        The file exists or cannot be written.
     """
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
-    base = of if isinstance(of, Baseline) else baseline(of, str(path))
     data = manifest_of(
         kind="baseline",
         scenario=base.scenario,
@@ -126,19 +138,17 @@ def is_baseline(path: Path) -> bool:
 
 
 def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baseline:
-    """A results folder, or a file of :func:`write_baseline`.
+    """Read a file of :func:`write_baseline`.
 
     Parameters
     ----------
-    skip : first steps to leave out; of a file those that it was written without
+    skip : first steps that it was written without
 
     Raises
     ------
     InputError
-        Neither, or damaged.
+        It is no baseline, is damaged, or was written with other first steps.
     """
-    if path.is_dir():
-        return baseline(path, str(path), skip)
     data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")
@@ -147,16 +157,17 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
             if key not in data:
                 raise ValueError(f"key '{key}': missing")
         scenario, origin, left_out = data["scenario"], data["origin"], data.get("skip")  # files written before lack it
-        if not isinstance(scenario, str | None) or not isinstance(left_out, str | None):
-            raise ValueError(f"key '{'skip' if isinstance(scenario, str | None) else 'scenario'}': not a text")
+        for key, value in (("scenario", scenario), ("skip", left_out)):
+            if not isinstance(value, str | None):
+                raise ValueError(f"key '{key}': not a text")
         if not isinstance(origin, list) or len(origin) != 2:
             raise ValueError("key 'origin': not a list of two")
         if not isinstance(data["filters"], dict):
             raise ValueError("key 'filters': not a table")
         rows = {name: _filter_of(row, f"filters.{name}") for name, row in data["filters"].items()}
-    filters = {name: row[0] for name, row in rows.items()}
-    failures = {name: row[1] for name, row in rows.items()}
-    axes = {name: row[2] for name, row in rows.items()}
+    filters, failures, axes = {}, {}, {}
+    for name, row in rows.items():
+        filters[name], failures[name], axes[name] = row
     base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, axes, left_out)
     return require_skip(base, skip)
 
@@ -169,11 +180,13 @@ def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
     InputError
         They were not.
     """
-    first = skip_asked(skip)
-    asked = None if first is None else first.option
+    asked = _option(skip_asked(skip))
     if base.skip != asked:
-        own = "of all steps" if base.skip is None else f"with --skip {base.skip}"
-        wanted = "without --skip" if asked is None else f"with --skip {asked}"
+        own, wanted = f"with --skip {base.skip}", f"with --skip {asked}"
+        if base.skip is None:
+            own = "of all steps"
+        if asked is None:
+            wanted = "without --skip"
         raise InputError(f"{base.name}: was written {own}; write it again {wanted}, or compare by the same steps")
     return base
 
@@ -214,7 +227,10 @@ def _known(table: Any, place: str, keys: Sequence[str], optional: Sequence[str] 
 
 def _list(values: Any, place: str, longest: int | None = None) -> list[Any]:
     if not isinstance(values, list) or (longest is not None and len(values) > longest):
-        raise ValueError(f"key '{place}': not a list" + ("" if longest is None else f" of at most {longest}"))
+        most = ""
+        if longest is not None:
+            most = f" of at most {longest}"
+        raise ValueError(f"key '{place}': not a list{most}")
     return values
 
 
@@ -228,5 +244,8 @@ def _numbers(values: Any, place: str, longest: int | None = None) -> list[float 
 
 def _whole(value: Any, place: str, least: int, end: int | None = None) -> int:
     if type(value) is not int or value < least or (end is not None and value >= end):
-        raise ValueError(f"key '{place}': not a whole number from {least}" + (f" to below {end}" if end else ""))
+        below = ""
+        if end:
+            below = f" to below {end}"
+        raise ValueError(f"key '{place}': not a whole number from {least}{below}")
     return value

@@ -28,11 +28,15 @@ class Compared:
 
     @property
     def sentence(self) -> str:
-        c = self.comparison
-        way = "run by run on the same trials" if c.paired else "as independent samples"
-        reference = self.b if self.a != self.b else "the reference"
-        text = f"{self.a} is {'less consistent' if c.worse else 'not found less consistent'} than {reference}"
-        text += f": {c.runs} runs, {way}, p {c.p_value:.2g}"
+        c, reference = self.comparison, self.b
+        if self.a == self.b:
+            reference = "the reference"
+        found, way = "not found less consistent", "as independent samples"
+        if c.worse:
+            found = "less consistent"
+        if c.paired:
+            way = "run by run on the same trials"
+        text = f"{self.a} is {found} than {reference}: {c.runs} runs, {way}, p {c.p_value:.2g}"
         if c.distance == c.standard_error == 0.0:
             text += "; every run is the same in both"
         elif c.worse and c.conservative:
@@ -48,7 +52,9 @@ class Compared:
                 )
         if any(self.failures):
             text += f"; failed runs {self.failures.a}, {self.failures.b} in the reference"
-        return f"{text}. {self.note}".rstrip(". ") if self.note else text
+        if self.note:
+            return f"{text}. {self.note}".rstrip(". ")
+        return text
 
     @property
     def _limit(self) -> str:
@@ -56,7 +62,9 @@ class Compared:
         most = self.comparison.at_most
         if most < 0.0:
             return f"nearer to consistent, by x{np.exp(-most):.3g} at least"
-        return "no difference shown" + (f"; at most x{np.exp(most):.3g} farther off" if np.isfinite(most) else "")
+        if not np.isfinite(most):
+            return "no difference shown"
+        return f"no difference shown; at most x{np.exp(most):.3g} farther off"
 
     @property
     def worse(self) -> bool:
@@ -82,9 +90,12 @@ def compare_with(
         pairs = [(next(iter(new.filters)), next(iter(old.filters)))]
     if not pairs:
         raise InputError(f"{new.name} and {old.name} have no filter in common; name one with --filter")
-    same = new.of_the_trials_of(old)
-    which = "Log or truth" if new.scenario is None and old.scenario is None else "Scenario or seed"
-    note = "" if same else f"{which} differ: the trials are not the same"
+    same, note = new.of_the_trials_of(old), ""
+    if not same:
+        which = "Scenario or seed"
+        if new.scenario is None and old.scenario is None:
+            which = "Log or truth"
+        note = f"{which} differ: the trials are not the same"
     return [replace(_compared(new, a, old, b, same, false_alarm), note=note) for a, b in pairs]
 
 
@@ -98,7 +109,9 @@ def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, 
             f"{of_a} against {of_b}: their errors have different components, {', '.join(axes)} and "
             f"{', '.join(b.axes[of_b])}"
         )
-    paired = None if true_pairs else False
+    paired = None
+    if not true_pairs:
+        paired = False
     try:
         comparison = compare(a.filters[of_a], b.filters[of_b], false_alarm, axes, paired)
     except ValueError as error:

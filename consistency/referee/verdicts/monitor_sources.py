@@ -12,7 +12,6 @@ import numpy as np
 
 from consistency.referee.diagnostics import Alarm, Monitor
 from consistency.referee.errors import InputError
-from consistency.referee.extras import outside
 from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash, read_stated
 from consistency.referee.readers.formats.innovation_files import NisLog, choose, read_nis, stream_nis
 from consistency.referee.readers.formats.px4_log import SUFFIX, read_ulog
@@ -58,7 +57,7 @@ def make_monitor(innovations: str | None, **options: Any) -> Monitor:
 
 
 def read_innovations(path: Path, filter_name: str | None = None, run: int | None = None) -> NisLog:
-    """The innovations of one run from a file, or from a folder of ``consistency run``.
+    """Read the innovations of one run from a file.
 
     Of a flight log (.ulg of PX4, .bin of ArduPilot), ``filter_name`` is the sensor, and ``run`` the EKF's instance.
 
@@ -71,8 +70,7 @@ def read_innovations(path: Path, filter_name: str | None = None, run: int | None
         return read_ulog(path, filter_name, run)
     if is_dataflash(path):
         return read_stated(path, choose(path, "filter", list(STATED), filter_name), run)
-    read: Callable[..., NisLog] = outside("innovations") if path.is_dir() else read_nis
-    return read(path, filter_name, run)
+    return read_nis(path, filter_name, run)
 
 
 def watch(log: NisLog, monitor: Monitor) -> Watched:

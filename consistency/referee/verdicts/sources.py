@@ -4,30 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from consistency.referee.diagnostics import Record, Settings, Verdict
+from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.records.skipping import Skip
-from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
 from consistency.referee.errors import InputError
-from consistency.referee.extras import outside
-from consistency.referee.verdicts.options import settings_of, skip_asked
+from consistency.referee.verdicts.command_settings import settings_of, skip_asked
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics import Design
-
-
-class Results(Protocol):
-    """Results of filters of the bench, in memory or in a folder, as ``consistency.run_trials`` returns them."""
-
-    @property
-    def filters(self) -> list[str]:
-        """Names."""
-
-    @property
-    def batches(self) -> Callable[..., Any]:
-        """Reads the rows of a table, some at a time."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +28,10 @@ class Source:
     unfinished: str = ""  # number of runs, where some are missing
 
 
-def source_of(of: Source | Sequence[Record] | Results | str | Path) -> Source:
-    """Records, or results of the bench, in memory or in a folder, as a source."""
+def source_of(of: Source | Sequence[Record]) -> Source:
+    """Return records as a source."""
     if isinstance(of, Source):
         return of
-    if not isinstance(of, list | tuple):
-        source: Source = outside("results")(of)
-        return source
     named: dict[str, Record] = {record.name: record for record in of}
 
     def record(name: str) -> Record:
@@ -61,7 +43,7 @@ def source_of(of: Source | Sequence[Record] | Results | str | Path) -> Source:
 
 
 def analyse(
-    results: Source | Sequence[Record] | Results | str | Path,
+    results: Source | Sequence[Record],
     filters: Sequence[str] | None = None,
     confidence: float | None = None,
     settings: Settings | None = None,
@@ -72,7 +54,7 @@ def analyse(
 
     Parameters
     ----------
-    results : of ``consistency.run_trials``, a folder of them, or a sequence of records
+    results : records, or a source of them; :func:`consistency.analyse` also takes results of the bench
     confidence : 1 less the false-alarm rate of a verdict, in place of ``settings``
     settings : what to ask; the defaults of :class:`Settings` where None. Results of a run until decided are then
         judged as that run was.
@@ -84,21 +66,17 @@ def analyse(
     InputError
         Unknown filter, a confidence outside (0, 1), or nothing is left.
     """
-    source = source_of(results)
-    design = source.design() if settings is None and confidence is None else None
-    settings = settings_of(confidence) if settings is None else settings
+    source, design = source_of(results), None
+    if settings is None:
+        settings = settings_of(confidence)
+        if confidence is None:
+            design = source.design()
     first, verdicts = skip_asked(skip), {}
     for name in filters or source.filters:
-        verdict, ends = _of_poses(_record(source.record(name), first, optimal_gain), settings, design)
-        verdicts[name] = with_map(verdict, ends, settings, design)
+        record = source.record(name)
+        if first is not None:
+            record = record.without_first(first)
+        if optimal_gain:
+            record = replace(record, optimal_gain=True)
+        verdicts[name] = judge(record, settings, design)
     return verdicts
-
-
-def _record(record: Record, first: Skip | None, optimal_gain: bool) -> Record:
-    record = record if first is None else record.without_first(first)
-    return replace(record, optimal_gain=True) if optimal_gain else record
-
-
-def _of_poses(record: Record, settings: Settings, design: Design | None) -> tuple[Verdict, Record]:
-    """A verdict without the maps; the arrays are free before those are read."""
-    return judge_runs(record, settings, design), record.ends

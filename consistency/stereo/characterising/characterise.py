@@ -14,10 +14,10 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
-from consistency.stereo.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
-from consistency.stereo.characterising.coordinate_fit import Levels, ResidualTails, rate, ratios, tails
+from consistency.stereo.characterising.bias_map import GRID, BiasEstimate, estimate_bias, grid_of
+from consistency.stereo.characterising.coordinate_fit import Levels, ResidualTails, moving_over_rest, rate, tails
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
-from consistency.stereo.characterising.residuals import Residuals, RowSelection, octaves, select
+from consistency.stereo.characterising.log_residuals import Residuals, RowSelection, octaves, select
 
 NAMES = ("u", "v", "d")
 RATE = 0.01  # chance that any interval misses
@@ -138,8 +138,8 @@ def characterise(
         rate(chosen.gross, len(kept) + chosen.gross, levels.of("tails")), tracks, len(kept),
         {"near a limit of the sensor": chosen.at_limits, "grossly wrong": chosen.gross, "of no landmark": strange},
         levels, kept,
-        ratio=ratios(np.column_stack([f.regression.residual for f in fits]), np.ones((len(kept), 3)), kept.moving,
-                     kept.track, levels.of("sigma")),
+        ratio=moving_over_rest(np.column_stack([f.regression.residual for f in fits]), np.ones((len(kept), 3)),
+                               kept.moving, kept.track, levels.of("sigma")),
     )  # fmt: skip
 
 
@@ -172,7 +172,7 @@ def _coordinate(k: int, of: LikelihoodFit, kept: Residuals, levels: Levels, alon
     memory = rows.length >= 1.5 and not alone
     w = of.regression.residual
     return Coordinate(
-        NAMES[k], coordinate_fit.noise(of, levels.of("sigma")), float(r.std(ddof=1)),
+        NAMES[k], coordinate_fit.noise_interval(of, levels.of("sigma")), float(r.std(ddof=1)),
         float(np.sqrt((centred**2).sum() / max(len(r) - len(n), 1))),
         coordinate_fit.correlation(of, levels.of("correlation")) if memory else None,
         coordinate_fit.offset_share(of, levels.of("offset")) if memory else None,

@@ -50,7 +50,7 @@ def half_width(gradient: Array, fit: LikelihoodFit, level: float) -> float:
     return float(max(model * stats.norm.isf(level / 2), robust * stats.t.isf(level / 2, dof)))
 
 
-def noise(fit: LikelihoodFit, level: float) -> Interval:
+def noise_interval(fit: LikelihoodFit, level: float) -> Interval:
     """Standard deviation of what is drawn anew, in the root mean square over the rows, px."""
     log_sigma, gradient = log_level(fit)
     return _exponential(log_sigma, half_width(gradient, fit, level))
@@ -100,7 +100,7 @@ def offset_share(fit: LikelihoodFit, level: float) -> Interval:
     return Interval(float(value), float(low), float(high))
 
 
-def bias(fit: LikelihoodFit, level: float) -> tuple[Array, Array, Array]:
+def bias_coefficients(fit: LikelihoodFit, level: float) -> tuple[Array, Array, Array]:
     """Coefficients (p,) of the bias, half widths (p,) of their intervals, and their covariance (p, p), px."""
     of = fit.regression
     scores = np.add.reduceat(of.X * of.residual[:, None], fit.rows.first, axis=0)
@@ -225,7 +225,7 @@ def rate(count: int, total: int, level: float) -> Interval:
     return Interval(count / total, float(low), float(high))
 
 
-def ratios(w: Array, weight: Array, moving: Array, track: Array, level: float) -> tuple[Interval, ...]:
+def moving_over_rest(w: Array, weight: Array, moving: Array, track: Array, level: float) -> tuple[Interval, ...]:
     """Noise while moving over noise at rest, of u, v, d; nothing where one of the two has too few data.
 
     Parameters

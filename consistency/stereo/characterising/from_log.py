@@ -20,7 +20,7 @@ from consistency.referee.readers.formats.tum import read_trajectory
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
 from consistency.stereo.characterising.known_poses import characterise_posed
-from consistency.stereo.characterising.residuals import residuals_of
+from consistency.stereo.characterising.log_residuals import residuals_of
 from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
 from consistency.stereo.frontend.planar_log import CAMERA
 
@@ -77,7 +77,7 @@ def characterise_log(folder: Path, grid: tuple[int, int], at_rest: bool = False,
     Raises
     ------
     InputError
-        As :func:`consistency.store.log.read_log`; the sensor measures no disparity; too few data; no truth, and the
+        As :func:`consistency.store.read_log`; the sensor measures no disparity; too few data; no truth, and the
         sensor moves all the time.
     """
     log = read_log(folder)

@@ -12,14 +12,13 @@ from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation
 from consistency.stereo.characterising.from_log import EXACT, FREE, REST, SourceOptions
 from consistency.stereo.characterising.known_poses import characterise_posed
-from consistency.stereo.characterising.residuals import MAD
+from consistency.stereo.characterising.log_residuals import MAD
 from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
 from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
 from consistency.stereo.frontend.planar_log import CAMERA, observations
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig
-from consistency.stereo.visual_odometry.features import is_rectified
-from consistency.stereo.visual_odometry.motion import RelativeMotion
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
 from consistency.stereo.visual_odometry.odometry import visual_odometry
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
 
 CHOSEN = (
@@ -34,7 +33,7 @@ def characterise_images(folder: Path, options: SourceOptions) -> Characterisatio
     Raises
     ------
     InputError
-        As :func:`consistency.vision.sequence.read_sequence`; too few pairs; neither at rest nor with true poses.
+        As :func:`consistency.vision.read_sequence`; too few pairs; neither at rest nor with true poses.
     """
     sequence = read_sequence(folder, options.calibration, options.format, options.left, options.right)
     rig = sequence.rectification.rig
@@ -47,7 +46,7 @@ def characterise_images(folder: Path, options: SourceOptions) -> Characterisatio
     seen = _seen(rig, motions, R, t)
     free = options.free_poses or options.at_rest
     notes = (*((REST,) if options.at_rest else ()), FREE if free else EXACT, CHOSEN, rows_note(rig, motions))
-    return characterise_posed(seen, sensor_of(rig), str(folder), notes, free)
+    return characterise_posed(seen, uncalibrated_noise_sensor(rig), str(folder), notes, free)
 
 
 def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
@@ -63,7 +62,7 @@ def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
     return read_truth(path, sequence)
 
 
-def sensor_of(rig: StereoRig) -> PicturedSensor:
+def uncalibrated_noise_sensor(rig: StereoRig) -> PicturedSensor:
     """A sensor of which only the calibration is known; its noise is a placeholder."""
     return PicturedSensor(
         model="uvd", sigma=(1.0, 1.0, 1.0), f=float(rig.K_left[0, 0]), B=float(rig.baseline), image=rig.image_size,

@@ -19,8 +19,8 @@ from consistency.stereo.characterising.characterise import (
     Coordinate,
     DisparityNoise,
 )
-from consistency.stereo.characterising.coordinate_fit import LAGS, Levels, rate, ratios, tails
-from consistency.stereo.characterising.residuals import MARGIN, octaves, within_limits
+from consistency.stereo.characterising.coordinate_fit import LAGS, Levels, moving_over_rest, rate, tails
+from consistency.stereo.characterising.log_residuals import MARGIN, octaves, within_limits
 from consistency.stereo.characterising.unknown_landmarks import Fitted, Seen, fit_points, without_gross
 
 FREE = 0.1  # share of a value that the fits must leave for it to tell of the shape of the noise
@@ -61,7 +61,7 @@ def characterise_posed(
     wrong, limits = int((~good).sum()), int((good & ~inside).sum())
     tracks = len(np.unique(kept.track))
     u, v, d = (_coordinate(k, of, plain, levels) for k in range(3))
-    ratio = ratios(of.scaled, of.free, of.seen.moving, of.seen.track, levels.of("sigma"))
+    ratio = moving_over_rest(of.scaled, of.free, of.seen.moving, of.seen.track, levels.of("sigma"))
     left_out = {"of tracks too short": short, "near a limit of the sensor": limits, "of tracks grossly wrong": wrong}
     return Characterisation(
         sensor, source, (u, v, d), growth, None, rate(wrong, len(good), levels.of("tails")), tracks, len(kept.z),

@@ -69,7 +69,7 @@ class Whitened:
     log_variance: Array  # (K,), log det of the covariance of each track
 
 
-def whiten(rows: Rows, columns: Array, p: Parameters) -> Whitened | None:
+def whiten_rows(rows: Rows, columns: Array, p: Parameters) -> Whitened | None:
     """Columns (N, c) times the inverse root of the covariance; None where that is not positive definite."""
     sd = rows.G @ p.a
     if abs(p.rho) > MOST or not (sd > 0).all():
@@ -107,7 +107,7 @@ class Regression:
 
 def regress(rows: Rows, p: Parameters) -> Regression | None:
     """The coefficients and the restricted likelihood; None where the parameters are not possible."""
-    white = whiten(rows, np.column_stack([rows.r, rows.X]), p)
+    white = whiten_rows(rows, np.column_stack([rows.r, rows.X]), p)
     if white is None:
         return None
     y, X = white.values[:, 0], white.values[:, 1:]
@@ -187,7 +187,7 @@ def _held(rows: Rows, bias: Array, full: Callable[[Array], Array], length: float
     y = (rows.r - bias)[:, None]
 
     def negative(values: Array) -> float:
-        white = whiten(rows, y, Parameters.of(full(values), length))
+        white = whiten_rows(rows, y, Parameters.of(full(values), length))
         return IMPOSSIBLE if white is None else 0.5 * float(white.log_variance.sum() + (white.values**2).sum())
 
     return negative
@@ -205,7 +205,7 @@ def _climb(
         found = regress(rows, Parameters.of(full(x), length))
         if found is None:
             raise ValueError("the data do not determine the noise")
-        H = curvature(_held(rows, rows.X @ found.beta, full, length), x)
+        H = numerical_hessian(_held(rows, rows.X @ found.beta, full, length), x)
         if not np.isfinite(H).all() or np.linalg.eigvalsh(H)[0] <= 0:
             raise ValueError("the data do not determine the noise")
         slope = np.array([(restricted(x + d) - restricted(x - d)) / (2.0 * STEP) for d in e])
@@ -218,7 +218,7 @@ def _climb(
     return x, H
 
 
-def curvature(objective: Callable[[Array], float], x: Array) -> Array:
+def numerical_hessian(objective: Callable[[Array], float], x: Array) -> Array:
     """Second derivatives (k, k) by central differences."""
     k, e = len(x), STEP * np.eye(len(x))
     H = np.empty((k, k))
@@ -234,7 +234,7 @@ def _scores(rows: Rows, full: Callable[[Array], Array], x: Array, beta: Array, l
     y = (rows.r - rows.X @ beta)[:, None]
 
     def by_track(values: Array) -> Array:
-        white = whiten(rows, y, Parameters.of(full(values), length))
+        white = whiten_rows(rows, y, Parameters.of(full(values), length))
         assert white is not None
         return -0.5 * (white.log_variance + np.add.reduceat(white.values[:, 0] ** 2, rows.first))
 

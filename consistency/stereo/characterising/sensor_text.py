@@ -16,7 +16,7 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.sentences import p_text
+from consistency.referee.diagnostics.words.numbers import p_text
 from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
@@ -120,7 +120,7 @@ def counted(of: Characterisation) -> str:
     return f"{of.rows} observations of {of.tracks} tracks of {of.source}" + (f"; left out: {left}" if left else "")
 
 
-def blocks(of: Characterisation) -> tuple[Block, ...]:
+def sensor_blocks(of: Characterisation) -> tuple[Block, ...]:
     """One row a coordinate, then a sentence for each answer."""
     rows: list[tuple[Cell, ...]] = [
         (
@@ -137,7 +137,7 @@ def _or_dash(estimate: Interval | None) -> Cell:
     return Quantity(None) if estimate is None else interval(estimate, 2)
 
 
-def believed(of: Characterisation) -> PicturedSensor:
+def believed_sensor(of: Characterisation) -> PicturedSensor:
     """The sensor as a filter should believe it: noise drawn anew, and growth and bias map where they are shown."""
     changes: dict[str, Any] = {"sigma": tuple(_rounded(c.sigma.value, 5) for c in of.coordinates)}
     changes["disparity_growth"] = changes["bias"] = None
@@ -152,9 +152,9 @@ def believed(of: Characterisation) -> PicturedSensor:
     return of.sensor.model_copy(update=changes)
 
 
-def sensor_text(of: Characterisation, others: Mapping[str, Any] = MappingProxyType({})) -> str:
+def measured_sensor_toml(of: Characterisation, others: Mapping[str, Any] = MappingProxyType({})) -> str:
     """The text of ``sensor.toml``; ``others`` are tables of the log that stay as they are (motion, start, ...)."""
-    sensor = believed(of)
+    sensor = believed_sensor(of)
     lines = [f"# {line}" for line in ("Measured by 'consistency characterise'.", counted(of) + ".", *sentences(of))]
     lines += [f'model = "{sensor.model}"', _pair("sigma_px", sensor.sigma)]
     lines += [
@@ -206,7 +206,7 @@ def as_json(of: Characterisation) -> str:
     """All estimates with their intervals, for programs."""
     out = {
         "source": of.source, "observations": of.rows, "tracks": of.tracks, "left_out": dict(of.left_out),
-        "confidence": 1.0 - of.level.rate, "sensor": believed(of).model_dump(mode="json", exclude_none=True),
+        "confidence": 1.0 - of.level.rate, "sensor": believed_sensor(of).model_dump(mode="json", exclude_none=True),
         "coordinates": {c.name: _coordinate(c) for c in of.coordinates},
         "gross": of.gross._asdict(), "notes": list(of.notes), "sentences": sentences(of),
         "moving_over_rest": [r._asdict() for r in of.ratio],

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.bench.models import stereo
 from consistency.referee.types import Array, Indices
-from consistency.stereo.characterising.residuals import GROSS, MAD, Residuals
+from consistency.stereo.characterising.log_residuals import GROSS, MAD, Residuals
 
 SHORTEST = 3  # observations of a track: with two, most of what is seen is used up by the point
 ROUNDS = 30

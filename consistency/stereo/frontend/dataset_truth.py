@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading
-from consistency.referee.readers.file_kinds import is_drive
+from consistency.referee.readers.formats.file_kinds import is_drive
 from consistency.referee.readers.formats.kitti_files import BODIES, NANO, drive_poses, place_of, read_times
 from consistency.referee.readers.formats.tum import UNIT, read_trajectory
 from consistency.referee.readers.truth_matching import associate
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.camera_pair import CAMERA_0, EUROC_BODY
-from consistency.stereo.visual_odometry.sequence import RAW_CALIBRATION, Sequence, read_table
+from consistency.stereo.visual_odometry.sequence import RAW_CALIBRATION, Sequence, read_number_table
 
 MAX_DT = 0.01  # s between an image and its truth, as in `consistency analyse`
 PACKET_DT = 0.11  # s between an image of KITTI raw and a packet: one period, of 9.6 Hz
@@ -75,7 +75,7 @@ def _columns(path: Path) -> int:
 
 
 def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
-    rows = read_table(path, None, NO_TABLE)
+    rows = read_number_table(path, None, NO_TABLE)
     if len(rows) != frames:
         raise InputError(f"{path}: {len(rows)} poses for {frames} frames; must hold one a frame")
     poses = rows.reshape(-1, 3, 4)
@@ -107,7 +107,7 @@ def _drive(path: Path, sequence: Sequence) -> tuple[Array, Array]:
 
 
 def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
-    rows = read_table(path, ",", NO_TABLE)
+    rows = read_number_table(path, ",", NO_TABLE)
     if rows.shape[1] < 8 or not np.isfinite(rows[:, :8]).all() or (np.diff(rows[:, 0]) <= 0).any():
         raise InputError(f"{path}: must hold increasing nanoseconds, position and quaternion w x y z, all finite")
     if (np.abs(np.linalg.norm(rows[:, 4:8], axis=1) - 1.0) > UNIT).any():

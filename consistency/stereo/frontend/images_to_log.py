@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.scenario import Belief
-from consistency.bench.store.folder_tables import write_folder
+from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.log import write_log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
@@ -22,9 +22,10 @@ from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of
-from consistency.stereo.visual_odometry.features import is_rectified, opencv
-from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion
+from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.rig import is_rectified
 from consistency.stereo.visual_odometry.odometry import motion_covariances, trajectory, visual_odometry
+from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
 
 LANDMARKS = 200  # in a log; the filters' covariance is then 603 x 603
@@ -130,7 +131,7 @@ def write_frontend_log(images: Path, out: Path, options: FrontendOptions, overwr
     Raises
     ------
     InputError
-        As :func:`consistency.vision.sequence.read_sequence` and :func:`consistency.vision.relative_motion`; ``out``
+        As :func:`consistency.vision.read_sequence` and :func:`consistency.vision.relative_motion`; ``out``
         exists; no landmark is left.
     """
     started = time.monotonic()
@@ -150,7 +151,7 @@ def write_frontend_log(images: Path, out: Path, options: FrontendOptions, overwr
     path = options.truth or find_truth(sequence)
     truth = None if path is None else read_truth(path, sequence)
     motions = visual_odometry(sequence, rng=np.random.default_rng(options.seed), settings=options.settings)
-    files = trajectory_files(sequence, motions, truth)
+    files = trajectory_texts(sequence, motions, truth)
     manifest = manifest_of(
         kind=kind, seed=options.seed, runs=1, complete=True, failures=0, wall=time.monotonic() - started,
         opencv=opencv().__version__, images=str(images), calibration=sequence.calibration.source,
@@ -167,7 +168,7 @@ def write_frontend_log(images: Path, out: Path, options: FrontendOptions, overwr
         view = rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2]))
         write_log(out, [trial], belief, None, manifest, overwrite, view, files)
     else:
-        write_folder(out, {}, manifest, lambda at: _write_texts(at, files), overwrite)
+        write_tables(out, {}, manifest, lambda at: _write_texts(at, files), overwrite)
     return Summary(sequence, motions, plane, logged, path)
 
 
@@ -176,7 +177,7 @@ def _write_texts(folder: Path, files: dict[str, str]) -> None:
         (folder / name).write_text(text, encoding="utf-8")
 
 
-def trajectory_files(
+def trajectory_texts(
     sequence: Sequence, motions: list[RelativeMotion], truth: tuple[Array, Array] | None
 ) -> dict[str, str]:
     """Texts of trajectory.tum, covariance.txt and truth.tum, all in the first camera's frame, and of motions.tum.

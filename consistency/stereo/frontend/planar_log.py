@@ -18,7 +18,7 @@ from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
-from consistency.stereo.visual_odometry.motion import RelativeMotion
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, angular
 from consistency.stereo.visual_odometry.sequence import Sequence
 from consistency.stereo.visual_odometry.tracks import PIXELS, TrackSelection, linked, thinned

@@ -107,7 +107,7 @@ class Tracks:
         return self.take(self.flag == KEPT)
 
 
-def joined(parts: Sequence[Tracks]) -> Tracks:
+def join_tracks(parts: Sequence[Tracks]) -> Tracks:
     """Tracks of several sequences: each has a number of its own, and so has every track of all of them."""
     sequence = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
     shift = np.cumsum([0] + [int(part.track.max(initial=-1)) + 1 for part in parts])

@@ -16,18 +16,18 @@ from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import batch_inverses, input_checks
+from consistency.stereo.visual_odometry.cameras import array_checks, batch_inverses
+from consistency.stereo.visual_odometry.cameras.input_errors import ConvergenceError, DegenerateError
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
 from consistency.stereo.visual_odometry.covariance_propagation import implicit_covariance
-from consistency.stereo.visual_odometry.input_errors import ConvergenceError, DegenerateError
-from consistency.stereo.visual_odometry.registration import matched, register_svd
+from consistency.stereo.visual_odometry.registration import checked_clouds, register_svd
 from consistency.stereo.visual_odometry.relative_pose import RelativePose
 from consistency.stereo.visual_odometry.two_frame_cost import (
     Derivatives,
     PixelMatches,
     PointMatches,
     TwoFrames,
-    derivatives,
+    cost_derivatives,
 )
 
 Robust = Literal["huber", "cauchy"]
@@ -111,8 +111,8 @@ def register_weighted(
     ConvergenceError
         No minimum was reached.
     """
-    p1, p2 = matched(p1, p2)
-    S1, S2 = input_checks.covariances("S1", S1, len(p1), 3), input_checks.covariances("S2", S2, len(p1), 3)
+    p1, p2 = checked_clouds(p1, p2)
+    S1, S2 = array_checks.covariances("S1", S1, len(p1), 3), array_checks.covariances("S2", S2, len(p1), 3)
     frames = TwoFrames(PointMatches(), p1, p2, _weights("S1", S1), _weights("S2", S2))
     return _refined(frames, S1, S2, pose or register_svd(p1, p2), p2, robust)
 
@@ -147,11 +147,11 @@ def refine_reprojection(
     InputError, DegenerateError, GimbalLockError, ConvergenceError
         As :func:`register_weighted`.
     """
-    uv1, uv2 = input_checks.rows("uv1", uv1, 4), input_checks.rows("uv2", uv2, 4)
-    input_checks.same_length("uv1, uv2", uv1, uv2)
-    S1 = input_checks.covariances("S_uv", S_uv, len(uv1), 4)
-    S2 = S1 if S_uv2 is None else input_checks.covariances("S_uv2", S_uv2, len(uv1), 4)
-    _, q = matched(triangulate(rig, uv1), triangulate(rig, uv2))
+    uv1, uv2 = array_checks.checked_rows("uv1", uv1, 4), array_checks.checked_rows("uv2", uv2, 4)
+    array_checks.same_length("uv1, uv2", uv1, uv2)
+    S1 = array_checks.covariances("S_uv", S_uv, len(uv1), 4)
+    S2 = S1 if S_uv2 is None else array_checks.covariances("S_uv2", S_uv2, len(uv1), 4)
+    _, q = checked_clouds(triangulate(rig, uv1), triangulate(rig, uv2))
     rig.project(pose.apply(q))
     frames = TwoFrames(PixelMatches(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))
     return _refined(frames, S1, S2, pose, q, robust)
@@ -173,14 +173,14 @@ def _refined(frames: TwoFrames, S1: Array, S2: Array, pose: RelativePose, q: Arr
     pose, q = _minimum(frames, pose, q, robust, c)
     s = frames.squared(pose, q)
     _, weight, bend = loss(robust, s, c)
-    C_dd, C_dz = _profile(derivatives(frames, pose, q, exact=True), weight, bend)
+    C_dd, C_dz = _profile(cost_derivatives(frames, pose, q, exact=True), weight, bend)
     S = implicit_covariance(C_dd, C_dz, np.concatenate([S1, S2]))
     return Refined(pose, S, weight, pose.apply(q), s, free * len(q) - 6)
 
 
 def _profile(f: Derivatives, weight: Array, bend: Array) -> tuple[Array, Array]:
     """C_dd (6, 6) and C_dz (2N, 6, k) of the cost of the pose alone, each point at its best position."""
-    inverse, definite = batch_inverses.inverse(f.qq)
+    inverse, definite = batch_inverses.symmetric_inverses(f.qq)
     if not definite.all():
         k = int(np.argmin(definite))
         raise DegenerateError(f"match {k}: its point is not fixed by the images; leave it out", k)
@@ -200,11 +200,11 @@ def _minimum(
     damping, newton = 0.0, False
     cost, weight, bend = _cost(frames, pose, q, robust, c)
     for _ in range(STEPS):
-        f = derivatives(frames, pose, q, exact=newton)
+        f = cost_derivatives(frames, pose, q, exact=newton)
         while True:
             step, step_q, decrement = _step(f, weight, bend if newton else 0.0 * bend, damping)
             if newton and not decrement >= 0.0:
-                newton, f = False, derivatives(frames, pose, q, exact=False)
+                newton, f = False, cost_derivatives(frames, pose, q, exact=False)
                 continue
             there, q_there = RelativePose.from_vector(pose.vector + step), q + step_q
             if decrement < DECREMENT and damping < 1.0:
@@ -232,7 +232,7 @@ def _step(f: Derivatives, weight: Array, bend: Array, damping: float) -> tuple[A
     dd, qq = f.dd, f.qq
     if damping:
         dd, qq = dd * (1.0 + damping * np.eye(6)), qq * (1.0 + damping * np.eye(3))
-    inverse, definite = batch_inverses.inverse(qq)
+    inverse, definite = batch_inverses.symmetric_inverses(qq)
     gain = f.dq @ inverse
     g = f.d - (gain @ f.q[:, :, None])[:, :, 0]
     H = np.dot(weight[None], (dd - gain @ np.swapaxes(f.dq, 1, 2)).reshape(-1, 36)).reshape(6, 6)

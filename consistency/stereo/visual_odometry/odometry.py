@@ -10,10 +10,15 @@ from collections.abc import Sequence as Ordered
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import carried
+from consistency.referee.geometry.groups import propagated
 from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
-from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion, motion_between, stereo_features
+from consistency.stereo.visual_odometry.relative_motion import (
+    MotionSettings,
+    RelativeMotion,
+    motion_between,
+    stereo_features,
+)
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, angular, cross_matrix
 from consistency.stereo.visual_odometry.sequence import Sequence
 
@@ -89,7 +94,7 @@ def motion_covariances(motions: Ordered[RelativeMotion]) -> Array:
     G = np.zeros((len(motions), 6, 6))
     G[:, :3, :3] = np.eye(3)
     G[:, 3:, 3:] = [angular(motion.pose) for motion in motions]
-    return carried(G, np.array([motion.covariance for motion in motions]))
+    return propagated(G, np.array([motion.covariance for motion in motions]))
 
 
 def bridged(found: Ordered[RelativeMotion | InputError], t: Array) -> list[RelativeMotion]:

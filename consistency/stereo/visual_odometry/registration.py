@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import input_checks
-from consistency.stereo.visual_odometry.input_errors import ConsensusError, DegenerateError
+from consistency.stereo.visual_odometry.cameras import array_checks
+from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, DegenerateError
 from consistency.stereo.visual_odometry.relative_pose import RelativePose
 
 ON_A_LINE = 1e-8  # second singular value of a cloud, over its largest coordinate, up to which it is a line
@@ -44,7 +44,7 @@ def register_svd(p1: Array, p2: Array) -> RelativePose:
     DegenerateError
         Fewer than three points, identical points, or points on one line.
     """
-    p1, p2 = matched(p1, p2)
+    p1, p2 = checked_clouds(p1, p2)
     R, t, fixed = rigid_motions(p1, p2)
     _require_unique(float(fixed))
     return RelativePose(R, t)
@@ -72,7 +72,7 @@ def register_horn(p1: Array, p2: Array, *, directions: bool = False) -> Relative
     InputError, DegenerateError
         As :func:`register_svd`.
     """
-    p1, p2 = matched(p1, p2)
+    p1, p2 = checked_clouds(p1, p2)
     if directions:
         length1, length2 = (np.linalg.norm(p, axis=1, keepdims=True) for p in (p1, p2))
         if min(length1.min(), length2.min()) == 0.0:
@@ -93,10 +93,10 @@ def register_horn(p1: Array, p2: Array, *, directions: bool = False) -> Relative
     return RelativePose(R, p1.mean(axis=0) - R @ p2.mean(axis=0))
 
 
-def matched(p1: Array, p2: Array) -> tuple[Array, Array]:
+def checked_clouds(p1: Array, p2: Array) -> tuple[Array, Array]:
     """Both clouds as floats, (N, 3) and (N, 3), checked: errors as :func:`register_svd`."""
-    p1, p2 = input_checks.rows("p1", p1, 3), input_checks.rows("p2", p2, 3)
-    input_checks.same_length("p1, p2", p1, p2)
+    p1, p2 = array_checks.checked_rows("p1", p1, 3), array_checks.checked_rows("p2", p2, 3)
+    array_checks.same_length("p1, p2", p1, p2)
     if len(p1) < 3:
         raise DegenerateError(f"p1, p2: {len(p1)} points, a rigid motion needs at least 3")
     for name, p in (("p1", p1), ("p2", p2)):
@@ -168,13 +168,13 @@ def register_ransac(
     ConsensusError
         No motion has enough inliers.
     """
-    p1, p2 = matched(p1, p2)
+    p1, p2 = checked_clouds(p1, p2)
     if not 0.0 < threshold < np.inf:
         raise InputError(f"threshold: {threshold}, must be positive")
     if (S1 is None) != (S2 is None):
         raise InputError("S1, S2: give both covariances or none")
     if S1 is not None and S2 is not None:
-        S1, S2 = input_checks.covariances("S1", S1, len(p1), 3), input_checks.covariances("S2", S2, len(p1), 3)
+        S1, S2 = array_checks.covariances("S1", S1, len(p1), 3), array_checks.covariances("S2", S2, len(p1), 3)
     least = fewest(len(p1)) if minimum is None else minimum
 
     def inliers_of(R: Array, t: Array) -> Array:

@@ -15,8 +15,8 @@ from consistency.referee.parsing import HUGE, is_file, read_text, reading
 from consistency.referee.readers.formats.kitti_files import NANO, place_of, read_times
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
-from consistency.stereo.visual_odometry.cameras.camera_pair import Calibration, Rectification, rectify
-from consistency.stereo.visual_odometry.features import opencv
+from consistency.stereo.visual_odometry.cameras.camera_pair import PairCalibration, Rectification, rectify
+from consistency.stereo.visual_odometry.cameras.opencv import opencv
 
 FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")
 KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"))
@@ -37,7 +37,7 @@ class Sequence:
     right: list[Path]
     t: Array  # (n,), s, increasing
     timed: bool  # whether ``t`` was read, else it is a matter of the rate
-    calibration: Calibration
+    calibration: PairCalibration
     rectification: Rectification
 
     def __len__(self) -> int:
@@ -217,7 +217,7 @@ def _kitti_times(folder: Path) -> Array | None:
     path = folder / "times.txt"
     if not path.is_file():
         return None
-    t = read_table(path, None, "must hold one time in seconds a line")
+    t = read_number_table(path, None, "must hold one time in seconds a line")
     if t.shape[1] != 1:
         raise InputError(f"{path}: must hold one time in seconds a line")
     return np.asarray(t[:, 0])
@@ -231,7 +231,7 @@ def _kitti_raw(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
     return files, (stamps - stamps[0]) * NANO
 
 
-def read_table(path: Path, delimiter: str | None, refusal: str) -> Array:
+def read_number_table(path: Path, delimiter: str | None, refusal: str) -> Array:
     """A text file of finite numbers, (lines, columns); raises :class:`InputError` with the ``refusal``."""
     text = read_text(path, refusal)
     with reading(path, refusal):

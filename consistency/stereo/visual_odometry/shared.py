@@ -18,8 +18,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.maximum_likelihood import refine_reprojection
-from consistency.stereo.visual_odometry.motion import RelativeMotion, diagonal
 from consistency.stereo.visual_odometry.odometry import neighbours
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, diagonal_covariances
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, cross_matrix
 
 # What is shared, and the standard deviation of its prior
@@ -98,7 +98,7 @@ def _twist(pose: RelativePose) -> Array:
 def _by_rig(rig: StereoRig, motion: RelativeMotion) -> Array:
     """Derivative (6, 7) of the refined pose, by central differences."""
     i = motion.inliers
-    S0, S1 = diagonal(motion.sigma0[i]), diagonal(motion.sigma1[i])
+    S0, S1 = diagonal_covariances(motion.sigma0[i]), diagonal_covariances(motion.sigma1[i])
     columns = []
     for k, prior in enumerate(list(SHARED.values())[:RIG]):
         change = np.zeros(RIG)

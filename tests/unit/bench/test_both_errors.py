@@ -13,22 +13,21 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter, step_through
-from consistency.bench.runs.results_to_records import record_of
+from consistency.bench.runs.analyse_results import analyse
+from consistency.bench.runs.results_to_records import record_of, results_source
 from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.store.results import open_results
 from consistency.referee.column_names import OWN_COVARIANCE
 from consistency.referee.diagnostics import Interval, Settings, judge, map_score, sequential_design
 from consistency.referee.diagnostics.questions.scale import ratio_interval
-from consistency.referee.diagnostics.verdict.judge import judge_runs, with_map
-from consistency.referee.diagnostics.verdict.parts import MapScore
+from consistency.referee.diagnostics.verdict.verdict import MapScore
 from consistency.referee.document.map import map_text
 from consistency.referee.document.verdict import document
-from consistency.referee.gating.input_checks import of_results
+from consistency.referee.gating.checked_arrays import record_of_filter
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Failure
 from consistency.referee.verdicts.baselines import baseline
-from consistency.referee.verdicts.sources import analyse
 
 RUNS = 24
 KEYS = ["run", "step", "t", "x", "y", "heading"]
@@ -140,7 +139,7 @@ def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results: cs.Re
 def test_run_means_and_baselines_are_of_the_own_error(results: cs.Results) -> None:
     c = record_of(results, "right")
     np.testing.assert_allclose(run_means(c), np.nanmean(c.nees, axis=1), rtol=1e-12)
-    of = baseline(results).filters["right"]
+    of = baseline(results_source(results)).filters["right"]
     np.testing.assert_allclose(of.nees, run_means(c) / 3.0, rtol=1e-12)
     world, counted = c.in_world, np.isfinite(c.nees)[..., None]
     square = np.nanmean(np.where(counted, np.square(world.error), np.nan), axis=1)
@@ -148,7 +147,7 @@ def test_run_means_and_baselines_are_of_the_own_error(results: cs.Results) -> No
 
 
 def test_a_gate_has_the_own_error_alone(results: cs.Results) -> None:
-    record = of_results(results, "right")
+    record = record_of_filter(results_source(results), "right")
     verdict = judge(record)
     assert (verdict.world, verdict.map, verdict.convention) == (None, None, None)
     assert verdict.scale.mean_anees == analyse(results)["right"].scale.mean_anees
@@ -174,7 +173,7 @@ def test_until_decided_says_both(uvd: cs.Scenario) -> None:
 
 def test_a_look_scores_the_maps_of_its_own_runs(results: cs.Results) -> None:
     record, design = record_of(results, "ekf-uvd"), sequential_design(3, max_runs=12)
-    v = with_map(judge_runs(record, Settings(), design), record.ends, Settings(), design)
+    v = judge(record, Settings(), design)
     assert (v.runs, v.map.runs) == (12, 12)
     planned = replace(results, manifest=results.manifest | {"until_decided": {"dof": 3, "max_runs": 12}})
     assert analyse(planned, ["ekf-uvd"])["ekf-uvd"].runs == 12

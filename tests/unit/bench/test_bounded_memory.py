@@ -15,33 +15,29 @@ import pandas as pd
 import pytest
 
 import consistency as cs
+from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.results import open_results
-from consistency.referee.diagnostics import Evidence, Settings, judge, summary
-from consistency.referee.diagnostics.records import large_arrays
-from consistency.referee.diagnostics.records.large_arrays import Symmetric
-from consistency.referee.diagnostics.records.sample import sample_of
+from consistency.referee.diagnostics import Record, Settings, judge, summary
+from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.as_json import render
-from consistency.referee.verdicts.sources import analyse
 
 STEPS = 200
 RUNS = 4000
 
 
-def evidence(runs: int, steps: int = STEPS, bias: float = 0.3) -> Evidence:
-    """Errors with a mean, so that every question is asked twice, and covariances in half."""
+def evidence(runs: int, steps: int = STEPS, bias: float = 0.3) -> Record:
+    """Errors with a mean, so that every question is asked twice."""
     rng = np.random.default_rng(0)
-    P = Symmetric.filled((runs, steps), 3, 0.2)
-    for i in range(3):
-        P.entry(i, i)[:] = 1.0 + i
+    P = np.tile(0.2 + np.diag([0.8, 1.8, 2.8]), (runs, steps, 1, 1))
     error = rng.standard_normal((runs, steps, 3)) + bias
     nis = rng.chisquare(2, (runs, steps))
-    return Evidence("f", error, P, nis=nis, nis_dof=np.full((runs, steps), 2), axes=("x", "y", "heading"))
+    return Record("f", error, P, nis=nis, nis_dof=np.full((runs, steps), 2), axes=("x", "y", "heading"))
 
 
-def numbers_a_cell(work: Callable[[Evidence], object], runs: int = 1400) -> float:
+def numbers_a_cell(work: Callable[[Record], object], runs: int = 1400) -> float:
     """Most numbers of 8 bytes that ``work`` holds beside what it is given, for each further pair of run and step."""
     most = []
     for count in (runs, 3 * runs):
@@ -52,14 +48,6 @@ def numbers_a_cell(work: Callable[[Evidence], object], runs: int = 1400) -> floa
         tracemalloc.stop()
     # from 1400 runs on a block of steps is not all of them
     return (most[1] - most[0]) / (2 * runs * STEPS * 8)
-
-
-def numbers(value: object) -> list[float]:
-    """Every number of a verdict, one after the other."""
-    if isinstance(value, dict | list | tuple | np.ndarray):
-        parts = value.values() if isinstance(value, dict) else value
-        return [number for part in parts for number in numbers(part)]
-    return [float(value)] if isinstance(value, int | float | np.number) else []
 
 
 @pytest.mark.parametrize("settings", [Settings(), Settings(allow="conservative")], ids=["both", "conservative"])
@@ -73,25 +61,10 @@ def test_a_summary_of_runs_takes_hardly_any() -> None:
     assert numbers_a_cell(lambda g: summary(nees[: len(np.asarray(g.nis))], 3, g.error, g.covariance)) < 0.5
 
 
-@pytest.mark.parametrize("settings", [Settings(tolerance=1.1), Settings(allow="conservative")], ids=["both", "one"])
-def test_small_blocks_say_what_large_ones_do(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = evidence(90, 23)
-    given.error[::7, 11:] = np.nan
-    given.error[40:, 15:] *= 3.0
-    whole = judge(given, settings)
-    monkeypatch.setattr(large_arrays, "ROWS", 400)
-    monkeypatch.setattr(large_arrays, "FEWER", 100)
-    parts = judge(given, settings)
-    assert parts.reasons == whole.reasons
-    np.testing.assert_allclose(numbers(parts.statistics), numbers(whole.statistics), rtol=1e-12)
-
-
 def test_errors_about_their_mean() -> None:
     """With variances 1, 2, 3 alone the NEES about the mean has a closed form."""
     given = evidence(30, 8)
-    P = Symmetric.filled((30, 8), 3, 0.0)
-    for i in range(3):
-        P.entry(i, i)[:] = 1.0 + i
+    P = np.tile(np.diag([1.0, 2.0, 3.0]), (30, 8, 1, 1))
     sample = sample_of(replace(given, covariance=P), Settings())
     about = (given.error - given.error.mean(axis=0)) * np.sqrt(30 / 29)
     nees = (np.square(about) / [1.0, 2.0, 3.0]).sum(axis=-1)
@@ -99,40 +72,6 @@ def test_errors_about_their_mean() -> None:
     centred = sample.centred()
     np.testing.assert_allclose(centred.nees, nees)
     np.testing.assert_allclose(centred.group_means([1]), (np.square(about[..., 1]) / 2.0).mean(axis=1))
-
-
-def test_evidence_is_not_changed_by_a_verdict() -> None:
-    given, same = evidence(40, 20), evidence(40, 20)
-    assert "bias" in judge(given).faults
-    np.testing.assert_array_equal(given.error, same.error)
-    np.testing.assert_array_equal(given.covariance, same.covariance)
-
-
-def test_half_of_a_covariance_says_what_the_whole_does() -> None:
-    given = evidence(40, 20)
-    full = replace(given, covariance=np.asarray(given.covariance))
-    np.testing.assert_array_equal(numbers(judge(given).statistics), numbers(judge(full).statistics))
-
-
-def test_entries_are_those_of_the_matrices() -> None:
-    rng = np.random.default_rng(0)
-    P = rng.standard_normal((4, 5, 3, 3))
-    P += np.swapaxes(P, -1, -2)
-    half = Symmetric.filled((4, 5), 3)
-    for i in range(3):
-        for j in range(i + 1):
-            half.entry(i, j)[:] = P[..., i, j]
-    for each in (half, Symmetric.of(P)):
-        assert each.shape == P.shape
-        np.testing.assert_array_equal(each, P)
-        np.testing.assert_array_equal(each[1:3, ::2], P[1:3, ::2])
-        np.testing.assert_array_equal(each[2, :, 0, 1], P[2, :, 0, 1])
-        np.testing.assert_array_equal(each.part([2, 0]), P[..., [2, 0], :][..., [2, 0]])
-        np.testing.assert_array_equal(each.variances, np.diagonal(P, axis1=-2, axis2=-1))
-    P[1, 2, 0, 2] = P[1, 2, 2, 0] = np.nan
-    half.entry(2, 0)[1, 2] = np.nan
-    for each in (half, Symmetric.of(P)):
-        assert np.argwhere(~each.where_all(np.isfinite)).tolist() == [[1, 2]]
 
 
 @pytest.mark.parametrize("n", range(1, 12))
@@ -185,7 +124,7 @@ print(most() - before)
 READ = "from consistency.bench.store.results import open_results\n"
 WORK = {
     "analyse": READ
-    + "from consistency.referee.verdicts.sources import analyse\nwork = lambda f: analyse(open_results(f))",
+    + "from consistency.bench.runs.analyse_results import analyse\nwork = lambda f: analyse(open_results(f))",
     "report": "from consistency.bench.pages.build import build_report as work",
     "baseline": "from consistency.referee.verdicts.baselines import read_baseline as work",
 }

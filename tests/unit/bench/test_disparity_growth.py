@@ -13,6 +13,7 @@ from scenario_files import load, put
 import consistency as cs
 from consistency.bench.scenario import DisparityGrowth
 from consistency.bench.simulation import World
+from consistency.scenario import scenario_text
 
 Small = Callable[..., cs.Scenario]
 GROWTH = {"disparity": [3.0, 5.0, 12.0], "ratio": [0.5, 1.0, 2.4]}
@@ -46,7 +47,7 @@ def test_a_growth_changes_the_hash_and_survives_a_file(small: Small, tmp_path: P
     grown = base.variant("grown", **{f"{half}__sensor__disparity_growth": GROWTH})
     assert grown.hash != base.hash
     assert grown.variant("back", **{f"{half}__sensor__disparity_growth": None}).hash == base.hash
-    (tmp_path / "grown.toml").write_text(cs.scenario.scenario_text(grown), encoding="utf-8")
+    (tmp_path / "grown.toml").write_text(scenario_text(grown), encoding="utf-8")
     assert cs.load_scenario(tmp_path / "grown.toml").hash == grown.hash
 
 

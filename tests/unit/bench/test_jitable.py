@@ -17,7 +17,7 @@ def doubled(x: float) -> float:
 
 
 def test_numba_knows_what_is_jitable_once_it_is_told() -> None:
-    jitable.register()
+    jitable.register_jitables()
 
     @numba.njit
     def calls(x: float) -> float:

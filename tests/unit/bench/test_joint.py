@@ -13,8 +13,8 @@ import consistency as cs
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.trial_rows import outcome_of
-from consistency.referee.diagnostics import Evidence, JointNees, Settings, Verdict, judge
-from consistency.referee.diagnostics.maps.map_nees import joint_nees, joint_test
+from consistency.referee.diagnostics import JointNees, Record, Settings, Verdict, judge
+from consistency.referee.diagnostics.maps.map_nees import joint_nees, joint_test, last_nees
 from consistency.referee.diagnostics.questions.equivalence import is_tolerated
 from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
 from consistency.referee.geometry.conventions import planar_error, planar_map_error
@@ -31,13 +31,13 @@ def covariance_of(rng: np.random.Generator) -> Array:
     return np.asarray(J @ np.diag([0.3, 0.2, 0.1]) @ J.T + 0.05 * (own @ own.T + 0.1 * np.eye(NUMBER)))
 
 
-def map_of_gaussians(rng: np.random.Generator, errors: Array, P: Array) -> Evidence:
-    """Evidence of runs with joint errors (N, n) that state the covariance P (n, n)."""
+def map_of_gaussians(rng: np.random.Generator, errors: Array, P: Array) -> Record:
+    """Record of runs with joint errors (N, n) that state the covariance P (n, n)."""
     parts = np.stack([joint_nees(e, P) for e in errors])
     error = errors[:, 3:].reshape(len(errors), -1, 3)
     blocks = np.stack([P[i : i + 3, i : i + 3] for i in range(3, NUMBER, 3)])
     joint = JointNees(parts[:, 0], parts[:, 1:].sum(axis=1), np.full(len(errors), NUMBER - 3), parts[:, 1:])
-    return Evidence(
+    return Record(
         "map", error, np.broadcast_to(blocks, (*error.shape, 3)).copy(), axes=("x", "y", "z"),
         landmarks=np.arange(10, 10 + LANDMARKS), joint=joint,
     )  # fmt: skip
@@ -136,7 +136,7 @@ def test_a_joint_scale_within_the_tolerance_is_excused(ratio: float) -> None:
         assert test.p_values[JOINT] < 1e-10
         assert is_tolerated(test.nees, test.score.dof, settings) == excused
         nees = np.random.default_rng(8).chisquare(3, (50, 1))
-        v = judge(Evidence("map", nees=nees, dof=3, joint=joint, landmarks=np.arange(1)), settings)
+        v = judge(Record("map", nees=nees, dof=3, joint=joint, landmarks=np.arange(1)), settings)
         assert [(a.found, a.tolerated) for a in v.answers if a.question == JOINT] == [(True, excused)]
 
 
@@ -200,9 +200,9 @@ def results() -> cs.Results:
     return cs.run_trials(scenario, ["ekf-uvd", "ri-ekf-uvd"], runs=6, seed=3, jobs=1)
 
 
-def _evidence(results: cs.Results, name: str) -> Evidence:
-    ends = record_of(results, name).ends
-    evidence = ends.map().record(ends.nees[:, 0])
+def _evidence(results: cs.Results, name: str) -> Record:
+    record = record_of(results, name)
+    evidence = record.map().record(last_nees(record))
     assert evidence is not None
     return evidence
 

@@ -19,6 +19,7 @@ from consistency.bench.simulation import World
 from consistency.bench.store.log import read_log
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
+from consistency.scenario import scenario_text
 
 Small = Callable[..., cs.Scenario]
 U, V = [-150.0, -40.0, 30.0, 160.0], [-100.0, 10.0, 90.0]
@@ -73,7 +74,7 @@ def test_an_effect_gives_the_map_that_a_belief_holds(small: Small) -> None:
 def test_a_believed_map_goes_through_files(small: Small, tmp_path: Path) -> None:
     scenario = small("herath2007-stereo", belief__sensor__bias=MAP)
     assert scenario.hash != small("herath2007-stereo").hash
-    (tmp_path / "mine.toml").write_text(cs.scenario.scenario_text(scenario), encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(scenario_text(scenario), encoding="utf-8")
     assert cs.load_scenario(tmp_path / "mine.toml").hash == scenario.hash
     simulate_log(scenario, runs=1, seed=0, out=tmp_path / "log")
     assert read_log(tmp_path / "log").belief == scenario.belief

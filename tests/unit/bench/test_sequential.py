@@ -12,7 +12,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.referee.diagnostics import Design, Evidence, follow, look, sequential_design
+from consistency.referee.diagnostics import Design, Record, follow, look, sequential_design
 from consistency.referee.types import Array
 
 SHORT = {"truth__steps": 60}
@@ -48,8 +48,8 @@ def test_a_design_that_cannot_be_is_refused(options: dict[str, Any]) -> None:
         sequential_design(**{"dof": 3, **options})
 
 
-def nees(values: Array) -> Callable[[int], Evidence]:
-    return lambda runs: Evidence("f", nees=values[:runs], dof=3)
+def nees(values: Array) -> Callable[[int], Record]:
+    return lambda runs: Record("f", nees=values[:runs], dof=3)
 
 
 def test_consistent_is_said_at_a_look_and_a_fault_at_once() -> None:
@@ -88,7 +88,7 @@ def test_other_questions_are_asked_at_looks_only() -> None:
     error = rng.standard_normal((18, 5, 3)) + np.array(
         [9.0, 0.0, 0.0]
     )  # and no scale at fault: the covariance holds the bias
-    evidence = Evidence("f", error, np.broadcast_to(np.diag([82.0, 1.0, 1.0]), (18, 5, 3, 3)))
+    evidence = Record("f", error, np.broadcast_to(np.diag([82.0, 1.0, 1.0]), (18, 5, 3, 3)))
     assert "bias" in look(sequential_design(3), evidence, 0.5).faults
     assert look(sequential_design(3), evidence, None).faults == ()
 

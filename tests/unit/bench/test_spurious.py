@@ -20,6 +20,7 @@ from consistency.bench.simulation import World
 from consistency.bench.store.log import read_log
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
+from consistency.scenario import scenario_text
 
 ALARM = 1e-6
 WIDE = {"truth__sensor__disparity": (1e-6, 1e6), "truth__sensor__range": (0.5, 3.0)}  # d is 4.5 px or more
@@ -301,5 +302,5 @@ def test_a_mistake_is_answered_with_file_and_key(
 @pytest.mark.parametrize("kind", GOOD)
 def test_a_file_is_read_as_it_is_written(tmp_path: Path, kind: str) -> None:
     scenario = load(tmp_path, put("truth.sensor.effects", [{"kind": kind, **GOOD[kind]}]))
-    (tmp_path / "again.toml").write_text(cs.scenario.scenario_text(scenario), encoding="utf-8")
+    (tmp_path / "again.toml").write_text(scenario_text(scenario), encoding="utf-8")
     assert cs.load_scenario(tmp_path / "again.toml").hash == scenario.hash

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import consistency as cs
-from consistency.referee.cli.app import app
-from consistency.referee.diagnostics import Evidence, Settings, judge
+from consistency.commands.app import app
+from consistency.referee.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.imperfect_truth import residuals_of_fit
 from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import (
     _at_most,
@@ -35,13 +35,11 @@ from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers import clock_offset
 from consistency.referee.readers.alignment import residuals
 from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned
+from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned, clocks_and_frames
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
-from consistency.referee.readers.clock_offset import clocks_and_frames
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 
@@ -390,7 +388,7 @@ def test_what_a_frame_may_have_taken_is_added_before_consistent_is_said(rng: np.
     """60 runs of 20 steps know their ratio to 3 %: within 1.5 with a tenth added, and not with 0.4 added."""
     error, P = rng.normal(size=(60, 20, 3)), np.broadcast_to(np.eye(3), (60, 20, 3, 3))
     for unseen, status in ((0.0, "consistent"), (0.1, "consistent"), (0.4, "undecided"), (1.0, "undecided")):
-        v = judge(Evidence("f", error, P, reduced=True, unavailable=ALL_BUT_SCALE, unseen=unseen), Settings(1e-6))
+        v = judge(Record("f", error, P, reduced=True, unavailable=ALL_BUT_SCALE, unseen=unseen), Settings(1e-6))
         assert v.status == status
         assert "would probably decide" not in v.reasons[0]
     means = np.square(error).mean(axis=(1, 2))
@@ -513,11 +511,11 @@ def test_questions_without_an_answer_are_not_asked(rng: np.random.Generator) -> 
     error = rng.normal(size=(30, 20, 3))
     error[:, 3] += 5.0
     P = np.broadcast_to(np.eye(3), (30, 20, 3, 3))
-    every = judge(Evidence("f", error, P))
+    every = judge(Record("f", error, P))
     assert "bias in some step" in every.faults
-    some = judge(Evidence("f", error, P, reduced=True, unavailable=ALL_BUT_SCALE))
+    some = judge(Record("f", error, P, reduced=True, unavailable=ALL_BUT_SCALE))
     assert {a.question for a in some.answers} == {"scale"}
-    low = judge(Evidence("f", 0.3 * rng.normal(size=(30, 20, 3)), P, reduced=True))
+    low = judge(Record("f", 0.3 * rng.normal(size=(30, 20, 3)), P, reduced=True))
     assert low.status == "undecided"
     assert not low.equivalence.one_sided
     assert low.equivalence.runs is None
@@ -528,7 +526,7 @@ def test_where_the_scale_is_asked_alone_it_has_the_whole_rate(rng: np.random.Gen
     P = np.broadcast_to(np.eye(3), (40, 10, 3, 3))
     w = rng.normal(size=(40, 10, 3))
     for ratio in np.linspace(0.9, 1.5, 120):
-        v = judge(Evidence("f", np.sqrt(ratio) * w, P, reduced=True, unavailable=ALL_BUT_SCALE), Settings())
+        v = judge(Record("f", np.sqrt(ratio) * w, P, reduced=True, unavailable=ALL_BUT_SCALE), Settings())
         (answer,) = v.answers
         if 0.026 < answer.p_value < 0.049:
             assert v.status == "overconfident"
@@ -560,7 +558,7 @@ def test_clock_and_frame_are_found_in_turn_until_the_clock_settles(
     """To 0.1 ms, or five times."""
     then = iter(shifts)
     monkeypatch.setattr(residuals, "frames_of", lambda *_: [])
-    monkeypatch.setattr(clock_offset, "clock_shift", lambda *_: (next(then), []))
+    monkeypatch.setattr(residuals, "clock_shift", lambda *_: (next(then), []))
     monkeypatch.setattr(residuals, "aligned", lambda *_: Aligned([]))
     assert clocks_and_frames("est", [], "estimate", "posyaw", range(3))[0] == said
 

@@ -103,14 +103,6 @@ def test_a_verdict_needs_less_memory_than_its_arrays_hold(
 @pytest.mark.parametrize(("count", "each"), [(0, 5), (1, 5), (10, 0), (10, 3), (10, 10**9)])
 def test_slices_cover_everything_once(monkeypatch: pytest.MonkeyPatch, count: int, each: int) -> None:
     monkeypatch.setattr(large_arrays, "ROWS", 7)
-    slices = list(large_arrays.blocks(count, each))
+    slices = list(large_arrays.block_slices(count, each))
     assert slices
     assert [k for here in slices for k in range(count)[here]] == list(range(count))
-
-
-def test_rows_and_columns_of_matrices_stored_by_entry(rng: np.random.Generator) -> None:
-    A = rng.normal(size=(4, 5, 3, 3))
-    P = A @ np.swapaxes(A, -1, -2)
-    stored, index = large_arrays.Symmetric.of(P), [2, 0]
-    np.testing.assert_array_equal(np.asarray(stored.part(index)), P[..., index, :][..., index])
-    np.testing.assert_array_equal(stored.variances, np.diagonal(P, axis1=-2, axis2=-1))

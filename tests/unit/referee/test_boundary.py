@@ -22,12 +22,13 @@ from recorded import read_recordings
 import consistency as cs
 from consistency.bench.store.parquet import read_parquet
 from consistency.bench.sweeps.plan import load_sweep
-from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics import Record
 from consistency.referee.parsing import one_line, read_json, read_text, read_toml, reading, require_room
+from consistency.referee.system.shipped import data_folder
 from consistency.referee.verdicts.baselines import read_baseline
 
 
-def read(path: Path, **options: Path) -> Evidence:
+def read(path: Path, **options: Path) -> Record:
     """The recording of the first estimator."""
     return read_recordings(Path(path), **options)[0]
 
@@ -395,7 +396,7 @@ def test_room_is_in_proportion_to_the_file(tmp_path: Path) -> None:
 
 
 def scenario(tmp_path: Path, old: str, new: str) -> Path:
-    text = (cs.scenario.data_folder("scenarios") / "herath2007-xyz.toml").read_text(encoding="utf-8")
+    text = (data_folder("scenarios") / "herath2007-xyz.toml").read_text(encoding="utf-8")
     key = next(line for line in text.splitlines() if line.split("=")[0].strip() in (old, f"{old}_s"))
     path = tmp_path / "world.toml"
     path.write_text(text.replace(key, f"{old} = {new}", 1), encoding="utf-8")

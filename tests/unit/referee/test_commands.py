@@ -8,7 +8,6 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
@@ -20,11 +19,19 @@ from documents import parsed
 import consistency as cs
 from consistency.bench import filters
 from consistency.bench.sweeps.plan import load_sweep
+from consistency.commands.app import app
+from consistency.commands.registry import COMMANDS
 from consistency.referee import extras
-from consistency.referee.cli.app import app
-from consistency.referee.cli.commands import COMMANDS
-from consistency.referee.extras import EXTRAS, MissingPackageError, explained, missing, packages, remedy, require
-from consistency.referee.shipped import summaries
+from consistency.referee.extras import (
+    IMPORT_NAMES,
+    MissingPackageError,
+    explained,
+    missing,
+    remedy,
+    require,
+    requirements,
+)
+from consistency.referee.system.shipped import summaries
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -52,18 +59,46 @@ def forgotten() -> None:
 # --- the extras ------------------------------------------------------------------------------------
 
 
-def test_the_extras_are_those_of_the_project() -> None:
-    def names(requirements: Iterable[str]) -> set[str]:
-        return {re.split("[>=]", each)[0] for each in requirements}
+def listed(extra: str) -> set[tuple[str, str]]:
+    """Packages and floors of an extra in pyproject.toml, those of the extras that it includes too."""
+    pairs: set[tuple[str, str]] = set()
+    for line in PROJECT["optional-dependencies"][extra]:
+        name, _, floor = line.partition(">=")
+        included = name.removeprefix("filter-consistency").strip("[]").split(",")
+        pairs |= {(name, floor)} if floor else set().union(*map(listed, included))
+    return pairs
 
-    listed = PROJECT["optional-dependencies"]
-    assert set(listed) == {*EXTRAS, "all", "docs", "dev"}
-    for extra, of_extra in EXTRAS.items():
-        assert names(each.removeprefix("filter-consistency") for each in listed[extra]) == names(of_extra)
-        assert {each for each in of_extra if ">=" in each} <= set(listed[extra])
-    (every,) = listed["all"]
-    included = every.removeprefix("filter-consistency[").rstrip("]").split(",")
-    assert set(packages(*included)) == set(packages(*EXTRAS))
+
+@pytest.mark.parametrize("extra", PROJECT["optional-dependencies"])
+def test_an_extra_brings_what_the_project_lists(extra: str) -> None:
+    """Also a check of the installation: one that is stale is mended by ``pip install -e .``."""
+    assert set(requirements(extra)) == listed(extra), "the installation is stale: pip install -e ."
+
+
+def test_several_extras_bring_each_package_once() -> None:
+    assert requirements("plot", "report").count(("matplotlib", "3.9")) == 1
+    assert requirements() == requirements("nonsense") == []
+
+
+def test_names_of_imports_that_differ_are_known() -> None:
+    """Of all packages that are installed here, so that no package is missed that is there."""
+    packages = {package for package, _ in requirements("all")}
+    assert set(IMPORT_NAMES) <= packages
+    assert [each.package for each in requirements("all") if not each.is_found and not _is_absent(each.package)] == []
+
+
+def _is_absent(package: str) -> bool:
+    try:
+        metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return True
+    return False
+
+
+def test_a_checkout_that_is_not_installed_knows_no_extras(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extras, "DISTRIBUTION", "no-such-distribution")
+    assert requirements("bench") == []
+    assert explained(ModuleNotFoundError(name="numba"), "this") is None
 
 
 def test_the_core_is_small() -> None:
@@ -73,10 +108,10 @@ def test_the_core_is_small() -> None:
 @pytest.mark.usefixtures("nowhere")
 def test_a_sentence_names_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     require("this", "bench", "report")
-    without(monkeypatch, "numba", "tomli_w", "bokeh")
+    without(monkeypatch, "numba", "tomli_w", "typst")
     with pytest.raises(MissingPackageError) as refusal:
         require("this", "bench", "report")
-    assert str(refusal.value) == "this needs numba, tomli-w, bokeh: pip install numba tomli-w bokeh"
+    assert str(refusal.value) == "this needs numba, tomli-w, typst: pip install numba tomli-w typst"
     assert isinstance(refusal.value, ImportError)
     assert isinstance(refusal.value, cs.InputError)
     assert extras.is_installed("ros")
@@ -85,7 +120,8 @@ def test_a_sentence_names_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.usefixtures("nowhere")
 def test_a_package_that_is_too_old_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metadata, "version", {"numpy": "1.26.4", "scipy": "1.16.0rc1", "rich": "14.1.0"}.__getitem__)
+    versions = dict(requirements("bench")) | {"numpy": "1.26.4", "scipy": "1.16.0rc1", "rich": "14.1.0"}
+    monkeypatch.setattr(metadata, "version", versions.__getitem__)
     assert missing("bench") == ["numpy>=2.0"]
     assert remedy("bench") == "numpy>=2.0: pip install 'numpy>=2.0'"
 
@@ -97,11 +133,20 @@ def test_the_python_that_the_bench_needs(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "Python" not in remedy("plot")
 
 
+@pytest.mark.parametrize(("version", "floor", "is_met"), [
+    ("2.4.40", "2.4.40", True), ("2.4.39", "2.4.40", False), ("2.10", "2.9", True), ("3", "2.9", True),
+    ("2025.11.1", "2025.1", True), ("1.16.0rc1", "1.16", True), ("1.15.9", "1.16", False), ("unknown", "1.0", False),
+])  # fmt: skip
+def test_versions_are_compared_as_numbers(
+    version: str, floor: str, is_met: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(metadata, "version", lambda _: version)
+    assert extras.Requirement("numpy", floor).is_met == is_met
+
+
 @pytest.mark.usefixtures("nowhere")
-def test_one_of_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    without(monkeypatch, "distributed", "submitit", "numba")
-    assert remedy("cluster", own="submitit") == "numba, submitit: pip install numba submitit"
-    assert remedy("ulog") == "pyulog: pip install pyulog"  # is there, and could not be loaded
+def test_a_package_that_is_there_and_cannot_be_loaded_is_named() -> None:
+    assert remedy("ulog", package="pyulog") == "pyulog: pip install pyulog"
 
 
 @pytest.mark.parametrize(
@@ -130,19 +175,24 @@ def test_the_place_that_it_came_from(
     place.mkdir()
     (place / "pyproject.toml").touch()
 
+    installed = metadata.distribution
+
     class Installed:
+        requires = installed(extras.DISTRIBUTION).requires
+
         def read_text(self, name: str) -> str | None:
             assert name == "direct_url.json"
             return (
                 None if record is None else json.dumps(record).replace("{at}", place.as_uri().removeprefix("file://"))
             )
 
-    monkeypatch.setattr(metadata, "distribution", lambda _: Installed())
+    found = {extras.DISTRIBUTION: Installed()}
+    monkeypatch.setattr(metadata, "distribution", lambda name: found.get(name) or installed(name))
     words = [word.replace("{at}", str(place)) for word in expected]
     assert extras._from_origin(("bench", "plot")) == words
-    without(monkeypatch, "bokeh")
-    expected = [word.replace("bench,plot", "report") for word in words] or ["bokeh"]
-    assert shlex.split(remedy("report")) == ["bokeh:", "pip", "install", *expected]
+    without(monkeypatch, "typst")
+    expected = [word.replace("bench,plot", "report") for word in words] or ["typst"]
+    assert shlex.split(remedy("report")) == ["typst:", "pip", "install", *expected]
 
 
 def test_no_text_installs_from_an_index() -> None:
@@ -184,6 +234,23 @@ print(cs.anees.__name__, "run_trials" in dir(cs))
     assert (other, here) == ("ImportError", "anees True")
 
 
+def test_a_failed_import_is_explained_by_the_extra_that_has_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not by one that collects others."""
+    monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
+    for module, package, extra in (("joblib", "joblib", "bench"), ("yaml", "pyyaml", "vision")):
+        without(monkeypatch, module)
+        error = explained(ModuleNotFoundError(name=f"{module}.part"), "this")
+        assert str(error) == f"this needs {package}: pip install 'here[{extra}]'"
+        monkeypatch.undo()
+        monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
+
+
+def test_who_needs_no_extra_does_not_wait_for_the_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "requires", lambda _: pytest.fail("the metadata were read"))
+    require("this")
+    assert requirements() == []
+
+
 def test_another_module_that_is_missing_is_not_explained() -> None:
     assert explained(ModuleNotFoundError(name="no_such_module"), "this") is None
     assert explained(ModuleNotFoundError(), "this") is None
@@ -198,7 +265,7 @@ def test_a_command_without_its_packages(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Whatever its options are; its help is there."""
-    module = "bokeh" if name == "report" else "numba"
+    module = "typst" if name == "report" else "numba"
     without(monkeypatch, module)
     err = refused(capsys, name, "--no-such-option")
     assert err.startswith(f"consistency: '{name}' needs {module}: pip install ")
@@ -212,7 +279,7 @@ def test_a_command_without_its_packages(
 def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     before, _ = consistency(capsys, "--help")
     assert "[bench]" not in before
-    without(monkeypatch, "numba", "bokeh")
+    without(monkeypatch, "numba", "typst")
     after, _ = consistency(capsys, "--help")
     lines = dict(re.findall(r"^  ([a-z-]+) +(\S.*)$", after, re.MULTILINE))
     assert set(COMMANDS) <= set(lines)
@@ -220,7 +287,7 @@ def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pyt
         mark = f"[{','.join(row.extras)}] " if row.extras else ""
         assert lines[name].startswith(mark), name
         assert row.extras or not lines[name].startswith("[")
-    assert "[report,bench,vision]: needs bokeh, numba: pip install " in after
+    assert "[report,bench,vision]: needs typst, numba: pip install " in after
     assert consistency(capsys, "-h")[0] == after
 
 
@@ -247,16 +314,16 @@ def test_arguments_that_need_the_bench(
 def test_only_the_called_command_is_loaded() -> None:
     code = """
 import sys
-from consistency.referee.cli import main
+from consistency.commands import main
 try:
     main(["plan", "--dof", "3", "--json"])
 except SystemExit as end:
     print(end.code)
-print(*sorted(name for name in sys.modules if name.startswith("consistency.referee.cli.")))
+print(*sorted(name for name in sys.modules if name.startswith("consistency.commands.")))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    names = ["app", "commands", "judging", "options"]
-    assert done.stdout.splitlines()[-2:] == ["None", " ".join(f"consistency.referee.cli.{name}" for name in names)]
+    names = ["app", "judging", "registry", "shared_options"]
+    assert done.stdout.splitlines()[-2:] == ["None", " ".join(f"consistency.commands.{name}" for name in names)]
 
 
 def test_a_command_is_a_row_and_a_function() -> None:
@@ -336,7 +403,7 @@ def test_help_of_no_command_is_refused(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_help_imports_nothing_that_checks_values() -> None:
-    code = "import sys; sys.argv[1:] = ['run', '-h']; from consistency.referee.cli.app import _show_help; \
+    code = "import sys; sys.argv[1:] = ['run', '-h']; from consistency.commands.app import _show_help; \
 _show_help(None) or sys.exit(3); sys.exit('pydantic' in sys.modules or 'numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 

@@ -13,10 +13,11 @@ from recorded import read_recordings
 from scipy import optimize, special, stats
 
 import consistency as cs
+from consistency.bench.runs.results_to_records import results_source
 from consistency.referee.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.referee.diagnostics.statistics.log_ratio import Contrast, contrast, margin
 from consistency.referee.gating.session import needed_at
-from consistency.referee.gating.watch import Watch, watching
+from consistency.referee.gating.watch import RunningTest, watching
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
 from consistency.referee.verdicts.compare_sources import Compared, compare_filters, compare_with
@@ -364,7 +365,7 @@ def test_the_end_of_a_session_plans_as_the_gate_did(rng: np.random.Generator) ->
     entries = []
     a, b = together(rng, 400)
     for scale in (1.0, 2.0):
-        with watching(Watch(keep=entries.append)):
+        with watching(RunningTest(keep=entries.append)):
             c = assert_not_worse(nees_a=scale * a[:, None], nees_b=scale * b[:, None], dof=1, false_alarm=1e-9)
         assert needed_at(entries[-1], 1e-9) == entries[-1].needed == c.needed_runs()
         assert needed_at(replace(entries[-1], detect=1.01), 1e-9) == c.needed_runs(1.01)
@@ -380,7 +381,7 @@ def results() -> cs.Results:
 
 
 def test_two_filters_of_the_same_trials(results: cs.Results) -> None:
-    (compared,) = compare_filters(baseline(results), ["ekf-xyz", "ekf-uvd"])
+    (compared,) = compare_filters(baseline(results_source(results)), ["ekf-xyz", "ekf-uvd"])
     assert compared.comparison.paired
     assert compared.sentence.startswith("ekf-xyz is ")
     names = [d.name for d in compared.comparison.differences]
@@ -390,8 +391,8 @@ def test_two_filters_of_the_same_trials(results: cs.Results) -> None:
 
 
 def test_a_baseline_read_back_is_the_same(results: cs.Results, tmp_path: Path) -> None:
-    write_baseline(results, tmp_path / "base.json")
-    for compared in compare_with(baseline(results), read_baseline(tmp_path / "base.json"), []):
+    write_baseline(baseline(results_source(results)), tmp_path / "base.json")
+    for compared in compare_with(baseline(results_source(results)), read_baseline(tmp_path / "base.json"), []):
         assert compared.comparison.paired
         assert compared.comparison.distance == 0.0
         assert not compared.worse
@@ -400,16 +401,16 @@ def test_a_baseline_read_back_is_the_same(results: cs.Results, tmp_path: Path) -
 
 def test_other_trials_are_not_paired(results: cs.Results) -> None:
     other = cs.run_trials(results.scenario, ["ekf-uvd"], runs=12, seed=4)
-    (compared,) = compare_with(baseline(results), baseline(other), [])
+    (compared,) = compare_with(baseline(results_source(results)), baseline(results_source(other)), [])
     assert not compared.comparison.paired
     assert "not the same" in compared.sentence
 
 
 def test_bad_baselines_are_refused(results: cs.Results, tmp_path: Path) -> None:
-    path = tmp_path / "base.json"
-    write_baseline(results, path)
+    path, base = tmp_path / "base.json", baseline(results_source(results))
+    write_baseline(base, path)
     with pytest.raises(cs.InputError, match="exists already"):
-        write_baseline(results, path)
+        write_baseline(base, path)
     data = json.loads(path.read_text())
     for broken, message in (
         ("{", "not valid JSON"),
@@ -422,7 +423,6 @@ def test_bad_baselines_are_refused(results: cs.Results, tmp_path: Path) -> None:
             read_baseline(path)
     with pytest.raises(cs.InputError, match="cannot be read"):
         read_baseline(tmp_path / "nix.json")
-    base = baseline(results)
     with pytest.raises(cs.InputError, match="is not in"):
         compare_filters(base, ["ekf-uvd", "nix"])
     with pytest.raises(cs.InputError, match="give two filters"):

@@ -39,7 +39,8 @@ from consistency.referee.fit_covariance.white_noise import fit_noise
 from consistency.referee.fit_covariance.writing import toml
 from consistency.referee.geometry.groups import composed, inverse, vectors
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.places import Places
+from consistency.referee.readers.truth_matching import Manifold, Poses, unstated
 from consistency.referee.types import Array
 
 SPAN = "10m"
@@ -267,6 +268,12 @@ def test_the_mean_of_logarithms_of_few_degrees_of_freedom(rng: np.random.Generat
 # --- clocks ---------------------------------------------------------------------------------------------
 
 
+def bare(t: Array, estimate: Array, true_t: Array, truth: Array, manifold: Manifold, max_dt: float) -> Poses:
+    """Poses without covariances."""
+    place, P = Places("row {}".format, np.arange(len(t))), unstated(len(t), 3 if manifold == "planar" else 6)
+    return Poses(place, t, estimate, *P, true_t, truth, manifold, "left", max_dt)
+
+
 def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> list[tuple[Poses, Array]]:
     """Poses whose timestamps are ``late`` s early, in a world of their own, of a vehicle that does not move evenly."""
     found = []
@@ -274,7 +281,7 @@ def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> 
         t = np.cumsum(0.4 + 0.3 * np.sin(0.3 * np.arange(len(drive.t))))
         place = matrices_of(np.full((1, 3 if drive.d == 2 else 6), 0.7))
         E, M = vectors(place @ drive.estimate), vectors(drive.truth)
-        poses = Poses.bare(None, t - late, E, t, M, "planar" if drive.d == 2 else "spatial", 0.02)  # type: ignore[arg-type]
+        poses = bare(t - late, E, t, M, "planar" if drive.d == 2 else "spatial", 0.02)
         found.append((poses, place @ drive.estimate))
     return found
 
@@ -291,7 +298,7 @@ def test_an_offset_of_clocks_is_found_from_motions(
 
 def test_an_offset_that_nothing_tells_is_refused() -> None:
     M = np.column_stack([np.arange(300.0), np.zeros((300, 2))])
-    poses = Poses.bare(None, np.arange(300.0), M, np.arange(300.0), M, "planar", 0.5)  # type: ignore[arg-type]
+    poses = bare(np.arange(300.0), M, np.arange(300.0), M, "planar", 0.5)
     with pytest.raises(InputError, match="--time-offset estimate: the motions do not tell it"):
         clock_offset([(poses, matrices_of(M))])
 

@@ -14,7 +14,7 @@ from scipy import integrate, stats
 
 from consistency.referee.diagnostics import (
     Design,
-    Evidence,
+    Record,
     Settings,
     Verdict,
     follow,
@@ -25,9 +25,9 @@ from consistency.referee.diagnostics import (
     lost_runs,
     pilot_plan,
 )
-from consistency.referee.diagnostics.planning.number_of_runs import share_limit
 from consistency.referee.diagnostics.questions.lost_runs import lost_evidence, lost_of
-from consistency.referee.gating.watch import Watch, watching
+from consistency.referee.diagnostics.statistics.number_of_runs import share_limit
+from consistency.referee.gating.watch import RunningTest, watching
 from consistency.referee.types import Array, Failure
 from consistency.testing import InsufficientTrials, assert_consistent
 
@@ -35,7 +35,7 @@ SURE = 1e-5
 
 
 def verdict_on(nees: Array, failures: tuple[Failure, ...] = (), **settings: Any) -> Verdict:
-    return judge(Evidence("f", nees=nees, dof=3, failures=failures), Settings(**settings))
+    return judge(Record("f", nees=nees, dof=3, failures=failures), Settings(**settings))
 
 
 def right(runs: int, steps: int = 4) -> Array:
@@ -148,15 +148,15 @@ def test_a_lost_run_takes_more_runs() -> None:
 def test_failed_runs_are_lost_and_runs_without_a_value_are_none(rng: np.random.Generator) -> None:
     nees = right(60)
     nees[3], nees[5] = np.nan, np.nan
-    evidence = Evidence("f", nees=nees, dof=3, failures=(Failure("f", 13, 2, "broke"),), runs=np.arange(60) + 10)
+    evidence = Record("f", nees=nees, dof=3, failures=(Failure("f", 13, 2, "broke"),), runs=np.arange(60) + 10)
     lost = lost_of(evidence, nees, 3, Settings())
     assert (lost.count, lost.runs) == (1, 59)
-    assert lost_of(Evidence("f", nees=np.full((2, 3), np.nan), dof=3), np.full((2, 3), np.nan), 3, Settings()) is None
+    assert lost_of(Record("f", nees=np.full((2, 3), np.nan), dof=3), np.full((2, 3), np.nan), 3, Settings()) is None
 
 
 def test_innovations_alone_show_no_share(rng: np.random.Generator) -> None:
     nis: dict[str, Any] = {"nis": rng.chisquare(2, (200, 30)), "nis_dof": np.full((200, 30), 2)}
-    verdict = judge(Evidence("f", **nis, optimal_gain=True), Settings(SURE, lost=0.05))
+    verdict = judge(Record("f", **nis, optimal_gain=True), Settings(SURE, lost=0.05))
     assert verdict.status == "undecided"
     assert "cannot show" in verdict.reasons[0]
 
@@ -180,13 +180,13 @@ def test_the_bet_against_a_share() -> None:
 
 def test_until_decided_goes_on_until_the_share_is_excluded() -> None:
     nees = right(400)
-    free, runs = follow(Design(3, max_runs=400), lambda n: Evidence("f", nees=nees[:n], dof=3))
-    asked, more = follow(Design(3, max_runs=400, lost=0.05), lambda n: Evidence("f", nees=nees[:n], dof=3))
+    free, runs = follow(Design(3, max_runs=400), lambda n: Record("f", nees=nees[:n], dof=3))
+    asked, more = follow(Design(3, max_runs=400, lost=0.05), lambda n: Record("f", nees=nees[:n], dof=3))
     assert (free.status, asked.status) == ("consistent", "consistent")
     assert runs < more == 96
     assert asked.lost.upper <= 0.05
     assert asked.reasons[0].count("lost runs") == 1
-    early = look(Design(3, lost=0.05), Evidence("f", nees=nees[:48], dof=3), 0.1)
+    early = look(Design(3, lost=0.05), Record("f", nees=nees[:48], dof=3), 0.1)
     assert early.lost.upper > 0.05
     assert early.lost.bound == pytest.approx(float(lost_bound(3, 0.05 / (48 * 49))))
     needed = early.lost.needed
@@ -209,10 +209,10 @@ def test_a_gate_asks_for_runs_that_exclude_the_share(rng: np.random.Generator) -
 def test_a_marker_may_ask(rng: np.random.Generator) -> None:
     error = independent(rng, 110, 6, 3)
     entries: list[Any] = []
-    with watching(Watch({"lost": 0.01}, keep=entries.append)), pytest.raises(InsufficientTrials):
+    with watching(RunningTest({"lost": 0.01}, keep=entries.append)), pytest.raises(InsufficientTrials):
         assert_consistent(error, identities(error), false_alarm=SURE)
     assert entries[0].lost == 0.01
-    with watching(Watch({"lost": 0.01}, budget=1e-3, keep=entries.append)), pytest.raises(InsufficientTrials):
+    with watching(RunningTest({"lost": 0.01}, budget=1e-3, keep=entries.append)), pytest.raises(InsufficientTrials):
         assert_consistent(error, identities(error))
     assert entries[1].lost == 0.01
     assert entries[1].needed == 299

@@ -16,13 +16,12 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.questions.innovations import outliers_of
-from consistency.referee.gating.input_checks import checked
+from consistency.referee.gating.checked_arrays import record_of_checked
 from consistency.referee.readers.formats.position_truth import placeholder
-from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.heading_units import require_radians
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import not_estimated
-from consistency.referee.readers.space_trajectories import AXES, REST
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import AXES, REST, Poses
 from consistency.referee.types import Array
 from consistency.testing import assert_consistent
 
@@ -69,12 +68,12 @@ def test_masks_of_innovations(rng: np.random.Generator) -> None:
     v, S = rng.normal(size=(4, 9, 2)), identities(2, 4, 9)
     given: dict[str, Any] = {"optimal_gain": True, "innovation_covariances": S}
     with pytest.raises(cs.InputError, match=r"innovations, run 1, step 6: 1 of 2 numbers are masked"):
-        checked("f", innovations=np.ma.array(v, mask=partly(v.shape, 1, 5, 0)), **given)
+        record_of_checked("f", innovations=np.ma.array(v, mask=partly(v.shape, 1, 5, 0)), **given)
     given["innovation_covariances"] = np.ma.array(S, mask=partly(S.shape, 1, 5))
-    assert np.argwhere(checked("f", innovations=v, **given).nis_dof == 0).tolist() == [[1, 5]]
+    assert np.argwhere(record_of_checked("f", innovations=v, **given).nis_dof == 0).tolist() == [[1, 5]]
     given["innovation_covariances"] = np.ma.array(S, mask=partly(S.shape, 1, 5, 0))
     with pytest.raises(cs.InputError, match=r"innovation_covariances, run 1, step 6: 2 of 4"):
-        checked("f", innovations=v, **given)
+        record_of_checked("f", innovations=v, **given)
 
 
 @pytest.mark.parametrize("key", ["nis", "nis_dof"])
@@ -82,7 +81,7 @@ def test_a_masked_nis_is_no_innovation(key: str, rng: np.random.Generator) -> No
     given: dict[str, Any] = {"nis": rng.chisquare(2, (3, 9)), "nis_dof": np.full((3, 9), 2)}
     given["nis"][1, 4] = 1e9
     given[key] = np.ma.array(given[key], mask=partly((3, 9), 1, 4))
-    verdict = judge(checked("f", optimal_gain=True, **given))
+    verdict = judge(record_of_checked("f", optimal_gain=True, **given))
     assert verdict.innovations.dof == 2 * 26
     assert verdict.innovations.ratio < 10.0
 
@@ -369,7 +368,7 @@ def test_orders_that_do_not_fit(order: str, said: str, tmp_path: Path) -> None:
 
 
 def of_nis(nis: Array, **settings: Any) -> Any:
-    return judge(checked("f", nis=nis, nis_dof=2, optimal_gain=True), Settings(false_alarm=SURE, **settings))
+    return judge(record_of_checked("f", nis=nis, nis_dof=2, optimal_gain=True), Settings(false_alarm=SURE, **settings))
 
 
 def quantiles(shape: tuple[int, int], scale: float = 1.0) -> Array:
@@ -424,7 +423,9 @@ def test_outliers_beside_errors(rng: np.random.Generator) -> None:
     v = rng.normal(size=(60, 20, 2))
     v[7, 9] = [40.0, 0.0]
     P = identities(2, 60, 20)
-    record = checked("f", rng.normal(size=v.shape), P, innovations=v, innovation_covariances=P, optimal_gain=True)
+    record = record_of_checked(
+        "f", rng.normal(size=v.shape), P, innovations=v, innovation_covariances=P, optimal_gain=True
+    )
     verdict = judge(record, Settings(false_alarm=SURE))
     assert verdict.status == "inconsistent"
     said = "inconsistent: 1 of 1200 innovations is an outlier, in run 7, step 10 (NIS 1600, 2 expected); NIS"

@@ -18,7 +18,7 @@ from consistency.referee.diagnostics import Record, Settings, gate_runs, judge, 
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.gating.session import needed_at
-from consistency.referee.gating.watch import Entry, Watch, watching
+from consistency.referee.gating.watch import Entry, RunningTest, watching
 from consistency.referee.types import Array
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
@@ -170,7 +170,10 @@ def test_a_gate_plans_for_parts_that_share_the_rate(innovations: bool, rng: np.r
     kept: list[Entry] = []
     more: dict[str, Any] = {"nis": rng.chisquare(2, (9, 3)), "nis_dof": 2, "optimal_gain": True} if innovations else {}
     needed = gate_runs(1, 1.5, SURE / (3 + innovations), 0.95)
-    with watching(Watch(keep=kept.append)), pytest.raises(InsufficientTrials, match=f"Simulate {needed} ") as caught:
+    with (
+        watching(RunningTest(keep=kept.append)),
+        pytest.raises(InsufficientTrials, match=f"Simulate {needed} ") as caught,
+    ):
         assert_consistent(error, deviations=np.ones(error.shape), false_alarm=SURE, **more)
     assert caught.value.needed == needed
     assert f"consistency plan --dof 1 --detect 1.5 --false-alarm {SURE / (3 + innovations)!r}" in str(caught.value)

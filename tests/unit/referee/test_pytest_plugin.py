@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from consistency.referee.diagnostics import gate_runs
-from consistency.referee.gating.session import refusal
+from consistency.referee.gating.session import path_fault
 from consistency.referee.gating.watch import FIRST, final_rate, in_place_rate
 
 SAMPLES = '''
@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from consistency.referee.diagnostics import Evidence, compare, judge, summary
+from consistency.referee.diagnostics import Record, compare, judge, summary
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 
@@ -38,7 +38,7 @@ def nees(runs, factor=1.0):
 def nees_with(p, runs):
     """NEES just so much too large that the verdict's p value is p."""
     def excess(log_factor):
-        return np.log(judge(Evidence("", nees=nees(runs, np.exp(log_factor)), dof=3)).p_value / p)
+        return np.log(judge(Record("", nees=nees(runs, np.exp(log_factor)), dof=3)).p_value / p)
     return nees(runs, np.exp(optimize.brentq(excess, 0.01, 1.5)))
 
 
@@ -211,9 +211,9 @@ def test_a_folder_without_leave_is_refused(tmp_path: Path, monkeypatch: pytest.M
     def refuse(**_: Any) -> None:
         raise PermissionError(13, "Permission denied")
 
-    assert refusal(tmp_path / "gates.json") == ""
+    assert path_fault(tmp_path / "gates.json") == ""
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
-    assert "cannot be written (Permission denied); name another file" in refusal(tmp_path / "gates.json")
+    assert "cannot be written (Permission denied); name another file" in path_fault(tmp_path / "gates.json")
 
 
 # --- runs to simulate ----------------------------------------------------------------------------

@@ -16,10 +16,10 @@ from documents import blocks
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
-from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.geometry.groups import carried, composed, matrices, to_left
+from consistency.referee.geometry.groups import composed, matrices, propagated, to_left
 from consistency.referee.readers.relative_motions import Stretch, windows_of
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
@@ -87,7 +87,7 @@ def test_another_world_of_either_changes_no_number_of_poses(group: str, rng: np.
         turned.append(
             replace(
                 run, estimate=vectors(G @ T), truth=vectors(H @ matrices(run.truth)),
-                covariance=carried(J, run.covariance), cross=cross,
+                covariance=propagated(J, run.covariance), cross=cross,
             )
         )  # fmt: skip
     same(statistics(runs, "1", False), statistics(turned, "1", False))
@@ -122,7 +122,7 @@ def test_declared_windows_are_runs(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
 
 
-def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Evidence:
+def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Record:
     """Independent windows of poses, by declaration only; true errors are 3 times what is stated."""
     runs = [pose_stretch(rng, "SE(2)", steps + 1, 5, 9.0, run) for run in range(windows // steps)]
     return world.relative_recording(
@@ -299,7 +299,7 @@ def test_the_command_and_its_report(motion_file: Path, capsys: pytest.CaptureFix
 def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[object], Array]:
     """Motions of a front-end, and true poses (number + 1, 4, 4); errors are of roll, pitch, yaw."""
     from consistency.referee.geometry import rotation
-    from consistency.stereo.visual_odometry.motion import RelativeMotion
+    from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
     from consistency.stereo.visual_odometry.relative_pose import RelativePose
 
     root = np.diag([0.02, 0.01, 0.03, 0.002, 0.004, 0.003]) @ (np.eye(6) + 0.3 * rng.normal(size=(6, 6)))
@@ -360,7 +360,7 @@ def test_a_real_sequence_from_images_to_windows(
 
 def test_the_example_of_the_manual(inside: Path) -> None:
     (example,) = (block.text for block in blocks("docs/files.md", "python") if "wheels" in block.text)
-    names: dict[str, Evidence] = {}
+    names: dict[str, Record] = {}
     exec(example, names)
     verdict = cs.judge(names["record"])
     assert (verdict.runs, verdict.unit, verdict.status) == (60, "window", "consistent")

@@ -15,7 +15,7 @@ from draws import autoregression, independent, verdict_on
 from scipy import optimize, special, stats
 
 from consistency.referee.diagnostics import (
-    Evidence,
+    Record,
     Settings,
     e_process,
     ever,
@@ -537,16 +537,16 @@ def test_a_single_honest_log_is_undecided() -> None:
 def test_nothing_is_shown_by_innovations_that_are_not_judged() -> None:
     rng = np.random.default_rng(34)
     nis, dof = rng.chisquare(2, (40, 50)), np.full((40, 50), 2)
-    assert judge(Evidence("f", nis=nis, nis_dof=dof), Settings(SURE)).status == "undecided"
-    optimal = judge(Evidence("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE))
+    assert judge(Record("f", nis=nis, nis_dof=dof), Settings(SURE)).status == "undecided"
+    optimal = judge(Record("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE))
     assert optimal.status == "consistent"
-    assert judge(Evidence("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE, 1.0001)).status == "undecided"
+    assert judge(Record("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE, 1.0001)).status == "undecided"
 
 
 def test_innovations_of_nearly_the_stated_size_are_tolerated() -> None:
     """4 % too small in 40,000 innovations is found, shown to lie within 1.1 and not within 1.02; no chance in it."""
     nis = 1.04 * stats.chi2.ppf((np.random.default_rng(0).permutation(40_000) + 0.5) / 40_000, 2).reshape(400, 100)
-    evidence = Evidence("f", nis=nis, nis_dof=np.full(nis.shape, 2), optimal_gain=True)
+    evidence = Record("f", nis=nis, nis_dof=np.full(nis.shape, 2), optimal_gain=True)
     assert judge(evidence).status == "overconfident"
     verdict = judge(evidence, Settings(tolerance=1.1))
     assert (verdict.status, verdict.faults) == ("consistent", ())

@@ -14,10 +14,10 @@ import pytest
 from draws import fully_dependent, identities, independent
 from scipy import stats
 
-from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
+from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.faults import bias_text, scale_text, shape_text
-from consistency.referee.diagnostics.words.numbers import plain, short
+from consistency.referee.diagnostics.words.numbers import ratio_text, short
 from consistency.referee.diagnostics.words.sentences import reasons
 from consistency.referee.document.blocks import Quantity
 from consistency.referee.document.verdict import TERMINAL, document, rows
@@ -31,7 +31,7 @@ AXES = ("x", "y", "heading")
 def judged(error: Array, stated: Array | None = None, **settings: object) -> Verdict:
     P = identities(error) if stated is None else np.broadcast_to(stated, (*error.shape, error.shape[-1]))
     axes = AXES[: error.shape[-1]]
-    return judge(Evidence("f", error, P, axes=axes), Settings(**{"false_alarm": SURE} | settings))  # type: ignore[arg-type]
+    return judge(Record("f", error, P, axes=axes), Settings(**{"false_alarm": SURE} | settings))  # type: ignore[arg-type]
 
 
 def correlated(
@@ -80,7 +80,7 @@ def test_a_small_axis_may_be_the_worst(rng: np.random.Generator) -> None:
     assert (judged(error).worst_axis or ("",))[0] == "y"
     assert (judged(error, allow="conservative").worst_axis or ("",))[0] == "heading"
     assert judged(error[..., :1]).worst_axis is None
-    assert judge(Evidence("f", nees=np.square(error).sum(axis=-1), dof=3)).worst_axis is None
+    assert judge(Record("f", nees=np.square(error).sum(axis=-1), dof=3)).worst_axis is None
 
 
 # --- opposite axes -------------------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ def test_an_axis_that_decides_stands_beside_the_status(
     assert verdict.statistics["axis_ratio"] == tuple(interval)
     assert verdict.statistics["ratio"] == verdict.inflation  # of the whole, as ever
     assert dict(rows(verdict))["decided by"].startswith(f"{axis}, {short(interval.value)} [")
-    assert str(cell) == f"{plain(interval)} in {axis}"
+    assert str(cell) == f"{ratio_text(interval)} in {axis}"
 
 
 @pytest.mark.parametrize(("times", "status"), [(8.3, "inconsistent"), (12.0, "heavy-tailed")])
@@ -131,7 +131,7 @@ def test_few_large_errors_do_not_hide_that_the_mean_is_small(times: float, statu
     """Quantiles of chi-square, so that there is no chance in it: most runs are smaller than stated, 15 larger."""
     few, most = (stats.chi2.ppf((np.arange(runs) + 0.5) / runs, 2) for runs in (15, 135))
     nees = 0.36 * np.concatenate([most, times * few])[:, None]
-    verdict = judge(Evidence("f", nees=nees, dof=2), Settings(0.01))
+    verdict = judge(Record("f", nees=nees, dof=2), Settings(0.01))
     assert (verdict.scale.inflation.high < 1.0) == (status == "inconsistent")
     assert verdict.status == status
     if status == "inconsistent":

@@ -17,7 +17,6 @@ from scipy import integrate, stats
 from consistency.bench.runs import sequential
 from consistency.referee.diagnostics import (
     Design,
-    Evidence,
     Record,
     Verdict,
     e_process,
@@ -27,9 +26,9 @@ from consistency.referee.diagnostics import (
     look,
     sequential_design,
 )
-from consistency.referee.diagnostics.planning import e_process as betting
+from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
-from consistency.referee.diagnostics.verdict.verdict import Look, judge_alone
+from consistency.referee.diagnostics.statistics import e_process as betting
 from consistency.referee.types import Array, Failure
 
 SURE = 1e-5
@@ -42,7 +41,7 @@ def inspections(design: Design, count: int) -> list[tuple[int, float | None]]:
 def evidence_from(error: Array, **more: Any) -> Any:
     """The first runs of a filter, as many as asked for."""
     P = identities(error)
-    return lambda runs: Evidence("f", error[:runs], P[:runs], **more)
+    return lambda runs: Record("f", error[:runs], P[:runs], **more)
 
 
 # --- the grid -----------------------------------------------------------------------------------------
@@ -157,7 +156,7 @@ def test_failed_runs_decide_at_once() -> None:
 def test_without_truth_looks_are_at_the_innovations() -> None:
     rng = np.random.default_rng(78)
     nis, dof = 2.0 * rng.chisquare(2, (48, 30)), np.full((48, 30), 2)
-    evidence = Evidence("f", nis=nis, nis_dof=dof, optimal_gain=True)
+    evidence = Record("f", nis=nis, nis_dof=dof, optimal_gain=True)
     design = Design(3, false_alarm=1e-3)
     assert look(design, evidence, None).status == "undecided"
     at_look = look(design, evidence, 1 / 12)
@@ -171,9 +170,9 @@ def test_a_look_inside_judge() -> None:
     """A scale just below and just above its half of the rate."""
     evidence = evidence_from(independent(np.random.default_rng(79), 24, 6, 3))(24)
     design = Design(3, false_alarm=0.01)
-    found = judge_alone(evidence, design.settings, Look(None, 0.00499))
+    found = findings_of(evidence, design.settings, Inspection(None, 0.00499))
     assert found.faults == ("scale",)
-    assert judge_alone(evidence, design.settings, Look(None, 0.00501)).faults == ()
+    assert findings_of(evidence, design.settings, Inspection(None, 0.00501)).faults == ()
 
 
 # --- until decided -------------------------------------------------------------------------------------
@@ -210,7 +209,7 @@ def test_a_limit_is_not_exceeded() -> None:
     error = independent(np.random.default_rng(82), 400, 2, 3)
     asked: list[int] = []
 
-    def evidence(runs: int) -> Evidence:
+    def evidence(runs: int) -> Record:
         asked.append(runs)
         return evidence_from(error)(runs)
 
@@ -241,11 +240,11 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPa
     calls: list[tuple[str, int]] = []
     script = {("early", 12): "overconfident", ("late", 24): "conservative"}
 
-    def verdict_at(design: Design, evidence: Evidence, spent: float | None) -> Verdict:
+    def verdict_at(design: Design, evidence: Record, spent: float | None) -> Verdict:
         runs = len(evidence.run_numbers)
         calls.append((evidence.name, runs))
         status = script.get((evidence.name, runs), "consistent" if evidence.name == "early" else "undecided")
-        return Verdict(evidence.name, status, (f"{status}: at {runs}",), runs, 1, design.settings)
+        return Verdict(evidence.name, status, runs, 1, design.settings, reasons=(f"{status}: at {runs}",))
 
     monkeypatch.setattr(sequential, "look", verdict_at)
     monkeypatch.setattr(sequential, "speaks", lambda design, evidence, spent: spent is not None)
@@ -372,7 +371,7 @@ def test_ever_is_the_inverse_of_the_largest_value() -> None:
 
 
 def test_what_was_seen_is_not_forgotten() -> None:
-    """Evidence against a fault that comes later does not take an earlier finding back."""
+    """Record against a fault that comes later does not take an earlier finding back."""
     bet = e_process(np.concatenate([np.full(20, 2.0), np.full(200, 0.9)]), 3)
     assert ever(bet.up) < 1e-4
     assert bet.up[-1] < 1.0

@@ -15,7 +15,7 @@ from scipy import signal, stats
 from single_log import errors
 
 import consistency as cs
-from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
+from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.planning.single_log import (
     APART,
     MOST,
@@ -27,7 +27,6 @@ from consistency.referee.diagnostics.planning.single_log import (
 from consistency.referee.diagnostics.questions.independence import ALIKE, ENOUGH, FEWEST, RATE, SIZES, independence
 from consistency.referee.diagnostics.questions.lost_runs import early_ends
 from consistency.referee.diagnostics.verdict.answers import BIAS
-from consistency.referee.diagnostics.verdict.as_dictionary import flat
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import analyse
@@ -38,7 +37,7 @@ SURE = 1e-5
 
 def log_of(rng: np.random.Generator, rho: float, steps: int, n: int = 3, ratio: float = 1.0) -> Verdict:
     e = np.sqrt(ratio) * errors(rng, rho, steps, n)[None]
-    return judge(Evidence("log", e, np.broadcast_to(np.eye(n), (*e.shape, n))), Settings(SURE))
+    return judge(Record("log", e, np.broadcast_to(np.eye(n), (*e.shape, n))), Settings(SURE))
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
@@ -101,12 +100,12 @@ def test_a_long_log_is_to_be_cut(rng: np.random.Generator) -> None:
     assert found.pieces == 50
     assert any("cut into 50 runs, this log would then probably decide" in reason for reason in verdict.reasons)
     cut = errors(rng, 0.5, 20_000, 3).reshape(50, 400, 3)
-    assert judge(Evidence("cut", cut, np.broadcast_to(np.eye(3), (50, 400, 3, 3))), Settings(SURE)).consistent
+    assert judge(Record("cut", cut, np.broadcast_to(np.eye(3), (50, 400, 3, 3))), Settings(SURE)).consistent
 
 
 def test_several_runs_have_no_such_line(rng: np.random.Generator) -> None:
     e = errors(rng, 0.5, 400, 3).reshape(2, 200, 3)
-    verdict = judge(Evidence("two", e, np.broadcast_to(np.eye(3), (2, 200, 3, 3))), Settings(SURE))
+    verdict = judge(Record("two", e, np.broadcast_to(np.eye(3), (2, 200, 3, 3))), Settings(SURE))
     assert verdict.scale.within is None
     assert not any("decorrelate" in reason for reason in verdict.reasons)
 
@@ -143,18 +142,18 @@ def test_relative_poses_are_named_where_they_would_help(tmp_path: Path, rng: np.
 N = 2
 
 
-def log(rng: np.random.Generator, steps: int, rho: float = 0.0, constant: float = 0.0, ratio: float = 1.0) -> Evidence:
+def log(rng: np.random.Generator, steps: int, rho: float = 0.0, constant: float = 0.0, ratio: float = 1.0) -> Record:
     """Errors AR(rho) beside an error that has a share ``constant`` of the variance and is the same in all steps."""
     w = rng.standard_normal((steps, N))
     w[1:] *= np.sqrt(1.0 - rho**2)
     e = np.sqrt(1.0 - constant) * signal.lfilter([1.0], [1.0, -rho], w, axis=0)
     e += np.sqrt(constant) * rng.standard_normal((1, N))
     P = np.broadcast_to(np.eye(N), (1, steps, N, N))
-    return Evidence("log", np.sqrt(ratio) * e[None], P, axes=("x", "y"), t=np.arange(float(steps)))
+    return Record("log", np.sqrt(ratio) * e[None], P, axes=("x", "y"), t=np.arange(float(steps)))
 
 
-def of(array: Array, name: str = "log") -> Evidence:
-    return Evidence(name, array, np.broadcast_to(np.eye(array.shape[-1]), (*array.shape, array.shape[-1])))
+def of(array: Array, name: str = "log") -> Record:
+    return Record(name, array, np.broadcast_to(np.eye(array.shape[-1]), (*array.shape, array.shape[-1])))
 
 
 def test_pieces_are_rows_of_the_log() -> None:
@@ -240,11 +239,11 @@ def test_growing_errors_are_refused() -> None:
     one = log(np.random.default_rng(7), 2000)
     growing = np.linspace(0.1, 3.0, 2000)[None, :, None, None] * np.eye(N)
     with pytest.raises(cs.InputError, match=r"the stated variance of x grows by x.* over the log.* --relative 10s"):
-        in_pieces(Evidence("log", one.error, growing, axes=("x", "y")))
+        in_pieces(Record("log", one.error, growing, axes=("x", "y")))
     outage = np.where(np.arange(2000) >= 1890, 9.0, 1.0)[None, :, None, None] * np.eye(N)
-    assert in_pieces(Evidence("log", one.error, outage, axes=("x", "y"))).unit == "piece"
+    assert in_pieces(Record("log", one.error, outage, axes=("x", "y"))).unit == "piece"
     shrinking = growing[:, ::-1]
-    assert in_pieces(Evidence("log", one.error, shrinking, axes=("x", "y"))).unit == "piece"
+    assert in_pieces(Record("log", one.error, shrinking, axes=("x", "y"))).unit == "piece"
 
 
 def test_what_is_refused() -> None:
@@ -261,7 +260,7 @@ def test_steps_before_the_first_covariance_are_in_no_piece() -> None:
     one = of(np.random.default_rng(9).standard_normal((1, 1010, N)))
     P = np.asarray(one.covariance).copy()
     P[0, :10] = np.nan
-    r = in_pieces(Evidence("log", one.error, P), 25)
+    r = in_pieces(Record("log", one.error, P), 25)
     np.testing.assert_array_equal(r.error.reshape(-1, N), one.error[0, 10:])
 
 
@@ -412,13 +411,13 @@ def test_runs_that_end_lost_are_named_and_others_are_not(rng: np.random.Generato
     """100 runs that end where the NEES is beyond its 5 % point, certain but for 1e-5; 60 gates of any lengths."""
     nees = runs(rng, 100, 60)
     ended = np.cumsum(nees > stats.chi2.isf(0.05, 3), axis=1) - (nees > stats.chi2.isf(0.05, 3)) > 0
-    verdict = judge(Evidence("f", nees=np.where(ended, np.nan, nees), dof=3))
+    verdict = judge(Record("f", nees=np.where(ended, np.nan, nees), dof=3))
     assert verdict.ends.lost
     assert "that end early have a larger NEES in their last step than" in verdict.reasons[1]
-    assert flat(verdict)["early_ends"]["lost"]
-    whole = judge(Evidence("f", nees=nees, dof=3))
+    assert verdict.statistics["early_ends"]["lost"]
+    whole = judge(Record("f", nees=nees, dof=3))
     assert whole.ends is None
-    assert "early_ends" not in flat(whole)
+    assert "early_ends" not in whole.statistics
     lost = 0
     for _ in range(60):
         nees, length = runs(rng, 25, 20), rng.integers(1, 21, 25)

@@ -14,7 +14,6 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.referee.diagnostics import Record
-from consistency.referee.diagnostics.records.large_arrays import Symmetric
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped, skip_of, without_first
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -211,7 +210,7 @@ def test_a_baseline_holds_what_it_was_written_with(archive: Path, tmp_path: Path
 def test_records_of_two_errors() -> None:
     """Errors stay, and so does the error of the filter's own; what they are held against is left out."""
     shape = (2, 4)
-    P, own = Symmetric.filled(shape, 3, 1.0), Symmetric.filled(shape, 3, 2.0)
+    P, own = np.full((*shape, 3, 3), 1.0), np.full((*shape, 3, 3), 2.0)
     numbers = np.ones(shape)
     error = np.ones((*shape, 3))
     c = Record(
@@ -220,12 +219,12 @@ def test_records_of_two_errors() -> None:
     )  # fmt: skip
     rest = c.without_first(Skip(2.0, "s"))
     world = rest.in_world
-    for values in (rest.nees, rest.nis, rest.covariance.entry(0, 1), world.nees, world.covariance.entry(2, 2)):
+    for values in (rest.nees, rest.nis, rest.covariance[..., 0, 1], world.nees, world.covariance[..., 2, 2]):
         np.testing.assert_array_equal(np.isnan(values), [[True, True, False, False]] * 2)
     np.testing.assert_array_equal(rest.nis_dof, [[0, 0, 1, 1]] * 2)
     assert rest.nis_dof.dtype == np.int64
     assert rest.error is world.error is error
-    assert np.isfinite(P.entry(0, 0)).all()
+    assert np.isfinite(P).all()
     with pytest.raises(InputError, match="--skip 4: nothing of f is left"):
         c.without_first(Skip(4))
 

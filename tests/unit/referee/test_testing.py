@@ -18,7 +18,7 @@ from draws import autoregression
 
 import consistency as cs
 from consistency.referee.diagnostics import gate_runs
-from consistency.referee.gating.input_checks import checked, planned_dof
+from consistency.referee.gating.checked_arrays import planned_dof, record_of_checked
 from consistency.referee.types import Array
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
@@ -213,7 +213,7 @@ def test_innovations_end_with_a_failed_run(rng: np.random.Generator) -> None:
     v, S = rng.normal(size=(RUNS, 8, 2)), np.broadcast_to(np.eye(2), (RUNS, 8, 2, 2)).copy()
     S[4, 7], v[4, 7, 0] = -1.0, np.nan
     for step, arrays in ((7, {"nis": nis, "nis_dof": 2}), (8, {"innovations": v, "innovation_covariances": S})):
-        record = checked("f", errors, covariances, **arrays)
+        record = record_of_checked("f", errors, covariances, **arrays)
         assert np.isnan(record.nis[4]).tolist() == [False] * 6 + [True] * 2
         assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
         with pytest.raises(ConsistencyError, match="1 of"):
@@ -226,12 +226,12 @@ def test_innovations_of_a_start_without_rank(rng: np.random.Generator) -> None:
     """Left out where every run begins so; a run that alone does has failed."""
     v, S = rng.normal(size=(40, 8, 2)), np.broadcast_to(np.eye(2), (40, 8, 2, 2)).copy()
     S[:, 0] = 0.0
-    record = checked("f", innovations=v, innovation_covariances=S, **OPTIMAL)
+    record = record_of_checked("f", innovations=v, innovation_covariances=S, **OPTIMAL)
     assert record.failures == ()
     assert np.isnan(record.innovations[:, 0]).all()
     assert np.isfinite(record.innovations[:, 1:]).all()
     S[:, 0], S[6, 0] = np.eye(2), 0.0
-    failures = checked("f", innovations=v, innovation_covariances=S, **OPTIMAL).failures
+    failures = record_of_checked("f", innovations=v, innovation_covariances=S, **OPTIMAL).failures
     assert [(failure.run, failure.step) for failure in failures] == [(6, 1)]
 
 
@@ -265,7 +265,7 @@ def test_runs_fail_by_their_innovations(what: str, reason: str, rng: np.random.G
     assert verdict.innovations.dof == 2 * (40 * 50 - 2 * 44) - 80 * (what == "masked")
     assert verdict.innovations.ratio == pytest.approx(1.0, abs=0.2)  # of the rest; 6 standard errors
     errors, covariances = spoilt("", rng, 40)
-    own = checked("f", errors, covariances, innovations=v[:, :8], innovation_covariances=S[:, :8])
+    own = record_of_checked("f", errors, covariances, innovations=v[:, :8], innovation_covariances=S[:, :8])
     assert np.isnan(own.nees).sum(axis=1).tolist() == [2 * (run in (4, 9)) for run in range(40)]
     assert [(each.run, each.step) for each in own.failures] == [(4, 7), (9, 7)]
 
@@ -273,7 +273,7 @@ def test_runs_fail_by_their_innovations(what: str, reason: str, rng: np.random.G
 def test_nis_count_nothing_from_the_failure_of_their_run_on(rng: np.random.Generator) -> None:
     nis = rng.chisquare(2, (20, 8))
     nis[4, 6] = np.nan
-    record = checked("f", nis=nis, nis_dof=2, optimal_gain=True)
+    record = record_of_checked("f", nis=nis, nis_dof=2, optimal_gain=True)
     assert [(each.run, each.step) for each in record.failures] == [(4, 7)]
     assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
     assert (np.delete(record.nis_dof, 4, axis=0) == 2).all()
@@ -283,7 +283,7 @@ def test_a_run_fails_where_anything_of_it_failed_first(rng: np.random.Generator)
     errors, covariances = spoilt("error", rng, 20)  # run 4 in step 7
     v, S = rng.normal(size=(20, 8, 1)), np.ones((20, 8, 1, 1))
     S[4, 2], S[3, 7] = -1.0, np.nan
-    record = checked("f", errors, covariances, innovations=v, innovation_covariances=S)
+    record = record_of_checked("f", errors, covariances, innovations=v, innovation_covariances=S)
     assert [(each.run, each.step, "innovation" in each.reason) for each in record.failures] == [
         (3, 8, True),
         (4, 3, True),
@@ -306,7 +306,7 @@ def test_misuse_of_innovations_is_no_failed_run(rng: np.random.Generator) -> Non
     refused("innovations, step 6: not finite in any run", never, S)
     known = S.copy()
     known[:, 0] = 0.0  # a start that is known exactly, and a measurement without noise
-    record = checked("f", innovations=v, innovation_covariances=known, optimal_gain=True)
+    record = record_of_checked("f", innovations=v, innovation_covariances=known, optimal_gain=True)
     assert record.failures == ()
     assert record.nis_dof[0].tolist() == [0] + [2] * 7
 
@@ -460,6 +460,6 @@ def test_results_need_a_filter_and_bring_the_rest(stereo: cs.Results) -> None:
 
 def test_a_run_is_planned_for_the_fewest_degrees_of_freedom() -> None:
     nis_dof = np.array([[2, 2, 0], [2, 2, 2]])
-    record = checked("f", nis=np.where(nis_dof, 2.0, np.nan), nis_dof=nis_dof, optimal_gain=True)
+    record = record_of_checked("f", nis=np.where(nis_dof, 2.0, np.nan), nis_dof=nis_dof, optimal_gain=True)
     assert planned_dof(record) == 4
-    assert planned_dof(checked("f", nis=np.ones((2, 3)), nis_dof=2, nees=np.ones((2, 3)), dof=5)) == 5
+    assert planned_dof(record_of_checked("f", nis=np.ones((2, 3)), nis_dof=2, nees=np.ones((2, 3)), dof=5)) == 5

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from command import consistency, refused
 from draws import autoregression
+from painted import lines, panels
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
+from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
     contrasts,
     of_both,
     uncertain_truth,
     upper_weights,
 )
-from consistency.referee.document.drawing import Line
-from consistency.referee.pages.files_report import record_figures
+from consistency.referee.pages.record_figures import record_figures
 from consistency.referee.types import Array
 
 RUNS, STEPS, N = 50, 8, 3
@@ -57,13 +57,13 @@ def errors_of_truth(rng: np.random.Generator, kind: str, runs: int, steps: int) 
 def record(
     rng: np.random.Generator, kind: str, s: float, ratio: float = 1.0, errors: str | None = None, runs: int = RUNS,
     steps: int = STEPS, shared: bool = False,
-) -> Evidence:  # fmt: skip
+) -> Record:  # fmt: skip
     """Errors of a filter whose covariance is wrong by ``ratio``, against a truth of the share s."""
     of_truth = truth_of_share(s)
     e = np.sqrt(ratio) * autoregression(rng, runs, steps, N, 0.5) @ np.linalg.cholesky(P).T
     d = e + errors_of_truth(rng, kind, runs, steps) @ np.linalg.cholesky(of_truth).T
     shape = (runs, steps, N, N)
-    return Evidence(
+    return Record(
         "est", d, np.broadcast_to(P, shape), axes=("x", "y", "z"), truth_covariance=np.broadcast_to(of_truth, shape),
         truth_errors=errors, truth_shared=shared,
     )  # fmt: skip
@@ -88,7 +88,7 @@ def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherw
     """The error that all runs share has s = .3: an honest filter is biased if the truth is said to be independent."""
     rng = np.random.default_rng(5)
     one = record(rng, "common", 0.3, errors="independent")
-    wrong = judge(Evidence("est", one.error + 1.5, one.covariance, truth_covariance=one.truth_covariance,
+    wrong = judge(Record("est", one.error + 1.5, one.covariance, truth_covariance=one.truth_covariance,
                            truth_errors="independent"))  # fmt: skip
     assert "bias" in wrong.faults
     assert not judge(record(np.random.default_rng(5), "common", 0.3, errors="common")).faults
@@ -99,7 +99,7 @@ def test_a_bias_beyond_the_truth_is_found(errors: str | None) -> None:
     rng = np.random.default_rng(8)
     one = record(rng, "common", 0.2, errors=errors)
     far = 6.0 * np.sqrt(np.diag(truth_of_share(0.2)))
-    v = judge(Evidence("est", one.error + far, one.covariance, axes=one.axes, truth_covariance=one.truth_covariance,
+    v = judge(Record("est", one.error + far, one.covariance, axes=one.axes, truth_covariance=one.truth_covariance,
                        truth_errors=errors))  # fmt: skip
     assert v.status == "biased"
     assert {"bias", "bias in some step"} <= set(v.faults)
@@ -142,13 +142,13 @@ def test_a_share_of_an_axis_is_of_that_axis() -> None:
 def test_consistent_needs_the_interval_of_the_estimate() -> None:
     """At s = .45 the sum lies in [1 / 1.5, 1.5] where P is off by x1.7."""
     v = judge(record(np.random.default_rng(1), "white", 0.45, 1.0, "independent", runs=30, steps=1))
-    plain = judge(Evidence("est", *_sum(record(np.random.default_rng(1), "white", 0.45, 1.0, runs=30, steps=1))))
+    plain = judge(Record("est", *_sum(record(np.random.default_rng(1), "white", 0.45, 1.0, runs=30, steps=1))))
     assert v.equivalence.p_value > plain.equivalence.p_value
     sure = judge(record(np.random.default_rng(1), "white", 0.2, 1.0, "independent", runs=200))
     assert sure.status == "consistent"
 
 
-def _sum(one: Evidence) -> tuple[Array, Array]:
+def _sum(one: Record) -> tuple[Array, Array]:
     assert one.error is not None
     return one.error, np.asarray(one.covariance) + one.truth_covariance
 
@@ -175,13 +175,13 @@ def test_words_name_the_share_and_the_option() -> None:
     assert any("20 % of the sum of both (x " in line and "--truth-errors" in line for line in v.reasons)
     declared = judge(record(np.random.default_rng(2), "white", 0.2, errors="per-run"))
     assert any("declared per-run" in line for line in declared.reasons)
-    exact = judge(Evidence("est", *_sum(record(np.random.default_rng(2), "white", 0.2))))
+    exact = judge(Record("est", *_sum(record(np.random.default_rng(2), "white", 0.2))))
     assert not any("truth" in line for line in exact.reasons)
 
 
 def test_json_gains_keys_only() -> None:
     one = record(np.random.default_rng(2), "white", 0.2, errors="per-run")
-    new, old = judge(one).statistics, judge(Evidence("est", *_sum(one), axes=one.axes)).statistics
+    new, old = judge(one).statistics, judge(Record("est", *_sum(one), axes=one.axes)).statistics
     assert set(new) - set(old) == {"truth_share", "truth_share_of_axes", "truth_errors", "truth_shared"}
     assert not set(old) - set(new)
 
@@ -194,8 +194,8 @@ def test_pictures_are_of_both_covariances() -> None:
     figures = record_figures(replace(one, t=np.arange(float(STEPS)), dof=N), v)
     assert {figure.title for figure in figures} == {"Errors and stated bounds", "NEES", "Coverage"}
     assert all(figure.caption.endswith("Covariances are those of estimate and truth together.") for figure in figures)
-    (bounds,) = [mark.bound for mark in figures[0].panels[0].marks if isinstance(mark, Line) and mark.bound is not None]
-    np.testing.assert_allclose(bounds, 2.0 * np.sqrt((P + truth_of_share(0.2))[0, 0]))
+    (below,) = lines(panels(figures[0])[0], "2-sigma bounds")
+    np.testing.assert_allclose(-below.get_ydata(), 2.0 * np.sqrt((P + truth_of_share(0.2))[0, 0]))
     assert of_both(drawn) is drawn
 
 

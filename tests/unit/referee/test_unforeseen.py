@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.referee.cli import main
+from consistency.commands import main
 from consistency.referee.parsing import reading
 
 POSES = (
@@ -45,7 +45,7 @@ def test_positions_alone_are_no_truth_of_planar_poses(
 def test_an_unforeseen_exception_ends_in_2_with_its_kind_and_place(
     capsys: pytest.CaptureFixture[str], error: Exception, debug: bool
 ) -> None:
-    with mock.patch("consistency.referee.cli.app.app", side_effect=error):
+    with mock.patch("consistency.commands.app.app", side_effect=error):
         assert ended(*["--debug"] * debug, "plan") == 2
     said = capsys.readouterr().err
     last = said.splitlines()[-1]
@@ -60,7 +60,7 @@ def test_debug_stands_before_any_command(capsys: pytest.CaptureFixture[str]) -> 
     assert "runs" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", [NameError, UnboundLocalError])
+@pytest.mark.parametrize("kind", [NameError, UnboundLocalError, TypeError, AttributeError, IndexError])
 def test_a_programming_error_of_ours_is_not_reworded(kind: type[Exception]) -> None:
     code = compile(
         "def parse():\n    raise KIND('ours')", str(Path(cs.__file__).parent / "referee" / "some.py"), "exec"

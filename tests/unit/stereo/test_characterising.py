@@ -17,11 +17,11 @@ from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
-from consistency.stereo.characterising.bias import estimate_bias, grid_of, shrunken
+from consistency.stereo.characterising.bias_map import estimate_bias, grid_of, shrunken
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.coordinate_fit import Levels, rate, ratios, tails
+from consistency.stereo.characterising.coordinate_fit import Levels, moving_over_rest, rate, tails
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Parameters, Rows, fit, regress
-from consistency.stereo.characterising.residuals import Residuals, octaves, residuals_of, select
+from consistency.stereo.characterising.log_residuals import Residuals, octaves, residuals_of, select
 
 LEVEL = 1e-7
 SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=150.0, B=0.09, disparity=(1.0, 32.0), image=(320, 240))
@@ -156,7 +156,7 @@ def test_a_fit_is_the_top_of_the_likelihood(rng: np.random.Generator) -> None:
 
 def test_noise_memory_and_offsets_are_told_apart(rng: np.random.Generator) -> None:
     found = fit(rows_of(rng, 400, 25, 1.5, 0.5, 0.9), 1.0)
-    assert coordinate_fit.noise(found, LEVEL).holds(1.5)
+    assert coordinate_fit.noise_interval(found, LEVEL).holds(1.5)
     assert coordinate_fit.correlation(found, LEVEL).holds(0.5)
     assert coordinate_fit.correlation(found, LEVEL).low > 0.3
     assert coordinate_fit.offset_share(found, LEVEL).holds(0.81 / (0.81 + 2.25))
@@ -180,7 +180,9 @@ def test_intervals_of_heavy_tailed_noise_are_wider(rng: np.random.Generator) -> 
     rows = rows_of(rng, 1000, 10)
     heavy = Rows(stats.t.rvs(6, size=10_000, random_state=rng), *list(vars(rows).values())[1:])
     found = [fit(each, 1.0) for each in (rows, heavy)]
-    width = [np.log(coordinate_fit.noise(f, 0.01).high / coordinate_fit.noise(f, 0.01).low) for f in found]
+    width = [
+        np.log(coordinate_fit.noise_interval(f, 0.01).high / coordinate_fit.noise_interval(f, 0.01).low) for f in found
+    ]
     assert 1.2 < width[1] / width[0] < 3.0
     assert np.isclose(found[1].robust[0, 0] / found[1].cov[0, 0], 2.5, rtol=0.6)
 
@@ -225,12 +227,12 @@ def test_a_rate_has_the_interval_of_clopper_and_pearson() -> None:
 def test_noise_that_doubles_while_moving_has_a_ratio_of_two(rng: np.random.Generator) -> None:
     moving = np.arange(6000) < 3000
     w = rng.standard_normal((6000, 3)) * np.where(moving, 2.0, 1.0)[:, None]
-    found = ratios(w, np.ones((6000, 3)), moving, np.arange(6000) // 20, LEVEL)
+    found = moving_over_rest(w, np.ones((6000, 3)), moving, np.arange(6000) // 20, LEVEL)
     assert len(found) == 3
     for each in found:
         assert each.holds(2.0)
         assert not each.holds(1.5)
-    assert ratios(w, np.ones((6000, 3)), np.ones(6000, bool), np.arange(6000), LEVEL) == ()
+    assert moving_over_rest(w, np.ones((6000, 3)), np.ones(6000, bool), np.arange(6000), LEVEL) == ()
 
 
 # --- residuals and their selection -------------------------------------------------------------------
@@ -321,7 +323,7 @@ def test_a_bias_scatters_as_tracks_do_where_offsets_are_not_modelled(rng: np.ran
     """40 tracks of 50 rows with offsets: 1 / 40 of their variance, 40 times what independent rows would have."""
     rows = rows_of(rng, 40, 50, 0.5, 0.0, 1.0)
     found = fit(rows, 1.0, memory=False)
-    _, half, cov = coordinate_fit.bias(found, 0.01)
+    _, half, cov = coordinate_fit.bias_coefficients(found, 0.01)
     assert 10.0 < cov[0, 0] / found.regression.cov[0, 0] < 120.0
     assert np.isclose(half[0], stats.t.isf(0.005, 39) * np.sqrt(cov[0, 0]), rtol=1e-6)
 

@@ -7,11 +7,11 @@ import pytest
 
 import consistency as cs
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import ConsensusError, RelativePose, StereoRig, register_ransac, triangulate
-from consistency.stereo.visual_odometry.input_errors import MatchError
-from consistency.stereo.visual_odometry.motion import MotionSettings, RelativeMotion, estimate_motion
+from consistency.stereo.visual_odometry.cameras.input_errors import MatchError
 from consistency.stereo.visual_odometry.odometry import bridged
+from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion, estimate_motion
 from consistency.stereo.visual_odometry.resection import inliers_within, resect_ransac, squared_reprojections
+from consistency.vision import ConsensusError, RelativePose, StereoRig, register_ransac, triangulate
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scripts
 
-from consistency.stereo.visual_odometry import RelativePose
+from consistency.vision import RelativePose
 
 figures = scripts.experiment("front_end_figures")
 

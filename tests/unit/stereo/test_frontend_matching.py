@@ -10,7 +10,6 @@ import pytest
 import consistency as cs
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import StereoRig
 from consistency.stereo.visual_odometry.features import (
     Features,
     StereoFeatures,
@@ -22,6 +21,7 @@ from consistency.stereo.visual_odometry.features import (
     opencv,
     stereo_matches,
 )
+from consistency.vision import StereoRig
 
 K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
 RECTIFIED = StereoRig(K, K, np.eye(3), np.array([0.5, 0.0, 0.0]), (1200, 360))

@@ -28,11 +28,11 @@ from consistency.stereo.frontend.planar_log import (
     relative,
     robot_axes,
 )
-from consistency.stereo.visual_odometry import ConsensusError, RelativePose, relative_motion
-from consistency.stereo.visual_odometry.motion import ESTIMATORS, MotionSettings, RelativeMotion
 from consistency.stereo.visual_odometry.odometry import trajectory, visual_odometry
+from consistency.stereo.visual_odometry.relative_motion import ESTIMATORS, MotionSettings, RelativeMotion
 from consistency.stereo.visual_odometry.sequence import read_sequence
 from consistency.stereo.visual_odometry.tracks import linked
+from consistency.vision import ConsensusError, RelativePose, relative_motion
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 ROOT = Path(__file__).parents[3]

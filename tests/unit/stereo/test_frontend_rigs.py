@@ -23,11 +23,11 @@ from consistency.referee.readers.formats.kitti_files import drive_poses
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
 from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import plane_of
-from consistency.stereo.visual_odometry import RelativePose
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
 from consistency.stereo.visual_odometry.cameras.camera_pair import rectify
-from consistency.stereo.visual_odometry.motion import RelativeMotion
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.sequence import read_sequence
+from consistency.vision import RelativePose
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 FULL = (SIZE[0] + 40, SIZE[1] + 20)  # px of unrectified images

@@ -18,8 +18,8 @@ from consistency.stereo.rendered_images.calibration import (
 )
 from consistency.stereo.rendered_images.camera import StereoCamera
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Chain, Tracks
-from consistency.stereo.rendered_images.protocols import Stops, stand
 from consistency.stereo.rendered_images.stages import Spread
+from consistency.stereo.rendered_images.stops import Stops, stand
 
 NODES = np.array([2.25, 6.0, 10.0, 13.5])
 U, V = np.array([-90.0, 0.0, 90.0]), np.array([-90.0, 0.0, 90.0])

@@ -21,10 +21,9 @@ from consistency.stereo.rendered_images.chain import (
     Chain,
     Tracks,
     at_junction,
-    joined,
+    join_tracks,
     stage,
 )
-from consistency.stereo.rendered_images.protocols import Stops, pose_at, stand, wall_texture
 from consistency.stereo.rendered_images.render import film
 from consistency.stereo.rendered_images.scene import Layer, Plain, RandomTexture, Scene
 from consistency.stereo.rendered_images.stages import (
@@ -43,6 +42,7 @@ from consistency.stereo.rendered_images.stages import (
     dissimilarity,
     patches,
 )
+from consistency.stereo.rendered_images.stops import Stops, pose_at, stand, wall_texture
 
 pytest.importorskip("cv2")
 
@@ -252,7 +252,7 @@ def test_the_crossing_of_a_pole_and_an_edge_is_no_rigid_point() -> None:
 def test_joined_tracks_keep_their_own_numbers() -> None:
     scene = wall()
     parts = [Chain().run(film(scene, CAMERA, [np.zeros(6)], np.random.default_rng(k)), scene, CAMERA) for k in range(2)]
-    both = joined(parts)
+    both = join_tracks(parts)
     assert len(np.unique(both.track)) == sum(len(np.unique(part.track)) for part in parts)
     assert both.sequence.tolist() == [0] * len(parts[0]) + [1] * len(parts[1])
     np.testing.assert_array_equal(both.z, np.concatenate([part.z for part in parts]))

@@ -13,7 +13,7 @@ from scripts import experiment
 import consistency as cs
 from consistency.bench.scenario import PicturedSensor
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.residuals import Residuals
+from consistency.stereo.characterising.log_residuals import Residuals
 
 SIGMA = (0.2, 0.15, 0.3)
 

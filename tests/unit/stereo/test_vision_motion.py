@@ -8,8 +8,14 @@ from rigs import MOTION, RIG
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import StereoRig, triangulate, triangulation_covariance
-from consistency.stereo.visual_odometry.motion import ESTIMATORS, MotionSettings, disparities, estimate_motion, usable
+from consistency.stereo.visual_odometry.relative_motion import (
+    ESTIMATORS,
+    MotionSettings,
+    disparities,
+    estimate_motion,
+    usable,
+)
+from consistency.vision import StereoRig, triangulate, triangulation_covariance
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 EQUATIONS = {"reprojection": 5, "svd": 3, "horn": 3}  # of a point: eight pixels less its position, or three coordinates

@@ -11,15 +11,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.stereo.visual_odometry import (
-    GimbalLockError,
-    RelativePose,
-    compose,
-    invert,
-    register_svd,
-    registration_covariance,
-)
 from consistency.stereo.visual_odometry.relative_pose import rotation_derivatives
+from consistency.vision import GimbalLockError, RelativePose, compose, invert, register_svd, registration_covariance
 
 Array = np.ndarray[Any, Any]
 A = np.array([0.3, -0.2, 0.9, 0.5, -0.7, 2.0])

@@ -9,7 +9,8 @@ import pytest
 from rigs import MOTION, RIG
 
 from consistency.referee.errors import InputError
-from consistency.stereo.visual_odometry import (
+from consistency.stereo.visual_odometry import maximum_likelihood as module
+from consistency.vision import (
     ConvergenceError,
     DegenerateError,
     PointError,
@@ -22,7 +23,6 @@ from consistency.stereo.visual_odometry import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.visual_odometry import maximum_likelihood as module
 
 Array = np.ndarray[Any, Any]
 S = 0.25 * np.eye(4)

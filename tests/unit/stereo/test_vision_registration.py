@@ -12,7 +12,9 @@ from rigs import MOTION
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.stereo.visual_odometry import (
+from consistency.stereo.visual_odometry import registration
+from consistency.stereo.visual_odometry.registration import squared_distances
+from consistency.vision import (
     ConsensusError,
     ConvergenceError,
     DegenerateError,
@@ -21,10 +23,8 @@ from consistency.stereo.visual_odometry import (
     register_ransac,
     register_svd,
     register_weighted,
-    registration,
     registration_covariance,
 )
-from consistency.stereo.visual_odometry.registration import squared_distances
 
 Array = np.ndarray[Any, Any]
 BOTH = pytest.mark.parametrize("register", [register_svd, register_horn])

@@ -11,13 +11,7 @@ from hypothesis import strategies as st
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
-from consistency.stereo.visual_odometry import (
-    PointError,
-    StereoRig,
-    triangulable,
-    triangulate,
-    triangulation_covariance,
-)
+from consistency.vision import PointError, StereoRig, triangulable, triangulate, triangulation_covariance
 
 Array = np.ndarray[Any, Any]
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])

@@ -13,10 +13,10 @@ import consistency as cs
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import posterior
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import RelativePose, StereoRig, refine_reprojection
-from consistency.stereo.visual_odometry.motion import RelativeMotion, diagonal
 from consistency.stereo.visual_odometry.odometry import bridged
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, diagonal_covariances
 from consistency.stereo.visual_odometry.shared import RIG, SHARED, SharedError, fit_shared, perturbed, sensitivities
+from consistency.vision import RelativePose, StereoRig, refine_reprojection
 
 K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
 ROTATED = Rotation.from_rotvec([0.01, -0.02, 0.005]).as_matrix()
@@ -54,7 +54,7 @@ def test_a_wrong_rig_errs_by_its_derivative(name: str, rng: np.random.Generator)
     change = 0.01 * PRIOR[k] * np.eye(RIG)[k]
     J = sensitivities(TURNED, motions, 0.1 * np.arange(4.0))
     for m, derivative in zip(motions, J, strict=True):
-        S = diagonal(m.sigma0)
+        S = diagonal_covariances(m.sigma0)
         wrong = refine_reprojection(perturbed(TURNED, change), m.uv0, m.uv1, m.pose, S, robust="cauchy").pose
         error = difference(wrong, m.pose)
         expected = derivative[:, :RIG] @ change
@@ -111,7 +111,7 @@ def test_a_bridge_errs_as_its_neighbours_do(rng: np.random.Generator) -> None:
 
 def remeasured(m: RelativeMotion, change: Array) -> RelativeMotion:
     """The same pixels, with a rig that is ``change`` (7,) off."""
-    S = diagonal(m.sigma0)
+    S = diagonal_covariances(m.sigma0)
     pose = refine_reprojection(perturbed(TURNED, change), m.uv0, m.uv1, m.pose, S, robust="cauchy").pose
     return dataclasses.replace(m, pose=pose)
 

@@ -38,11 +38,11 @@ def folder() -> Path:
     return Path(base) / "filter-consistency"
 
 
-def place(key: str) -> Path:
+def code_path(key: str) -> Path:
     return folder() / f"{key}{SUFFIX}"
 
 
-def read(path: Path, tell: bool = False) -> bytes | None:
+def read_code(path: Path, tell: bool = False) -> bytes | None:
     """What a file keeps; None where it is absent, damaged, or could have been written by somebody else.
 
     With ``tell``, what is wrong is said on stderr.
@@ -68,7 +68,7 @@ def read(path: Path, tell: bool = False) -> bytes | None:
     return payload
 
 
-def write(path: Path, payload: bytes) -> bool:
+def write_code(path: Path, payload: bytes) -> bool:
     """Keep this, whole or not at all; False where the folder does not take it, which is said once."""
     try:
         _make(path.parent)
@@ -89,7 +89,7 @@ def write(path: Path, payload: bytes) -> bool:
     return True
 
 
-def refusal() -> str:
+def folder_fault() -> str:
     """Why the folder takes no compiled code; empty where it does, and then it is there."""
     where = folder()
     try:

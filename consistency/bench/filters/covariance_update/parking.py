@@ -1,7 +1,7 @@
 """Landmarks that have not been seen for a while stay in the frame of a clone of the pose.
 
 Nothing moves them there, so that they and the clones are the passive part of a state that is updated locally
-(:mod:`consistency.filters.covariance_update.local`): the active part is the robot, the landmarks in use, and what
+(:mod:`consistency.bench.filters.covariance_update.local`): the active part is the robot, the landmarks in use, and what
 was seen again since the split. A clone is Exp(xi) T with the pose T at which it was made and xi in the state, so that
 what a step says of it is a sum.
 """

@@ -63,7 +63,7 @@ def invariant_pose_covariance(error: InvariantPose, x: Array, P: Array, out: Arr
 def bend(C: Array) -> None:
     """``C`` (3, 3) <- second moments of Exp(xi) T about T, from the covariance of its additive error to first order.
 
-    The equations are those of :func:`consistency.filters.textbook.inverse_range.moments`.
+    The equations are those of :func:`consistency.bench.filters.textbook.inverse_range.pose_moments`.
     """
     s = C[2, 2]
     if s <= 0.0:

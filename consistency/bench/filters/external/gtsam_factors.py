@@ -53,7 +53,7 @@ def landmark_key(label: int) -> int:
     return int(gtsam.symbol("l", label))
 
 
-def factor(keys: Sequence[int], sigmas: Array, error: Error) -> gtsam.CustomFactor:
+def custom_factor(keys: Sequence[int], sigmas: Array, error: Error) -> gtsam.CustomFactor:
     """A factor with an error of vectors (3,); a sigma of 0 makes a constraint."""
 
     def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -96,7 +96,7 @@ class PlanarStereo:
             by_before[:2, 2] = way[1], -way[0]
             return way - told, [by_before, by_after] if step > 1 else [by_after]
 
-        return factor([pose_key(k) for k in (step - 1, step) if k > 0], sigmas, error)
+        return custom_factor([pose_key(k) for k in (step - 1, step) if k > 0], sigmas, error)
 
     # --- observation -----------------------------------------------------------------------------
 
@@ -136,7 +136,7 @@ class PlanarStereo:
             blocks[np.arange(len(labels))[:, None], rows] = by_landmark / sigmas[:, :, None]
             return ((expected - aim) / sigmas).ravel(), [(by_q @ by_pose / sigmas[:, :, None]).reshape(n, 3), *blocks]
 
-        return factor([pose_key(step), *map(landmark_key, labels)], np.ones(n), error)
+        return custom_factor([pose_key(step), *map(landmark_key, labels)], np.ones(n), error)
 
     def scaled(self, pose: Array, landmarks: Array, origins: Array) -> tuple[Array, Array, Array, Array]:
         """Landmarks (m, 3) in the frame of the sensor, times their inverse range: finite however far they are.

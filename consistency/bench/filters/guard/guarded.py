@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from consistency.bench.filters.guard.plain_rules import kept, limits_of
+from consistency.bench.filters.guard.plain_rules import kept_observations, limits_of
 from consistency.bench.protocols import Filter, Problem
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Control, Gaussian, Info, Observation
@@ -63,7 +63,9 @@ class Guarded:
         keep = np.array([self._is_offered(state, label) for label in labels], dtype=bool)
         known, info = self._known(state, observation, keep)
         if info is not None:
-            keep[known] = kept(self.kind, info.innovation, info.S, s, limits_of(state.settings, s, len(known)))
+            keep[known] = kept_observations(
+                self.kind, info.innovation, info.S, s, limits_of(state.settings, s, len(known))
+            )
         misses = state.misses | {labels[i]: 0 if keep[i] else state.misses.get(labels[i], 0) + 1 for i in known}
         agreed = {labels[i] for i in known if keep[i]}
         begun = {label: at for label, at in state.begun.items() if label not in agreed}

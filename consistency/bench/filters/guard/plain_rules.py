@@ -63,7 +63,7 @@ def _quantiles(confidence: float, s: int, m: int) -> tuple[float, ...]:
     return 0.0, *map(float, 2.0 * special.gammaincinv(0.5 * s * np.arange(1, m + 1), confidence))
 
 
-def kept(kind: str, y: Array, S: Array, s: int, limits: Limits) -> Array:
+def kept_observations(kind: str, y: Array, S: Array, s: int, limits: Limits) -> Array:
     """Which observations (m,) a guard of this kind keeps, of an innovation y (s m,) with covariance S (s m, s m).
 
     Raises
@@ -71,7 +71,7 @@ def kept(kind: str, y: Array, S: Array, s: int, limits: Limits) -> Array:
     numpy.linalg.LinAlgError
         The covariance of some observations is not positive definite.
     """
-    own = np.array([distance(y, S, rows_of([i], s)) for i in range(len(y) // s)])
+    own = np.array([distance(y, S, component_rows([i], s)) for i in range(len(y) // s)])
     passed = own <= limits.own
     if kind == "gate":
         return passed
@@ -81,7 +81,7 @@ def kept(kind: str, y: Array, S: Array, s: int, limits: Limits) -> Array:
     return keep
 
 
-def rows_of(which: list[int] | Indices, s: int) -> Indices:
+def component_rows(which: list[int] | Indices, s: int) -> Indices:
     """Rows (s k,) of k observations in an innovation."""
     return (s * np.asarray(which, np.int64)[:, None] + np.arange(s)).ravel()
 
@@ -92,7 +92,7 @@ def distance(y: Array, S: Array, rows: Indices) -> float:
     return float(white @ white)
 
 
-def given(y: Array, S: Array, rows: Indices, known: Indices) -> float:
+def conditional_distance(y: Array, S: Array, rows: Indices, known: Indices) -> float:
     """Squared distance of ``rows`` after an update with the rows ``known``."""
     W = np.linalg.solve(S[np.ix_(known, known)], S[np.ix_(known, rows)]).T
     left, among = y[rows] - W @ y[known], S[np.ix_(rows, rows)] - W @ S[np.ix_(known, rows)]
@@ -120,7 +120,7 @@ def largest_compatible(y: Array, S: Array, s: int, own: Array, candidates: Indic
             nodes += 1
             if nodes > MOST_NODES:
                 return
-            far = distance(y, S, rows_of(branch, s)) if branch is more else total
+            far = distance(y, S, component_rows(branch, s)) if branch is more else total
             most = len(branch) + len(order) - level - 1
             if (most, -far) > (best[0], -best[1]) and far <= limits.joint[most]:
                 follow(branch, far, level + 1)
@@ -134,12 +134,16 @@ def best_supported(y: Array, S: Array, s: int, own: Array, candidates: Indices, 
     best: tuple[int, float, list[int]] = (0, 0.0, [])
     for i in candidates:
         support = [
-            int(j) for j in candidates if j == i or given(y, S, rows_of([j], s), rows_of([i], s)) <= limits.support
+            int(j)
+            for j in candidates
+            if j == i or conditional_distance(y, S, component_rows([j], s), component_rows([i], s)) <= limits.support
         ]
         if (len(support), -own[i]) > (best[0], -best[1]):
             best = (len(support), own[i], support)
     low = best[2]
     rescued = [
-        int(j) for j in candidates if j not in low and given(y, S, rows_of([j], s), rows_of(low, s)) <= limits.own
+        int(j)
+        for j in candidates
+        if j not in low and conditional_distance(y, S, component_rows([j], s), component_rows(low, s)) <= limits.own
     ]
     return np.array(low + rescued, np.int64)

@@ -1,4 +1,7 @@
-"""EKF-SLAM on anchored inverse depths, compiled. Equations and source: :mod:`consistency.filters.textbook.anchored`."""
+"""EKF-SLAM on anchored inverse depths, compiled.
+
+Equations and source: :mod:`consistency.bench.filters.textbook.anchored`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Equivariant filter SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.equivariant`."""
+"""Equivariant filter SLAM, compiled. Equations and source: :mod:`consistency.bench.filters.textbook.equivariant`."""
 
 from __future__ import annotations
 

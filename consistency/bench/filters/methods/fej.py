@@ -1,4 +1,6 @@
-"""EKF-SLAM with first-estimates Jacobians, compiled. Equations and source: :mod:`consistency.filters.textbook.fej`.
+"""EKF-SLAM with first-estimates Jacobians, compiled.
+
+Equations and source: :mod:`consistency.bench.filters.textbook.fej`.
 
 First-estimates Jacobians, Huang, Mourikis & Roumeliotis (2010), "Observability-based rules ...", IJRR 29(5).
 

@@ -1,4 +1,4 @@
-"""The ideal EKF, compiled. Equations and source: :mod:`consistency.filters.textbook.ideal`."""
+"""The ideal EKF, compiled. Equations and source: :mod:`consistency.bench.filters.textbook.ideal`."""
 
 from __future__ import annotations
 

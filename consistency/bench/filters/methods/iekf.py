@@ -1,4 +1,4 @@
-"""Iterated EKF-SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.iekf`."""
+"""Iterated EKF-SLAM, compiled. Equations and source: :mod:`consistency.bench.filters.textbook.iekf`."""
 
 from __future__ import annotations
 

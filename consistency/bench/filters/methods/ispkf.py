@@ -1,4 +1,4 @@
-"""Iterated sigma points, compiled. Equations and source: :mod:`consistency.filters.textbook.ispkf`."""
+"""Iterated sigma points, compiled. Equations and source: :mod:`consistency.bench.filters.textbook.ispkf`."""
 
 from __future__ import annotations
 

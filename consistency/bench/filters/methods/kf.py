@@ -1,4 +1,4 @@
-"""The linear Kalman filter, compiled. Equations and source: :mod:`consistency.filters.textbook.kf`."""
+"""The linear Kalman filter, compiled. Equations and source: :mod:`consistency.bench.filters.textbook.kf`."""
 
 from __future__ import annotations
 

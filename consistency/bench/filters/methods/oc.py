@@ -1,4 +1,4 @@
-"""Observability-constrained EKF-SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.oc`.
+"""Observability-constrained EKF-SLAM, compiled. Equations and source: :mod:`consistency.bench.filters.textbook.oc`.
 
 Points nearest to the estimates under which a turn of robot and map stays unobserved.
 

@@ -1,4 +1,4 @@
-"""Right-invariant EKF-SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.riekf`."""
+"""Right-invariant EKF-SLAM, compiled. Equations and source: :mod:`consistency.bench.filters.textbook.riekf`."""
 
 from __future__ import annotations
 

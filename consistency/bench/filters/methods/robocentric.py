@@ -1,6 +1,6 @@
 """Robot-centred EKF-SLAM in inverse range, compiled.
 
-Equations and source: :mod:`consistency.filters.textbook.robocentric`.
+Equations and source: :mod:`consistency.bench.filters.textbook.robocentric`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""EKF-SLAM on triangulated points, compiled. Equations and source: :mod:`consistency.filters.textbook.triangulated`."""
+"""EKF-SLAM on triangulated points, compiled.
+
+Equations and source: :mod:`consistency.bench.filters.textbook.triangulated`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""UKF-SLAM and cubature SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.ukf`."""
+"""UKF-SLAM and cubature SLAM, compiled. Equations and source: :mod:`consistency.bench.filters.textbook.ukf`."""
 
 from __future__ import annotations
 

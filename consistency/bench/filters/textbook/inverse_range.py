@@ -1,6 +1,6 @@
 """Geometry and conversion of a robot-centred map of inverse ranges, in plain NumPy.
 
-The methods and their sources are in :mod:`consistency.filters.textbook.robocentric`.
+The methods and their sources are in :mod:`consistency.bench.filters.textbook.robocentric`.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def curvature(
     return np.asarray(0.5 * np.square(noise) * np.stack([of_drive, of_turn], axis=2))
 
 
-def moved(pose: Array, xi: Array) -> Array:
+def moved_pose(pose: Array, xi: Array) -> Array:
     """Exp(xi) T of a pose (3,), with xi = (x, y, angle) in SE(2)."""
     angle = xi[2]
     along = np.sinc(angle / np.pi)
@@ -126,7 +126,7 @@ def moved(pose: Array, xi: Array) -> Array:
     return np.array([*(heading_matrix(angle)[:2, :2] @ pose[:2] + V @ xi[:2]), pose[2] + angle])
 
 
-def moments(C: Array) -> Array:
+def pose_moments(C: Array) -> Array:
     """Second moments (3, 3) of Exp(xi) T about T, from the covariance C (3, 3) of the additive error to first order.
 
     With xi = M (d, t), Exp(xi) moves the position by V(t) d, d = k t + w, where w does not depend on the turn t, and
@@ -160,7 +160,7 @@ def left_jacobian(xi: Array) -> Array:
     return np.asarray(np.eye(3) + ad / 2.0 + ad @ ad / 6.0)
 
 
-def apart(poses: Array, xi: Array, recency: bool = False) -> tuple[Array, Array]:
+def poses_moved(poses: Array, xi: Array, recency: bool = False) -> tuple[Array, Array]:
     """Poses (k, 3) moved by errors (k, 3), each Exp(xi) T; d error about the moved ones / d xi, (3 k, 3 k).
 
     With ``recency`` the last pose is moved by the noise of its last motion, whose errors come after all older ones:
@@ -169,7 +169,7 @@ def apart(poses: Array, xi: Array, recency: bool = False) -> tuple[Array, Array]
     J = np.array([left_jacobian(x) for x in xi])
     if recency:
         J[-1] = np.eye(3)
-    return np.array([moved(pose, x) for pose, x in zip(poses, xi, strict=True)]), block_diag(*J)
+    return np.array([moved_pose(pose, x) for pose, x in zip(poses, xi, strict=True)]), block_diag(*J)
 
 
 def chained(poses: Array, xi: Array, on: int) -> tuple[Array, Array]:
@@ -190,7 +190,7 @@ def chained(poses: Array, xi: Array, on: int) -> tuple[Array, Array]:
         rows[j, :, 3 * j : 3 * j + 3] += B
         if j > 0:
             rows[j, :, 3 * last : 3 * last + 3] -= B
-        E[j] = moved(before, M @ step)
+        E[j] = moved_pose(before, M @ step)
         out[j] = [*(E[j, :2] + heading_matrix(E[j, 2])[:2, :2] @ pose[:2]), E[j, 2] + pose[2]]
     return out, rows.reshape(xi.size, xi.size)
 
@@ -224,7 +224,7 @@ def imaged(y: Array, sensor: BelievedSensor) -> Array:
     return np.where(((ca > BESIDE) & (ce > BESIDE))[:, None], z, np.nan)
 
 
-def bias(z: Array, sensor: BelievedSensor) -> Array:
+def conversion_bias(z: Array, sensor: BelievedSensor) -> Array:
     """Mean of the conversion less the conversion of the mean, (m, 3), by three points in u and in v."""
     b = np.zeros(z.shape)
     for axis in range(2):
@@ -285,5 +285,5 @@ def observed(
         z[:, 2], variance[:, 2] = untruncated(z[:, 2], at[:, 2], sigma, (low - shift, high - shift))
     y, J = converted(z, sensor)[0], converted(at if which.prediction else z, sensor)[1]
     if which.debiasing:
-        y -= bias(z, sensor)
+        y -= conversion_bias(z, sensor)
     return y, (J * variance[:, None]) @ np.swapaxes(J, 1, 2)

@@ -48,14 +48,14 @@ from consistency.bench.filters.believed_noise import bias_at, variance_at
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.inverse_range import (
     Corrections,
-    apart,
-    bias,
     carried,
     chained,
+    conversion_bias,
     converted,
     curvature,
-    moments,
     observed,
+    pose_moments,
+    poses_moved,
     searched,
 )
 from consistency.bench.filters.textbook.robocentric_state import (
@@ -67,12 +67,12 @@ from consistency.bench.filters.textbook.robocentric_state import (
     expectation,
     indices_of,
     moved_by,
+    point_in_world,
     settled_clones,
     shifts_of,
     with_parked,
     without_block,
     without_idle_clones,
-    world_point,
 )
 from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.protocols import Problem
@@ -186,7 +186,7 @@ class RobotCentredKalman:
         is_parked = np.array([label in state.parked for label in seen])
         in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
         new = np.array([state.step - state.seen[label] > 1 for label in seen])
-        separate = partial(apart, recency=self.which.recency)
+        separate = partial(poses_moved, recency=self.which.recency)
         attempts: list[tuple[Chart, int]] = [(separate, PASSES if self.which.iteration and is_parked.any() else 1)]
         if self.which.turning and in_doubt.any():
             state = settled_clones(state)
@@ -259,7 +259,7 @@ class RobotCentredKalman:
         sensor, n = state.problem.belief.sensor, len(state.x)
         (y,), (J,) = converted(z[None], sensor)
         if self.which.debiasing:
-            y = y - bias(z[None], sensor)[0]
+            y = y - conversion_bias(z[None], sensor)[0]
         P = np.zeros((n + 3, n + 3))
         P[:n, :n], P[n:, n:] = state.P, J @ variance_at(z[None], sensor).reshape(3, 3) @ J.T
         return replace(state, x=np.append(state.x, y), P=P, places=state.places | {label: n})
@@ -270,14 +270,14 @@ class RobotCentredKalman:
 
     def pose(self, state: CentredState) -> Gaussian:
         P = state.P[:3, :3]
-        return Gaussian(state.x[:3], moments(P) if self.which.moments else P)
+        return Gaussian(state.x[:3], pose_moments(P) if self.which.moments else P)
 
     def map(self, state: CentredState) -> dict[int, Gaussian]:
-        points = {label: world_point(state, label) for label in state.places}
+        points = {label: point_in_world(state, label) for label in state.places}
         return {label: Gaussian(point, D @ state.P @ D.T) for label, (point, D) in points.items()}
 
     def joint(self, state: CentredState) -> Gaussian:
-        points = [world_point(state, label) for label in state.places]
+        points = [point_in_world(state, label) for label in state.places]
         mean = np.concatenate([state.x[:3], *(point for point, _ in points)])
         D = np.vstack([np.eye(3, len(state.x)), *(D for _, D in points)])
         return Gaussian(mean, D @ state.P @ D.T)

@@ -1,6 +1,6 @@
 """State of a robot-centred map, and its steps: landmarks are parked at clones of the pose, and activated again.
 
-The method is in :mod:`consistency.filters.textbook.robocentric`.
+The method is in :mod:`consistency.bench.filters.textbook.robocentric`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from consistency.bench.filters.textbook.inverse_range import apart, carried, left_jacobian, moved, rays, shift_matrix
+from consistency.bench.filters.textbook.inverse_range import (
+    carried,
+    left_jacobian,
+    moved_pose,
+    poses_moved,
+    rays,
+    shift_matrix,
+)
 from consistency.bench.filters.textbook.sensors import heading_matrix, mounted
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
@@ -35,7 +42,7 @@ class CentredState:
     origins: dict[int, Array] = field(default_factory=dict)  # pose T (3,) of each, which is Exp(xi) T
 
 
-def block(at: int) -> slice:
+def block_at(at: int) -> slice:
     """Places of the three numbers from ``at`` on."""
     return slice(at, at + 3)
 
@@ -43,7 +50,7 @@ def block(at: int) -> slice:
 def moved_by(state: CentredState, delta: Array) -> CentredState:
     """The state moved by an error (n,): the pose by Exp, all else by a sum."""
     x = state.x + delta
-    x[:3] = moved(state.x[:3], delta[:3])
+    x[:3] = moved_pose(state.x[:3], delta[:3])
     return replace(state, x=x)
 
 
@@ -62,7 +69,7 @@ def charted(state: CentredState, delta: Array, chart: Chart) -> tuple[CentredSta
 
 def settled_clones(state: CentredState) -> CentredState:
     """Every clone at the pose it has, with the covariance of the error about that."""
-    after, C = charted(state, np.zeros(len(state.x)), apart)
+    after, C = charted(state, np.zeros(len(state.x)), poses_moved)
     return replace(after, P=C @ state.P @ C.T)
 
 
@@ -86,15 +93,15 @@ def shifts_of(state: CentredState) -> Array:
 
 def clone_of(state: CentredState, number: int) -> tuple[slice, Array, Array]:
     """Where a clone is in the state, its pose (3,), and d xi about that pose / d xi about its origin (3, 3)."""
-    at = block(state.clones[number])
-    return at, moved(state.origins[number], state.x[at]), left_jacobian(state.x[at])
+    at = block_at(state.clones[number])
+    return at, moved_pose(state.origins[number], state.x[at]), left_jacobian(state.x[at])
 
 
 def expectation(state: CentredState, seen: list[int]) -> tuple[Array, Array]:
     """What is expected of landmarks, (m, 3), and its Jacobian (3 m, n), by xi of the pose about this state."""
     h, H = np.zeros((len(seen), 3)), np.zeros((3 * len(seen), len(state.x)))
     for i, label in enumerate(seen):
-        rows, at = block(3 * i), block(state.places[label])
+        rows, at = block_at(3 * i), block_at(state.places[label])
         if label not in state.parked:
             h[i], H[rows, at] = state.x[at], np.eye(3)
             continue
@@ -122,7 +129,7 @@ def activated(state: CentredState, labels: list[int]) -> CentredState:
     x, T = state.x.copy(), np.eye(len(state.x))
     M = shift_matrix(x[:3])
     for label in labels:
-        at, (clone, pose, J) = block(state.places[label]), clone_of(state, state.parked[label])
+        at, (clone, pose, J) = block_at(state.places[label]), clone_of(state, state.parked[label])
         x[at], T[at, at], by_shift = seen_from(state, pose, state.x[at])
         T[at, clone], T[at, :3] = by_shift @ J, -by_shift @ M
     parked = {label: number for label, number in state.parked.items() if label not in labels}
@@ -131,7 +138,7 @@ def activated(state: CentredState, labels: list[int]) -> CentredState:
 
 def without_block(state: CentredState, gone: int) -> CentredState:
     """The state without the block at ``gone``."""
-    keep = np.delete(np.arange(len(state.x)), block(gone))
+    keep = np.delete(np.arange(len(state.x)), block_at(gone))
 
     def moved_up(places: dict[int, int]) -> dict[int, int]:
         return {key: at - 3 if at > gone else at for key, at in places.items() if at != gone}
@@ -162,9 +169,9 @@ def with_parked(state: CentredState, unseen: int) -> CentredState:
     )  # fmt: skip
 
 
-def world_point(state: CentredState, label: int) -> tuple[Array, Array]:
+def point_in_world(state: CentredState, label: int) -> tuple[Array, Array]:
     """A landmark as a point (3,) in the world, m, and its Jacobian (3, n)."""
-    at, frame, pose, to_shift = block(state.places[label]), slice(0, 3), state.x[:3], shift_matrix(state.x[:3])
+    at, frame, pose, to_shift = block_at(state.places[label]), slice(0, 3), state.x[:3], shift_matrix(state.x[:3])
     if label in state.parked:
         frame, pose, to_shift = clone_of(state, state.parked[label])
     offset, axes = mounted(state.problem.belief.sensor)

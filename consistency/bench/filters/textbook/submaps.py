@@ -60,7 +60,7 @@ class SubmapKalman:
     def update(self, state: Maps, observation: Observation) -> tuple[Maps, Info]:
         small, info = self.small.update(state.small, observation)
         state = replace(state, small=small)
-        return (self._begun(joined(state)) if state.steps == self.steps else state), info
+        return (self._begun(joined_map(state)) if state.steps == self.steps else state), info
 
     def forget(self, state: Maps, landmark: int) -> Maps:
         large, small = (
@@ -73,7 +73,7 @@ class SubmapKalman:
         return basics.pose_of(in_world(state))
 
     def map(self, state: Maps) -> dict[int, Gaussian]:
-        return basics.map_of(joined(state))
+        return basics.map_of_state(joined_map(state))
 
     def _begun(self, large: SlamState) -> Maps:
         return Maps(large, self.small.init(replace(large.problem, start=np.zeros(3))))
@@ -97,7 +97,7 @@ def in_world(state: Maps) -> SlamState:
     return replace(large, x=np.concatenate(x), P=P, landmarks=large.landmarks + small.landmarks)
 
 
-def joined(state: Maps) -> SlamState:
+def joined_map(state: Maps) -> SlamState:
     """The large map with what the small one has, every landmark once."""
     both, first = in_world(state), len(state.large.landmarks)
     shared = [label for label in state.small.landmarks if label in state.large.landmarks]

@@ -6,7 +6,7 @@ docs/extending.md shows how to add one.
 
 from consistency.bench.scenario.effects.built_in import FieldOfView, Noise, SearchRange
 from consistency.bench.scenario.effects.distortion import Distortion
-from consistency.bench.scenario.effects.effect import EFFECTS, ListedEffect, register
+from consistency.bench.scenario.effects.effect import EFFECTS, ListedEffect, register_effect
 from consistency.bench.scenario.effects.gross_errors import HeavyTails as HeavyTails
 from consistency.bench.scenario.effects.gross_errors import Mismatch as Mismatch
 from consistency.bench.scenario.effects.gross_errors import Swap as Swap
@@ -36,5 +36,5 @@ __all__ = [
     "Noise",
     "Observations",
     "SearchRange",
-    "register",
+    "register_effect",
 ]

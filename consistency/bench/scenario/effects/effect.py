@@ -10,7 +10,7 @@ from pydantic import Field, ModelWrapValidatorHandler, TypeAdapter, model_valida
 from pydantic_core import PydanticCustomError
 
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Table
+from consistency.bench.scenario.tables.toml_tables import Table
 
 E = TypeVar("E", bound="ListedEffect")
 
@@ -72,7 +72,7 @@ class UvdEffect(ListedEffect):
 EFFECTS: dict[str, type[ListedEffect]] = {}  # by kind
 
 
-def register(effect: type[E]) -> type[E]:
+def register_effect(effect: type[E]) -> type[E]:
     """Decorator that makes the kind of an effect known to scenarios."""
     EFFECTS[effect.model_fields["kind"].default] = effect
     return effect

@@ -7,12 +7,12 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import model_validator
 
-from consistency.bench.scenario.effects.effect import ListedEffect, UvdEffect, register
+from consistency.bench.scenario.effects.effect import ListedEffect, UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import NO_LANDMARK, Context, Observations
-from consistency.bench.scenario.toml_tables import NonNegative, Positive, Rate
+from consistency.bench.scenario.tables.toml_tables import NonNegative, Positive, Rate
 
 
-@register
+@register_effect
 class Mismatch(UvdEffect):
     """With probability ``rate`` an observation has a disparity that says nothing of its landmark.
 
@@ -41,7 +41,7 @@ class Mismatch(UvdEffect):
         return observations.with_z(z, source)
 
 
-@register
+@register_effect
 class HeavyTails(UvdEffect):
     """A contaminated normal (Tukey 1960): some observations have a second Gaussian error beside their noise.
 
@@ -62,7 +62,7 @@ class HeavyTails(UvdEffect):
         return observations.with_z(z)
 
 
-@register
+@register_effect
 class Swap(ListedEffect):
     """With probability ``rate`` an observation carries what was measured of another id in the same step.
 

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from consistency.bench.models import point, stereo
-from consistency.bench.scenario.effects.effect import UvdEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Count, Positive, Rate
+from consistency.bench.scenario.tables.toml_tables import Count, Positive, Rate
 from consistency.referee.types import Array
 
 
@@ -25,7 +25,7 @@ class Crossings:
     by_far: Array  # (J,), whether the matcher takes the disparity of the far edge
 
 
-@register
+@register_effect
 class Junction(UvdEffect):
     """``count`` apparent crossings of a near vertical and a far horizontal edge, each of which is tracked as a corner.
 

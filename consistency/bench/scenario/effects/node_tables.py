@@ -8,9 +8,9 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from consistency.bench.scenario.effects.effect import UvdEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Finite, Positive, Table
+from consistency.bench.scenario.tables.toml_tables import Finite, Positive, Table
 from consistency.referee.types import Array
 
 Nodes = Annotated[tuple[Finite, ...], Field(min_length=1)]
@@ -93,7 +93,7 @@ def _between(x: Array, nodes: tuple[float, ...]) -> tuple[Array, Array, Array]:
     return before, np.minimum(before + 1, len(nodes) - 1), (place - before)[..., None]
 
 
-@register
+@register_effect
 class LocalBias(UvdEffect, BiasMap):
     """Adds the bias of a :class:`BiasMap` at the ideal (u, v) to each observation.
 

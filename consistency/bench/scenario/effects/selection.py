@@ -7,13 +7,13 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from consistency.bench.scenario.effects.effect import UvdEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Count, NonNegative, Positive
+from consistency.bench.scenario.tables.toml_tables import Count, NonNegative, Positive
 from consistency.referee.types import Array, Indices
 
 
-@register
+@register_effect
 class Selection(UvdEffect):
     """At most ``count`` tracks at a time. One that is chosen is kept until it is not seen for ``forget_steps``.
 

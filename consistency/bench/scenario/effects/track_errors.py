@@ -7,13 +7,13 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from consistency.bench.scenario.effects.effect import UvdEffect, register
+from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import NO_LANDMARK, Context, Observations
-from consistency.bench.scenario.toml_tables import NonNegative, Positive, Rate
+from consistency.bench.scenario.tables.toml_tables import NonNegative, Positive, Rate
 from consistency.referee.types import Array, Indices
 
 
-@register
+@register_effect
 class TrackError(UvdEffect):
     """A first-order Gauss-Markov error along each track, stationary from its first step on.
 
@@ -39,7 +39,7 @@ class TrackError(UvdEffect):
         return observations.with_z(observations.z + error[age, track] * self.sigma)
 
 
-@register
+@register_effect
 class Drift(UvdEffect):
     """In each step of a track, with probability ``rate``, the tracker loses its feature and starts to slide.
 

@@ -7,13 +7,13 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.effect import ListedEffect, register_effect
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Count, Finite
+from consistency.bench.scenario.tables.toml_tables import Count, Finite
 from consistency.referee.types import Array
 
 
-@register
+@register_effect
 class Occlusion(ListedEffect):
     """``walls``, [x0, y0, x1, y1] in m, are upright and of any height; a landmark is hidden where one stands before it.
 
@@ -49,7 +49,7 @@ def _side(a: Array, b: Array, p: Array) -> Array:
     return left
 
 
-@register
+@register_effect
 class Frames(ListedEffect):
     """Images come after ``every`` steps, whose numbers are taken in turn; in the steps between nothing is seen.
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import optimize
@@ -13,19 +12,16 @@ from scipy import optimize
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.questions.bias import hotelling, t_squared
 from consistency.referee.diagnostics.questions.equivalence import equivalence, equivalent
+from consistency.referee.diagnostics.questions.sample import Sample, sample_of
 from consistency.referee.diagnostics.questions.scale import scale_test
 from consistency.referee.diagnostics.questions.shape import weighted_chi_square_tail
-from consistency.referee.diagnostics.records.sample import Sample, sample_of
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES, least
-from consistency.referee.diagnostics.verdict.fault_location import accuracy_of, bias_of
-from consistency.referee.diagnostics.verdict.parts import Equivalence, Interval, Settings, TruthShare, Verdict
-from consistency.referee.diagnostics.words.headline import at_share
+from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES, at_share, least_of_steps
+from consistency.referee.diagnostics.verdict.parts import Answer, Equivalence, ErrorParts, Interval, TruthShare
+from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.types import Array
-
-if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.record import Record
 
 DECLARED = ("independent", "per-run", "common")  # how errors of the truth depend on each other
 MOST = 0.5  # share of the truth in both covariances beyond which nothing is decided
@@ -61,7 +57,9 @@ class UncertainTruth:
     @property
     def _together(self) -> float:
         """Factor by which both covariances grow if e and v may depend on each other."""
-        return SHARED if self.record.truth_shared else 1.0
+        if self.record.truth_shared:
+            return SHARED
+        return 1.0
 
     @property
     def contrasted(self) -> bool:
@@ -104,7 +102,9 @@ class UncertainTruth:
         """Those of S^-1/2 P_t S^-1/2 of some components, means over the steps of each run, (runs, k), descending."""
         some = np.ix_(index, index)
         counted = self.total.counted
-        S, T = ((M[counted][:, some[0], some[1]]) for M in (self.P + self.P_t, self.P_t))
+        rows, columns = some
+        T = self.P_t[counted][:, rows, columns]
+        S = self.P[counted][:, rows, columns] + T
         L = np.linalg.cholesky(S)
         half = np.linalg.solve(L, T)
         values = np.full((*counted.shape, len(index)), np.nan)
@@ -124,7 +124,9 @@ class UncertainTruth:
     def share(self, group: str = MAIN) -> float:
         """s of a group: the part of P_t in both covariances; NaN where nothing is judged."""
         values = self.by_group[group]
-        return float(values.mean()) if len(values) else float("nan")
+        if not len(values):
+            return float("nan")
+        return float(values.mean())
 
     @property
     def unjudged(self) -> str:
@@ -145,10 +147,19 @@ class UncertainTruth:
         bias = self._bias()
         if self.contrasted:
             return dict(p_values) | bias
-        p = {key: above if settings.one_sided else min(1.0, 2.0 * min(above, below))
-             for key, (above, below) in self.tails.items()}  # fmt: skip
-        axes = [value for key, value in p.items() if key != MAIN]
-        return {MAIN: p[MAIN], AXIS: least(np.array(axes))[0] if self.total.dof > 1 else float("nan")} | bias
+        of_axes, of_all = [], float("nan")
+        for key, (above, below) in self.tails.items():
+            p = above
+            if not settings.one_sided:
+                p = min(1.0, 2.0 * min(above, below))
+            if key == MAIN:
+                of_all = p
+            else:
+                of_axes.append(p)
+        of_axis = float("nan")
+        if self.total.dof > 1:
+            of_axis, _ = least_of_steps(np.array(of_axes))
+        return {MAIN: of_all, AXIS: of_axis} | bias
 
     @cached_property
     def tails(self) -> Mapping[str, tuple[float, float]]:
@@ -185,16 +196,22 @@ class UncertainTruth:
         if runs.sum() <= self.total.dof:
             return dict.fromkeys(BIAS, float("nan"))
         error = np.where(counted[..., None], e.error, np.nan)
-        P, T = (np.where(counted[..., None, None], M, np.nan).reshape(*counted.shape, -1) for M in (self.P, self.P_t))
-        mean, stated, of_truth = (mean_of_runs(M)[runs].mean(axis=0) for M in (error, P, T))
-        mean_k, stated_k, of_truth_k = (mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, T))
+        P, P_t = self._counted_entries(self.P), self._counted_entries(self.P_t)
         spread = hotelling(mean_of_runs(e.whitened)[runs]).p_value
-        p = {BIAS[0]: max(spread, float(self._allowed(mean, stated, of_truth, np.array(runs.sum()))))}
+        mean, stated, of_truth = (mean_of_runs(M)[runs].mean(axis=0) for M in (error, P, P_t))
+        allowed = self._allowed(mean, stated, of_truth, np.array(runs.sum()))
+        p = {BIAS[0]: max(spread, float(allowed))}
         if len(steps) > 1:
             _, spreads = t_squared(e.whitened[:, steps])
-            allowed = self._allowed(mean_k, stated_k, of_truth_k, counted.sum(axis=0)[steps])
-            p[BIAS[1]] = least(np.maximum(spreads, allowed))[0]
+            mean, stated, of_truth = (mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, P_t))
+            in_steps = self._allowed(mean, stated, of_truth, counted.sum(axis=0)[steps])
+            p[BIAS[1]], _ = least_of_steps(np.maximum(spreads, in_steps))
         return p
+
+    def _counted_entries(self, matrices: Array) -> Array:
+        """Entries of matrices in the steps that count, (runs, steps, n n), NaN elsewhere."""
+        counted = self.total.counted
+        return np.where(counted[..., None, None], matrices, np.nan).reshape(*counted.shape, -1)
 
     def _allowed(self, mean: Array, P: Array, P_t: Array, runs: Array) -> Array:
         """p values of mean errors (..., n), whose covariance is at most P / runs + P_t, (..., n n) each."""
@@ -207,94 +224,90 @@ class UncertainTruth:
     def equivalence(self, sample: Sample, settings: Settings, factor: float) -> Equivalence:
         """Whether the ratio of P is shown to lie in [1 / factor, factor]."""
         if not self.bounded:
-            share = 0.0 if self.contrasted else self.share()
+            share = self.share()
+            if self.contrasted:
+                share = 0.0
             return equivalence(sample.means(), sample.dof, sample.longest, settings, factor, share=share)
         return equivalent(self.below(ratio=factor), self.above(ratio=1.0 / factor), factor, settings, None)
 
     # --- output -----------------------------------------------------------------------------------
 
-    def of_estimate(self, v: Verdict) -> Verdict:
-        """The verdict with every ratio that of P, and with the mean error and its size, whatever was judged."""
+    def truth_share(self) -> TruthShare:
+        """Share of the truth's own covariance in that of the errors."""
         axes = {key: self.share(key) for key in self.by_group if key != MAIN}
-        truth = TruthShare(self.share(), axes, self.record.truth_errors, self.record.truth_shared)
-        v = replace(v, truth=truth, status=self._status(v))
-        if v.scale is None or v.axes is None or v.bias is None or v.location is None or not v.scale.judged_steps:
-            return v
-        if self.contrasted:
-            answers = {a.question: a for a in v.answers}
-            assert v.accuracy is not None
-            size = accuracy_of(self.total)
-            known = replace(
-                v.accuracy, rmse=size.rmse, rmse_position=size.rmse_position, rmse_heading=size.rmse_heading
-            )
-            w = self.total.known_errors.whitened
-            clearest = None if w.shape[1] == 1 else least(t_squared(w)[1])[1]  # whatever the truth allows
-            mean = bias_of(self.total, clearest, v.location, answers)
-            return replace(v, accuracy=known, bias=replace(mean, inflation_without=v.bias.inflation_without))
-        within, until, largest = v.scale.within, v.location.until, v.axes.largest
-        scale = replace(
-            v.scale,
-            inflation=self._of_P(v.scale.inflation, MAIN),
-            detectable=self._of_P(Interval(*[v.scale.detectable] * 3), MAIN).value,
-            within=None if within is None else replace(within, ratio=self._of_P(within.ratio, MAIN)),
-            accepted=self._accepted(v) if self.bounded else v.scale.accepted,
-        )
-        axes_of = {key: self._of_P(interval, key) for key, interval in v.axes.inflation.items()}
-        without = v.bias.inflation_without
-        if until is not None:
-            early = self._of_P(Interval(*[until.early] * 3), MAIN).value
-            until = replace(until, early=early, late=self._of_P(until.late, MAIN))
-        return replace(
-            v, scale=scale,
-            axes=replace(v.axes, inflation=axes_of, largest=None if largest is None else self._of_P(largest, MAIN)),
-            bias=replace(v.bias, inflation_without=None if without is None else self._of_P(without, MAIN)),
-            location=replace(v.location, until=until),
-        )  # fmt: skip
+        return TruthShare(self.share(), axes, self.record.truth_errors, self.record.truth_shared)
 
-    def _status(self, v: Verdict) -> str:
-        """The headline: where only bounds hold, by the side of what they found."""
-        faults = set(v.faults)
-        if not self.bounded or not faults & {MAIN, AXIS, *BIAS} or v.status == "heavy-tailed":
-            return v.status
+    def of_estimate(self, parts: ErrorParts, answers: Sequence[Answer], settings: Settings) -> ErrorParts:
+        """The parts with every ratio that of P."""
+        scale, location, axes, bias = parts.scale, parts.location, parts.axes, parts.bias
+        assert scale is not None
+        assert location is not None
+        assert axes is not None
+        assert bias is not None
+        detectable = self._of_P(Interval(*[scale.detectable] * 3), MAIN).value
+        scale = replace(scale, inflation=self._of_P(scale.inflation, MAIN), detectable=detectable)
+        if scale.within is not None:
+            scale = replace(scale, within=replace(scale.within, ratio=self._of_P(scale.within.ratio, MAIN)))
+        if self.bounded:
+            scale = replace(scale, accepted=self._accepted(answers, settings))
+        inflation = {key: self._of_P(interval, key) for key, interval in axes.inflation.items()}
+        axes = replace(axes, inflation=inflation)
+        if axes.largest is not None:
+            axes = replace(axes, largest=self._of_P(axes.largest, MAIN))
+        if bias.inflation_without is not None:
+            bias = replace(bias, inflation_without=self._of_P(bias.inflation_without, MAIN))
+        if location.until is not None:
+            until = location.until
+            early = self._of_P(Interval(*[until.early] * 3), MAIN).value
+            location = replace(location, until=replace(until, early=early, late=self._of_P(until.late, MAIN)))
+        return parts._replace(scale=scale, location=location, axes=axes, bias=bias)
+
+    def status(self, status: str, answers: Sequence[Answer], settings: Settings) -> str:
+        """The status: where only bounds hold, by the side of what they found."""
+        faults = {answer.question for answer in answers if answer.found and not answer.tolerated}
+        if not self.bounded or not faults & {MAIN, AXIS, *BIAS} or status == "heavy-tailed":
+            return status
         if faults & set(BIAS):
             about = float(self.total.centred_means(slice(None)).mean()) / self._together
-            rate = at_share(v).false_alarm * SHARES[MAIN] / 2.0
-            return "overconfident" if upper_tail(about, upper_weights(self.by_group[MAIN])) <= rate else "biased"
+            rate = at_share(answers, settings).false_alarm * SHARES[MAIN] / 2.0
+            if upper_tail(about, upper_weights(self.by_group[MAIN])) <= rate:
+                return "overconfident"
+            return "biased"
         tails = [self.tails[MAIN]]
         if MAIN not in faults:
             axes = [pair for key, pair in self.tails.items() if key != MAIN]
-            tails = [pair for pair in axes if 2.0 * min(pair) * len(axes) <= v.settings.false_alarm] or axes
-        sides = {"overconfident" if above < below else "conservative" for above, below in tails}
-        return sides.pop() if len(sides) == 1 else "inconsistent"
+            tails = [pair for pair in axes if 2.0 * min(pair) * len(axes) <= settings.false_alarm] or axes
+        if all(above < below for above, below in tails):
+            return "overconfident"
+        if any(above < below for above, below in tails):
+            return "inconsistent"
+        return "conservative"
 
-    def _accepted(self, v: Verdict) -> tuple[float, float]:
+    def _accepted(self, answers: Sequence[Answer], settings: Settings) -> tuple[float, float]:
         """Interval of the mean NEES by both covariances that is no fault of the scale; too large a one shows by P."""
-        rate = at_share(v).false_alarm * SHARES[MAIN] / (1.0 if v.settings.one_sided else 2.0)
+        rate = at_share(answers, settings).false_alarm * SHARES[MAIN]
+        if not settings.one_sided:
+            rate /= 2.0
         weights = upper_weights(self.by_group[MAIN])
-        low = beyond(weights)
-        high = (
-            low
-            if upper_tail(low, weights) <= rate
-            else float(optimize.brentq(lambda x: upper_tail(x, weights) - rate, low, 1e6 * low))
-        )
+        high = beyond(weights)
+        if upper_tail(high, weights) > rate:
+            high = float(optimize.brentq(lambda x: upper_tail(x, weights) - rate, high, 1e6 * high))
         return 0.0, high * self._together * self.total.dof
 
     def _of_P(self, of_both: Interval, group: str) -> Interval:
         """Ratio of P from that of both covariances; with its widest interval where only bounds hold."""
-        s = self.share(group)
-        value, low, high = of_both
+        share = self.share(group)
+        low, high = of_both.low - share, of_both.high - share
         if self.bounded:
             k = self.by_group[group].shape[1]
-            most = (
-                s * float(distributions.chi2.ppf(0.5 * (1.0 + CONFIDENCE), k)) / k
-            )  # of the truth, if all its errors are one
-            low -= most
+            # of the truth, if all its errors are one
+            most = share * float(distributions.chi2.ppf(0.5 * (1.0 + CONFIDENCE), k)) / k
+            low, high = of_both.low - most, of_both.high
             if self.record.truth_shared:
                 low = max(np.sqrt(of_both.low) - np.sqrt(most), 0.0) ** 2
                 high = (np.sqrt(of_both.high) + np.sqrt(most)) ** 2
-        else:
-            low, high = low - s, high - s
-        return Interval(*(float(max(end, 0.0) / (1.0 - s)) for end in (value - s, low, high)))
+        value, low, high = (float(max(end, 0.0) / (1.0 - share)) for end in (of_both.value - share, low, high))
+        return Interval(value, low, high)
 
 
 def uncertain_truth(record: Record) -> UncertainTruth | None:
@@ -307,7 +320,9 @@ def uncertain_truth(record: Record) -> UncertainTruth | None:
 def of_both(record: Record) -> Record:
     """The record with covariances and NEES of estimate and truth together, as it is drawn."""
     truth = uncertain_truth(record)
-    return record if truth is None else replace(truth.both, nees=truth.total.nees)
+    if truth is None:
+        return record
+    return replace(truth.both, nees=truth.total.nees)
 
 
 def upper_weights(eigenvalues: Array, ratio: float = 1.0) -> Array:
@@ -338,7 +353,9 @@ def beyond(weights: Array) -> float:
 
 def upper_tail(mean: float, weights: Array) -> float:
     """p value of a mean NEES over n by :func:`upper_weights`; 1 where the tail does not hold yet."""
-    return 1.0 if mean < beyond(weights) else weighted_chi_square_tail(mean, weights)
+    if mean < beyond(weights):
+        return 1.0
+    return weighted_chi_square_tail(mean, weights)
 
 
 def contrasts(error: Array, P: Array) -> tuple[Array, Array]:

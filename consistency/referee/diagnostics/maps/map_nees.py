@@ -9,17 +9,20 @@ from scipy.linalg import solve_triangular
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.questions.scale import ratio_interval
-from consistency.referee.diagnostics.records.record import JointNees
+from consistency.referee.diagnostics.records.large_arrays import by_runs
+from consistency.referee.diagnostics.records.record import JointNees, Record
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import kolmogorov
 from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
-from consistency.referee.diagnostics.verdict.parts import JointScore, MapScore, Settings
+from consistency.referee.diagnostics.verdict.parts import JointScore
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.diagnostics.verdict.verdict import MapScore, Verdict
 from consistency.referee.types import Array, Indices
 
 POSE, POINT = 3, 3  # degrees of freedom of a pose in the plane, and of a landmark in space
 
 
-def map_score(run: Indices, nees: Array, dof: int = POINT) -> MapScore:
+def map_score(run: Indices, nees: Array, dof: int = POINT, verdict: Verdict | None = None) -> MapScore:
     """Mean NEES over ``dof`` of landmarks (M,), with an interval from the spread between their runs (M,).
 
     Landmarks of one run share the error of its pose, so each run counts once, by the mean of its landmarks.
@@ -28,7 +31,21 @@ def map_score(run: Indices, nees: Array, dof: int = POINT) -> MapScore:
     _, place = np.unique(run[judged], return_inverse=True)
     counts = np.bincount(place)
     means = np.bincount(place, nees[judged]) / np.maximum(counts, 1) / dof
-    return MapScore(ratio_interval(means, dof), len(counts), int(judged.sum()), int((~judged).sum()))
+    return MapScore(ratio_interval(means, dof), len(counts), int(judged.sum()), int((~judged).sum()), verdict)
+
+
+def last_nees(record: Record) -> Array | None:
+    """The last NEES that each run has, (runs,), NaN where it has none; None without NEES."""
+    if record.nees is None:
+        return None
+    return by_runs(_last_of_runs, record.nees)
+
+
+def _last_of_runs(nees: Array) -> Array:
+    if not nees.size:
+        return np.full(len(nees), np.nan)
+    step = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
+    return np.asarray(nees[np.arange(len(nees)), step])
 
 
 def joint_nees(error: Array, covariance: Array, dof: int = POINT) -> Array:
@@ -46,7 +63,9 @@ def joint_nees(error: Array, covariance: Array, dof: int = POINT) -> Array:
         return np.full(count, np.inf)
     squares = np.square(solve_triangular(L, error, lower=True, check_finite=False))
     parts = np.append(squares[:POSE].sum(), squares[POSE:].reshape(-1, dof).sum(axis=1))
-    return parts if np.isfinite(parts).all() else np.full(count, np.inf)
+    if not np.isfinite(parts).all():
+        return np.full(count, np.inf)
+    return parts
 
 
 SURE = 0.04  # false-alarm rate of naming a landmark that does not stand out
@@ -85,8 +104,9 @@ def joint_test(
     p_values = dict.fromkeys((JOINT, JOINT_DISTRIBUTION), float("nan"))
     if len(q):
         above, below = float(distributions.chi2.sf(Q, D)), float(distributions.chi2.cdf(Q, D))
-        p_values[JOINT] = above if settings.one_sided else min(1.0, 2.0 * min(above, below))
+        p_values[JOINT] = above
         if not settings.one_sided:
+            p_values[JOINT] = min(1.0, 2.0 * min(above, below))
             p_values[JOINT_DISTRIBUTION] = kolmogorov(distributions.chi2.cdf(q, d))[1]
     least = int(d.min()) if len(d) else 2 * POSE
     score = JointScore(

@@ -8,14 +8,15 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.planning.number_of_runs import MARGIN
+from consistency.referee.diagnostics.planning.pilot import MARGIN
 from consistency.referee.diagnostics.questions.equivalence import deciding_runs
 from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest, run_means
 from consistency.referee.diagnostics.records.record import Record, arrays_of, numbered_axes
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.answers import BIAS
-from consistency.referee.diagnostics.verdict.parts import Interval, Settings, Within
+from consistency.referee.diagnostics.verdict.parts import Interval, Within
+from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
@@ -56,12 +57,15 @@ def within(nees: Array, dof: int, settings: Settings, factor: float, confidence:
     log_nu = np.log(2.0 * ratio**2 * steps / (spread * tau)) - np.sqrt(doubt)
     nu = float(np.exp(min(log_nu, np.log(dof * steps))))
     z = float(distributions.t.isf(0.5 * (1.0 - confidence), max(2.0 / doubt, LEAST)))
-    low, high = (float(distributions.chi2.ppf(special.ndtr(side), nu)) / nu for side in (-z, z))
+    low = float(distributions.chi2.ppf(special.ndtr(-z), nu)) / nu
+    high = float(distributions.chi2.ppf(special.ndtr(z), nu)) / nu
+    interval = Interval(ratio, ratio / high, ratio / max(low, 1e-300))
     one_step = MeanTest(FEW, ratio, nu / steps, np.inf, np.nan, np.nan)
     least = deciding_runs(one_step, factor, settings)
-    needed = None if least is None else max(int(np.ceil(MARGIN * least)), int(np.ceil(FEW * APART * tau)))
-    pieces = None if needed is None else int(min(MOST, max(needed, steps) // (APART * tau)))
-    return Within(Interval(ratio, ratio / high, ratio / max(low, 1e-300)), tau, nu, needed, pieces)
+    if least is None:
+        return Within(interval, tau, nu, None, None)
+    needed = max(int(np.ceil(MARGIN * least)), int(np.ceil(FEW * APART * tau)))
+    return Within(interval, tau, nu, needed, int(min(MOST, max(needed, steps) // (APART * tau))))
 
 
 def correlation_time(series: Array) -> tuple[float, int]:
@@ -73,7 +77,9 @@ def correlation_time(series: Array) -> tuple[float, int]:
         return 1.0, 1
     tau = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
     enough = np.arange(T) >= REACH * tau
-    lag = int(np.argmax(enough)) if enough.any() else T - 1
+    lag = T - 1
+    if enough.any():
+        lag = int(np.argmax(enough))
     return max(1.0, float(tau[lag])), max(lag, 1)
 
 
@@ -87,7 +93,7 @@ CAPTION = "what is constant over the log is not judged, and every piece has it"
 
 
 @dataclass(frozen=True)
-class Memory:
+class ErrorMemory:
     """Over how many steps the errors of a log go on."""
 
     steps: int  # of the log
@@ -97,7 +103,9 @@ class Memory:
     @property
     def piece(self) -> int:
         """Least number of steps in a piece."""
-        return max(int(np.ceil(APART * self.upper)), 1) if np.isfinite(self.upper) else self.steps + 1
+        if not np.isfinite(self.upper):
+            return self.steps + 1
+        return max(int(np.ceil(APART * self.upper)), 1)
 
     @property
     def pieces(self) -> int:
@@ -105,7 +113,7 @@ class Memory:
         return min(int(self.steps // self.piece), int(MOST))
 
 
-def memory_of(whitened: Array) -> Memory:
+def memory_of(whitened: Array) -> ErrorMemory:
     """Integrated correlation time of the errors of a log about zero, and of their squares about their mean.
 
     A constant error never decorrelates about zero; about the log's own mean it would not be seen. The largest time of
@@ -117,11 +125,15 @@ def memory_of(whitened: Array) -> Memory:
     whitened : (T, n), L^-1 e with L L' = P; NaN where there is none
     """
     w = whitened[np.isfinite(whitened).all(axis=1)]
+    if len(w) < 2:
+        return ErrorMemory(len(whitened), np.inf, np.inf)
     sizes = np.square(w).sum(axis=1)
-    found = [correlation_time(series) for series in (*w.T, sizes - sizes.mean())] if len(w) > 1 else []
-    z = float(special.ndtri(CONFIDENCE))
-    uppers = [time * np.exp(z * np.sqrt(2.0 * (2.0 * reach + 1.0) / len(w))) for time, reach in found]
-    return Memory(len(whitened), max((time for time, _ in found), default=np.inf), max(uppers, default=np.inf))
+    longest, upper, z = 0.0, 0.0, float(special.ndtri(CONFIDENCE))
+    for series in (*w.T, sizes - sizes.mean()):
+        time, reach = correlation_time(series)
+        longest = max(longest, time)
+        upper = max(upper, time * float(np.exp(z * np.sqrt(2.0 * (2.0 * reach + 1.0) / len(w)))))
+    return ErrorMemory(len(whitened), longest, upper)
 
 
 def in_pieces(record: Record, count: int | None = None) -> Record:
@@ -152,7 +164,9 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
     log = slice(int(there[0]), int(there[-1]) + 1)
     _require_steady(record, P[0, log])
     memory = memory_of(whitened[log])
-    pieces = max(memory.pieces, FEWEST) if count is None else count
+    pieces = count
+    if pieces is None:
+        pieces = max(memory.pieces, FEWEST)
     length = memory.steps // max(pieces, 1)
     if length < 1:
         raise InputError(f"--split {pieces}: {record.name} has only {memory.steps} steps")
@@ -163,8 +177,11 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
         for name, array in arrays_of(record).items()
         if name not in ("covariance", "times", "truth_covariance")
     }
-    clock = record.times[0] if record.times is not None else record.t
-    times = clock[log.start : end].reshape(pieces, length) if len(clock) else None
+    clock, times = record.t, None
+    if record.times is not None:
+        clock = record.times[0]
+    if len(clock):
+        times = clock[log.start : end].reshape(pieces, length)
     note = (
         f"{record.name}: the log is cut into {pieces} pieces of {length} steps, which stand as runs; its errors go on "
         f"over {memory.time:.3g} steps"
@@ -194,12 +211,14 @@ def _require_steady(record: Record, P: Array) -> None:
             )
 
 
-def _unshown(memory: Memory, pieces: int, length: int, parts: Array) -> str:
+def _unshown(memory: ErrorMemory, pieces: int, length: int, parts: Array) -> str:
     """Why nothing is shown by these pieces; '' where it may be."""
     if pieces < FEWEST:
         return f"{pieces} pieces of one log are too few, at least {FEWEST} are needed to see that they are independent"
     if length < memory.piece:
-        whole = "as long as the log" if memory.piece > memory.steps else f"{memory.piece} steps"
+        whole = f"{memory.piece} steps"
+        if memory.piece > memory.steps:
+            whole = "as long as the log"
         return (
             f"{pieces} pieces of {length} steps are not shown to be independent: errors go on over {memory.time:.3g} "
             f"steps (up to {memory.upper:.3g}), about zero or in size, and pieces should be {whole}"

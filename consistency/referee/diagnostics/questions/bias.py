@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.records.large_arrays import blocks
+from consistency.referee.diagnostics.records.large_arrays import block_slices
 from consistency.referee.diagnostics.records.whitening import all_finite
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array, Indices
@@ -43,13 +43,15 @@ def hotelling(sample: Array, confidence: float = CONFIDENCE) -> Hotelling:
     return Hotelling(mean, np.stack([mean - half, mean + half], axis=-1), float(statistic), float(p_value))
 
 
-def t_squared(whitened: Array, known: Moments | None = None) -> tuple[Array, Array]:
+def t_squared(whitened: Array, known: StepMoments | None = None) -> tuple[Array, Array]:
     """T-squared and p value of each step, (runs, steps, n) -> (steps,), (steps,).
 
     T^2 (N - n) / (n (N - 1)) is F(n, N - n) distributed (Anderson 2003, Theorem 5.2.2). NaN where fewer
     than n + 1 runs are left. ``known`` are the moments, if already computed.
     """
-    N, mean, S = moments(whitened) if known is None else known
+    if known is None:
+        known = step_moments(whitened)
+    N, mean, S = known
     n = whitened.shape[-1]
     statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
     good = n + 1 <= N
@@ -63,7 +65,7 @@ def t_squared(whitened: Array, known: Moments | None = None) -> tuple[Array, Arr
     return statistic, p_value
 
 
-class Moments(NamedTuple):
+class StepMoments(NamedTuple):
     """Runs, mean and sample covariance of every step."""
 
     runs: Indices  # (steps,)
@@ -71,11 +73,11 @@ class Moments(NamedTuple):
     covariance: Array  # (steps, n, n)
 
 
-def moments(whitened: Array) -> Moments:
+def step_moments(whitened: Array) -> StepMoments:
     """Moments of whitened errors (runs, steps, n)."""
     runs, steps = whitened.shape[:2]
-    N, mean, S = zip(*(_moments(whitened[:, here]) for here in blocks(steps, runs)), strict=True)
-    return Moments(np.concatenate(N), np.concatenate(mean), np.concatenate(S))
+    N, mean, S = zip(*(_moments(whitened[:, here]) for here in block_slices(steps, runs)), strict=True)
+    return StepMoments(np.concatenate(N), np.concatenate(mean), np.concatenate(S))
 
 
 def _moments(whitened: Array) -> tuple[Array, Array, Array]:

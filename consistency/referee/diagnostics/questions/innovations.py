@@ -9,8 +9,10 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.diagnostics.records.large_arrays import by_runs
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import all_finite, whiten
 from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.verdict.parts import NisTest, Outliers
 from consistency.referee.types import Array
 
 LAGS = 10
@@ -20,20 +22,6 @@ FEWEST = 400  # innovations; below, the chi-square of the portmanteau is not to 
 FEWEST_EACH = 40  # innovations for each component, measured with up to 40 components
 
 
-@dataclass(frozen=True)
-class NisTest:
-    """Total NIS against its degrees of freedom."""
-
-    ratio: float  # total NIS over total degrees of freedom
-    dof: int
-    above: float  # one-sided p values
-    below: float
-
-    @property
-    def p_value(self) -> float:
-        return float(np.minimum(1.0, 2.0 * np.minimum(self.above, self.below)))
-
-
 def nis_of(innovations: Array, covariances: Array) -> tuple[Array, Array]:
     """NIS and its degrees of freedom, (runs, steps, m), (runs, steps, m, m) -> (runs, steps), (runs, steps).
 
@@ -41,6 +29,15 @@ def nis_of(innovations: Array, covariances: Array) -> tuple[Array, Array]:
     """
     u = whiten(innovations, covariances)
     return np.square(u).sum(axis=-1), np.where(np.isfinite(u[..., 0]), u.shape[-1], 0)
+
+
+def nis_and_dof(record: Record) -> tuple[Array, Array] | None:
+    """NIS of a record and its degrees of freedom, (runs, steps) each; None without any."""
+    if record.nis is not None and record.nis_dof is not None:
+        return record.nis, record.nis_dof
+    if record.innovations is not None and record.innovation_covariances is not None:
+        return nis_of(record.innovations, record.innovation_covariances)
+    return None
 
 
 def nis_test(nis: Array, dof: Array) -> NisTest:
@@ -54,20 +51,6 @@ def nis_test(nis: Array, dof: Array) -> NisTest:
     if k == 0:
         return NisTest(float("nan"), 0, float("nan"), float("nan"))
     return NisTest(total / k, k, float(distributions.chi2.sf(total, k)), float(distributions.chi2.cdf(total, k)))
-
-
-@dataclass(frozen=True)
-class Outliers:
-    """Few innovations that are far larger than a Gaussian of the stated covariance allows."""
-
-    count: int
-    of: int  # innovations
-    run: int  # row of the largest
-    step: int  # its column
-    nis: float
-    dof: int
-    p_value: float  # of the largest among all
-    rest: NisTest  # of the other innovations
 
 
 def outliers_of(nis: Array, dof: Array) -> Outliers | None:

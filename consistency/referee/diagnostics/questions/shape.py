@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special
 
-from consistency.referee.diagnostics.questions.bias import Moments, moments, t_squared
+from consistency.referee.diagnostics.questions.bias import StepMoments, step_moments, t_squared
 from consistency.referee.diagnostics.questions.scale import UNKNOWN, ratio_interval, scale_test
 from consistency.referee.diagnostics.records.large_arrays import by_runs
 from consistency.referee.diagnostics.records.whitening import all_finite
@@ -36,14 +36,16 @@ def identity_statistic(whitened: Array) -> tuple[float, float]:
     return statistic, float(distributions.chi2.sf(statistic, n * (n + 1) / 2))
 
 
-def sphericity(whitened: Array, known: Moments | None = None) -> tuple[Array, Array]:
+def sphericity(whitened: Array, known: StepMoments | None = None) -> tuple[Array, Array]:
     """Mauchly's (1940) test of every step: covariance of the whitened errors proportional to I.
 
     (runs, steps, n) -> statistic and p value, (steps,) each; the mean and the scale may be anything. Box's
     second-order expansion of the null distribution (Anderson 2003, sec. 10.7.4). NaN where fewer than 4 n runs are
     left, or n is 1. ``known`` are the moments, if already computed.
     """
-    N, _, S = moments(whitened) if known is None else known
+    if known is None:
+        known = step_moments(whitened)
+    N, _, S = known
     n = whitened.shape[-1]
     statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
     good = (4 * n <= N) & (np.trace(S, axis1=-2, axis2=-1) > 0)

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.large_arrays import Symmetric, by_runs
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped, without_first
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
@@ -73,7 +72,7 @@ class Record:
 
     name: str
     error: Array | None = None  # (runs, steps, n), truth minus estimate; NaN where a run has no estimate
-    covariance: Array | Symmetric | None = None  # (runs, steps, n, n)
+    covariance: Array | None = None  # (runs, steps, n, n)
     nees: Array | None = None  # (runs, steps), NaN where it does not count; worked out from the errors if not given
     dof: int = 0  # dimension of the error, where NEES stands alone; 0 where there is none
     nis: Array | None = None  # (runs, steps), NaN where there was no innovation
@@ -148,19 +147,6 @@ class Record:
         """Without what is judged beside the errors and innovations."""
         return replace(self, world=None, map=None, rejections=None, convention="")
 
-    @property
-    def ends(self) -> Record:
-        """Each run by the last NEES that it has, (runs, 1): what a verdict on the maps needs of the poses."""
-
-        def last(nees: Array) -> Array:
-            if not nees.size:
-                return np.full(len(nees), np.nan)
-            step = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
-            return np.asarray(nees[np.arange(len(nees)), step])
-
-        nees = None if self.nees is None else by_runs(last, self.nees)[:, None]
-        return Record(self.name, nees=nees, failures=self.failures, runs=self.run_numbers, map=self.map)
-
     def of_runs(self, rows: slice | Indices) -> Record:
         """Some of the runs, by their rows, with maps and rejections of all."""
         arrays = {name: array[rows] for name, array in arrays_of(self).items()}
@@ -182,12 +168,12 @@ class Record:
         InputError
             Nothing is left, or seconds are asked for and there are no times.
         """
-        names = ("covariance", "nees", "nis", "nis_dof", "innovations")
-        arrays = {name: getattr(self, name) for name in names}
-        world = self.world
+        arrays = {name: getattr(self, name) for name in ("covariance", "nees", "nis", "nis_dof", "innovations")}
+        world, t = self.world, self.times
         if world is not None:
             arrays |= {"world covariance": world.covariance, "world nees": world.nees}
-        t = self.times if self.times is not None else self.t if len(self.t) else None
+        if t is None and len(self.t):
+            t = self.t
         try:
             rest, skipped = without_first(skip, arrays, self.name, t)
         except ValueError as error:
@@ -252,7 +238,7 @@ class Record:
         return str(shown_by("record_html", self))
 
 
-Evidence = Record  # name of the record as input of :func:`consistency.diagnostics.judge`
+Evidence = Record  # name of the record in scripts of before
 
 
 def numbered_axes(n: int) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.large_arrays import Symmetric
+from consistency.referee.diagnostics.records.large_arrays import every_entry
 from consistency.referee.types import Array
 
 FORMS = "a whole number of steps (20) or seconds (2s)"
@@ -29,14 +29,18 @@ class Skip:
     @property
     def option(self) -> str:
         """Value of the option: 20, 2s."""
-        return f"{self.size:g}{'s' * (self.unit == 's')}"
+        if self.unit == "s":
+            return f"{self.size:g}s"
+        return f"{self.size:g}"
 
     @property
     def text(self) -> str:
         """The first 20 steps, the first 2 s."""
         if self.unit == "s":
             return f"the first {self.size:g} s"
-        return "the first step" if self.size == 1 else f"the first {self.size:g} steps"
+        if self.size == 1:
+            return "the first step"
+        return f"the first {self.size:g} steps"
 
     def mask(self, shape: tuple[int, int], t: Array | None = None) -> Array:
         """Which of (runs, steps) are left out, of bool.
@@ -55,7 +59,9 @@ class Skip:
         """
         if self.unit == "step":
             return np.broadcast_to(np.arange(1, shape[1] + 1) <= self.size, shape)
-        times = np.broadcast_to(np.nan if t is None else t, shape)
+        if t is None:
+            t = np.full(shape, np.nan)
+        times = np.broadcast_to(t, shape)
         known = np.isfinite(times)
         if not known.any(axis=1).all():
             raise ValueError(f"skip {self.option}: there are no times; give a number of steps, as --skip 20")
@@ -84,11 +90,12 @@ def skip_of(given: str | float | Skip | None) -> Skip | None:
     if given is None or isinstance(given, Skip):
         return given
     match = re.fullmatch(r"\s*(\d+|\d*\.\d+|\d+\.\d*)\s*(s?)\s*", str(given))
-    whole = match is not None and (match[2] == "s" or match[1].isdigit())
-    if match is None or not whole or isinstance(given, bool):
+    if match is None or isinstance(given, bool) or not (match[2] == "s" or match[1].isdigit()):
         raise ValueError(f"skip {given}: must be {FORMS}")
     size = float(match[1])
-    return Skip(size, "s" if match[2] else "step") if size > 0 else None
+    if size == 0:
+        return None
+    return Skip(size, match[2] or "step")
 
 
 def without_first(
@@ -100,7 +107,7 @@ def without_first(
 
     Parameters
     ----------
-    arrays : covariances as arrays or :class:`Symmetric`, NEES, NIS, innovations, by any name; those that end in "dof"
+    arrays : covariances, NEES, NIS, innovations, by any name; those that end in "dof"
         become 0, the others NaN. None is passed over.
     t : as in :meth:`Skip.mask`
 
@@ -109,27 +116,26 @@ def without_first(
     ValueError
         Nothing is left, or seconds are asked for and there are no times.
     """
-    there = {key: value for key, value in arrays.items() if value is not None}
-    if skip is None or not there:
+    given = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
+    if skip is None or not given:
         return dict(arrays), None
-    runs, steps = next(iter(there.values())).shape[:2]
+    runs, steps = next(iter(given.values())).shape[:2]
     mask = skip.mask((int(runs), int(steps)), t)
     counted = np.zeros(mask.shape, bool)
-    for key, value in there.items():
-        if isinstance(value, Symmetric):
-            counted |= value.where_all(np.isfinite)
+    for key, value in given.items():
+        if value.ndim == 4:
+            counted |= every_entry(np.isfinite, value)
         elif not key.endswith("dof"):
             counted |= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
     left = (counted & ~mask).any(axis=1)
     if not left.any():
         last = int(np.flatnonzero(counted.any(axis=0)).max(initial=-1)) + 1
         raise ValueError(f"skip {skip.option}: nothing of {name} is left, whose last step is {last}; leave out less")
-    lost = Skipped(skip, int(mask.sum(axis=1).max()), int((counted.any(axis=1) & ~left).sum()))
     rest = dict(arrays)
-    for key, value in there.items():
-        if isinstance(value, Symmetric):
-            rest[key] = value.without(mask)
+    for key, value in given.items():
+        beside = mask.reshape(*mask.shape, *[1] * (value.ndim - 2))
+        if key.endswith("dof"):
+            rest[key] = np.where(beside, np.asarray(0, value.dtype), value)
         else:
-            fill = np.asarray(0 if key.endswith("dof") else np.nan, value.dtype)
-            rest[key] = np.where(mask.reshape(*mask.shape, *[1] * (value.ndim - 2)), fill, value)
-    return rest, lost
+            rest[key] = np.where(beside, np.asarray(np.nan, value.dtype), value)
+    return rest, Skipped(skip, int(mask.sum(axis=1).max()), int((counted.any(axis=1) & ~left).sum()))

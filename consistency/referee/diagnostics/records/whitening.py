@@ -2,44 +2,45 @@
 
 from __future__ import annotations
 
-import functools
-import operator
+from collections.abc import Sequence
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.large_arrays import Symmetric, blocks, by_runs
+from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.types import Array
 
 LARGE = 40  # components from which on LAPACK, matrix by matrix, is faster than all matrices entry by entry
 NUMBERS = 2**22  # of matrices that are factored in one call
-AT_ONCE = 8 * NUMBERS  # of matrices that are copied whole from their entries
 FEW = 7  # components that NumPy adds one after the other; sums over so short an axis are slow
+GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
-def whiten(error: Array, covariance: Array | Symmetric) -> Array:
+def whiten(error: Array, covariance: Array) -> Array:
     """L^-1 error with L L' = covariance: standard normal, independent components, if the covariance is right.
 
     Shapes (..., n) and (..., n, n) -> (..., n). Rows that hold a NaN, or whose covariance is not positive
     definite, come back as NaN.
     """
-    e = np.asarray(error, float)
+    e, P = np.asarray(error, float), np.asarray(covariance, float)
+    P = np.broadcast_to(P, (*e.shape, P.shape[-1]))
     if e.shape[-1] >= LARGE:
-        return _whiten_large(e, covariance)
-    P = Symmetric.of(covariance)
-    P = P if P.shape[:-1] == e.shape else P.broadcast(e.shape[:-1])
-    return by_runs(_whiten, e, P) if e.ndim > 1 else _whiten(e, P)
+        return _whiten_matrix_by_matrix(e, P)
+    if e.ndim == 1:
+        return _whiten_entry_by_entry(e, P)
+    return by_runs(_whiten_entry_by_entry, e, P)
 
 
-def _whiten(e: Array, P: Symmetric) -> Array:
+def _whiten_entry_by_entry(e: Array, P: Array) -> Array:
+    """The Cholesky factor of all matrices at once: n is small, the batch is not."""
     out = np.empty(e.shape)
-    L: list[list[Array]] = []  # rows of arrays over the batch: n is small, the batch is not
+    L: list[list[Array]] = []  # rows of arrays over the batch
     w: list[Array] = []
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for i in range(e.shape[-1]):
             row: list[Array] = []
             for j in range(i):
-                row.append(_less(P.entry(i, j), row, L[j]) / L[j][j])
-            row.append(np.sqrt(_less(P.entry(i, i), row, row)))  # NaN or 0 where P is not definite, and so what follows
+                row.append(_less(P[..., i, j], row, L[j]) / L[j][j])
+            row.append(np.sqrt(_less(P[..., i, i], row, row)))  # NaN or 0 where P is not definite, and so what follows
             w.append(_less(e[..., i], row, w) / row[i])
             L.append(row)
             out[..., i] = w[i]
@@ -47,22 +48,29 @@ def _whiten(e: Array, P: Symmetric) -> Array:
     return out
 
 
-def _whiten_large(e: Array, covariance: Array | Symmetric) -> Array:
-    n = e.shape[-1]
-    rows, P = e.reshape(*(e.shape[:-1] or (1,)), n), covariance
-    if P.shape[:-1] != rows.shape:
-        P = np.broadcast_to(np.asarray(P, float), (*rows.shape, n))
-    elif rows.size * n <= AT_ONCE:
-        P = np.asarray(P, float)  # indexing entry by entry is slow
-    out = np.full(rows.shape, np.nan)
-    for here in blocks(out.size // n, n * n, NUMBERS):
-        index = np.unravel_index(np.arange(out.size // n)[here], rows.shape[:-1])
-        some, matrices = rows[index], np.asarray(P[index], float)
+def _less(value: Array, a: list[Array], b: list[Array]) -> Array:
+    """``value`` less the sum of the products, as many as the shorter list has."""
+    if not a or not b:
+        return value
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=False):
+        total = total + x * y
+    return np.asarray(value - total)
+
+
+def _whiten_matrix_by_matrix(error: Array, covariance: Array) -> Array:
+    n, batch = error.shape[-1], error.shape[:-1] or (1,)
+    e, P = error.reshape(*batch, n), covariance.reshape(*batch, n, n)
+    out = np.full(e.shape, np.nan)
+    count = e.size // n
+    for here in block_slices(count, n * n, NUMBERS):
+        index = np.unravel_index(np.arange(here.start, min(here.stop, count)), batch)
+        some, matrices = e[index], P[index]
         known = np.isfinite(some).all(axis=1) & np.isfinite(matrices).all(axis=(1, 2))
         some[~known] = np.nan
         some[known] = _solve(some[known], matrices[known])
         out[index] = some
-    return out.reshape(e.shape)
+    return out.reshape(error.shape)
 
 
 def _solve(e: Array, P: Array) -> Array:
@@ -76,50 +84,56 @@ def _solve(e: Array, P: Array) -> Array:
         return np.concatenate([_solve(e[:half], P[:half]), _solve(e[half:], P[half:])])
 
 
-def _less(value: Array, a: list[Array], b: list[Array]) -> Array:
-    """``value`` less the sum of the products, as many as the shorter list has."""
-    products = [x * y for x, y in zip(a, b, strict=False)]
-    return value - functools.reduce(operator.add, products) if products else value
-
-
-def standardise(error: Array, covariance: Array | Symmetric) -> Array:
+def standardise(error: Array, covariance: Array) -> Array:
     """Each component over its own standard deviation, (..., n) and (..., n, n) -> (..., n); NaN where that is 0."""
-
-    def of_block(e: Array, P: Symmetric) -> Array:
-        out = np.empty(e.shape)
-        for i in range(e.shape[-1]):
-            variance = P.entry(i, i)
-            out[..., i] = e[..., i] / np.sqrt(np.where(variance > 0, variance, np.nan))
-        return out
-
-    e = np.asarray(error, float)
-    return by_runs(of_block, e, Symmetric.of(covariance)) if e.ndim > 1 else of_block(e, Symmetric.of(covariance))
+    e, P = np.asarray(error, float), np.asarray(covariance, float)
+    if e.ndim == 1:
+        return _standardise(e, P)
+    return by_runs(_standardise, e, P)
 
 
-def subset(error: Array, covariance: Array | Symmetric, index: list[int]) -> Array:
-    """Whitened errors of a group, (runs, steps, n) and (runs, steps, n, n) -> (runs, steps, len(index))."""
+def _standardise(e: Array, P: Array) -> Array:
+    out = np.empty(e.shape)
+    for i in range(e.shape[-1]):
+        variance = P[..., i, i]
+        out[..., i] = e[..., i] / np.sqrt(np.where(variance > 0, variance, np.nan))
+    return out
 
-    def of_block(e: Array, P: Symmetric) -> Array:
-        e, P = e[..., index], P.part(index)
-        return standardise(e, P) if len(index) == 1 else whiten(e, P)
 
-    return by_runs(of_block, error, Symmetric.of(covariance))
+def whiten_group(error: Array, covariance: Array, index: Sequence[int]) -> Array:
+    """Whitened errors of some components, (runs, steps, n) and (runs, steps, n, n) -> (runs, steps, len(index))."""
+    some = list(index)
+
+    def of_block(e: Array, P: Array) -> Array:
+        if len(some) == 1:
+            return _standardise(e[..., some], P[..., some, :][..., some])
+        return whiten(e[..., some], P[..., some, :][..., some])
+
+    if some == list(range(error.shape[-1])) and len(some) > 1:
+        return whiten(error, covariance)
+    return by_runs(of_block, error, covariance)
 
 
 def squared_length(whitened: Array) -> Array:
     """(runs, steps, n) -> (runs, steps): the NEES, if nothing is missing."""
+    return by_runs(_squared_length, whitened)
 
-    def of_block(w: Array) -> Array:
-        if w.shape[-1] > FEW:
-            return np.asarray(np.square(w).sum(axis=-1))
-        return functools.reduce(operator.add, (np.square(w[..., i]) for i in range(w.shape[-1])))
 
-    return by_runs(of_block, whitened)
+def _squared_length(w: Array) -> Array:
+    if w.shape[-1] > FEW:
+        return np.asarray(np.square(w).sum(axis=-1))
+    total = np.square(w[..., 0])
+    for i in range(1, w.shape[-1]):
+        total = total + np.square(w[..., i])
+    return np.asarray(total)
 
 
 def all_finite(values: Array) -> Array:
     """Rows without a missing component, (..., n) -> (...) of bool."""
-    return functools.reduce(operator.and_, (np.isfinite(values[..., i]) for i in range(values.shape[-1])))
+    out = np.isfinite(values[..., 0])
+    for i in range(1, values.shape[-1]):
+        out = out & np.isfinite(values[..., i])
+    return out
 
 
 def mean_and_count(values: Array, axis: int) -> tuple[Array, Array]:
@@ -143,12 +157,14 @@ def spread_steps(present: Array) -> Array:
     number of runs and does not depend on the data.
     """
     present = np.asarray(present, bool)
+    if not present.shape[1]:
+        return np.full(len(present), -1)
 
     def of_block(present: Array, place: Array) -> Array:
         count = present.sum(axis=1)
         rank = np.minimum((place * count).astype(int), np.maximum(count - 1, 0))
         nth = np.cumsum(present, axis=1) - 1
-        step = np.argmax(present & (nth == rank[:, None]), axis=1) if present.shape[1] else np.zeros(len(present), int)
+        step = np.argmax(present & (nth == rank[:, None]), axis=1)
         return np.where(count > 0, step, -1)
 
-    return by_runs(of_block, present, np.mod(0.5 + np.arange(len(present)) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0))
+    return by_runs(of_block, present, np.mod(0.5 + np.arange(len(present)) * GOLDEN, 1.0))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections.abc import Sequence
 
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.records.large_arrays import Symmetric, blocks, by_runs, of_runs
+from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs, of_runs
 from consistency.referee.diagnostics.records.whitening import all_finite, spread_steps, squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.types import Array
@@ -17,19 +15,20 @@ from consistency.referee.types import Array
 TWO_SIGMA = 0.9544997361036416  # P(|N(0, 1)| <= 2)
 
 
-def coverage(error: Array, covariance: Array | Symmetric, bound: float = 2.0, counted: Array | None = None) -> Array:
+def coverage(error: Array, covariance: Array, bound: float = 2.0, counted: Array | None = None) -> Array:
     """Share of errors within ``bound`` standard deviations, for each axis.
 
     Shapes (..., n) and (..., n, n) -> (n,); rows with NaN, or not ``counted`` (...), do not count.
     """
-    error, P = np.asarray(error, float), Symmetric.of(covariance)
-    n = error.shape[-1]
-    inside, count = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    error, P = np.asarray(error, float), np.asarray(covariance, float)
     if error.ndim == 1:
         error, P = error[None], P[None]
+    P = np.broadcast_to(P, (*error.shape, error.shape[-1]))
+    n = error.shape[-1]
+    inside, count = np.zeros(n, np.int64), np.zeros(n, np.int64)
     for here in of_runs(error):
         for i in range(n):
-            e, sigma = error[here][..., i], _sigma(P.entry(i, i)[here])
+            e, sigma = error[here][..., i], _sigma(P[here][..., i, i])
             valid = np.isfinite(e) & np.isfinite(sigma)
             if counted is not None:
                 valid &= counted[here]
@@ -54,19 +53,25 @@ def rmse(error: Array, axes: Sequence[int] | None = None, counted: Array | None 
     counted : (...) of bool, rows that count
     """
     e = np.asarray(error, float)
-    some = list(range(e.shape[-1])) if axes is None else list(axes)
+    if axes is None:
+        axes = range(e.shape[-1])
     squared, count = np.empty(e[..., 0].size), 0
     for here in of_runs(e):
-        part = squared_length(e[here][..., some])
-        part = part[np.isfinite(part) if counted is None else np.isfinite(part) & counted[here]]
+        part = squared_length(e[here][..., list(axes)])
+        known = np.isfinite(part)
+        if counted is not None:
+            known &= counted[here]
+        part = part[known]
         squared[count : count + len(part)] = part
         count += len(part)
-    return float(np.sqrt(squared[:count].mean())) if count else float("nan")
+    if not count:
+        return float("nan")
+    return float(np.sqrt(squared[:count].mean()))
 
 
 def coverage_interval(
     error: Array,
-    covariance: Array | Symmetric,
+    covariance: Array,
     bound: float = 2.0,
     confidence: float = CONFIDENCE,
     counted: Array | None = None,
@@ -77,22 +82,25 @@ def coverage_interval(
     not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2); rows with NaN, or not ``counted`` (runs, steps),
     are not drawn.
     """
-    error, P = np.asarray(error, float), Symmetric.of(covariance)
+    error, P = np.asarray(error, float), np.asarray(covariance, float)
     there = by_runs(_usable, error, P)
-    steps = spread_steps(there if counted is None else there & counted)
+    if counted is not None:
+        there &= counted
+    steps = spread_steps(there)
     rows = np.flatnonzero(steps >= 0)
-    variance = P[rows, steps[rows]].variances
-    inside = (np.abs(error[rows, steps[rows]]) <= bound * _sigma(variance)).sum(axis=0)
     if not len(rows):
         n = error.shape[-1]
         return np.full(n, np.nan), np.tile([0.0, 1.0], (n, 1))
+    variance = np.diagonal(P[rows, steps[rows]], axis1=-2, axis2=-1)
+    inside = (np.abs(error[rows, steps[rows]]) <= bound * _sigma(variance)).sum(axis=0)
     return inside / len(rows), np.stack(binomial_interval(inside, len(rows), confidence), axis=-1)
 
 
-def _usable(error: Array, P: Symmetric) -> Array:
-    variances = (P.entry(i, i) for i in range(P.n))
-    known = (np.isfinite(error[..., i]) & np.isfinite(v) & (v >= 0) for i, v in enumerate(variances))
-    return functools.reduce(operator.and_, known)
+def _usable(error: Array, P: Array) -> Array:
+    out = np.ones(error.shape[:-1], bool)
+    for i in range(error.shape[-1]):
+        out &= np.isfinite(error[..., i]) & np.isfinite(P[..., i, i]) & (P[..., i, i] >= 0)
+    return out
 
 
 def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
@@ -113,7 +121,7 @@ def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
     (steps,) and (steps,) in dB; NaN where fewer than 2 n runs have a value
     """
     runs, steps = nees.shape
-    index, inclination = zip(*(_of_steps(error[:, s], nees[:, s]) for s in blocks(steps, runs)), strict=True)
+    index, inclination = zip(*(_of_steps(error[:, s], nees[:, s]) for s in block_slices(steps, runs)), strict=True)
     return np.concatenate(index), np.concatenate(inclination)
 
 

@@ -1,27 +1,18 @@
-"""Settings and output of the referee: frozen, with the shape of each field; :mod:`record` has its input."""
+"""The parts of a verdict: frozen, with the shape of each field."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.records.record import Record, shown_by
-from consistency.referee.diagnostics.records.skipping import Skipped
-from consistency.referee.errors import InputError
-from consistency.referee.types import Array, Failure, Indices
-
-if TYPE_CHECKING:
-    from consistency.referee.diagnostics.questions.innovations import Outliers
+from consistency.referee.types import Array, Indices
 
 TINY = 1e-12  # ratio of an error that is rounding
-EARLY = (
-    1e-3  # chance to call runs that end early lost where they end for reasons that have nothing to do with their errors
-)
+# chance to call runs that end early lost where they end for reasons that have nothing to do with their errors
+EARLY = 1e-3
 
 # status -> what it means; the order is that of reports
 STATUSES = {
@@ -46,62 +37,6 @@ class Interval(NamedTuple):
     def holds(self, value: float) -> bool:
         """Is ``value`` inside? NaN ends hold nothing."""
         return self.low <= value <= self.high
-
-
-# --- questions -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Questions of a verdict, and its error rates.
-
-    Raises
-    ------
-    ValueError
-        A value out of its range.
-    """
-
-    false_alarm: float = FALSE_ALARM  # chance to find a fault in a right filter, all questions together
-    detect: float = DETECT  # consistent: the ratio of true to stated covariance is shown to be in [1 / detect, detect]
-    power: float = POWER  # a filter at either end is not called consistent, with this probability or more
-    tolerance: float | None = None  # a ratio shown to lie in [1 / tolerance, tolerance] is no fault
-    allow: str | None = None  # "conservative": a covariance that is too large is no fault
-    method: str = "max"  # of the band over all steps: "max" or "bonferroni"
-    subsets: Mapping[str, Sequence[int]] | None = None  # further groups of components to look at, name -> indices
-    lost: float | None = None  # consistent: the share of lost runs is shown to be this at most
-
-    def __post_init__(self) -> None:
-        for name in ("false_alarm", "power"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name)}")
-        for name in ("detect", "tolerance"):
-            value = getattr(self, name)
-            if value is not None and not (0.0 < value < float("inf") and value != 1.0):
-                raise ValueError(f"{name} must be a positive ratio of true to stated covariance, not 1; got {value}")
-        if self.lost is not None and not 0.0 < self.lost < 1.0:
-            raise ValueError(f"lost must lie between 0 and 1, got {self.lost}")
-        if self.allow not in (None, "conservative"):
-            raise ValueError(f"allow must be 'conservative' or None, got '{self.allow}'")
-        if self.method not in ("max", "bonferroni"):
-            raise ValueError(f"method must be 'max' or 'bonferroni', got '{self.method}'")
-
-    @property
-    def factor(self) -> float:
-        """``detect`` as a factor above 1."""
-        return max(self.detect, 1.0 / self.detect)
-
-    @property
-    def tolerated(self) -> float:
-        """``tolerance`` as a factor of 1 or more; 1 where nothing is tolerated."""
-        return 1.0 if self.tolerance is None else max(self.tolerance, 1.0 / self.tolerance)
-
-    @property
-    def one_sided(self) -> bool:
-        """Only a covariance that is too small is a fault."""
-        return self.allow == "conservative"
-
-
-# --- output of the referee ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -239,6 +174,34 @@ class Tails:
 
 
 @dataclass(frozen=True)
+class NisTest:
+    """Total NIS against its degrees of freedom."""
+
+    ratio: float  # total NIS over total degrees of freedom
+    dof: int
+    above: float  # one-sided p values
+    below: float
+
+    @property
+    def p_value(self) -> float:
+        return float(np.minimum(1.0, 2.0 * np.minimum(self.above, self.below)))
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """Few innovations that are far larger than a Gaussian of the stated covariance allows."""
+
+    count: int
+    of: int  # innovations
+    run: int  # row of the largest
+    step: int  # its column
+    nis: float
+    dof: int
+    p_value: float  # of the largest among all
+    rest: NisTest  # of the other innovations
+
+
+@dataclass(frozen=True)
 class Innovations:
     """Size and whiteness of the innovations."""
 
@@ -290,17 +253,6 @@ class JointScore:
 
 
 @dataclass(frozen=True)
-class MapScore:
-    """Landmarks in the map after the last step, each with 3 degrees of freedom, or 2 in the plane."""
-
-    ratio: Interval  # mean over runs of the mean NEES over its degrees of freedom, 95 % by the spread between runs
-    runs: int  # with a landmark that has a NEES
-    landmarks: int  # that have one, of all runs
-    left_out: int  # that have none: no landmark of the world, not known where, or covariance not positive definite
-    verdict: Verdict | None = None  # on the map, landmarks in the place of steps; None where it is not judged
-
-
-@dataclass(frozen=True)
 class RejectionScore:
     """Observations that a guard rejected, with 95 % intervals of the shares from the runs."""
 
@@ -337,165 +289,13 @@ class TruthShare:
     shared: bool  # the estimator has fused the truth
 
 
-class Guess(NamedTuple):
-    """What the errors say if they are of one convention, where none is declared."""
+class ErrorParts(NamedTuple):
+    """What the tests say about the errors of a sample; a part is None if it could not be computed."""
 
-    status: str  # of that convention
-    faults: tuple[str, ...]
-    ratio: Interval  # of true to stated covariance, simultaneous over the conventions
-    possible: bool  # no fault is found
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The referee's answer for one filter.
-
-    ``print`` shows the sentence and a short table. A part is None if it could not be computed.
-    """
-
-    filter: str
-    status: str  # see STATUSES
-    reasons: tuple[str, ...]  # the first is a sentence to act on
-    runs: int
-    steps: int
-    settings: Settings
-    answers: tuple[Answer, ...] = ()
-    failures: tuple[Failure, ...] = ()
-    impossible: tuple[tuple[int, int], ...] = ()  # (run, step) of what no filter may say
-    left_out_steps: tuple[int, ...] = ()  # rank-deficient covariance
     scale: Scale | None = None
+    location: Location | None = None
     axes: Axes | None = None
     bias: Bias | None = None
     shape: Shape | None = None
     tails: Tails | None = None
-    innovations: Innovations | None = None
-    location: Location | None = None
     accuracy: Accuracy | None = None
-    convention: str | None = None  # of the error that is judged, where files or the filter declare one
-    notes: tuple[str, ...] = ()  # of whoever read the files
-    causes: tuple[str, ...] = ()  # probable mix-ups; they stand in the reasons and notes, too
-    align: str | None = None  # how estimates in files were moved into the world of the truth
-    world: Verdict | None = None  # the same runs in the additive error of the world, where the filter has another
-    map: MapScore | None = None
-    landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
-    joint: JointScore | None = None  # of the verdict on a map
-    rejection: RejectionScore | None = None  # of a filter with a guard
-    unit: str = "run"  # what a run is called, as in :class:`~consistency.diagnostics.Record`
-    lost: Lost | None = None  # where there is a NEES
-    ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
-    skipped: Skipped | None = None  # first steps of each run that were left out
-    axis: tuple[str, Interval] | None = None  # that decides the status, with its ratio; None where the whole does
-    truth: TruthShare | None = None  # where the truth has a covariance of its own
-    guesses: Mapping[str, Guess] = field(default_factory=dict)  # by convention, where none is declared
-    parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
-    record: Record | None = None  # what was judged, where it is kept to be drawn
-
-    @property
-    def in_world(self) -> Verdict:
-        """The verdict whose errors are those of the pose in the world: ``world``, or this one."""
-        return self if self.world is None else self.world
-
-    @property
-    def consistent(self) -> bool:
-        return self.status == "consistent"
-
-    def place(self, step: int) -> str:
-        """Name of step 1..T: "step 3", or "landmark 17" where landmarks stand in the place of steps."""
-        return f"step {step}" if self.landmarks is None else f"landmark {self.landmarks[step - 1]}"
-
-    @property
-    def places(self) -> str:
-        """Noun for the second axis of the arrays: steps, or landmarks of a map."""
-        return "steps" if self.landmarks is None else "landmarks"
-
-    @property
-    def worst_axis(self) -> tuple[str, Interval] | None:
-        """Component whose ratio is farthest from 1, on the side of a fault of the scale; None if there is only one."""
-        if self.axes is None or len(self.axes.names) < 2:
-            return None
-        logs = {a: np.log(max(i.value, TINY)) for a, i in self.axes.inflation.items() if a in self.axes.names}
-        side = {"overconfident": 1.0, "conservative": -1.0}.get(self.status, 1.0 if self.settings.one_sided else 0.0)
-        known = [axis for axis, log in logs.items() if np.isfinite(log)]
-        if not known:
-            return None
-        worst = max(known, key=lambda axis: side * logs[axis] if side else abs(logs[axis]))
-        return worst, self.axes.inflation[worst]
-
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """Questions in which a fault was found, those within the tolerance left out."""
-        return tuple(a.question for a in self.answers if a.found and not a.tolerated)
-
-    @property
-    def p_value(self) -> float:
-        """False-alarm rate at which some fault would just be found, all questions together; NaN without any."""
-        return min((min(1.0, a.p_value / a.share) for a in self.answers if not a.tolerated), default=float("nan"))
-
-    @property
-    def statistic(self) -> float:
-        """Mean NEES over runs and steps; without truth, NIS per degree of freedom."""
-        if self.scale is not None:
-            return self.scale.mean_anees
-        return self.innovations.ratio if self.innovations is not None else float("nan")
-
-    @property
-    def threshold(self) -> tuple[float, float]:
-        """Interval in which ``statistic`` is no fault."""
-        if self.scale is not None:
-            return self.scale.accepted
-        return self.innovations.interval if self.innovations is not None else (float("nan"), float("nan"))
-
-    @property
-    def inflation(self) -> float:
-        """Factor by which the stated covariance has to grow (below 1: shrink) to be that of the errors."""
-        return self.scale.inflation.value if self.scale is not None else float("nan")
-
-    @property
-    def inflation_interval(self) -> tuple[float, float]:
-        """95 % interval of ``inflation``, from the spread between runs."""
-        return self.scale.inflation[1:] if self.scale is not None else (float("nan"), float("nan"))
-
-    @property
-    def equivalence(self) -> Equivalence | None:
-        """Equivalence of the scale of the NEES, or of the NIS without truth."""
-        if self.scale is not None:
-            return self.scale.equivalence
-        return self.innovations.equivalence if self.innovations is not None else None
-
-    @property
-    def first_step(self) -> int | None:
-        """First step in which the ANEES is outside its simultaneous band; None if in none."""
-        return self.location.first_step if self.location is not None else None
-
-    @property
-    def subset(self) -> str | None:
-        """Axes that carry the fault; None if no axis stands out."""
-        return self.location.subset if self.location is not None else None
-
-    @property
-    def statistics(self) -> dict[str, Any]:
-        """Every number as one flat dictionary, as ``--json`` has it."""
-        from consistency.referee.diagnostics.verdict.as_dictionary import flat
-
-        return flat(self)
-
-    def __str__(self) -> str:
-        return str(shown_by("verdict_text", self))
-
-    def __repr__(self) -> str:
-        return f"<Verdict {self.filter}: {self.status}, {self.runs} runs x {self.steps} steps; print() shows it>"
-
-    def _repr_html_(self) -> str:
-        return str(shown_by("verdict_html", self))
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Errors with their bounds, NEES with its band, and coverage; arguments as those of :meth:`Record.plot`.
-
-        Raises
-        ------
-        InputError
-            The verdict was not made by ``consistency.judge``, or nothing can be drawn.
-        """
-        if self.record is None:
-            raise InputError(f"{self.filter}: the record was not kept with the verdict; draw record.plot() of it")
-        return shown_by("plot", self.record, self, path)

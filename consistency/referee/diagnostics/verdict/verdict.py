@@ -1,257 +1,309 @@
-"""The verdict on one filter, from its errors over independent runs."""
+"""The verdict on one filter: what the tests found, the status that follows, and the sentences that say so."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.planning.number_of_runs import detectable_ratio
-from consistency.referee.diagnostics.questions.band import simultaneous_band
-from consistency.referee.diagnostics.questions.equivalence import (
-    equivalence,
-    equivalence_by_betting,
-    equivalence_of_total,
-    is_tolerated,
-)
-from consistency.referee.diagnostics.questions.lost_runs import early_ends, lost_of
-from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
-from consistency.referee.diagnostics.records.large_arrays import Symmetric
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.sample import Sample, impossible, innovations_of, sample_of
-from consistency.referee.diagnostics.records.sample import shape_of as shape_of_arrays
-from consistency.referee.diagnostics.statistics.nees import anees, chi2_mean_interval
-from consistency.referee.diagnostics.verdict.answers import (
-    AXIS,
-    DIRECTION,
-    JOINT,
-    MAIN,
-    SHARES,
-    STEP,
-    Tests,
-    answers,
-    ask,
-)
-from consistency.referee.diagnostics.verdict.fault_location import (
-    accuracy_of,
-    axes_of,
-    bias_of,
-    location_of,
-    shape_of,
-    tails_of,
-)
+from consistency.referee.diagnostics.records.record import Record, shown_by
+from consistency.referee.diagnostics.records.skipping import Skipped
+from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
 from consistency.referee.diagnostics.verdict.parts import (
+    TINY,
+    Accuracy,
     Answer,
+    Axes,
+    Bias,
+    EarlyEnds,
     Equivalence,
     Innovations,
+    Interval,
+    JointScore,
     Location,
+    Lost,
+    RejectionScore,
     Scale,
-    Settings,
-    Verdict,
+    Shape,
+    Tails,
+    TruthShare,
 )
-from consistency.referee.diagnostics.words import sentences
-from consistency.referee.diagnostics.words.headline import at_share, deciding_axis, status_of
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.errors import InputError
+from consistency.referee.types import Failure, Indices
 
-if TYPE_CHECKING:
-    from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import UncertainTruth
-    from consistency.referee.diagnostics.maps.map_nees import JointTest
-
-DEFAULT = Settings()
+UNKNOWN_ENDS = (float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)
-class Look:
-    """One of several looks at growing evidence; see :mod:`consistency.referee.diagnostics.planning.early_stopping`."""
+class Findings:
+    """What the tests found in the errors and innovations of one filter; a part is None if it could not be computed."""
 
-    spent: float | None  # part of the false-alarm rate of every question but the scale that this look may cost;
-    # None where nothing but the scale is asked
-    scale: float  # p value of the scale, valid at any time
+    filter: str
+    status: str  # see STATUSES
+    runs: int
+    steps: int
+    settings: Settings
+    answers: tuple[Answer, ...] = ()
+    failures: tuple[Failure, ...] = ()
+    impossible: tuple[tuple[int, int], ...] = ()  # (run, step) of what no filter may say
+    left_out_steps: tuple[int, ...] = ()  # rank-deficient covariance
+    scale: Scale | None = None
+    axes: Axes | None = None
+    bias: Bias | None = None
+    shape: Shape | None = None
+    tails: Tails | None = None
+    innovations: Innovations | None = None
+    location: Location | None = None
+    accuracy: Accuracy | None = None
+    landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
+    joint: JointScore | None = None  # of the verdict on a map
+    unit: str = "run"  # what a run is called, as in :class:`~consistency.diagnostics.Record`
+    lost: Lost | None = None  # where there is a NEES
+    ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
+    skipped: Skipped | None = None  # first steps of each run that were left out
+    truth: TruthShare | None = None  # where the truth has a covariance of its own
+    parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
+
+    @property
+    def consistent(self) -> bool:
+        return self.status == "consistent"
+
+    def place(self, step: int) -> str:
+        """Name of step 1..T: "step 3", or "landmark 17" where landmarks stand in the place of steps."""
+        if self.landmarks is None:
+            return f"step {step}"
+        return f"landmark {self.landmarks[step - 1]}"
+
+    @property
+    def places(self) -> str:
+        """Noun for the second axis of the arrays: steps, or landmarks of a map."""
+        if self.landmarks is None:
+            return "steps"
+        return "landmarks"
+
+    @property
+    def worst_axis(self) -> tuple[str, Interval] | None:
+        """Component whose ratio is farthest from 1, on the side of a fault of the scale; None if there is only one."""
+        if self.axes is None or len(self.axes.names) < 2:
+            return None
+        side = 0.0
+        if self.status == "overconfident":
+            side = 1.0
+        elif self.status == "conservative":
+            side = -1.0
+        elif self.settings.one_sided:
+            side = 1.0
+        worst, farthest = None, -np.inf
+        for axis, interval in self.axes.inflation.items():
+            log = float(np.log(max(interval.value, TINY)))
+            if axis not in self.axes.names or not np.isfinite(log):
+                continue
+            distance = side * log if side else abs(log)
+            if distance > farthest:
+                worst, farthest = (axis, interval), distance
+        return worst
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Questions in which a fault was found, those within the tolerance left out."""
+        return tuple(a.question for a in self.answers if a.found and not a.tolerated)
+
+    @property
+    def p_value(self) -> float:
+        """False-alarm rate at which some fault would just be found, all questions together; NaN without any."""
+        return min((min(1.0, a.p_value / a.share) for a in self.answers if not a.tolerated), default=float("nan"))
+
+    @property
+    def statistic(self) -> float:
+        """Mean NEES over runs and steps; without truth, NIS per degree of freedom."""
+        if self.scale is not None:
+            return self.scale.mean_anees
+        if self.innovations is not None:
+            return self.innovations.ratio
+        return float("nan")
+
+    @property
+    def threshold(self) -> tuple[float, float]:
+        """Interval in which ``statistic`` is no fault."""
+        if self.scale is not None:
+            return self.scale.accepted
+        if self.innovations is not None:
+            return self.innovations.interval
+        return UNKNOWN_ENDS
+
+    @property
+    def inflation(self) -> float:
+        """Factor by which the stated covariance has to grow (below 1: shrink) to be that of the errors."""
+        if self.scale is None:
+            return float("nan")
+        return self.scale.inflation.value
+
+    @property
+    def inflation_interval(self) -> tuple[float, float]:
+        """95 % interval of ``inflation``, from the spread between runs."""
+        if self.scale is None:
+            return UNKNOWN_ENDS
+        return self.scale.inflation[1:]
+
+    @property
+    def equivalence(self) -> Equivalence | None:
+        """Equivalence of the scale of the NEES, or of the NIS without truth."""
+        if self.scale is not None:
+            return self.scale.equivalence
+        if self.innovations is not None:
+            return self.innovations.equivalence
+        return None
+
+    @property
+    def first_step(self) -> int | None:
+        """First step in which the ANEES is outside its simultaneous band; None if in none."""
+        if self.location is None:
+            return None
+        return self.location.first_step
+
+    @property
+    def subset(self) -> str | None:
+        """Axes that carry the fault; None if no axis stands out."""
+        if self.location is None:
+            return None
+        return self.location.subset
 
 
-def judge_alone(
-    evidence: Record, settings: Settings = DEFAULT, look: Look | None = None, truth: UncertainTruth | None = None
-) -> Verdict:
-    """Judge the errors and innovations of a record, and nothing beside them; see :func:`judging.judge`.
+@dataclass(frozen=True)
+class MapScore:
+    """Landmarks in the map after the last step, each with 3 degrees of freedom, or 2 in the plane."""
 
-    With a ``truth`` that is uncertain ``evidence`` is :attr:`UncertainTruth.evidence`.
+    ratio: Interval  # mean over runs of the mean NEES over its degrees of freedom, 95 % by the spread between runs
+    runs: int  # with a landmark that has a NEES
+    landmarks: int  # that have one, of all runs
+    left_out: int  # that have none: no landmark of the world, not known where, or covariance not positive definite
+    verdict: Verdict | None = None  # on the map, landmarks in the place of steps; None where it is not judged
+
+
+class ConventionResult(NamedTuple):
+    """What the errors say if they are of one convention, where none is declared."""
+
+    status: str  # of that convention
+    faults: tuple[str, ...]
+    ratio: Interval  # of true to stated covariance, simultaneous over the conventions
+    possible: bool  # no fault is found
+
+
+@dataclass(frozen=True, repr=False)
+class Verdict(Findings):
+    """The referee's answer for one filter.
+
+    ``print`` shows the sentence and a short table.
     """
-    runs, steps = shape_of_arrays(evidence)
-    both_sides = settings
-    settings = replace(settings, allow="conservative") if evidence.reduced else settings
-    innovations, p_values = _innovations(evidence, settings)
-    sample = sample_of(evidence, settings)
-    joint: JointTest | None = None
-    excused, tests = set[str](), None
-    if evidence.joint is not None:
-        from consistency.referee.diagnostics.maps.map_nees import joint_test
 
-        joint = joint_test(evidence.joint, settings, evidence.run_numbers, evidence.landmarks)
-        p_values |= joint.p_values
-        excused = {JOINT} if is_tolerated(joint.nees, joint.score.dof, settings) else excused
-    if sample is not None:
-        tests = ask(sample, settings, p_values, look.scale if look else None)
-        asked = tests.p_values if truth is None else truth.p_values(tests.p_values, settings)
-        p_values |= {q: p for q, p in asked.items() if q not in evidence.unavailable}
-    if look is not None:
-        p_values = _at(look, p_values)
-    by_question = answers(p_values, settings.false_alarm)
-    i = innovations
-    if i is not None and i.judged and not i.outliers and is_tolerated(i.ratio * i.dof, i.dof, settings):
-        excused |= {"innovation scale"}
-    verdict = Verdict(
-        evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), excused), evidence.failures,
-        innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
-        unit=evidence.unit, skipped=evidence.skipped,
-    )  # fmt: skip
-    if sample is not None and evidence.landmarks is None:
-        ends = early_ends(sample.nees)
-        verdict = replace(verdict, ends=ends if ends.runs else None)
-    if sample is not None and tests is not None:
-        shown = _equivalence(sample, both_sides, look, evidence, truth)
-        lost = lost_of(evidence, sample.nees, sample.dof, settings, any_time=look is not None)
-        verdict = _with_records(replace(verdict, lost=lost), evidence, sample, tests, shown)
-    verdict = replace(verdict, status=status_of(verdict, sample, tests, joint))
-    verdict = verdict if truth is None else truth.of_estimate(verdict)
-    verdict = replace(verdict, axis=deciding_axis(verdict))
-    return replace(verdict, reasons=tuple(sentences.reasons(verdict)))
+    reasons: tuple[str, ...] = ()  # the first is a sentence to act on
+    axis: tuple[str, Interval] | None = None  # that decides the status, with its ratio; None where the whole does
+    convention: str | None = None  # of the error that is judged, where files or the filter declare one
+    notes: tuple[str, ...] = ()  # of whoever read the files
+    causes: tuple[str, ...] = ()  # probable mix-ups; they stand in the reasons and notes, too
+    align: str | None = None  # how estimates in files were moved into the world of the truth
+    world: Verdict | None = None  # the same runs in the additive error of the world, where the filter has another
+    map: MapScore | None = None
+    rejection: RejectionScore | None = None  # of a filter with a guard
+    guesses: Mapping[str, ConventionResult] = field(default_factory=dict)  # by convention, where none is declared
+    record: Record | None = None  # what was judged, where it is kept to be drawn
 
+    @property
+    def in_world(self) -> Verdict:
+        """The verdict whose errors are those of the pose in the world: ``world``, or this one."""
+        if self.world is None:
+            return self
+        return self.world
 
-def _at(look: Look, p_values: dict[str, float]) -> dict[str, float]:
-    """p values corrected for the number of looks; the share of the scale stays what it is if it is asked alone."""
-    if look.spent is None:
-        return {q: p if q == MAIN else 1.0 for q, p in p_values.items() if np.isfinite(p)}
-    return {q: p if q == MAIN or not np.isfinite(p) else min(1.0, p / look.spent) for q, p in p_values.items()}
+    @property
+    def statistics(self) -> dict[str, Any]:
+        """Every number as one flat dictionary, as ``--json`` has it; parts that could not be computed are left out."""
+        numbers: dict[str, Any] = {
+            "runs": self.runs,
+            "steps": self.steps,
+            "unit": self.unit,
+            "false_alarm": self.settings.false_alarm,
+            "confidence": 1.0 - self.settings.false_alarm,
+            "detect": self.settings.detect,
+            "power": self.settings.power,
+            "tolerance": self.settings.tolerance,
+            "allow": self.settings.allow,
+            "failures": [[failure.run, failure.step, failure.reason] for failure in self.failures],
+            "answers": [vars(answer) for answer in self.answers],
+            "p_value": self.p_value,
+            "left_out_steps": list(self.left_out_steps),
+        }
+        numbers |= dictionary.scale_numbers(self.scale) | dictionary.lost_numbers(self.lost, self.settings.lost)
+        numbers |= dictionary.location_numbers(self.location) | self._of_axes() | dictionary.bias_numbers(self.bias)
+        numbers |= dictionary.shape_numbers(self.shape) | dictionary.tails_numbers(self.tails)
+        numbers |= (
+            dictionary.innovations_numbers(self.innovations)
+            | dictionary.accuracy_numbers(self.accuracy)
+            | self._of_map()
+        )
+        if self.landmarks is not None:
+            numbers["landmarks"] = list(self.landmarks)
+        numbers |= dictionary.joint_numbers(self.joint) | dictionary.rejection_numbers(self.rejection)
+        numbers |= dictionary.ends_numbers(self.ends) | dictionary.skipped_numbers(self.skipped)
+        if self.guesses:
+            numbers["guesses"] = {kind: guess._asdict() for kind, guess in self.guesses.items()}
+        numbers |= dictionary.truth_numbers(self.truth)
+        if self.convention is not None or self.notes:
+            numbers |= {"convention": self.convention, "align": self.align, "notes": list(self.notes)}
+        if self.world is not None:
+            numbers["world"] = self.world.as_dictionary()
+        return numbers
 
+    def as_dictionary(self) -> dict[str, Any]:
+        """Status, reasons and statistics."""
+        return {"status": self.status, "reasons": self.reasons, "statistics": self.statistics}
 
-# --- innovations -------------------------------------------------------------------------------------
+    def _of_axes(self) -> dict[str, Any]:
+        if self.axes is None:
+            return {}
+        numbers = dictionary.axes_numbers(self.axes) | {"impossible": [list(pair) for pair in self.impossible]}
+        for key, axis in (("worst_axis", self.worst_axis), ("axis", self.axis)):
+            if axis is not None:
+                numbers |= {key: axis[0], f"{key}_ratio": tuple(axis[1])}
+        if self.axes.largest is not None:
+            numbers |= {"largest": tuple(self.axes.largest), "largest_direction": self.axes.direction}
+        return numbers
 
+    def _of_map(self) -> dict[str, Any]:
+        if self.map is None:
+            return {}
+        numbers: dict[str, Any] = {
+            "map_ratio": self.map.ratio.value,
+            "map_ratio_interval": tuple(self.map.ratio[1:]),
+            "map_runs": self.map.runs,
+            "map_landmarks": self.map.landmarks,
+            "map_left_out": self.map.left_out,
+        }
+        if self.map.verdict is not None:
+            numbers["map"] = self.map.verdict.as_dictionary()
+        return numbers
 
-def _innovations(evidence: Record, settings: Settings) -> tuple[Innovations | None, dict[str, float]]:
-    nis_and_dof = innovations_of(evidence)
-    if nis_and_dof is None:
-        return None, {}
-    from consistency.referee.diagnostics.questions.innovations import nis_test, nis_whiteness, outliers_of, whiteness
+    def __str__(self) -> str:
+        return str(shown_by("verdict_text", self))
 
-    test = nis_test(*nis_and_dof)
-    low_high = chi2_mean_interval(test.dof, CONFIDENCE) if test.dof else (float("nan"), float("nan"))
-    if evidence.innovations is not None and evidence.innovation_covariances is not None:
-        white = whiteness(evidence.innovations, evidence.innovation_covariances)
-    else:
-        white = nis_whiteness(*nis_and_dof)
-    judged = evidence.optimal_gain
-    factor = max(settings.factor, settings.tolerated)
-    shown = equivalence_of_total(test.ratio * test.dof, test.dof, settings, factor) if judged else None
-    record = Innovations(test.ratio, low_high, test.dof, judged, white.correlation, white.bound, shown)
-    if not judged:
-        return record, {}
-    p = {"innovation scale": test.above if settings.one_sided else test.p_value}
-    if (far := outliers_of(*nis_and_dof)) is not None:
-        p["innovation scale"] = min(p["innovation scale"], far.p_value)
-        far = replace(far, run=int(evidence.run_numbers[far.run]), step=far.step + 1)
-        record = replace(record, outliers=far)
-    return record, p if settings.one_sided else p | {"innovation whiteness": white.p_value}
+    def __repr__(self) -> str:
+        return f"<Verdict {self.filter}: {self.status}, {self.runs} runs x {self.steps} steps; print() shows it>"
 
+    def _repr_html_(self) -> str:
+        return str(shown_by("verdict_html", self))
 
-# --- results beside the p values -----------------------------------------------------------------
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Errors with their bounds, NEES with its band, and coverage; arguments as those of :meth:`Record.plot`.
 
-
-def _with_records(verdict: Verdict, evidence: Record, sample: Sample, tests: Tests, shown: Equivalence) -> Verdict:
-    settings = verdict.settings
-    if settings.tolerance is not None:
-        verdict = replace(verdict, answers=_excused(verdict.answers, _tolerated(sample, tests, settings)))
-    by_question = {a.question: a for a in verdict.answers if not a.tolerated}
-    band = tests.band
-    step = by_question.get(STEP)
-    if step is not None and step.found and not band.outside.any():  # found by what Holm's correction left over
-        rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
-        band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
-    location = location_of(sample, band, by_question, ordered=evidence.landmarks is None, detect=settings.factor)
-    scale = _scale_of(sample, tests, at_share(verdict), location, shown)
-    if sample.errors is None or evidence.error is None or evidence.covariance is None:
-        return replace(verdict, scale=scale, location=location, tails=tails_of(tests, evidence.run_numbers))
-    odd = impossible(evidence, sample.counted)
-    there = Symmetric.of(evidence.covariance).where_all(np.isfinite)
-    return replace(
-        verdict,
-        scale=scale,
-        location=location,
-        impossible=tuple((int(run), int(k) + 1) for run, k in np.argwhere(odd)),
-        left_out_steps=tuple(int(k) + 1 for k in np.flatnonzero((there & ~sample.counted).any(axis=0))),
-        axes=axes_of(sample, tests, location),
-        bias=bias_of(sample, tests.bias_step, location, by_question),
-        shape=shape_of(sample, tests, by_question, at_share(verdict).false_alarm),
-        tails=tails_of(tests, evidence.run_numbers),
-        accuracy=accuracy_of(sample),
-    )
-
-
-def _equivalence(
-    sample: Sample, settings: Settings, look: Look | None, evidence: Record, truth: UncertainTruth | None
-) -> Equivalence:
-    if look is not None:
-        return equivalence_by_betting(sample.means(), sample.dof, settings)
-    factor = max(settings.factor, settings.tolerated)
-    if truth is not None:
-        return truth.equivalence(sample, settings, factor)
-    return equivalence(
-        sample.means(), sample.dof, sample.longest, settings, factor, not evidence.reduced, evidence.unseen
-    )
-
-
-def _excused(all_answers: Iterable[Answer], questions: set[str]) -> tuple[Answer, ...]:
-    """Answers with the faults in these questions marked as tolerated."""
-    return tuple(replace(a, tolerated=True) if a.found and a.question in questions else a for a in all_answers)
-
-
-def _tolerated(sample: Sample, tests: Tests, settings: Settings) -> set[str]:
-    """Questions about the scale whose ratio is shown to lie within the tolerance, whatever they found."""
-    R, steps = settings.tolerated, sample.longest
-    if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
-        return set()
-    tolerated = {MAIN}
-    if sample.errors is not None:
-        groups = sample.errors.groups.values()
-        if all(equivalence(sample.group_means(g), len(g), steps, settings, R).shown for g in groups):
-            tolerated |= {AXIS}
-    if tests.largest is not None and tests.largest.ratio.high <= R:
-        tolerated |= {DIRECTION}
-    band = tests.band
-    curve = anees(sample.nees)
-    outside = (curve > band.high * R) | (curve < band.low / R)
-    return tolerated if outside.any() else tolerated | {STEP}
-
-
-def _scale_of(sample: Sample, tests: Tests, settings: Settings, location: Location, shown: Equivalence) -> Scale:
-    """Assemble the record of the scale; the inflation is that since the fault began, if it began late."""
-    dof, means = sample.dof, sample.means()
-    alive = sample.counted.sum(axis=0)
-    curve, band = anees(sample.nees), pointwise_band(alive, dof)
-    judged = alive > 0
-    some = bool(judged.any())
-    rate = SHARES[MAIN] * settings.false_alarm
-    inside = (curve >= band[:, 0]) & (curve <= band[:, 1])
-    of_log = None
-    if len(sample.nees) == 1:
-        from consistency.referee.diagnostics.planning.single_log import within
-
-        of_log = within(sample.nees[0], dof, settings, shown.factor)
-    late = means if location.since is None else sample.means(slice(location.since - 1, None))
-    return Scale(
-        dof=dof,
-        anees=curve,
-        alive=alive,
-        band=band,
-        mean_anees=tests.main.ratio * dof,
-        accepted=acceptance(tests.main, dof, rate, settings.allow),
-        effective_dof=tests.main.effective_dof,
-        inflation=ratio_interval(late, dof, CONFIDENCE),
-        detectable=detectable_ratio(dof, len(means), rate, two_sided=not settings.one_sided) if some else np.nan,
-        median_run=float(np.median(means)) * dof if some else np.nan,
-        worst_run=float(means.max()) * dof if some else np.nan,
-        share_inside=float(inside[judged].mean()) if some else np.nan,
-        equivalence=shown,
-        within=of_log,
-    )
+        Raises
+        ------
+        InputError
+            The verdict was not made by ``consistency.judge``, or nothing can be drawn.
+        """
+        if self.record is None:
+            raise InputError(f"{self.filter}: the record was not kept with the verdict; draw record.plot() of it")
+        return shown_by("plot", self.record, self, path)

@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from consistency.referee.diagnostics.judging.error_parts import VISIBLE
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
-from consistency.referee.diagnostics.verdict.fault_location import VISIBLE
-from consistency.referee.diagnostics.verdict.parts import TINY, Answer, Innovations, Interval, JointScore, Verdict
-from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, off_by_factor, plain, plural, short
+from consistency.referee.diagnostics.verdict.parts import TINY, Answer, Innovations, Interval, JointScore
+from consistency.referee.diagnostics.verdict.verdict import Findings
+from consistency.referee.diagnostics.words.numbers import (
+    UNCERTAIN,
+    off_by,
+    off_by_factor,
+    plural,
+    ratio_text,
+    short,
+)
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
 MOST = 3  # axes that a sentence names with their figures
+NAMED = 0.1  # part of a unit vector that a sentence names
 SIDES = {"overconfident": 1, "conservative": -1}  # to which the whole errs
 
 Faults = Mapping[str, Answer]
+NamedRatio = tuple[str, Interval]
 
 
 # --- the scale ---------------------------------------------------------------------------------------
 
 
-def scale_text(v: Verdict, faults: Faults) -> str:
+def scale_text(v: Findings, faults: Faults) -> str:
     """Too small or too large a covariance; '' where a correlation of the wrong sign is all that it is."""
     assert v.scale is not None
     assert v.location is not None
@@ -29,100 +39,159 @@ def scale_text(v: Verdict, faults: Faults) -> str:
         return ""
     if (MAIN not in faults and STEP not in faults) or opposite(v, faults):
         return _axes_text(v)
-    if v.status == "inconsistent" and v.scale.inflation.value > 1.0 and _sure(v, -1):
+    if v.status == "inconsistent" and v.scale.inflation.value > 1.0 and _wrong(v, -1):
         return _correlation_text(v)
-    where, inflation, about = v.location, v.scale.inflation, ""
+    inflation, about = v.scale.inflation, ""
     if v.bias is not None and v.bias.inflation_without is not None:
         inflation, about = v.bias.inflation_without, " about the mean"
     contrary = SIDES.get(v.status, 0) * (inflation.value - 1.0) < 0.0
     if about and contrary:
         return f"covariance{about} {_side(SIDES[v.status])} in some {v.places}"
-    if MAIN not in faults and (contrary or not where.lasting):
+    if MAIN not in faults and (contrary or not v.location.lasting):
         return _steps_text(v)
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
-    text = f"covariance{about} {off_by(inflation)}"
-    if v.runs > 1 and inflation.value > TINY and not inflation.high < UNCERTAIN * inflation.low:
-        text = f"covariance{about} {off_by_factor(inflation.value)}{_since(v)} in the mean, which a few {v.unit}s make"
-    elif inflation.holds(1.0) and v.runs > 1:
-        text += f"{_since(v)}, an interval that holds 1: the {v.unit}s differ more than Gaussian errors would"
-    else:
-        text += _since(v)
-    if where.subset:
-        text += f", mainly {where.subset}"
-    first = int(np.argmax(v.scale.alive > 0)) + 1  # judged step
-    if where.lasting and where.since is None and where.first_step is not None and where.first_step > first:
-        text += f", first visible in step {where.first_step}"
+    text = _size_text(v, inflation, about)
+    if v.location.subset:
+        text += f", mainly {v.location.subset}"
+    text += _first_visible(v)
     if not about and v.status == "overconfident" and AXIS in faults and not v.settings.one_sided:
-        below = [(a, i) for a, i in _sure(v, -1).items() if v.axes is not None and a in v.axes.names]
-        text += "".join(f", but {off_by(i)} in {a}" for a, i in below[:1])  # an axis errs in the other direction
+        text += _contrary_axis(v)
     return text
 
 
-def _since(v: Verdict) -> str:
-    since = v.location.since if v.location is not None else None
-    return "" if since is None else f" since step {since}"
+def _size_text(v: Findings, inflation: Interval, about: str) -> str:
+    """The size of the fault, and since when."""
+    if v.runs > 1 and inflation.value > TINY and not inflation.high < UNCERTAIN * inflation.low:
+        off = off_by_factor(inflation.value)
+        return f"covariance{about} {off}{_since(v)} in the mean, which a few {v.unit}s make"
+    text = f"covariance{about} {off_by(inflation)}"
+    if inflation.holds(1.0) and v.runs > 1:
+        return f"{text}{_since(v)}, an interval that holds 1: the {v.unit}s differ more than Gaussian errors would"
+    return f"{text}{_since(v)}"
+
+
+def _first_visible(v: Findings) -> str:
+    """The step in which a lasting fault is first visible, unless that is the first one that is judged."""
+    where = v.location
+    assert v.scale is not None
+    if where is None or not where.lasting or where.since is not None or where.first_step is None:
+        return ""
+    if where.first_step <= int(np.argmax(v.scale.alive > 0)) + 1:
+        return ""
+    return f", first visible in step {where.first_step}"
+
+
+def _contrary_axis(v: Findings) -> str:
+    """The component farthest in the other direction."""
+    for axis, interval in _wrong(v, -1).items():
+        if v.axes is not None and axis in v.axes.names:
+            return f", but {off_by(interval)} in {axis}"
+    return ""
+
+
+def _since(v: Findings) -> str:
+    if v.location is None or v.location.since is None:
+        return ""
+    return f" since step {v.location.since}"
 
 
 def _side(sign: float) -> str:
-    return "too small" if sign > 0 else "too large"
+    if sign > 0:
+        return "too small"
+    return "too large"
 
 
-def _steps_text(v: Verdict) -> str:
+def _steps_text(v: Findings) -> str:
     """Steps above and below the band, each side with their number, the first, and on the verdict's side the largest."""
     assert v.scale is not None
     assert v.location is not None
     ratio, (low, high) = v.scale.anees / v.scale.dof, v.location.simultaneous.T / v.scale.dof
-    outside = {1: ratio > high, -1: ratio < low}
-    mine = SIDES.get(v.status, 0)
+    own = SIDES.get(v.status, 0)
+    signs = [1, -1]
+    if own == -1:
+        signs = [-1, 1]
     parts: list[str] = []
-    for sign in sorted(outside, key=lambda sign: sign != mine):
-        steps = np.flatnonzero(outside[sign])
+    for sign in signs:
+        steps = np.flatnonzero(ratio > high)
+        if sign < 0:
+            steps = np.flatnonzero(ratio < low)
         if not len(steps):
             continue
-        worst = ratio[steps].max() if sign > 0 else ratio[steps].min()
-        size = off_by_factor(worst, up_to=True) if sign == mine or not mine else _side(sign)
-        total = "" if parts else f" of {v.scale.judged_steps} {v.places}"
+        size = _side(sign)
+        if own in (sign, 0):
+            worst = max(ratio[steps], key=lambda value: sign * value)
+            size = off_by_factor(worst, "up to ")
+        total = ""
+        if not parts:
+            total = f" of {v.scale.judged_steps} {v.places}"
         parts.append(f"{size} in {len(steps)}{total}, first in {v.place(int(steps[0]) + 1)}")
-    return f"covariance {', and '.join(parts)}" if parts else f"covariance wrong in some {v.places}"
+    if not parts:
+        return f"covariance wrong in some {v.places}"
+    return f"covariance {', and '.join(parts)}"
 
 
-def opposite(v: Verdict, faults: Faults) -> bool:
+def opposite(v: Findings, faults: Faults) -> bool:
     """Is the verdict about axes that err in opposite directions?"""
-    return v.status == "inconsistent" and AXIS in faults and all(_sure(v, sign) for sign in (1, -1))
+    return v.status == "inconsistent" and AXIS in faults and bool(_wrong(v, 1)) and bool(_wrong(v, -1))
 
 
-def _sure(v: Verdict, sign: int) -> dict[str, Interval]:
+def _wrong(v: Findings, sign: int) -> dict[str, Interval]:
     """Components wrong to one side beyond doubt, the farthest first; groups where no component is."""
     assert v.axes is not None
-    found = {a: i for a, i in v.axes.inflation.items() if (i.low > 1.0 if sign > 0 else i.high < 1.0)}
-    found = {a: i for a, i in found.items() if a in v.axes.names} or found
-    return dict(sorted(found.items(), key=lambda item: -sign * np.log(max(item[1].value, TINY))))
+    components, groups = [], []
+    for axis, interval in v.axes.inflation.items():
+        beyond = interval.low > 1.0
+        if sign < 0:
+            beyond = interval.high < 1.0
+        if beyond and axis in v.axes.names:
+            components.append((axis, interval))
+        elif beyond:
+            groups.append((axis, interval))
+    return dict(sorted(components or groups, key=lambda item: -sign * np.log(max(item[1].value, TINY))))
 
 
-def _axes_text(v: Verdict) -> str:
+def _axes_text(v: Findings) -> str:
     """The fault shows in an axis, a group or a direction alone, or in opposite axes."""
     assert v.axes is not None
-    side = 1 if v.settings.one_sided else SIDES.get(v.status, 0)
-    above, below = ([*_sure(v, sign).items()] if side != -sign else [] for sign in (1, -1))
-    largest, u = v.axes.largest, v.axes.direction
+    side = SIDES.get(v.status, 0)
+    if v.settings.one_sided:
+        side = 1
+    above: list[NamedRatio] = []
+    below: list[NamedRatio] = []
+    if side != -1:
+        above = list(_wrong(v, 1).items())
+    if side != 1:
+        below = list(_wrong(v, -1).items())
+    largest = v.axes.largest
     if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for _, i in above):
-        assert u is not None
-        u = u * np.sign(u[np.argmax(np.abs(u))])  # of errors in stated standard deviations
-        along = (f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > 0.1)
-        return f"covariance {off_by(largest)} in the direction {' '.join(along)}"
-    named = (above + below)[:MOST] if not (above and below) else [*above[: MOST - 1], below[0]]
+        return f"covariance {off_by(largest)} in the direction {_direction_text(v)}"
+    named = (above + below)[:MOST]
+    if above and below:
+        named = [*above[: MOST - 1], below[0]]
     if not named:
         return "covariance wrong in an axis"
-    return f"covariance {', '.join(f'{off_by(i)} in {a}' for a, i in named)}{_since(v)}"
+    return f"covariance {_sizes_in_axes(named)}{_since(v)}"
 
 
-def _correlation_text(v: Verdict) -> str:
+def _direction_text(v: Findings) -> str:
+    """The worst direction, of errors in stated standard deviations."""
+    assert v.axes is not None
+    assert v.axes.direction is not None
+    u = v.axes.direction
+    u = u * np.sign(u[np.argmax(np.abs(u))])
+    return " ".join(f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > NAMED)
+
+
+def _sizes_in_axes(named: Iterable[NamedRatio]) -> str:
+    return ", ".join(f"{off_by(interval)} in {axis}" for axis, interval in named)
+
+
+def _correlation_text(v: Findings) -> str:
     """Axes that are too large, and a direction in which the correlation makes the covariance too small."""
     assert v.scale is not None
-    large = ", ".join(f"{off_by(i)} in {a}" for a, i in [*_sure(v, -1).items()][:MOST])
-    text = f"covariance {large}"
+    text = f"covariance {_sizes_in_axes(list(_wrong(v, -1).items())[:MOST])}"
     if v.shape is None:
         return text
     worst = float(np.linalg.eigvalsh(v.shape.matrix)[-1]) * v.scale.mean_anees / v.scale.dof
@@ -132,69 +201,105 @@ def _correlation_text(v: Verdict) -> str:
 # --- bias, shape, tails, maps --------------------------------------------------------------------------
 
 
-def bias_text(v: Verdict, in_steps: bool) -> str:
+def bias_text(v: Findings, in_steps: bool) -> str:
     """Mean error of the axes that have one, or of the chief axis in the step in which it was found."""
     assert v.bias is not None
     rest = ""
     if v.bias.inflation_without is not None and v.status == "biased":
-        rest = f"; without the bias the covariance ratio is {plain(v.bias.inflation_without)}"
+        rest = f"; without the bias the covariance ratio is {ratio_text(v.bias.inflation_without)}"
     if in_steps:
-        size = "" if v.bias.size is None else f" {_sigmas(v.bias.size)} sigma in {v.bias.axis},"
+        size = ""
+        if v.bias.size is not None:
+            size = f" {_sigmas(v.bias.size)} sigma in {v.bias.axis},"
         return f"mean error{size} in {v.place(v.bias.step or 1)}{rest}"
-    sure = {axis: interval for axis, interval in v.bias.by_axis.items() if not interval.holds(0.0)}
-    sure = dict(sorted(sure.items(), key=lambda item: -abs(item[1].value))[:MOST])
-    named = [f"{_sigmas(i.value)} sigma [{_sigmas(i.low)}, {_sigmas(i.high)}] in {a}" for a, i in sure.items()]
-    return f"mean error {', '.join(named) if named else 'in a combination of axes'}{rest}"
+    sure = [(axis, interval) for axis, interval in v.bias.by_axis.items() if not interval.holds(0.0)]
+    sure.sort(key=lambda item: -abs(item[1].value))
+    named = []
+    for axis, interval in sure[:MOST]:
+        value, low, high = map(_sigmas, interval)
+        named.append(f"{value} sigma [{low}, {high}] in {axis}")
+    if not named:
+        return f"mean error in a combination of axes{rest}"
+    return f"mean error {', '.join(named)}{rest}"
 
 
 def _sigmas(value: float) -> str:
-    return f"{value:+.2f}" if abs(value) < 100.0 else f"{value:+.1e}"
+    if abs(value) < 100.0:
+        return f"{value:+.2f}"
+    return f"{value:+.1e}"
 
 
-def shape_text(v: Verdict, faults: Faults) -> str:
+def shape_text(v: Findings, faults: Faults) -> str:
     """The two axes that are correlated least as stated, where it can be seen."""
     assert v.shape is not None
     assert v.axes is not None
-    s, where = v.shape, "" if "shape" in faults else f" in {v.place(v.shape.step or 1)}"
-    gap = abs(s.actual - s.stated)
-    if s.pair is not None and (gap > (VISIBLE if "shape" in faults else NOTABLE) or s.wrong_sign):
-        a, b = (v.axes.names[i] for i in s.pair)
-        what = "correlation of the wrong sign:" if s.wrong_sign else "covariance of the wrong shape: correlation"
-        alone = "; no axis by itself is wrong" if s.alone else ""
-        return f"{what} {s.actual:+.2f}, stated {s.stated:+.2f}, of {a} and {b}{where}{alone}"
-    text = f"covariance of the wrong shape{where}"
-    return text if "shape" in faults else f"{text}: axes are wrong by different factors"
+    shape, where, worth_a_word = v.shape, "", VISIBLE
+    if "shape" not in faults:
+        where, worth_a_word = f" in {v.place(shape.step or 1)}", NOTABLE
+    gap = abs(shape.actual - shape.stated)
+    if shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
+        a, b = (v.axes.names[i] for i in shape.pair)
+        what = "covariance of the wrong shape: correlation"
+        if shape.wrong_sign:
+            what = "correlation of the wrong sign:"
+        text = f"{what} {shape.actual:+.2f}, stated {shape.stated:+.2f}, of {a} and {b}{where}"
+        if shape.alone:
+            text += "; no axis by itself is wrong"
+        return text
+    if "shape" in faults:
+        return f"covariance of the wrong shape{where}"
+    return f"covariance of the wrong shape{where}: axes are wrong by different factors"
 
 
-def tails_text(v: Verdict, faults: Faults) -> str:
+def tails_text(v: Findings, faults: Faults) -> str:
     """The error that stands out, or that runs differ more than they should."""
     if "outliers" not in faults:
         return f"heavy tails: the {v.unit}s differ more than Gaussian errors would"
     assert v.tails is not None
-    where = f"{v.unit} {v.tails.run}" + f", {v.place(v.tails.step)}" * (v.steps > 1)
+    where = f"{v.unit} {v.tails.run}"
+    if v.steps > 1:
+        where += f", {v.place(v.tails.step)}"
     return f"heavy tails: {short(v.tails.distance)} sigma from the other {v.unit}s in {where}"
 
 
-def innovations_text(v: Verdict, i: Innovations, they: str = "innovations") -> str:
+def innovations_text(v: Findings, i: Innovations, they: str = "innovations") -> str:
     """That innovations are larger or smaller than stated; of outliers which they are, and the size of the rest."""
-    if (far := i.outliers) is None:
-        return f"{they} {'larger' if i.ratio > 1 else 'smaller'} than stated"
-    are = "is an outlier," if far.count == 1 else "are outliers, the largest"
-    where = f"{v.unit} {far.run}, " * (v.runs > 1) + v.place(far.step)
+    far = i.outliers
+    if far is None:
+        if i.ratio > 1:
+            return f"{they} larger than stated"
+        return f"{they} smaller than stated"
+    are = "are outliers, the largest"
+    if far.count == 1:
+        are = "is an outlier,"
+    where = v.place(far.step)
+    if v.runs > 1:
+        where = f"{v.unit} {far.run}, {where}"
     return (
         f"{far.count} of {plural(far.of, 'innovation')} {are} in {where} (NIS {short(far.nis)}, {far.dof} expected); "
         f"NIS per degree of freedom of the rest {far.rest.ratio:.3f}"
     )
 
 
-def joint_text(v: Verdict, joint: JointScore) -> str:
+def joint_text(v: Findings, joint: JointScore) -> str:
     """What pose and map together say, and which of the two parts stands out, or which landmarks."""
-    pose, map_ = (not part.holds(1.0) for part in (joint.pose, joint.map))
-    part = "" if pose == map_ else f", mainly {'the pose' if pose else 'the map given the pose'}"
-    if joint.chief and not pose:
-        labels = ", ".join(str(label) for label in joint.chief[:MOST])
-        more = f" and {len(joint.chief) - MOST} more" if len(joint.chief) > MOST else ""
-        part += f" (most in landmark{'s' * (len(joint.chief) > 1)} {labels}{more})"
+    pose_is_wrong, map_is_wrong = not joint.pose.holds(1.0), not joint.map.holds(1.0)
+    part = ""
+    if pose_is_wrong and not map_is_wrong:
+        part = ", mainly the pose"
+    elif map_is_wrong and not pose_is_wrong:
+        part = ", mainly the map given the pose"
+    if joint.chief and not pose_is_wrong:
+        part += f" ({_chief_landmarks(joint.chief)})"
     if SIDES.get(v.status, 0) * (joint.both.value - 1.0) < 0.0:
         return f"pose and map together: the {v.unit}s differ more than Gaussian errors would{part}"
     return f"pose and map together: covariance {off_by(joint.both)}{part}"
+
+
+def _chief_landmarks(chief: tuple[int, ...]) -> str:
+    if len(chief) == 1:
+        return f"most in landmark {chief[0]}"
+    text = f"most in landmarks {', '.join(str(label) for label in chief[:MOST])}"
+    if len(chief) > MOST:
+        text += f" and {len(chief) - MOST} more"
+    return text

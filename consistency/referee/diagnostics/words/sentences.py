@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+
 import numpy as np
 
+from consistency.referee.diagnostics.judging.status import smaller
+from consistency.referee.diagnostics.questions.sample import ATTITUDE
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, JOINT, SCALE, SHAPE
-from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Location, Scale, Verdict
+from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Location, Scale, Within
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.words.faults import (
     MOST,
     Faults,
@@ -18,54 +25,71 @@ from consistency.referee.diagnostics.words.faults import (
     shape_text,
     tails_text,
 )
-from consistency.referee.diagnostics.words.headline import smaller
-from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, p_text, percent, plain, plural, short
-
-__all__ = ["UNCERTAIN", "off_by", "p_text", "percent", "plain", "plural", "question_text", "reasons", "short"]
+from consistency.referee.diagnostics.words.numbers import is_or_are, p_text, percent, plural, ratio_text, short
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
 MUCH = 100_000  # runs; more are no advice
 MOST_STEPS = 10_000_000  # of a log; more are no advice
+LATER = "no fault found in the scale; the other questions are asked at the next look"
 
 
-def reasons(v: Verdict) -> list[str]:
-    """First the sentence, then the figures."""
-    faults = {a.question: a for a in v.answers if a.found and not a.tolerated}
-    broken = _failures(v)
-    lines: list[str] = []
-    if (s := v.scale) is not None and s.judged_steps:
-        about = [*_truth(v), *_early_ends(v), *_levels(v, s), *_within_one(v, s), *_together(v), *_coverage(v)]
-        lines = [_sentence(v, s, faults) if faults else _no_fault(v, s), *about]
-    elif s is not None:
-        lines = ["no step has a covariance of full rank to judge"]
-    elif v.innovations is not None and v.innovations.dof:
-        lines = [_without_truth(v, v.innovations, faults)]
-    else:
-        lines = ["neither truth nor innovations to judge"]
-    lines = [lines[0], *broken, *lines[1:]] if faults else [*broken, *lines]
+def reasons(v: Findings, first: str = "") -> list[str]:
+    """First the sentence, then the figures.
+
+    Parameters
+    ----------
+    first : sentence in place of the first one, which is then not that of the findings
+    """
+    faults = {answer.question: answer for answer in v.answers if answer.found and not answer.tolerated}
+    sentence, figures = _sentence_and_figures(v, faults)
+    lines = [*_failures(v), sentence, *figures]
+    if faults:
+        lines = [sentence, *_failures(v), *figures]
     if v.innovations is not None:
         lines.append(_nis(v.innovations))
     if v.answers:
         lines.append(_questions(v, faults))
     lines += _first_steps(v)
-    first = "" if v.skipped is None else f"; without {v.skipped.skip.text} of each {_whole(v)}"
-    return [f"{v.status}: {lines[0]}{first}", *lines[1:]]
+    if not first:
+        first = lines[0]
+        if v.skipped is not None:
+            first += f"; without {v.skipped.skip.text} of each {_whole(v)}"
+    return [f"{v.status}: {first}", *lines[1:]]
+
+
+def _sentence_and_figures(v: Findings, faults: Faults) -> tuple[str, list[str]]:
+    """The sentence on errors, or without truth on innovations, and the figures behind it."""
+    if v.scale is not None and v.scale.judged_steps:
+        figures = [*_truth(v), *_early_ends(v), *_levels(v, v.scale), *_single_log(v, v.scale), *_together(v)]
+        figures += _coverage(v)
+        if faults:
+            return _fault(v, v.scale, faults), figures
+        return _no_fault(v, v.scale), figures
+    if v.scale is not None:
+        return "no step has a covariance of full rank to judge", []
+    if v.innovations is not None and v.innovations.dof:
+        return _without_truth(v, v.innovations, faults), []
+    return "neither truth nor innovations to judge", []
 
 
 # --- the sentence ------------------------------------------------------------------------------------
 
 
-def _failures(v: Verdict) -> list[str]:
+def _failures(v: Findings) -> list[str]:
     lines = []
     if v.failures:
-        first, count = v.failures[0], len({f.run for f in v.failures})
-        where = f"{v.unit} {first.run}" + f" in step {first.step}" * (v.unit == "run")
+        first, count = v.failures[0], len({failure.run for failure in v.failures})
+        where = f"{v.unit} {first.run}"
+        if v.unit == "run":
+            where += f" in step {first.step}"
         lines.append(f"{count} of {v.runs} {v.unit}s failed, first {where}: {first.reason}")
     if v.impossible:
         row, step = v.impossible[0]
-        count = len({r for r, _ in v.impossible})
+        count, have = len({run for run, _ in v.impossible}), "have"
+        if count == 1:
+            have = "has"
         lines.append(
-            f"{count} of {v.runs} {v.unit}s {'has' if count == 1 else 'have'} an infinite error or a covariance with a "
+            f"{count} of {v.runs} {v.unit}s {have} an infinite error or a covariance with a "
             f"negative variance, first {v.unit} {row} in {v.place(step)}; those {v.places} are left out"
         )
     if v.joint is not None and v.joint.not_definite:
@@ -76,97 +100,141 @@ def _failures(v: Verdict) -> list[str]:
     return lines
 
 
-def _whole(v: Verdict) -> str:
+def _whole(v: Findings) -> str:
     """Noun for the whole that steps belong to: a run, or a log whose windows are runs."""
-    return "run" if v.unit == "run" else "log"
+    if v.unit == "run":
+        return "run"
+    return "log"
 
 
-def _first_steps(v: Verdict) -> list[str]:
+def _first_steps(v: Findings) -> list[str]:
     """Steps left out of the beginning, or that might be."""
     if v.skipped is not None:
-        gone = f"; nothing is left of {plural(v.skipped.empty, 'run')}" if v.skipped.empty else ""
+        gone = ""
+        if v.skipped.empty:
+            gone = f"; nothing is left of {plural(v.skipped.empty, 'run')}"
+        are = is_or_are(v.skipped.skip.size)
         return [
-            f"{v.skipped.skip.text} of each {_whole(v)} {'is' if v.skipped.skip.size == 1 else 'are'} left out as "
+            f"{v.skipped.skip.text} of each {_whole(v)} {are} left out as "
             f"asked{gone}; a number that was chosen on these data voids the false-alarm rate: choose it beforehand, or "
             "on other data"
         ]
-    until = None if v.location is None else v.location.until
-    if until is None:
+    if v.location is None or v.location.until is None:
         return []
-    where = "the first step" if until.step == 1 else f"the first {until.step} steps"
+    until, where = v.location.until, "the first step"
+    if until.step > 1:
+        where = f"the first {until.step} steps"
     return [
         f"the fault is in {where} only, where the covariance ratio is {short(until.early)}; after that it is "
-        f"{plain(until.late)}. If the start is not meant to count, state --skip {until.step} (skip={until.step} in a "
-        "gate) and judge other runs by it"
+        f"{ratio_text(until.late)}. If the start is not meant to count, state --skip {until.step} (skip={until.step} "
+        "in a gate) and judge other runs by it"
     ]
 
 
-def _sentence(v: Verdict, s: Scale, faults: Faults) -> str:
+def _fault(v: Findings, s: Scale, faults: Faults) -> str:
+    """The sentence where a question found a fault."""
     if v.parts:
-        named = [(name, part) for name, part in v.parts.items() if part.faults]
-        texts = [
-            f"{name}: {part.reasons[0].removeprefix(f'{part.status}: ').removesuffix('; no bias found')}"
-            for name, part in named[:MOST]
-        ]
-        return "; ".join(texts + [f"and {len(named) - MOST} more"] * (len(named) > MOST))
+        return _faults_of_parts(v)
     parts = []
-    if any(q in faults for q in BIAS):
+    of_scale, of_bias = _any_of(SCALE, faults), _any_of(BIAS, faults)
+    if of_bias:
         parts.append(bias_text(v, "bias" not in faults))
     if v.status == "heavy-tailed":
-        parts.append(f"in the mean the covariance ratio is {plain(s.inflation)}")
-    elif v.status != "biased":
-        parts += [scale_text(v, faults)] if any(q in faults for q in SCALE) else []
-        parts += [shape_text(v, faults)] if any(q in faults for q in SHAPE) else []
-    contrary = v.status == "inconsistent" and smaller(v) and JOINT not in faults and not opposite(v, faults)
-    if "outliers" in faults or v.status == "heavy-tailed" or contrary:
-        parts.insert(0 if v.status == "heavy-tailed" else len(parts), tails_text(v, faults))
-    if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
-        parts.append(joint_text(v, v.joint))
-    parts += [ALONE[q] for q in faults if q in ALONE and len(faults) == 1]
+        parts.insert(0, tails_text(v, faults))
+        parts.append(f"in the mean the covariance ratio is {ratio_text(s.inflation)}")
+    else:
+        if of_scale and v.status != "biased":
+            parts.append(scale_text(v, faults))
+        if _any_of(SHAPE, faults) and v.status != "biased":
+            parts.append(shape_text(v, faults))
+        contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in faults
+        if "outliers" in faults or (contrary and not opposite(v, faults)):
+            parts.append(tails_text(v, faults))
+        if JOINT in faults and v.joint is not None:
+            parts.append(joint_text(v, v.joint))
+    if len(faults) == 1:
+        parts += [ALONE[question] for question in faults if question in ALONE]
     if "innovation scale" in faults and v.innovations is not None:
         parts.append(innovations_text(v, v.innovations))
     if "innovation whiteness" in faults:
         parts.append("innovations correlated over steps")
-    sought = any(a.question in BIAS for a in v.answers) and not set(v.faults) & set(BIAS)
-    if any(q in faults for q in SCALE) and v.status != "heavy-tailed" and sought:
+    if of_scale and not of_bias and v.status != "heavy-tailed" and _any_of(BIAS, [a.question for a in v.answers]):
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
 
 
-def _no_fault(v: Verdict, s: Scale) -> str:
+def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
+    return any(question in asked for question in questions)
+
+
+def _faults_of_parts(v: Findings) -> str:
+    texts = []
+    for name, part in v.parts.items():
+        if part.faults:
+            sentence = part.reasons[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
+            texts.append(f"{name}: {sentence}")
+    if len(texts) > MOST:
+        texts = [*texts[:MOST], f"and {len(texts) - MOST} more"]
+    return "; ".join(texts)
+
+
+def _no_fault(v: Findings, s: Scale) -> str:
     """Whether the ratio is shown to be right, with that of the worst axis; and what share of lost runs stays open."""
     shown, runs = s.equivalence, plural(v.runs, v.unit)
-    tolerated = [a.question for a in v.answers if a.tolerated]
-    none = "no fault beyond the tolerance" if tolerated else "no fault found"
-    size = "covariance ratio of every part" if v.parts else f"covariance ratio {plain(s.inflation)}"
-    axis = "" if (worst := v.worst_axis) is None else f" (worst axis: {worst[0]}, {plain(worst[1])})"
+    none, size, axis = "no fault found", f"covariance ratio {ratio_text(s.inflation)}", ""
+    if any(answer.tolerated for answer in v.answers):
+        none = "no fault beyond the tolerance"
+    if v.parts:
+        size = "covariance ratio of every part"
+    if v.worst_axis is not None:
+        name, ratio = v.worst_axis
+        axis = f" (worst axis: {name}, {ratio_text(ratio)})"
     if shown.shown:
-        return f"{none} in {runs}, and the {size} is shown to be {_within(shown)}{axis}{_lost(v)}"
-    advice, asked = "", 0 if v.lost is None or v.settings.lost is None else v.lost.needed or 0
-    if shown.runs is not None and shown.runs <= MUCH:
-        advice = f"; {max(shown.runs, v.runs + 1, asked)} such {v.unit}s would probably decide"
-    do = "does" if v.runs == 1 else "do"
-    return f"{none}, but {runs} {do} not show the {size} to be {_within(shown)}{axis}{advice}"
+        return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
+    do = "do"
+    if v.runs == 1:
+        do = "does"
+    return f"{none}, but {runs} {do} not show the {size} to be {_between(shown)}{axis}{_advice(v, shown)}"
 
 
-def _lost(v: Verdict) -> str:
-    """Lost runs, and the share of them that is shown or not excluded."""
-    if (lost := v.lost) is None:
+def _advice(v: Findings, shown: Equivalence) -> str:
+    """The number of runs that would probably decide."""
+    if shown.runs is None or shown.runs > MUCH:
         return ""
-    asked, unit, runs = v.settings.lost, v.unit, plural(v.runs, v.unit)
-    some = f"{plural(lost.count, unit)} of {lost.runs} {'is' if lost.count == 1 else 'are'} lost" if lost.count else ""
+    needed = max(shown.runs, v.runs + 1)
+    if v.lost is not None and v.settings.lost is not None and v.lost.needed is not None:
+        needed = max(needed, v.lost.needed)
+    return f"; {needed} such {v.unit}s would probably decide"
+
+
+def _lost(v: Findings) -> str:
+    """Lost runs, and the share of them that is shown or not excluded."""
+    if v.lost is None:
+        return ""
+    lost, asked, unit, some = v.lost, v.settings.lost, v.unit, ""
+    if lost.count:
+        some = f"{plural(lost.count, unit)} of {lost.runs} {is_or_are(lost.count)} lost"
     if asked is not None and lost.upper <= asked:
-        return f"; lost {unit}s are shown to be at most {percent(asked)} of all ({some or f'none of {lost.runs} is'})"
-    found = f"; {some}, and" if some else ";" if asked is None else ", but"
-    upper = percent(lost.upper, 2 if asked is None else 3)
-    text = f"{found} lost {unit}s of up to {upper} cannot be excluded with {runs}"
+        which = some or f"none of {lost.runs} is"
+        return f"; lost {unit}s are shown to be at most {percent(asked)} of all ({which})"
+    text = ";"
+    if some:
+        text = f"; {some}, and"
+    elif asked is not None:
+        text = ", but"
+    digits = 3
+    if asked is None:
+        digits = 2
+    text += f" lost {unit}s of up to {percent(lost.upper, digits)} cannot be excluded with {plural(v.runs, unit)}"
     if asked is None:
         return text
-    more = "" if lost.needed is None else f"; {lost.needed} {unit}s would, if no further one is lost"
-    return f"{text}, and {percent(asked)} is asked for{more}"
+    text += f", and {percent(asked)} is asked for"
+    if lost.needed is not None:
+        text += f"; {lost.needed} {unit}s would, if no further one is lost"
+    return text
 
 
-def _within(shown: Equivalence) -> str:
+def _between(shown: Equivalence) -> str:
     if shown.one_sided:
         return f"below {short(shown.factor)}"
     return f"between {short(1.0 / shown.factor)} and {short(shown.factor)}"
@@ -175,48 +243,56 @@ def _within(shown: Equivalence) -> str:
 # --- the figures behind it -----------------------------------------------------------------------------
 
 
-def _level(v: Verdict, s: Scale, location: Location) -> str:
+def _level(v: Findings, s: Scale, location: Location) -> str:
     low, high = s.accepted
     text = f"mean NEES {short(s.mean_anees)}, accepted {short(low)} to {short(high)} ({s.dof} expected)"
     if s.worst_run > SPREAD * s.median_run:
         text += f"; {short(s.median_run)} in the median and {short(s.worst_run)} in the worst {v.unit}"
     if s.judged_steps > 1:
-        counts = {"above": location.above, "below": location.below}
-        where = [f"{count} {side}" for side, count in counts.items() if count]
-        text += f"; {v.places} outside the simultaneous band: {' and '.join(where) if where else 'none'}"
-        text += f" of {s.judged_steps}"
+        where = []
+        if location.above:
+            where.append(f"{location.above} above")
+        if location.below:
+            where.append(f"{location.below} below")
+        outside = " and ".join(where) or "none"
+        text += f"; {v.places} outside the simultaneous band: {outside} of {s.judged_steps}"
     return text
 
 
-def _levels(v: Verdict, s: Scale) -> list[str]:
+def _levels(v: Findings, s: Scale) -> list[str]:
     """The mean NEES, the worst axis and lost runs; of parts whose cross terms are not stated also that of each part."""
-    lines, each = [], []
-    if v.location is not None:
-        lines = [_level(v, s, v.location)]
+    lines = []
     if v.parts:
         ratio = short(s.mean_anees / s.dof)
-        lines = [
+        lines.append(
             f"cross terms of {', '.join(v.parts)} are not stated: each is judged by itself, and the mean NEES over the "
             f"{s.dof} components, {ratio} (1 expected under any correlation), is not judged"
-        ]
-        known = [(name, p, p.scale, p.location) for name, p in v.parts.items()]
-        each = [f"{name}: {_level(part, scale, at)}" for name, part, scale, at in known if scale and at]
-    if v.faults and (worst := v.worst_axis) is not None:
-        lines.append(f"covariance ratio of the worst axis: {worst[0]}, {plain(worst[1])}; of all {plain(s.inflation)}")
+        )
+    elif v.location is not None:
+        lines.append(_level(v, s, v.location))
+    if v.faults and v.worst_axis is not None:
+        axis, ratio_of_axis = v.worst_axis
+        of_all = ratio_text(s.inflation)
+        lines.append(f"covariance ratio of the worst axis: {axis}, {ratio_text(ratio_of_axis)}; of all {of_all}")
     if v.lost is not None and (v.lost.count or v.settings.lost is not None):
         lines.append(
             f"lost {v.unit}s: {v.lost.count} of {v.lost.runs} failed or have a mean NEES above {short(v.lost.bound)}; "
             f"at most {percent(v.lost.upper)} of all at a confidence of {v.lost.level:g}"
         )
-    if tolerated := [a.question for a in v.answers if a.tolerated]:
+    tolerated = [answer.question for answer in v.answers if answer.tolerated]
+    if tolerated:
         factor = f"{v.settings.tolerated:g}"
         lines.append(f"found, but shown to be within the tolerance of x{factor}: {', '.join(tolerated)}")
-    return lines + each
+    for name, part in v.parts.items():
+        if part.scale is not None and part.location is not None:
+            lines.append(f"{name}: {_level(part, part.scale, part.location)}")
+    return lines
 
 
-def _truth(v: Verdict) -> list[str]:
+def _truth(v: Findings) -> list[str]:
     """What errors of the truth leave to be said, and what to declare."""
-    if (truth := v.truth) is None:
+    truth = v.truth
+    if truth is None:
         return []
     shares = ", ".join(f"{axis} {percent(share)}" for axis, share in truth.by_axis.items())
     text = (
@@ -233,7 +309,7 @@ def _truth(v: Verdict) -> list[str]:
     return [f"{text}; its errors are declared {truth.errors}"]
 
 
-def _early_ends(v: Verdict) -> list[str]:
+def _early_ends(v: Findings) -> list[str]:
     """That runs seem to end because the filter is lost."""
     if v.ends is None or not v.ends.lost:
         return []
@@ -244,51 +320,57 @@ def _early_ends(v: Verdict) -> list[str]:
     ]
 
 
-def _within_one(v: Verdict, s: Scale) -> list[str]:
+def _single_log(v: Findings, s: Scale) -> list[str]:
     """Ratio of a single run, and the data that would decide."""
     if v.runs != 1 or v.landmarks is not None or v.unit != "run":
         return []
-    if (w := s.within) is None:
+    if s.within is None:
         return [
             "the log is too short to show how its errors decorrelate; further runs, or a far longer log, would decide"
         ]
+    return [_ratio_within(s.within, s.judged_steps)]
+
+
+def _ratio_within(w: Within, steps: int) -> str:
     text = (
         f"if errors go on to decorrelate as within this log (over {short(w.correlation)} steps), the covariance ratio "
-        f"is {plain(w.ratio)}, reported and not judged"
+        f"is {ratio_text(w.ratio)}, reported and not judged"
     )
     if w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
-        return [text]
-    if w.steps <= s.judged_steps:
-        return [f"{text}; cut into {w.pieces} runs, this log would then probably decide"]
-    return [f"{text}; a log of {w.steps} steps, cut into {w.pieces} runs, would then probably decide"]
+        return text
+    if w.steps <= steps:
+        return f"{text}; cut into {w.pieces} runs, this log would then probably decide"
+    return f"{text}; a log of {w.steps} steps, cut into {w.pieces} runs, would then probably decide"
 
 
-def _together(v: Verdict) -> list[str]:
+def _together(v: Findings) -> list[str]:
     if v.landmarks is None:
         return []
     if v.joint is None or not v.joint.runs:
         return ["the joint covariance of pose and map was not kept: each landmark is judged by itself"]
     j = v.joint
     return [
-        f"NEES of pose and map together over its degrees of freedom {plain(j.both)}: of the pose {plain(j.pose)}, "
-        f"of the map given the pose {plain(j.map)}"
+        f"NEES of pose and map together over its degrees of freedom {ratio_text(j.both)}: of the pose "
+        f"{ratio_text(j.pose)}, of the map given the pose {ratio_text(j.map)}"
     ]
 
 
-def _coverage(v: Verdict) -> list[str]:
+def _coverage(v: Findings) -> list[str]:
     if v.accuracy is None or v.axes is None:
         return []
-    known = [(axis, c) for axis, c in zip(v.axes.names, v.accuracy.coverage, strict=True) if np.isfinite(c)]
+    known = []
+    for axis, share in zip(v.axes.names, v.accuracy.coverage, strict=True):
+        if np.isfinite(share):
+            known.append(f"{axis} {100 * share:.1f} %")
     if not known:
         return []
-    covered = ", ".join(f"{axis} {100 * c:.1f} %" for axis, c in known)
-    text = f"2-sigma coverage {covered} ({100 * TWO_SIGMA:.1f} % expected)"
+    text = f"2-sigma coverage {', '.join(known)} ({100 * TWO_SIGMA:.1f} % expected)"
     if np.isfinite(v.accuracy.nci):
         text += f"; noncredibility index {v.accuracy.nci:.1f} dB, inclination {v.accuracy.inclination:+.1f} dB"
     return [text]
 
 
-def _without_truth(v: Verdict, i: Innovations, faults: Faults) -> str:
+def _without_truth(v: Findings, i: Innovations, faults: Faults) -> str:
     if not i.judged:
         return (
             "no truth, and innovations decide nothing unless the filter declares an optimal gain: those of any other "
@@ -301,8 +383,10 @@ def _without_truth(v: Verdict, i: Innovations, faults: Faults) -> str:
         parts.append("they are correlated over steps")
     shown = i.equivalence
     if not faults and shown is not None:
-        is_shown = "is shown to be" if shown.shown else "is not shown to be"
-        parts.append(f"their NIS {is_shown} {_within(shown)} times its degrees of freedom")
+        is_shown = "is not shown to be"
+        if shown.shown:
+            is_shown = "is shown to be"
+        parts.append(f"their NIS {is_shown} {_between(shown)} times its degrees of freedom")
         if v.settings.lost is not None:
             parts.append("they cannot show what share of runs is lost")
     return "; ".join(parts)
@@ -320,16 +404,67 @@ def _nis(i: Innovations) -> str:
     return text
 
 
-def _questions(v: Verdict, faults: Faults) -> str:
-    count, rate = len(v.answers), v.settings.false_alarm
-    text = f"{plural(count, 'question')} at a false-alarm rate of {rate:.3g}{' together' if count > 1 else ''}"
+def _questions(v: Findings, faults: Faults) -> str:
+    text = f"{plural(len(v.answers), 'question')} at a false-alarm rate of {v.settings.false_alarm:.3g}"
+    if len(v.answers) > 1:
+        text += " together"
     if not faults:
-        least = min(v.answers, key=lambda a: a.adjusted)
+        least = min(v.answers, key=lambda answer: answer.adjusted)
         return f"{text}; nearest to a fault: {question_text(v, least.question)} (corrected p {p_text(least.adjusted)})"
-    found = (f"{question_text(v, q)} (p {p_text(a.adjusted)})" for q, a in faults.items())
+    found = (f"{question_text(v, q)} (p {p_text(answer.adjusted)})" for q, answer in faults.items())
     return f"{text}; found: {', '.join(found)}"
 
 
-def question_text(v: Verdict, question: str) -> str:
+def question_text(v: Findings, question: str) -> str:
     """A question as it is called: of a map, "in some landmark" in the place of "in some step"."""
-    return question if v.landmarks is None else question.replace("some step", "some landmark")
+    if v.landmarks is None:
+        return question
+    return question.replace("some step", "some landmark")
+
+
+# --- where nothing is decided ----------------------------------------------------------------------------
+
+
+def unshown_sentence(found: Findings, why: str) -> str:
+    """Why nothing can be shown, and the ratio that would be judged."""
+    assert found.scale is not None
+    provided = " if they are"
+    if found.truth is not None:
+        provided = ""
+    ratio = f"the covariance ratio would be {ratio_text(found.scale.inflation)}{provided}, reported and not judged"
+    return f"{why}; {ratio}"
+
+
+def other_ways(status: str, record: Record) -> list[str]:
+    """What else would decide on a single log of poses."""
+    is_log = len(record.run_numbers) == 1 and record.window is None and record.align and record.convention
+    if status != "undecided" or not is_log or not ATTITUDE & set(record.axes):
+        return []
+    return [
+        "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances, "
+        "or poses with cross-covariances (docs/files.md)"
+    ]
+
+
+def sentences_of_conventions(
+    found: Mapping[str, ConventionResult], verdicts: Mapping[str, Verdict], settings: Settings
+) -> list[str]:
+    """Which conventions of the error are not rejected, and the sentence of each."""
+    left, gone = [], []
+    for kind, result in found.items():
+        if result.possible:
+            left.append(f"{kind} (covariance ratio {ratio_text(result.ratio)})")
+        else:
+            gone.append(kind)
+    rate = percent(settings.false_alarm)
+    if left:
+        text = f"no error is declared; not rejected at a rate of {rate}: {', '.join(left)}"
+        if gone:
+            text += f"; rejected: {', '.join(gone)}"
+        text += ". The filter's documentation says which it is; declare it with --error"
+    else:
+        text = f"no error is declared, and at a rate of {rate} each all are rejected: {', '.join(found)}"
+    lines = [f"undecided: {text}"]
+    for kind, verdict in verdicts.items():
+        lines.append(f"if the error is {kind}: {verdict.reasons[0]}")
+    return lines

@@ -97,7 +97,7 @@ def _loaded(path: Path) -> Any:
     try:
         from pyulog import ULog
     except ImportError:
-        raise MissingPackageError(f"{path}: a ULog needs {remedy('ulog')}") from None
+        raise MissingPackageError(f"{path}: a ULog needs {remedy('ulog', package='pyulog')}") from None
     if not is_file(path):
         raise InputError(f"{path}: no such file")
     refusal = "cannot be read as a ULog, damaged or cut short"

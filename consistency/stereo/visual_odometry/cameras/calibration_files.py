@@ -14,12 +14,12 @@ from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.camera_pair import (
     CAMERA_0,
     EUROC_BODY,
-    Calibration,
-    checked,
+    PairCalibration,
+    checked_calibration,
     distortion,
     sized,
 )
-from consistency.stereo.visual_odometry.cameras.yaml_file import matrix, read_yaml
+from consistency.stereo.visual_odometry.cameras.yaml_file import read_matrix, read_yaml
 
 # names that tools give to the same thing; the first one is used in messages
 OPENCV_KEYS = {
@@ -41,7 +41,7 @@ RADIAL_TANGENTIAL = ("radial-tangential", "radtan", "plumb_bob", *NO_DISTORTION)
 
 def read_calibration(
     path: Path, left: str = "", right: str = "", image_size: tuple[int, int] | None = None
-) -> Calibration:
+) -> PairCalibration:
     """A calibration by the look of ``path``: a folder as EuRoC's, .yaml or .yml as OpenCV's or BoofCV's, else KITTI's.
 
     ``left`` and ``right`` are the folders of the images: they choose the cameras in a KITTI file. ``image_size``,
@@ -64,7 +64,7 @@ def read_calibration(
         return read_kitti(path, left, right)
 
 
-def read_opencv(path: Path) -> Calibration:
+def read_opencv(path: Path) -> PairCalibration:
     """A YAML file as OpenCV's FileStorage writes it: K1, D1, K2, D2, R, T in Bouguet's convention.
 
     x_right = R x_left + T. D1 and D2 may be left out for images without distortion, R for rectified ones;
@@ -76,7 +76,7 @@ def read_opencv(path: Path) -> Calibration:
     for key, names in OPENCV_KEYS.items():
         name = next((name for name in names if name in data), None)
         if name is not None:
-            matrices[key] = matrix(path, name, data[name])
+            matrices[key] = read_matrix(path, name, data[name])
         elif "T_BS" in data:
             raise InputError(f"{path}: is one of the two files of EuRoC; --calibration takes the folder with both")
         elif key in ("K1", "K2", "T"):
@@ -91,12 +91,12 @@ def read_opencv(path: Path) -> Calibration:
     size = tuple(int(_number(path, data, key)) for key in ("image_width", "image_height") if key in data)
     D_left, D_right = (distortion(path, key, matrices.get(key, np.zeros(4))) for key in ("D1", "D2"))
     R, image_size = matrices.get("R", np.eye(3)), (size[0], size[1]) if len(size) == 2 else None
-    return checked(
-        Calibration(str(path), matrices["K1"], matrices["K2"], D_left, D_right, R, matrices["T"], image_size)
+    return checked_calibration(
+        PairCalibration(str(path), matrices["K1"], matrices["K2"], D_left, D_right, R, matrices["T"], image_size)
     )
 
 
-def read_euroc(folder: Path) -> Calibration:
+def read_euroc(folder: Path) -> PairCalibration:
     """``sensor.yaml`` of both cameras of a EuRoC / ASL folder: mav0/cam0, cam0, or cam0_sensor.yaml beside cam0."""
     left, right = (_euroc_camera(folder, camera) for camera in ("cam0", "cam1"))
     if left.size != right.size:
@@ -104,7 +104,9 @@ def read_euroc(folder: Path) -> Calibration:
     right_from_left = np.linalg.solve(right.pose, left.pose)
     R, T = right_from_left[:3, :3], right_from_left[:3, 3]
     source = f"{left.path} and {right.path}"
-    return checked(Calibration(source, left.K, right.K, left.D, right.D, R, T, left.size, left.pose, EUROC_BODY))
+    return checked_calibration(
+        PairCalibration(source, left.K, right.K, left.D, right.D, R, T, left.size, left.pose, EUROC_BODY)
+    )
 
 
 class _Camera(NamedTuple):
@@ -134,7 +136,7 @@ def _euroc_camera(folder: Path, camera: str) -> _Camera:
     fu, fv, cu, cv = sized(path, "intrinsics", data["intrinsics"], 4)
     width, height = sized(path, "resolution", data["resolution"], 2)
     K = np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
-    D = distortion(path, "distortion_coefficients", matrix(path, "D", data["distortion_coefficients"]))
+    D = distortion(path, "distortion_coefficients", read_matrix(path, "D", data["distortion_coefficients"]))
     return _Camera(path, K, D, (int(width), int(height)), sized(path, "T_BS", data["T_BS"], 16).reshape(4, 4))
 
 
@@ -153,7 +155,7 @@ def _number(path: Path, data: dict[str, Any], key: str) -> float:
     return float(sized(path, key, data[key], 1)[0])
 
 
-def read_boofcv(path: Path) -> Calibration:
+def read_boofcv(path: Path) -> PairCalibration:
     """``stereo.yaml`` of BoofCV: left and right pin-hole cameras, rightToLeft with x_left = R x_right + (x, y, z)."""
     data = read_yaml(path)
     cameras = [_boofcv_camera(path, data, side) for side in ("left", "right")]
@@ -163,7 +165,7 @@ def read_boofcv(path: Path) -> Calibration:
     (K_left, D_left, size), (K_right, D_right, other) = cameras
     if size != other:
         raise InputError(f"{path}: left has {size[0]} x {size[1]} px, right {other[0]} x {other[1]}; must be equal")
-    return checked(Calibration(str(path), K_left, K_right, D_left, D_right, R.T, -R.T @ t, size))
+    return checked_calibration(PairCalibration(str(path), K_left, K_right, D_left, D_right, R.T, -R.T @ t, size))
 
 
 def _boofcv_camera(path: Path, data: dict[str, Any], side: str) -> tuple[Array, Array, tuple[int, int]]:
@@ -183,7 +185,7 @@ def _boofcv_camera(path: Path, data: dict[str, Any], side: str) -> tuple[Array, 
     D = np.zeros(5)
     if model != "pinhole":
         bend = _part(path, camera, "radial_tangential", f"{side}.")
-        radial = matrix(path, f"{side}.radial_tangential.radial", bend.get("radial") or [0.0]).ravel()
+        radial = read_matrix(path, f"{side}.radial_tangential.radial", bend.get("radial") or [0.0]).ravel()
         if radial.size > 3:
             raise InputError(f"{path}: key '{side}.radial_tangential.radial': has {radial.size} numbers, 3 at most")
         D[[0, 1, 4][: radial.size]] = radial
@@ -200,7 +202,7 @@ def _part(path: Path, data: dict[str, Any], key: str, before: str = "") -> dict[
     return part
 
 
-def read_kitti(path: Path, left: str = "", right: str = "") -> Calibration:
+def read_kitti(path: Path, left: str = "", right: str = "") -> PairCalibration:
     """``calib.txt`` of KITTI odometry: lines ``P0:`` to ``P3:`` of 12 numbers, or two lines without names.
 
     P = K [I | t] of each camera in the common rectified axes; colour images (image_2, image_3) go with P2 and P3.
@@ -217,7 +219,7 @@ def _projections(
     names: tuple[str, str],
     size: tuple[int, int] | None,
     rectified: Array | None = None,
-) -> Calibration:
+) -> PairCalibration:
     """Rectified cameras by their matrices P = K [I | t]; ``rectified`` (3, 3) turns camera 0 into their axes."""
     P_left, P_right = (numbers(path, rows, name, (3, 4)) for name in names)
     for name, P in zip(names, (P_left, P_right), strict=True):
@@ -226,8 +228,8 @@ def _projections(
     t_left, t_right = (np.linalg.solve(P[:, :3], P[:, 3]) for P in (P_left, P_right))
     none = np.zeros(4)
     body = (None, "") if rectified is None else (_pose(rectified, t_left), CAMERA_0)
-    return checked(
-        Calibration(str(path), P_left[:, :3], P_right[:, :3], none, none, np.eye(3), t_right - t_left, size, *body)
+    return checked_calibration(
+        PairCalibration(str(path), P_left[:, :3], P_right[:, :3], none, none, np.eye(3), t_right - t_left, size, *body)
     )
 
 
@@ -240,7 +242,7 @@ def _pose(R: Array, t: Array) -> Array:
 
 def read_kitti_raw(
     path: Path, left: str = "", right: str = "", image_size: tuple[int, int] | None = None
-) -> Calibration:
+) -> PairCalibration:
     """``calib_cam_to_cam.txt`` of KITTI raw (Geiger et al. 2013), of image_00 and image_01 or image_02 and image_03.
 
     Images of ``image_size`` S_rect are rectified (``sync``) and have P_rect; those of size S (``extract``) have K, D, R
@@ -262,8 +264,8 @@ def read_kitti_raw(
                for name, shape in (("K", (3, 3)), ("D", (5,)), ("T", (3,))))  # fmt: skip
     R = [turn(path, rows, f"R_{camera}") for camera in two]
     between = R[1] @ R[0].T
-    return checked(
-        Calibration(
+    return checked_calibration(
+        PairCalibration(
             str(path), K[0], K[1], D[0], D[1], between, T[1] - between @ T[0], sizes["S"], _pose(R[0], T[0]), CAMERA_0
         )
     )  # fmt: skip

@@ -13,9 +13,9 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig
-from consistency.stereo.visual_odometry.cameras.yaml_file import matrix
-from consistency.stereo.visual_odometry.features import is_rectified, opencv
+from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
+from consistency.stereo.visual_odometry.cameras.yaml_file import read_matrix
 
 WIDEST = 30.0  # m between two cameras on one rig; calibrations are often in millimetres by mistake
 EUROC_BODY, CAMERA_0 = "body of EuRoC", "camera 0 of KITTI raw"
@@ -23,7 +23,7 @@ COUNTS = (4, 5, 8, 12, 14)  # distortion coefficients that OpenCV knows
 
 
 @dataclass(frozen=True)
-class Calibration:
+class PairCalibration:
     """Two cameras as calibrated, before any rectification."""
 
     source: str  # file or files, for messages
@@ -38,7 +38,7 @@ class Calibration:
     body: str = ""  # which body that is: that of EuRoC, or camera 0 of KITTI raw
 
 
-def checked(calibration: Calibration) -> Calibration:
+def checked_calibration(calibration: PairCalibration) -> PairCalibration:
     """The calibration, if its numbers can be those of two cameras side by side."""
     where = calibration.source
     for name, K in (("left", calibration.K_left), ("right", calibration.K_right)):
@@ -47,7 +47,7 @@ def checked(calibration: Calibration) -> Calibration:
             raise InputError(
                 f"{where}: the matrix of the {name} camera must be fx 0 cx, 0 fy cy, 0 0 1 with fx, fy > 0"
             )
-    calibration = replace(calibration, R=rotation(where, calibration.R))
+    calibration = replace(calibration, R=nearest_rotation(where, calibration.R))
     centre = -calibration.R.T @ calibration.T
     if centre[0] <= 0 or abs(centre[1]) > centre[0]:
         raise InputError(
@@ -61,7 +61,7 @@ def checked(calibration: Calibration) -> Calibration:
     return calibration
 
 
-def rotation(where: str, R: Array) -> Array:
+def nearest_rotation(where: str, R: Array) -> Array:
     """The rotation nearest to ``R``; calibrations print six digits or more."""
     U, singular, Vt = np.linalg.svd(R)
     if not np.allclose(singular, 1.0, atol=1e-3) or np.linalg.det(R) < 0:
@@ -77,7 +77,7 @@ def distortion(path: Path, key: str, values: Array) -> Array:
 
 
 def sized(path: Path, key: str, value: Any, count: int) -> Array:
-    numbers = matrix(path, key, value).ravel()
+    numbers = read_matrix(path, key, value).ravel()
     if numbers.size != count:
         raise InputError(f"{path}: key '{key}': has {numbers.size} numbers, not {count}")
     return numbers
@@ -102,7 +102,7 @@ class Rectification:
         return one, two
 
 
-def rectify(calibration: Calibration, image_size: tuple[int, int]) -> Rectification:
+def rectify(calibration: PairCalibration, image_size: tuple[int, int]) -> Rectification:
     """Rectification by OpenCV (Bouguet's algorithm, only pixels that both images have: alpha = 0).
 
     Images that are rectified already (no distortion, same axes and focal lengths, baseline along x) stay as they

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from itertools import accumulate
 from pathlib import Path
@@ -14,7 +13,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import HUGE, read_text, reading
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.features import opencv
+from consistency.stereo.visual_odometry.cameras.opencv import opencv
 
 UNREADABLE = "cannot be read as YAML"
 LARGEST = 2**20  # bytes of a calibration
@@ -52,9 +51,9 @@ def _require_shallow(text: str) -> None:
 
 def _plain(path: Path, text: str) -> Any:
     try:
-        yaml: Any = importlib.import_module("yaml")
+        import yaml
     except ImportError:
-        raise MissingPackageError(f"{path}: YAML needs {remedy('vision')}") from None
+        raise MissingPackageError(f"{path}: YAML needs {remedy('vision', package='pyyaml')}") from None
     with reading(path, UNREADABLE):
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise ValueError("aliases (*name) are not followed; write their values")  # a few lines hold 10^9 of them
@@ -101,7 +100,7 @@ def _value(cv2: Any, node: Any) -> Any:
     return node.string() if node.isString() else None
 
 
-def matrix(path: Path, key: str, value: Any) -> Array:
+def read_matrix(path: Path, key: str, value: Any) -> Array:
     """Numbers of one key: a number, a list, an array, or a table with rows, cols and data."""
     shape: tuple[int, ...] | None = None
     try:

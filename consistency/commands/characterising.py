@@ -1,0 +1,77 @@
+"""``consistency characterise``: parses, calls, prints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from consistency.commands.shared_options import AsJson
+from consistency.referee.extras import require
+
+
+def characterise_command(
+    source: Annotated[
+        Path, typer.Argument(metavar="LOG|IMAGES", help="Log folder with truth, or folder of stereo pairs.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="sensor.toml to write, for a belief or a log.")],
+    report: Annotated[Path | None, typer.Option("--report", help="Folder to write with report.html and .pdf.")] = None,
+    grid: Annotated[
+        str | None, typer.Option("--grid", metavar="KxL", help="Nodes of the bias map, across and down [5x4].")
+    ] = None,
+    at_rest: Annotated[bool, typer.Option("--at-rest", help="The sensor stood still all the time.")] = False,
+    free_poses: Annotated[
+        bool, typer.Option("--free-poses", help="Fit the pose of each step, so that its error is no noise.")
+    ] = False,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="Of images: a file or folder, as 'frontend' takes it.")
+    ] = None,
+    truth: Annotated[Path | None, typer.Option("--truth", help="True poses of images, as 'frontend' does.")] = None,
+    format: Annotated[str | None, typer.Option("--format", help="kitti, euroc or opencv [by the folders].")] = None,
+    left: Annotated[str | None, typer.Option("--left", help="Pattern of plain left images, as 'left/*.png'.")] = None,
+    right: Annotated[str | None, typer.Option("--right", help="Pattern of plain right images.")] = None,
+    board: Annotated[
+        str | None, typer.Option("--board", metavar="KxL", help="Inner corners of a chessboard in leftN, rightN.")
+    ] = None,
+    square: Annotated[float | None, typer.Option("--square", help="Side of a square of the board, m.")] = None,
+    distortion: Annotated[
+        str | None, typer.Option("--distortion", help="Lens model for a board: full, poor or none [full].")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of RANSAC, for images without a board [0].")] = None,
+    as_json: AsJson = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --out and --report.")] = False,
+) -> None:
+    """Measure a stereo sensor: noise, growth with disparity, bias map, tails, whiteness, each with an interval."""
+    from consistency.referee.show import terminal
+    from consistency.referee.system.folders import require_free
+    from consistency.stereo.characterising.from_log import SourceOptions
+    from consistency.stereo.characterising.logs_and_images import CORNERS, NODES, characterise_source, parse_counts
+    from consistency.stereo.characterising.sensor_text import as_json as json_of
+    from consistency.stereo.characterising.sensor_text import (
+        measured_sensor_toml,
+        require_free_file,
+        sensor_blocks,
+        write_sensor,
+    )
+    from consistency.stereo.pages import write_sensor_reports
+
+    require_free_file(out, overwrite)
+    if report is not None:
+        require("--report", "report")
+        require_free(report, overwrite, "characterisation", "--report")
+    size = None if board is None else parse_counts(board, "--board", CORNERS)
+    nodes = None if grid is None else parse_counts(grid, "--grid", NODES)
+    options = SourceOptions(
+        nodes, at_rest, free_poses, calibration, truth, format, left, right, size, square, distortion, seed
+    )
+    measured = characterise_source(source, options)
+    written = [] if report is None else write_sensor_reports(measured.of, report, json_of(measured.of), overwrite)
+    write_sensor(out, measured_sensor_toml(measured.of, measured.others))
+    if as_json:
+        print(json_of(measured.of))
+        return
+    terminal.show(*sensor_blocks(measured.of))
+    for path in written:
+        print(path)
+    print(f"sensor in {out}; next: copy it into a log and consistency run --log LOG --filter F")

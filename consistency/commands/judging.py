@@ -1,0 +1,226 @@
+"""Verdicts: ``analyse``, ``report`` and ``plan``; they parse, call and print."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from consistency.commands.shared_options import (
+    DETECT_HELP,
+    ESTIMATES,
+    LOST_HELP,
+    AsJson,
+    FalseAlarm,
+    Judged,
+    Power,
+    Seed,
+    Skip,
+    are_files,
+    given_options,
+    print_document,
+    read_files,
+    reads_files,
+    require_word,
+    require_written,
+    tell_notes,
+)
+from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
+from consistency.referee.errors import InputError
+from consistency.referee.extras import missing, remedy
+from consistency.referee.readers.options import Reading
+
+
+@reads_files
+def analyse_command(
+    path: Judged,
+    files: Reading,
+    filters: Annotated[
+        list[str] | None, typer.Option("--filter", metavar="NAME", help="Only this filter; may be repeated.")
+    ] = None,
+    false_alarm: Annotated[
+        float | None,
+        typer.Option("--false-alarm", help=f"Chance to find a fault in a filter that has none [{FALSE_ALARM}]."),
+    ] = None,
+    detect: Annotated[
+        float | None,
+        typer.Option(
+            "--detect", help=f"Consistent is a covariance ratio shown inside [1/R, R] [{DETECT}].", metavar="R"
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option("--tolerance", help="A covariance ratio shown inside [1/R, R] is no fault.", metavar="R"),
+    ] = None,
+    lost: Annotated[
+        float | None,
+        typer.Option("--lost", help="Consistent is also a share of lost runs shown to be this at most.", metavar="P"),
+    ] = None,
+    innovations: Annotated[
+        str | None,
+        typer.Option("--innovations", help="'optimal': of an optimal gain without a gate, so that they are judged."),
+    ] = None,
+    confidence: Annotated[
+        float | None, typer.Option("--confidence", help="1 less the --false-alarm, in its place.")
+    ] = None,
+    skip: Skip = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", help="Folder for an HTML and a PDF page on files, or FILE.xml (JUnit) or FILE.md."),
+    ] = None,
+    as_json: AsJson = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
+) -> None:
+    """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
+    from consistency.referee.document.verdict import document
+    from consistency.referee.show import FORMATS
+    from consistency.referee.verdicts.command_settings import settings_of, skip_asked
+    from consistency.referee.verdicts.sources import analyse as judge
+
+    require_word("--fail-on", fail_on, "inconsistent")
+    require_word("--innovations", innovations, "optimal")
+    changes = given_options(
+        confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance, lost=lost
+    )
+    settings, first = settings_of(**changes) if changes else None, skip_asked(skip)
+    written: list[Path] = []
+    refused: InputError | None = None  # of a report, said below the verdict
+    is_file = report is not None and report.suffix.lower() in FORMATS.keys() - {".html", ".json"}  # a folder has both
+    require_written(overwrite, report, "--report")
+    if are_files(path, files):
+        recordings = [recording.without_first(first) for recording in read_files(path, files)]
+        verdicts = judge(recordings, filters, settings=settings, optimal_gain=innovations is not None)
+        tell_notes(recordings)
+        if report is not None and not is_file:
+            from consistency.referee.pages.write_pages import write_file_reports
+            from consistency.referee.show.as_json import render
+            from consistency.referee.system.folders import require_free
+
+            try:
+                require_free(report, overwrite, "verdict", "--report")
+                data = render(document(verdicts))
+                written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
+                if missing("report"):
+                    print(f"consistency: pictures and the PDF need {remedy('report')}", file=sys.stderr)
+            except InputError as error:
+                refused = error
+    else:
+        from consistency.bench.runs.results_to_records import results_source
+
+        results = results_source(path)
+        if report is not None and not is_file:
+            raise InputError(f"--report: is for files of another estimator; for {path} use 'consistency report {path}'")
+        if innovations is not None:
+            raise InputError(
+                "--innovations is for files of another estimator; filters of the bench declare it themselves"
+            )
+        verdicts = judge(results, filters, settings=settings, skip=first)
+        if results.unfinished:
+            text = f"{path}: {results.unfinished}; the same 'consistency run' with --resume goes on"
+            if fail_on:
+                raise InputError(f"--fail-on: {text}")
+            print(f"consistency: {text}", file=sys.stderr)
+    shown = document(verdicts, path.name)
+    if report is not None and is_file:
+        from consistency.referee.pages.write_pages import write_text_file
+
+        try:
+            written = [write_text_file(shown, report, overwrite)]
+        except InputError as error:
+            refused = error
+    print_document(shown, as_json, written)
+    is_failed = fail_on is not None and not all(verdict.consistent for verdict in verdicts.values())
+    if refused is not None and not is_failed:
+        raise refused
+    if refused is not None:
+        print(f"consistency: {refused}", file=sys.stderr)
+    if is_failed:
+        raise typer.Exit(1)
+
+
+@reads_files
+def report_command(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help=f"Folder written by 'run' or 'reproduce', or estimates: {ESTIMATES}.")
+    ],
+    files: Reading,
+    html: Annotated[
+        Path | None,
+        typer.Option("--html", help="HTML file [default: PATH/report.html; of estimates PATH-report.html]."),
+    ] = None,
+    pdf: Annotated[Path | None, typer.Option("--pdf", help="PDF file [beside the default HTML file].")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+) -> None:
+    """Write a report of results as one offline HTML file and a PDF."""
+    from consistency.referee.pages.write_pages import require_pages, write_file_pages
+    from consistency.referee.verdicts.sources import analyse as judge
+
+    estimates = are_files(path, files)
+    stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
+    # one of the two named: only that one is written
+    targets = (html, pdf) if html or pdf else (stem.with_name(f"{stem.name}.html"), stem.with_name(f"{stem.name}.pdf"))
+    if estimates:
+        require_pages(*targets, overwrite)
+        recordings = read_files(path, files)
+        write_file_pages(recordings, judge(recordings), *targets, path.name)
+        tell_notes(recordings)
+    else:
+        from consistency.bench.pages import write_reports
+
+        write_reports(path, *targets, overwrite)
+    for target in targets:
+        if target is not None:
+            print(target)
+
+
+def plan_command(
+    scenario: Annotated[
+        str | None, typer.Argument(metavar="[SCENARIO]", help="Run a short pilot of it to learn how steps depend.")
+    ] = None,
+    filters: Annotated[
+        list[str] | None, typer.Option("--filter", metavar="NAME", help="Filter of the pilot; may be repeated.")
+    ] = None,
+    like: Annotated[
+        Path | None, typer.Option("--like", metavar="RESULTS", help="Results to learn from, in place of a pilot.")
+    ] = None,
+    pilot_runs: Annotated[int, typer.Option("--pilot-runs", help="Runs of the pilot.")] = 40,
+    seed: Seed = 0,
+    detect: Annotated[float, typer.Option("--detect", help=f"{DETECT_HELP.capitalize()}.")] = DETECT,
+    dof: Annotated[int, typer.Option("--dof", help="Dimension of the error; 3 for a planar pose.")] = 3,
+    false_alarm: FalseAlarm = FALSE_ALARM,
+    power: Power = POWER,
+    allow: Annotated[
+        str | None, typer.Option("--allow", help="'conservative': a covariance too large is no fault.")
+    ] = None,
+    lost: Annotated[float | None, typer.Option("--lost", help=f"{LOST_HELP.capitalize()}.", metavar="P")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
+    from consistency.referee.document.plan import plan_lines
+    from consistency.referee.verdicts.command_settings import plan as plan_runs
+
+    if scenario is not None and like is not None:
+        raise InputError("give either a SCENARIO for a pilot or --like RESULTS")
+    if filters and scenario is None and like is None:
+        raise InputError("--filter goes with a SCENARIO or --like RESULTS")
+    if scenario is not None and not filters:
+        raise InputError(f"--filter: name the filter to plan for in {scenario}")
+    pilots = None
+    if like is not None:
+        from consistency.bench.runs.sequential import pilots_in
+
+        pilots = pilots_in(like, filters)
+    elif scenario is not None and filters:
+        plan_runs(dof, detect, false_alarm, power, allow, lost=lost)  # refuse before the work
+        from consistency.bench.runs.sequential import pilots_in_world
+
+        pilots = pilots_in_world(scenario, filters, pilot_runs, seed)
+    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost)
+    if as_json:
+        print(json.dumps(planned, indent=2))
+    else:
+        print("\n".join(plan_lines(planned)))

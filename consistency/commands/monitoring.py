@@ -1,0 +1,120 @@
+"""``consistency monitor``: parses, calls, prints."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from consistency.commands.shared_options import AsJson, given_options, print_document, require_word, tell
+from consistency.referee.defaults import GATE_FALSE_ALARM
+from consistency.referee.errors import InputError
+
+if TYPE_CHECKING:
+    from consistency.referee.readers.formats.innovation_files import NisLog
+
+
+def monitor_command(
+    path: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="Innovations of one run: .csv, .parquet, .npz, .ulg of PX4, .bin of ArduPilot, a folder of 'run', "
+            "or - for CSV lines.",
+        ),
+    ],
+    innovations: Annotated[
+        str | None,
+        typer.Option("--innovations", help="'optimal': declares the optimal gain, without which nothing is judged."),
+    ] = None,
+    false_alarm: Annotated[
+        float, typer.Option("--false-alarm", help="Chance that a right filter ever raises an alarm.")
+    ] = GATE_FALSE_ALARM,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Scales of the NIS up to this ratio are no fault; 1 is the exact test.")
+    ] = 1.2,
+    gate: Annotated[
+        float | None, typer.Option("--gate", help="Probability of the filter's chi-square gate, such as 0.99.")
+    ] = None,
+    mission: Annotated[
+        int | None, typer.Option("--mission", help="Innovations of the whole mission, if known.")
+    ] = None,
+    filter_name: Annotated[
+        str | None, typer.Option("--filter", help="Which, if FILE holds several; of a flight log the sensor.")
+    ] = None,
+    run: Annotated[
+        int | None, typer.Option("--run", help="Which, if FILE holds several; of a flight log the EKF's instance.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="NIS and evidence as .png, .pdf or .svg.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the plot if it exists.")] = False,
+    as_json: AsJson = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
+) -> None:
+    """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
+    from consistency.referee.document.monitor import monitor_document
+    from consistency.referee.pages.write_pages import plotted, require_plot
+    from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash
+    from consistency.referee.verdicts.monitor_sources import make_monitor, watch, watch_lines
+
+    require_word("--fail-on", fail_on, "alarm")
+    if is_dataflash(Path(path)) and filter_name not in STATED:
+        if refused := given_options(fail_on=fail_on, gate=gate, mission=mission):
+            option = next(iter(refused)).replace("_", "-")
+            raise InputError(f"--{option}: {path} holds test ratios, of which nothing is judged, unless --filter names "
+                             f"{' or '.join(STATED)}")  # fmt: skip
+        _show_ratios(Path(path), filter_name, run, plot, overwrite, as_json)
+        return
+    watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
+    if path == "-":
+        options = given_options(filter=filter_name, run=run, plot=plot)
+        if options:
+            raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
+        watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
+    else:
+        log = _read_innovations(Path(path), filter_name, run)
+        tell(log.notes)
+        if plot is not None:
+            require_plot(plot, overwrite)
+        watched = watch(log, watcher)
+    if plot is not None:
+        from consistency.referee.pages.monitor import monitor_drawing
+
+        plotted(partial(monitor_drawing, watched), plot)
+    print_document(
+        monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t), as_json
+    )
+    if fail_on and watched.alarm is not None:
+        raise typer.Exit(1)
+
+
+def _read_innovations(path: Path, filter_name: str | None, run: int | None) -> NisLog:
+    """Return the innovations of one run in a file, or in a folder of results."""
+    if path.is_dir():
+        from consistency.bench.runs.results_to_records import innovations_of
+
+        return innovations_of(path, filter_name, run)
+    from consistency.referee.verdicts.monitor_sources import read_innovations
+
+    return read_innovations(path, filter_name, run)
+
+
+def _show_ratios(
+    path: Path, sensor: str | None, core: int | None, plot: Path | None, overwrite: bool, as_json: bool
+) -> None:
+    """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
+    from consistency.referee.document.monitor import ratios_document
+    from consistency.referee.pages.write_pages import plotted, require_plot
+    from consistency.referee.readers.formats.ardupilot_log import read_ratios
+
+    if plot is not None:
+        require_plot(plot, overwrite)
+    ratios, notes = read_ratios(path, sensor, core)
+    tell(notes)
+    if plot is not None:
+        from consistency.referee.pages.monitor import monitor_drawing
+
+        plotted(partial(monitor_drawing, ratios), plot)
+    print_document(ratios_document(path.stem, ratios), as_json)

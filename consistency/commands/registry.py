@@ -1,0 +1,150 @@
+"""The table of commands: where each is, which extras it needs, and examples; and the group that loads the called one.
+
+A command is a function of Typer in a module of this folder, and a row here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
+from typing import Any, cast
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.models import CommandInfo
+
+from consistency.referee.extras import is_installed, remedy, require
+
+HELP = ["-h", "--help"]
+
+
+class Row:
+    """A command: its function, as ``module:name`` in this folder, extras that it always needs, and examples."""
+
+    def __init__(self, name: str, target: str, extras: str = "", *examples: str) -> None:
+        self.name = name
+        self.module, _, self.function_name = target.partition(":")
+        self.extras = tuple(extras.split())
+        self.examples = examples
+
+    def function(self) -> Callable[..., Any]:
+        """Import the module of the command, and return its function."""
+        module = import_module(f"consistency.commands.{self.module}")
+        return cast(Callable[..., Any], getattr(module, self.function_name))
+
+
+# fmt: off
+ROWS = (
+    # for any estimator
+    Row("analyse", "judging:analyse_command", "",
+        "analyse mine.npz --report look",
+        "analyse est.txt --truth truth.txt --covariance P.txt --error so3",
+        "analyse est --truth truth --align posyaw",
+        "analyse results --skip 2s --fail-on inconsistent"),
+    Row("report", "judging:report_command", "report",
+        "report est.txt --truth truth.txt --covariance P.txt",
+        "report results"),
+    Row("compare", "comparing:compare_command", "",
+        "compare new.csv old.csv --truth truth.csv --fail-on worse",
+        "compare results --filter ukf-uvd --filter ekf-uvd"),
+    Row("baseline", "comparing:baseline_command", "", "baseline results --out baseline.json"),
+    Row("plan", "judging:plan_command", "",
+        "plan --dof 3 --detect 1.2",
+        "plan --like results",
+        "plan herath2007-stereo --filter ekf-uvd --detect 1.2"),
+    Row("fit-covariance", "fitting:fit_covariance_command", "",
+        "fit-covariance wheels --truth truth --span 1m --out noise",
+        "fit-covariance odometry.csv --truth truth.csv --span 1s --held-out half"),
+    Row("monitor", "monitoring:monitor_command", "",
+        "monitor innovations.csv --innovations optimal --plot alarm.png",
+        "monitor flight.ulg"),
+    # the laboratory
+    Row("list", "listing:list_command"),
+    Row("simulate", "studies:simulate_command", "bench", "simulate herath2007-stereo --runs 10 --out log"),
+    Row("frontend", "frontend:frontend_command", "vision",
+        "frontend IMAGES --out drive",
+        "frontend IMAGES --calibration stereo.yml --rate 20 --out drive"),
+    Row("run", "studies:run_command", "bench",
+        "run herath2007-stereo --filter ekf-uvd --filter ukf-uvd --out results",
+        "run world.toml --filter ekf-uvd --until-decided --out results",
+        "run --log log --filter ekf-uvd --out results",
+        "run --log log --screen 2,2,1 --filter ekf-uvd --out results"),
+    Row("reproduce", "studies:reproduce_command", "bench report",
+        "reproduce --out findings",
+        "reproduce --only fig3-chain --runs 20 --out findings"),
+    Row("challenge", "searching:challenge_command", "bench", "challenge ukf-uvd --minutes 5 --out worst.toml"),
+    Row("characterise", "characterising:characterise_command", "bench",
+        "characterise log --out sensor.toml",
+        "characterise IMAGES --board 9x6 --square 0.024 --out s.toml"),
+    Row("sweep", "searching:sweep_command", "bench report",
+        "sweep regime --out regime",
+        "sweep grid.toml --share 1/4 --out cells"),
+    Row("tune", "searching:tune_command", "bench",
+        "tune herath2007-optimistic --filter oc-ekf-xyz",
+        "tune --log log --filter ekf-uvd"),
+)
+# fmt: on
+COMMANDS = {row.name: row for row in ROWS}
+
+
+class MarkedCommand(TyperCommand):
+    """A command that says in the list of commands which of its extras are not installed."""
+
+    lacks: tuple[str, ...] = ()
+
+    def get_short_help_str(self, limit: int = 45) -> str:
+        mark = f"[{','.join(self.lacks)}] " if self.lacks else ""
+        return mark + super().get_short_help_str(limit - len(mark))
+
+
+class Loaded(Mapping[str, Any]):
+    """The commands by name; the module of one is imported when it is asked for."""
+
+    def __getitem__(self, name: str) -> Any:
+        row = COMMANDS[name]
+        # below the options; the mark keeps the lines as they are
+        epilog = "\b\nExamples:\n" + "\n".join(f"  consistency {line}" for line in row.examples)
+        info = CommandInfo(
+            name,
+            cls=MarkedCommand,
+            callback=row.function(),
+            epilog=epilog if row.examples else None,
+        )
+        made: Any = typer.main.get_command_from_info(info, pretty_exceptions_short=True, rich_markup_mode=None)
+        made.lacks = lacking(row.extras)
+        return made
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
+
+
+class CommandGroup(TyperGroup):
+    """The commands of the table, one of which is loaded when it is called."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: Any = Loaded()
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(self.commands)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Refuse a command without its packages, before its options are looked at; its help is there."""
+        name, command, rest = super().resolve_command(ctx, args)
+        if name is not None and not ctx.resilient_parsing and not {*HELP} & {*rest}:
+            require(f"'{name}'", *COMMANDS[name].extras)
+        return name, command, rest
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """What the marks mean, where there are some."""
+        marks = {extra: None for row in ROWS for extra in lacking(row.extras)}
+        if marks:
+            formatter.write(f"\n  [{','.join(marks)}]: needs {remedy(*marks)}\n")  # on one line, to be copied
+
+
+def lacking(extras: tuple[str, ...]) -> tuple[str, ...]:
+    """Those of the extras that are not installed here."""
+    return tuple(extra for extra in extras if not is_installed(extra))

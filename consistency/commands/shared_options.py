@@ -1,0 +1,147 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import Field, fields
+from functools import partial, wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+
+from consistency.referee.errors import InputError
+from consistency.referee.readers.options import Reading, flag_of
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics import Evidence
+    from consistency.referee.document.blocks import Document
+
+Out = Annotated[Path, typer.Option("--out", help="Folder to write; must not exist.")]
+Runs = Annotated[int, typer.Option("--runs", help="Number of Monte Carlo runs.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of the noise.")]
+Jobs = Annotated[int, typer.Option("--jobs", help="Workers; -1 is one a core. The result does not depend on it.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output folder of this bench.")]
+AsJson = Annotated[bool, typer.Option("--json", help="For programs.")]
+ESTIMATES = ".csv, .parquet, .npz, TUM, ROS bags"
+Judged = Annotated[Path, typer.Argument(metavar="PATH", help=f"Folder written by 'run', or estimates: {ESTIMATES}.")]
+Power = Annotated[float, typer.Option("--power", help="Chance to find that ratio.")]
+FalseAlarm = Annotated[float, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none.")]
+BackendName = Annotated[
+    str, typer.Option("--backend", help="Where runs are done: local; dask or slurm (docs/cluster.md).")
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option("--scheduler", help="For dask: tcp://HOST:PORT, tls://HOST:PORT or a scheduler file [this machine]."),
+]
+SchedulerWait = Annotated[
+    float | None, typer.Option("--scheduler-wait", help="For dask: seconds to wait for the scheduler [60].")
+]
+SlurmOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--slurm", metavar="KEY=VALUE", help="For slurm: partition=short, time=60 (minutes); may be repeated."
+    ),
+]
+LOST_HELP = "share of lost runs that must be excluded"
+Skip = Annotated[
+    str | None,
+    typer.Option("--skip", metavar="N|Ns", help="Leave the first N steps, or seconds (2s), of each run out."),
+]
+DETECT_HELP = "ratio of true to stated covariance that must be found"
+SCENARIO = "Built-in name (see 'list') or path of a .toml file."
+
+
+def given_options(**options: Any) -> dict[str, Any]:
+    """Options that were given; the others keep the defaults of what they are handed to."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def require_word(option: str, value: str | None, word: str) -> None:
+    """Refuse what an option may not hold: it is ``word`` or is not given."""
+    if value not in (None, word):
+        raise InputError(f"{option} must be '{word}', got '{value}'")
+
+
+def require_written(overwrite: bool, out: Path | None, option: str) -> None:
+    """Refuse --overwrite where nothing is written, for want of ``option``."""
+    if overwrite and out is None:
+        raise InputError(f"--overwrite goes with {option}: nothing else is written")
+
+
+def print_document(document: Document, as_json: bool, written: Sequence[Path] = ()) -> None:
+    """Print a document for programs, or its opening and the files that were written."""
+    if as_json:
+        from consistency.referee.show.as_json import render
+
+        print(render(document))
+        return
+    from consistency.referee.show import terminal
+
+    terminal.show(*document.opening)
+    for file in written:
+        print(file)
+
+
+def are_files(path: Path, files: Reading) -> bool:
+    """Whether a path is files of another estimator, and no folder of ``consistency run``."""
+    from consistency.referee.readers.pipeline.read_files import is_recording
+
+    return is_recording(path, files)
+
+
+def read_files(path: Path, files: Reading) -> list[Evidence]:
+    from consistency.referee.readers.pipeline.read_files import read_recordings
+
+    return read_recordings(path, files)
+
+
+def tell_notes(*read: list[Evidence]) -> None:
+    """What was assumed and left out, to standard error; said when nothing is refused any more."""
+    tell(
+        dict.fromkeys(note for recordings in read for one in recordings for note in one.notes if note not in one.causes)
+    )
+
+
+def tell(notes: Iterable[str]) -> None:
+    """A line for each note on standard error."""
+    from consistency.referee.parsing import one_line
+
+    for note in notes:
+        print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
+
+
+def reads_files(command: Callable[..., Any] | None = None, only: Collection[str] | None = None) -> Callable[..., Any]:
+    """A command with the options of files, which it gets as one argument ``files``; with all, or ``only`` some."""
+    if command is None:
+        return partial(reads_files, only=only)
+    signature = inspect.signature(command, eval_str=True)
+    hints = get_type_hints(Reading)
+    taken = [each for each in fields(Reading) if only is None or each.name in only]
+    own = {each.name: _parameter(each, hints[each.name]) for each in taken}
+
+    @wraps(command)
+    def with_files(**given: Any) -> Any:
+        options = {each.name: given.pop(each.name) for each in taken}
+        for each in taken:
+            if (parse := each.metadata["parse"]) is not None and options[each.name] is not None:
+                options[each.name] = parse(options[each.name])
+        return command(files=Reading(**options), **given)
+
+    parameters = []
+    for name, parameter in signature.parameters.items():
+        parameters += list(own.values()) if name == "files" else [parameter.replace(kind=parameter.KEYWORD_ONLY)]
+    with_files.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    with_files.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return with_files
+
+
+def _parameter(of: Field[Any], kind: Any) -> inspect.Parameter:
+    """An option of files as typer takes it; what is parsed comes as text."""
+    m = of.metadata
+    option = typer.Option(m["flag"] or flag_of(of.name), help=m["help"], metavar=m["metavar"], show_default=False)
+    typed = str | None if m["parse"] else kind
+    annotation = Annotated[typed, option]  # type: ignore[valid-type]
+    return inspect.Parameter(of.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)

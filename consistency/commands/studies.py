@@ -1,0 +1,176 @@
+"""Commands that run filters: ``simulate``, ``run`` and ``reproduce``; they parse, call and print."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from consistency.commands.shared_options import (
+    DETECT_HELP,
+    LOST_HELP,
+    SCENARIO,
+    BackendName,
+    Jobs,
+    Out,
+    Overwrite,
+    Runs,
+    Scheduler,
+    SchedulerWait,
+    Seed,
+    SlurmOptions,
+    given_options,
+)
+from consistency.referee.errors import InputError
+
+
+def simulate_command(
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help=SCENARIO)],
+    out: Out,
+    runs: Runs = 1,
+    seed: Seed = 0,
+    form: Annotated[str, typer.Option("--format", help="Of the tables: parquet or csv; both are read.")] = "parquet",
+    overwrite: Overwrite = False,
+) -> None:
+    """Write truth, controls and observations of a scenario: a log for any filter, ours or not."""
+    from consistency.bench.runs.montecarlo import simulate_log
+    from consistency.bench.scenario import load_scenario
+
+    simulate_log(load_scenario(scenario), runs, seed, out, overwrite, form)
+    count = f"{runs} run{'s' * (runs != 1)}"
+    print(f"{count} of {scenario} in {out}; filter them with: consistency run --log {out} --filter F")
+
+
+def run_command(
+    out: Out,
+    filters: Annotated[
+        list[str], typer.Option("--filter", metavar="NAME", help="Filter name, or FILTER+gate; again for more.")
+    ],
+    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
+    log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
+    screen: Annotated[
+        str | None,
+        typer.Option(
+            "--screen",
+            metavar="U,V,D",
+            help="Landmarks of a log begin anew that leave the common motion by more, in px.",
+        ),
+    ] = None,
+    runs: Annotated[int | None, typer.Option("--runs", help="Number of Monte Carlo runs [default: 50].")] = None,
+    until_decided: Annotated[
+        bool, typer.Option("--until-decided", help="As many runs as the verdict takes, instead of --runs.")
+    ] = False,
+    max_runs: Annotated[int | None, typer.Option("--max-runs", help="Most runs of --until-decided.")] = None,
+    detect: Annotated[float | None, typer.Option("--detect", help=f"For --until-decided: {DETECT_HELP} [1.5]")] = None,
+    false_alarm: Annotated[
+        float | None, typer.Option("--false-alarm", help="For --until-decided: chance to fail a right filter [0.05].")
+    ] = None,
+    lost: Annotated[float | None, typer.Option("--lost", help=f"For --until-decided: {LOST_HELP}.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the noise [default: 0].")] = None,
+    jobs: Jobs = -1,
+    timeout: Annotated[
+        float | None,
+        typer.Option("--timeout", help="Seconds a run, after which it is killed; filters that are not compiled only."),
+    ] = None,
+    memory: Annotated[
+        float | None, typer.Option("--memory", metavar="GIB", help="GiB that such a filter may allocate in a run.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run in --out.")] = False,
+    overwrite: Overwrite = False,
+    backend: BackendName = "local",
+    scheduler: Scheduler = None,
+    scheduler_wait: SchedulerWait = None,
+    slurm: SlurmOptions = None,
+) -> None:
+    """Put simulated trials, or a recorded log, through filters."""
+    from consistency.bench.runs.analyse_results import analyse
+    from consistency.bench.runs.backends.choosing import executor_for
+    from consistency.bench.runs.montecarlo import resolve_filters, run_log, run_trials
+    from consistency.bench.runs.sequential import run_until_decided
+    from consistency.bench.scenario import load_scenario
+    from consistency.bench.store.log import read_log
+    from consistency.bench.store.results import Results, StoredResults
+    from consistency.referee.document.verdict import document
+    from consistency.referee.show import terminal
+    from consistency.referee.system.progress import say
+
+    if (scenario is None) == (log is None):
+        raise InputError("give either a SCENARIO or --log DIR")
+    if screen is not None and log is None:
+        raise InputError("--screen goes with --log: a scenario says which of its observations are spurious")
+    planned = given_options(max_runs=max_runs, detect=detect, false_alarm=false_alarm, lost=lost)
+    if planned and not until_decided:
+        raise InputError(f"--{next(iter(planned)).replace('_', '-')} goes with --until-decided")
+    if until_decided and runs is not None:
+        raise InputError("--until-decided finds the number of runs; give --max-runs instead of --runs")
+    results: Results | StoredResults
+    verdicts = None
+    if resume and overwrite:
+        raise InputError("--resume goes on with what --overwrite would replace; give one of them")
+    if log is not None and (runs is not None or seed is not None or until_decided):
+        raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
+    with executor_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out) as executor:
+        if log is not None:
+            recorded = read_log(log)
+            if screen is not None:
+                from consistency.stereo.visual_odometry.common_motion import screened_log, screening_line
+
+                recorded = screened_log(recorded, screen)
+                say(screening_line(recorded))
+            resolve_filters(filters, recorded.belief, recorded.name)
+            if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
+                raise InputError(f"--out {out}: lies in the log; choose another folder")
+            results = run_log(
+                recorded, filters, jobs, timeout, memory, executor, out=out, resume=resume, overwrite=overwrite
+            )  # fmt: skip
+        else:
+            world = load_scenario(str(scenario))
+            runs, seed = 50 if runs is None else runs, 0 if seed is None else seed
+            resolve_filters(filters, world.belief)
+            if until_decided:
+                results, verdicts = run_until_decided(
+                    world, filters, seed=seed, jobs=jobs, timeout=timeout, memory=memory, executor=executor,
+                    out=out, resume=resume, overwrite=overwrite, **planned,
+                )  # fmt: skip
+            else:
+                results = run_trials(
+                    world, filters, runs, seed, jobs, timeout,
+                    out=out, overwrite=overwrite, resume=resume, memory=memory, executor=executor,
+                )  # fmt: skip
+    terminal.show(*document(verdicts or analyse(results), reasons=False).opening)
+    print(f"results in {out}; next: consistency report {out}")
+
+
+def reproduce_command(
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="NAME", help="Only this finding or experiment; may be repeated."),
+    ] = None,
+    long: Annotated[bool, typer.Option("--all", help="Also experiments that take from minutes to hours.")] = False,
+    runs: Runs = 50,
+    seed: Seed = 0,
+    jobs: Jobs = -1,
+    out: Out = Path("reports/reproduce"),
+    overwrite: Overwrite = False,
+) -> None:
+    """Set each published finding beside what is measured here; exit 1 if a published one is not reproduced."""
+    from consistency.bench.pages import write_reports
+    from consistency.bench.runs.findings import findings_table
+    from consistency.bench.runs.findings import reproduce as reproduce_findings
+    from consistency.bench.types import OURS
+    from consistency.referee.show import terminal
+
+    findings = reproduce_findings(only, runs, seed, jobs, out, overwrite, long)
+    terminal.show(findings_table(findings))
+    for path in (out / "findings.json", *write_reports(out, out / "report.html", out / "report.pdf", overwrite=True)):
+        print(path)
+    missed = [finding.id for finding in findings if finding.verdict != "reproduced"]
+    own = [finding.id for finding in findings if finding.source.startswith(OURS) and finding.id in missed]
+    published = [id for id in missed if id not in own]
+    for said, names in (("not reproduced", published), ("do not hold", own)):
+        if names:
+            print(f"{said}: {', '.join(names)}", file=sys.stderr)
+    if published:
+        raise typer.Exit(1)

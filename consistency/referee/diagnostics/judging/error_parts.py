@@ -1,0 +1,269 @@
+"""What the tests say about the errors of a sample, part by part: size, place, components, mean, shape and tails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics.judging.fault_location import Answers, any_found, from_step, location_of
+from consistency.referee.diagnostics.judging.hypothesis_tests import Tests
+from consistency.referee.diagnostics.questions.band import Band, simultaneous_band
+from consistency.referee.diagnostics.questions.bias import hotelling
+from consistency.referee.diagnostics.questions.equivalence import equivalence
+from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
+from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
+from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
+from consistency.referee.diagnostics.statistics.accuracy import coverage, coverage_interval, noncredibility, rmse
+from consistency.referee.diagnostics.statistics.nees import anees
+from consistency.referee.diagnostics.statistics.number_of_runs import detectable_ratio
+from consistency.referee.diagnostics.verdict.answers import (
+    AXIS,
+    BIAS,
+    DIRECTION,
+    MAIN,
+    SHAPE,
+    SHARES,
+    STEP,
+    at_share,
+    with_tolerated,
+)
+from consistency.referee.diagnostics.verdict.parts import (
+    Accuracy,
+    Answer,
+    Axes,
+    Bias,
+    Equivalence,
+    ErrorParts,
+    Interval,
+    Location,
+    Scale,
+    Shape,
+    Tails,
+)
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.types import Array, Indices
+
+SIGN = 2.0  # standard errors from 0, of steps that are all one and the same, at which a correlation has a sign
+VISIBLE = 0.05  # a stated correlation that is worth a word
+TINIEST = 1e-300
+
+
+def error_parts(
+    record: Record, sample: Sample, tests: Tests, given: Sequence[Answer], settings: Settings, shown: Equivalence
+) -> ErrorParts:
+    """All parts of the errors of a sample; those of NEES alone have no components."""
+    faults = {answer.question: answer for answer in given if not answer.tolerated}
+    band = _band_of_fault(sample, tests, faults, settings)
+    location = location_of(sample, band, faults, ordered=record.landmarks is None, detect=settings.factor)
+    scaled = at_share(given, settings)
+    scale = scale_of(sample, tests, scaled, location, shown)
+    tails = tails_of(tests, record.run_numbers)
+    if sample.errors is None:
+        return ErrorParts(scale, location, tails=tails)
+    return ErrorParts(
+        scale,
+        location,
+        axes_of(sample, tests, location),
+        bias_of(sample, tests.bias_step, location, faults),
+        shape_of(sample, tests, faults, scaled.false_alarm),
+        tails,
+        accuracy_of(sample),
+    )
+
+
+def _band_of_fault(sample: Sample, tests: Tests, faults: Answers, settings: Settings) -> Band:
+    """The band of the steps; where they were found by what Holm's correction left over, one that shows it."""
+    step = faults.get(STEP)
+    if step is None or not step.found or tests.band.outside.any():
+        return tests.band
+    rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
+    return simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
+
+
+def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Settings) -> tuple[Answer, ...]:
+    """Answers with faults of the scale marked as tolerated whose ratio is shown to lie within the tolerance."""
+    if settings.tolerance is None:
+        return tuple(given)
+    R, steps = settings.tolerated, sample.longest
+    if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
+        return tuple(given)
+    tolerated = {MAIN}
+    if sample.errors is not None:
+        groups = sample.errors.groups.values()
+        if all(equivalence(sample.group_means(g), len(g), steps, settings, R).shown for g in groups):
+            tolerated.add(AXIS)
+    if tests.largest is not None and tests.largest.ratio.high <= R:
+        tolerated.add(DIRECTION)
+    curve = anees(sample.nees)
+    if not ((curve > tests.band.high * R) | (curve < tests.band.low / R)).any():
+        tolerated.add(STEP)
+    return with_tolerated(given, tolerated)
+
+
+def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Location, shown: Equivalence) -> Scale:
+    """Size of the errors; the inflation is that since the fault began, if it began late."""
+    dof, means = sample.dof, sample.means()
+    alive = sample.counted.sum(axis=0)
+    curve, band = anees(sample.nees), pointwise_band(alive, dof)
+    rate = SHARES[MAIN] * settings.false_alarm
+    judged = alive > 0
+    detectable = median_run = worst_run = share_inside = float("nan")
+    if judged.any():
+        detectable = detectable_ratio(dof, len(means), rate, two_sided=not settings.one_sided)
+        median_run, worst_run = float(np.median(means)) * dof, float(means.max()) * dof
+        inside = (curve >= band[:, 0]) & (curve <= band[:, 1])
+        share_inside = float(inside[judged].mean())
+    of_log = None
+    if len(sample.nees) == 1:
+        from consistency.referee.diagnostics.planning.single_log import within
+
+        of_log = within(sample.nees[0], dof, settings, shown.factor)
+    late = means
+    if location.since is not None:
+        late = sample.means(from_step(location.since))
+    return Scale(
+        dof=dof,
+        anees=curve,
+        alive=alive,
+        band=band,
+        mean_anees=tests.main.ratio * dof,
+        accepted=acceptance(tests.main, dof, rate, settings.allow),
+        effective_dof=tests.main.effective_dof,
+        inflation=ratio_interval(late, dof, CONFIDENCE),
+        detectable=detectable,
+        median_run=median_run,
+        worst_run=worst_run,
+        share_inside=share_inside,
+        equivalence=shown,
+        within=of_log,
+    )
+
+
+def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
+    """Inflation of each component and group, since the fault began."""
+    errors = sample.known_errors
+    late, confidence = from_step(location.since), 1.0 - (1.0 - CONFIDENCE) / len(errors.groups)
+    inflation = {}
+    for key, index in errors.groups.items():
+        inflation[key] = ratio_interval(sample.group_means(index, late), len(index), confidence)
+    if tests.largest is None:
+        return Axes(errors.names, errors.groups, inflation)
+    return Axes(errors.names, errors.groups, inflation, tests.largest.ratio, tests.largest.direction)
+
+
+def bias_of(sample: Sample, step: int | None, location: Location, answers: Answers) -> Bias:
+    """Mean error of each axis, clearest in ``step``, and the scale without it."""
+    errors, late = sample.known_errors, from_step(location.since)
+
+    def means(error: Array, covariance: Array, counted: Array) -> Array:
+        return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
+
+    of_runs = by_runs(means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
+    of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
+    by_axis = {}
+    if len(of_runs) > sample.dof:
+        test = hotelling(of_runs, CONFIDENCE)
+        for i, axis in enumerate(errors.names):
+            by_axis[axis] = Interval(test.mean[i], *test.interval[i])
+    if not any_found(answers, BIAS):
+        return Bias(by_axis, step, None, None, None)
+    without = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
+    if step is None:
+        return Bias(by_axis, step, None, None, without)
+    at = standardise(errors.error[:, step - 1], errors.covariance[:, step - 1])[sample.counted[:, step - 1]]
+    mean = at.mean(axis=0)
+    chief = int(np.argmax(np.abs(mean) / at.std(axis=0, ddof=1).clip(TINIEST)))  # what stands out most
+    return Bias(by_axis, step, errors.names[chief], float(mean[chief]), without)
+
+
+def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float) -> Shape | None:
+    """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
+    if tests.matrix is None or sample.dof == 1:
+        return None
+    errors, here = sample.known_errors, slice(None)
+    if tests.shape_step is not None and not any_found(answers, ("shape",)):
+        here = slice(tests.shape_step - 1, tests.shape_step)
+    counted = sample.counted[:, here]
+    pair, actual, stated = _correlation(errors.error[:, here], errors.covariance[:, here], counted)
+    known = SIGN / np.sqrt(max(int(counted.any(axis=1).sum()), 1))
+    opposite = actual * stated < 0.0 and abs(actual) > known and abs(stated) > VISIBLE
+    wrong_sign = any_found(answers, SHAPE) and opposite
+    right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in errors.names)
+    return Shape(tests.matrix, tests.shape_step, pair, actual, stated, wrong_sign, wrong_sign and right)
+
+
+def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
+    """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
+    run, step, distance = -1, 0, float("nan")
+    if tests.outlier is not None:
+        run, step, distance = tests.outlier.run, tests.outlier.step + 1, tests.outlier.distance
+    if run >= 0:
+        run = int(run_numbers[run])
+    return Tails(run, step, distance, tests.pit.values, tests.pit.half_width)
+
+
+def accuracy_of(sample: Sample) -> Accuracy:
+    """Coverage, RMSE and the noncredibility index."""
+    errors, counted = sample.known_errors, sample.counted
+    index, inclination = noncredibility(errors.error, sample.nees)
+    inside, interval = coverage_interval(errors.error, errors.covariance, counted=counted)
+
+    def rmse_of(members: set[str]) -> float:
+        columns = [i for i, axis in enumerate(errors.names) if axis in members]
+        if not columns:
+            return float("nan")
+        return rmse(errors.error, columns, counted)
+
+    return Accuracy(
+        coverage=coverage(errors.error, errors.covariance, counted=counted),
+        coverage_one_step=inside,
+        coverage_interval=interval,
+        rmse=np.array([rmse(errors.error, [i], counted) for i in range(sample.dof)]),
+        rmse_position=rmse_of(POSITION),
+        rmse_heading=rmse_of(ATTITUDE),
+        nci=_mean_of_known(index),
+        inclination=_mean_of_known(inclination),
+    )
+
+
+def _mean_of_known(values: Array) -> float:
+    if not np.isfinite(values).any():
+        return float("nan")
+    return float(np.nanmean(values))
+
+
+def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple[int, int] | None, float, float]:
+    """The two axes whose errors are correlated least as stated, with both correlations, averaged over steps."""
+    if not counted.any():
+        return None, float("nan"), float("nan")
+    n, count = error.shape[-1], int(counted.sum())
+    mean, stated, second = np.zeros(n), np.zeros((n, n)), np.zeros((n, n))
+    parts = list(block_slices(*counted.shape))
+    for here in parts:
+        mean += standardise(error[here], covariance[here])[counted[here]].sum(axis=0)
+    mean /= count
+    for here in parts:
+        e = standardise(error[here], covariance[here])[counted[here]] - mean
+        second += e.T @ e / count
+        stated += _sum_of_correlations(covariance[here][counted[here]]) / count
+    scale = np.sqrt(np.diag(second))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gap = np.nan_to_num(second / np.outer(scale, scale) - stated)
+    np.fill_diagonal(gap, 0.0)
+    i, j = sorted(int(k) for k in np.unravel_index(np.abs(gap).argmax(), gap.shape))
+    return (i, j), float(stated[i, j] + gap[i, j]), float(stated[i, j])
+
+
+def _sum_of_correlations(covariance: Array) -> Array:
+    """Correlation matrices of covariances (N, n, n), added up."""
+    n = covariance.shape[-1]
+    total = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i, n):
+            each = covariance[:, i, j] / (np.sqrt(covariance[:, i, i]) * np.sqrt(covariance[:, j, j]))
+            total[i, j] = total[j, i] = each.sum()
+    return total

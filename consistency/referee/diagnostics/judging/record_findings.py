@@ -1,0 +1,264 @@
+"""Every test of a record's errors and innovations, and the status that follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics.judging.error_parts import accuracy_of, bias_of, error_parts, excused
+from consistency.referee.diagnostics.judging.hypothesis_tests import run_tests
+from consistency.referee.diagnostics.judging.status import (
+    nothing_judged,
+    status_by_errors,
+    status_by_innovations,
+    status_without_fault,
+)
+from consistency.referee.diagnostics.questions.bias import t_squared
+from consistency.referee.diagnostics.questions.equivalence import (
+    equivalence,
+    equivalence_by_betting,
+    equivalence_of_total,
+    is_tolerated,
+)
+from consistency.referee.diagnostics.questions.lost_runs import early_ends, lost_of
+from consistency.referee.diagnostics.questions.sample import Sample, impossible_values, runs_and_steps, sample_of
+from consistency.referee.diagnostics.records.large_arrays import every_entry
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.statistics.nees import chi2_mean_interval
+from consistency.referee.diagnostics.verdict.answers import JOINT, MAIN, answers, least_of_steps, with_tolerated
+from consistency.referee.diagnostics.verdict.parts import (
+    Answer,
+    EarlyEnds,
+    Equivalence,
+    ErrorParts,
+    Innovations,
+)
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, Findings
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import UncertainTruth
+    from consistency.referee.diagnostics.maps.map_nees import JointTest
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """One of several looks at growing evidence; see :mod:`consistency.referee.diagnostics.planning.early_stopping`."""
+
+    spent: float | None  # part of the false-alarm rate of every question but the scale that this look may cost;
+    # None where nothing but the scale is asked
+    scale: float  # p value of the scale, valid at any time
+
+    def corrected(self, p_values: Mapping[str, float]) -> dict[str, float]:
+        """p values corrected for the number of looks; the share of the scale is the same if it is asked alone."""
+        corrected = {}
+        for question, p in p_values.items():
+            if question == MAIN or not np.isfinite(p):
+                corrected[question] = p
+            elif self.spent is None:
+                corrected[question] = 1.0
+            else:
+                corrected[question] = min(1.0, p / self.spent)
+        return corrected
+
+
+def findings_of(
+    record: Record, settings: Settings, inspection: Inspection | None = None, truth: UncertainTruth | None = None
+) -> Findings:
+    """Test the errors and innovations of a record, and nothing beside them.
+
+    With a ``truth`` that is uncertain the record is :attr:`UncertainTruth.evidence`.
+    """
+    runs, steps = runs_and_steps(record)
+    both_sides = settings
+    if record.reduced:
+        settings = replace(settings, allow="conservative")
+    innovations, p_values = _innovations(record, settings)
+    joint = _joint(record, settings)
+    if joint is not None:
+        p_values |= joint.p_values
+    sample, tests = sample_of(record, settings), None
+    if sample is not None:
+        scale = None
+        if inspection is not None:
+            scale = inspection.scale
+        tests = run_tests(sample, settings, p_values, scale)
+        asked = tests.p_values
+        if truth is not None:
+            asked = truth.p_values(asked, settings)
+        p_values |= {question: p for question, p in asked.items() if question not in record.unavailable}
+    if inspection is not None:
+        p_values = inspection.corrected(p_values)
+    given = tuple(answers(p_values, settings.false_alarm).values())
+    given = with_tolerated(given, _tolerated(joint, innovations, settings))
+
+    parts, lost, ends = ErrorParts(), None, None
+    impossible: list[tuple[int, int]] = []
+    left_out: list[int] = []
+    if sample is not None and tests is not None:
+        given = excused(given, sample, tests, settings)
+        shown = _equivalence(sample, both_sides, inspection, record, truth)
+        parts = error_parts(record, sample, tests, given, settings, shown)
+        lost = lost_of(record, sample.nees, sample.dof, settings, any_time=inspection is not None)
+        if record.landmarks is None:
+            ends = _early_ends(sample)
+        if sample.errors is not None:
+            impossible, left_out = _impossible(record, sample), _left_out_steps(record, sample)
+    broken = bool(record.failures or impossible or (joint is not None and joint.score.not_definite))
+
+    faults = {answer.question for answer in given if answer.found and not answer.tolerated}
+    if nothing_judged(parts.scale, innovations):
+        status = "failed"
+    elif not faults:
+        status = status_without_fault(broken, parts.scale, innovations, lost, settings)
+    elif sample is None or tests is None:
+        status = status_by_innovations(faults, innovations, settings)
+    else:
+        status = status_by_errors(given, settings, sample, tests, joint, parts)
+    share = None
+    if truth is not None:
+        share, status = truth.truth_share(), truth.status(status, given, settings)
+        parts = _parts_of_estimate(truth, parts, given, settings)
+    return Findings(
+        filter=record.name,
+        status=status,
+        runs=runs,
+        steps=steps,
+        settings=settings,
+        answers=given,
+        failures=record.failures,
+        impossible=tuple(impossible),
+        left_out_steps=tuple(left_out),
+        **parts._asdict(),
+        innovations=innovations,
+        landmarks=record.landmarks,
+        joint=None if joint is None else joint.score,
+        unit=record.unit,
+        lost=lost,
+        ends=ends,
+        skipped=record.skipped,
+        truth=share,
+    )
+
+
+# --- innovations, and pose and map together ----------------------------------------------------------
+
+
+def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None, dict[str, float]]:
+    """What the innovations say, and the p values of their questions where an optimal gain is declared."""
+    if record.nis is None and record.innovations is None:
+        return None, {}
+    from consistency.referee.diagnostics.questions.innovations import (
+        nis_and_dof,
+        nis_test,
+        nis_whiteness,
+        outliers_of,
+        whiteness,
+    )
+
+    found = nis_and_dof(record)
+    if found is None:
+        return None, {}
+    nis, dof = found
+    test, interval = nis_test(nis, dof), UNKNOWN_ENDS
+    if test.dof:
+        interval = chi2_mean_interval(test.dof, CONFIDENCE)
+    if record.innovations is not None and record.innovation_covariances is not None:
+        white = whiteness(record.innovations, record.innovation_covariances)
+    else:
+        white = nis_whiteness(nis, dof)
+    said = Innovations(test.ratio, interval, test.dof, record.optimal_gain, white.correlation, white.bound)
+    if not record.optimal_gain:
+        return said, {}
+    factor = max(settings.factor, settings.tolerated)
+    shown = equivalence_of_total(test.ratio * test.dof, test.dof, settings, factor)
+    p_values = {"innovation scale": test.p_value}
+    if settings.one_sided:
+        p_values = {"innovation scale": test.above}
+    far = outliers_of(nis, dof)
+    if far is not None:
+        p_values["innovation scale"] = min(p_values["innovation scale"], far.p_value)
+        far = replace(far, run=int(record.run_numbers[far.run]), step=far.step + 1)
+    if not settings.one_sided:
+        p_values["innovation whiteness"] = white.p_value
+    return replace(said, equivalence=shown, outliers=far), p_values
+
+
+def _joint(record: Record, settings: Settings) -> JointTest | None:
+    if record.joint is None:
+        return None
+    from consistency.referee.diagnostics.maps.map_nees import joint_test
+
+    return joint_test(record.joint, settings, record.run_numbers, record.landmarks)
+
+
+def _tolerated(joint: JointTest | None, innovations: Innovations | None, settings: Settings) -> set[str]:
+    """Questions of totals whose ratio is shown to lie within the tolerance."""
+    tolerated = set()
+    if joint is not None and is_tolerated(joint.nees, joint.score.dof, settings):
+        tolerated.add(JOINT)
+    i = innovations
+    if i is not None and i.judged and not i.outliers and is_tolerated(i.ratio * i.dof, i.dof, settings):
+        tolerated.add("innovation scale")
+    return tolerated
+
+
+# --- errors -----------------------------------------------------------------------------------------
+
+
+def _equivalence(
+    sample: Sample, settings: Settings, inspection: Inspection | None, record: Record, truth: UncertainTruth | None
+) -> Equivalence:
+    """Whether the ratio of true to stated covariance is shown to lie where it should."""
+    if inspection is not None:
+        return equivalence_by_betting(sample.means(), sample.dof, settings)
+    factor = max(settings.factor, settings.tolerated)
+    if truth is not None:
+        return truth.equivalence(sample, settings, factor)
+    low_is_fault = not record.reduced
+    return equivalence(sample.means(), sample.dof, sample.longest, settings, factor, low_is_fault, record.unseen)
+
+
+def _early_ends(sample: Sample) -> EarlyEnds | None:
+    ends = early_ends(sample.nees)
+    if not ends.runs:
+        return None
+    return ends
+
+
+def _impossible(record: Record, sample: Sample) -> list[tuple[int, int]]:
+    """Run and step (1..T) of every value that no filter may say."""
+    return [(int(run), int(k) + 1) for run, k in np.argwhere(impossible_values(record, sample.counted))]
+
+
+def _left_out_steps(record: Record, sample: Sample) -> list[int]:
+    """Steps (1..T) in which the covariance of some run is stated and of no full rank."""
+    stated = every_entry(np.isfinite, np.asarray(record.covariance, float))
+    return [int(k) + 1 for k in np.flatnonzero((stated & ~sample.counted).any(axis=0))]
+
+
+def _parts_of_estimate(
+    truth: UncertainTruth, parts: ErrorParts, given: Sequence[Answer], settings: Settings
+) -> ErrorParts:
+    """The parts with every ratio that of the estimate alone, and with the mean error and its size."""
+    if parts.axes is None or parts.scale is None or not parts.scale.judged_steps:
+        return parts
+    if not truth.contrasted:
+        return truth.of_estimate(parts, given, settings)
+    assert parts.bias is not None
+    assert parts.accuracy is not None
+    assert parts.location is not None
+    size, clearest, whitened = accuracy_of(truth.total), None, truth.total.known_errors.whitened
+    if whitened.shape[1] > 1:
+        _, clearest = least_of_steps(t_squared(whitened)[1])  # whatever the truth allows
+    mean = bias_of(truth.total, clearest, parts.location, {answer.question: answer for answer in given})
+    return parts._replace(
+        bias=replace(mean, inflation_without=parts.bias.inflation_without),
+        accuracy=replace(
+            parts.accuracy, rmse=size.rmse, rmse_position=size.rmse_position, rmse_heading=size.rmse_heading
+        ),
+    )

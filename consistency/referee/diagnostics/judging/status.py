@@ -1,0 +1,270 @@
+"""The status of a verdict: one word for the answers to all questions."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, run_tests, sided_p_value
+from consistency.referee.diagnostics.questions.sample import Sample
+from consistency.referee.diagnostics.questions.scale import scale_test, spreads_more, spreads_more_in_steps
+from consistency.referee.diagnostics.statistics.nees import anees
+from consistency.referee.diagnostics.verdict.answers import (
+    AXIS,
+    BIAS,
+    DIRECTION,
+    INNOVATIONS,
+    JOINT,
+    MAIN,
+    SCALE,
+    SHARES,
+    STEP,
+    answers,
+    at_share,
+)
+from consistency.referee.diagnostics.verdict.parts import (
+    TINY,
+    Answer,
+    ErrorParts,
+    Innovations,
+    Interval,
+    Lost,
+    Scale,
+)
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.diagnostics.verdict.verdict import Findings
+from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.maps.map_nees import JointTest
+
+SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones
+
+
+def nothing_judged(scale: Scale | None, innovations: Innovations | None) -> bool:
+    """Whether there is neither a step nor an innovation to judge."""
+    if scale is not None:
+        return scale.judged_steps == 0
+    return innovations is None or not innovations.dof
+
+
+def status_without_fault(
+    broken: bool, scale: Scale | None, innovations: Innovations | None, lost: Lost | None, settings: Settings
+) -> str:
+    """The status where no question found a fault; ``broken`` if a run failed or says what no filter may say."""
+    if broken:
+        return "failed"
+    shown = None
+    if scale is not None:
+        shown = scale.equivalence
+    elif innovations is not None:
+        shown = innovations.equivalence
+    if shown is not None and shown.shown and few_lost(lost, settings):
+        return "consistent"
+    return "undecided"
+
+
+def few_lost(lost: Lost | None, settings: Settings) -> bool:
+    """Whether the share of lost runs is shown to be what was asked for, if it was."""
+    if settings.lost is None:
+        return True
+    return lost is not None and lost.upper <= settings.lost
+
+
+def status_by_innovations(faults: Collection[str], innovations: Innovations | None, settings: Settings) -> str:
+    """The status where innovations alone are at fault: by the rest of them where outliers are among them."""
+    if "innovation scale" not in faults or innovations is None:
+        return "inconsistent"
+    far, rate = innovations.outliers, settings.false_alarm
+    if far is None or far.rest.above <= rate:
+        return _side(innovations.ratio)
+    if far.rest.below <= rate and not settings.one_sided:
+        return "inconsistent"
+    return "heavy-tailed"
+
+
+def status_by_errors(
+    given: Sequence[Answer],
+    settings: Settings,
+    sample: Sample,
+    tests: Tests,
+    joint: JointTest | None,
+    parts: ErrorParts,
+) -> str:
+    """The status where a question about errors found a fault. It may overwrite the arrays of the ``sample``."""
+    faults = {answer.question for answer in given if answer.found and not answer.tolerated}
+    if faults & set(BIAS):
+        sample, tests, rest = _without_bias(given, settings, sample)
+        status = "biased"
+        if rest & faults:
+            status = _status_of_sample(at_share(given, settings), rest & faults, sample, tests)
+        if status == "heavy-tailed":
+            status = "biased"  # a few errors explain less than the mean of all
+    else:
+        status = _with_joint(at_share(given, settings), faults, sample, tests, joint)
+    if status == "overconfident" and parts.shape is not None and parts.shape.alone and JOINT not in faults:
+        return "inconsistent"  # by the sign of a correlation
+    if status == "heavy-tailed" and smaller(faults, parts.scale):
+        return "inconsistent"
+    return status
+
+
+def smaller(faults: Collection[str], scale: Scale | None) -> bool:
+    """Are the errors found to be smaller than stated in the mean? Then few large ones are not all that is wrong."""
+    return scale is not None and MAIN in faults and scale.inflation.high < 1.0
+
+
+def deciding_axis(found: Findings) -> tuple[str, Interval] | None:
+    """The component that decides the status, with its ratio; None where the whole does.
+
+    It is the worst one where an axis is found at fault and the whole is not, or errs in the other direction, or looks
+    right: its ratio lies in [1 / detect, detect], and the interval of the axis outside.
+    """
+    axis, factor, faults = clear(found.worst_axis), found.settings.factor, found.faults
+    if found.parts:
+        of_parts = {question for part in found.parts.values() for question in part.faults}
+        if not of_parts & set(SCALE):
+            return None
+        return axis
+    if axis is None or found.scale is None or AXIS not in faults:
+        return None
+    if MAIN not in faults or found.status == "inconsistent":
+        return axis
+    whole_looks_right = 1.0 / factor <= found.scale.inflation.value <= factor
+    if whole_looks_right and (axis[1].low > factor or axis[1].high < 1.0 / factor):
+        return axis
+    return None
+
+
+def clear(axis: tuple[str, Interval] | None) -> tuple[str, Interval] | None:
+    """An axis whose interval does not hold 1, or None."""
+    if axis is None or axis[1].holds(1.0):
+        return None
+    return axis
+
+
+def _side(ratio: float) -> str:
+    if ratio > 1.0:
+        return "overconfident"
+    return "conservative"
+
+
+def _with_joint(settings: Settings, faults: set[str], sample: Sample, tests: Tests, joint: JointTest | None) -> str:
+    """The status of the landmarks, of pose and map together, or neither where they contradict each other."""
+    if joint is None or JOINT not in faults:
+        return _status_of_sample(settings, faults, sample, tests)
+    together = _side(joint.score.both.value)
+    if not _robust(joint.means, joint.dof, 1, settings, 1):
+        together = "heavy-tailed"
+    if not faults & set(SCALE):
+        return together
+    apart = _status_of_sample(settings, faults, sample, tests)
+    if {apart, together} == {"overconfident", "conservative"}:
+        return "inconsistent"
+    return apart
+
+
+def _without_bias(given: Sequence[Answer], settings: Settings, sample: Sample) -> tuple[Sample, Tests, set[str]]:
+    """Errors less their mean over runs, their tests, and the faults that remain."""
+    others = {answer.question: answer.p_value for answer in given if answer.question in INNOVATIONS}
+    centred = sample.centred()  # nobody asks the sample again
+    tests = run_tests(centred, settings, others)
+    p_values = {question: p for question, p in tests.p_values.items() if question not in BIAS}
+    found = answers(p_values | others, settings.false_alarm)
+    return centred, tests, {question for question, answer in found.items() if answer.found}
+
+
+def _status_of_sample(settings: Settings, faults: set[str], sample: Sample, tests: Tests) -> str:
+    """The status by the errors of a sample: of the scale only where it is no matter of a few large errors."""
+    if MAIN in faults:
+        if not _robust(sample.means(), sample.dof, sample.longest, settings, 1):
+            return "heavy-tailed"
+        if AXIS in faults and _contradicted(settings, sample, tests):
+            return "inconsistent"
+        return _side(tests.main.ratio)
+    heavy = "outliers" in faults or (STEP in faults and _heavy_steps(sample, tests))
+    if STEP in faults and not heavy:
+        return _status_of_steps(settings, faults, sample, tests)
+    if AXIS in faults or DIRECTION in faults:
+        if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
+            return _status_of_axes(settings, tests)
+        heavy = True
+    if heavy:
+        return "heavy-tailed"
+    return "inconsistent"
+
+
+def _status_of_steps(settings: Settings, faults: set[str], sample: Sample, tests: Tests) -> str:
+    """The side on which the ANEES is farthest from its band, unless axes err in both directions."""
+    if AXIS in faults and _status_of_axes(settings, tests) == "inconsistent":
+        return "inconsistent"
+    curve = anees(sample.nees)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        above, below = np.nanmax(curve / tests.band.high), np.nanmax(tests.band.low / curve)
+    if above >= below:
+        return "overconfident"
+    return "conservative"
+
+
+def _heavy_steps(sample: Sample, tests: Tests) -> bool:
+    """Do the runs differ more than Gaussian errors can, in most steps, or in all of those outside the band?"""
+    if spreads_more_in_steps(sample.nees, sample.dof):
+        return True
+    outside = np.flatnonzero(tests.band.outside)
+    for step in outside:
+        if not spreads_more(sample.nees[sample.counted[:, step], step] / sample.dof, sample.dof, SURE):
+            return False
+    return len(outside) > 0
+
+
+def _robust(means: Array, dof: int, steps: int, settings: Settings, questions: int) -> bool:
+    """Is the scale found at fault too where the runs differ more than Gaussian errors can?"""
+    test = scale_test(means, dof, steps, gaussian=not spreads_more(means, dof))
+    return bool(sided_p_value(test, settings) * questions <= SHARES[MAIN] * settings.false_alarm)
+
+
+def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
+    groups = sample.known_errors.groups
+    for key, test in tests.axes.items():
+        found = sided_p_value(test, settings) * len(groups) <= settings.false_alarm
+        if found and _robust(sample.group_means(groups[key]), len(groups[key]), sample.longest, settings, len(groups)):
+            return True
+    return False
+
+
+def _status_of_axes(settings: Settings, tests: Tests) -> str:
+    """Axes that err in one direction name the status, those that err in both do not."""
+    if settings.one_sided:
+        return "overconfident"
+    sides = set()
+    for test in tests.axes.values():
+        if test.p_value * len(tests.axes) <= settings.false_alarm:
+            sides.add(_side(test.ratio))
+    if len(sides) != 1:
+        return "inconsistent"
+    return sides.pop()
+
+
+def _contradicted(settings: Settings, sample: Sample, tests: Tests) -> bool:
+    """Does an axis err in the other direction than the whole?
+
+    Any does where the whole is too large, because nothing is too small in a conservative covariance. Where it is too
+    small, one that is farther from 1 than the whole, or all together, so that correlations make the whole too small.
+    """
+    if settings.one_sided or sample.errors is None:
+        return False
+    whole = float(np.log(max(tests.main.ratio, TINY)))
+    ratios, wrong = [], []
+    for axis in sample.errors.names:
+        test = tests.axes[axis]
+        ratios.append(test.ratio)
+        if test.p_value * len(tests.axes) <= settings.false_alarm:
+            wrong.append(test.ratio)
+    farther = bool(-np.log(max(min(ratios), TINY)) > whole)
+    if whole > 0.0 and wrong and max(wrong) < 1.0:
+        return farther or len(wrong) == len(ratios)
+    if _status_of_axes(settings, tests) != "inconsistent":
+        return False
+    return whole < 0.0 or farther

@@ -1,0 +1,225 @@
+"""Record prepared for the tests: whitened errors, the NEES that counts, run means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
+from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
+from consistency.referee.diagnostics.records.validity import negative
+from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, whiten, whiten_group
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.types import Array
+
+POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Whitened errors of a record and the names of their components; N runs, T steps, n components."""
+
+    record: Record  # with errors and covariances
+    whitened: Array  # (N, T, n), NaN where nothing counts
+    names: tuple[str, ...]
+    groups: Mapping[str, list[int]]  # components, named groups and subsets
+    centre: Centre | None = None  # where ``whitened`` is of the errors about it
+
+    @property
+    def error(self) -> Array:
+        """(N, T, n)."""
+        assert self.record.error is not None
+        return self.record.error
+
+    @property
+    def covariance(self) -> Array:
+        """(N, T, n, n)."""
+        return np.asarray(self.record.covariance, float)
+
+
+class Centre(NamedTuple):
+    """Mean of the errors of N runs in each step, and the factor that restores their variance about it."""
+
+    mean: Array  # (T, n)
+    factor: Array  # (T, 1), NaN in a step of a single run
+
+    def about(self, error: Array, counted: Array) -> Array:
+        """Errors (runs, T, n) about the mean; NaN where they are not ``counted`` (runs, T)."""
+        return np.where(counted[..., None], (error - self.mean) * self.factor, np.nan)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """NEES of N runs in T steps; with errors where they are known.
+
+    The arrays may be large: they are processed in blocks of runs or steps, and no other array of their size is kept.
+    """
+
+    nees: Array  # (N, T), NaN where nothing counts
+    dof: int
+    errors: Errors | None = None
+
+    @property
+    def known_errors(self) -> Errors:
+        """Errors of a sample that has them."""
+        assert self.errors is not None
+        return self.errors
+
+    @cached_property
+    def counted(self) -> Array:
+        """(N, T) of bool."""
+        return np.asarray(np.isfinite(self.nees))
+
+    def means(self, steps: slice = slice(None)) -> Array:
+        """Mean NEES over dof of each run that has any of ``steps``, (runs,)."""
+        means, counts = run_means(self.nees[:, steps])
+        return np.asarray(means[counts > 0] / self.dof)
+
+    @property
+    def longest(self) -> int:
+        """Steps of the longest run."""
+        return int(self.counted.sum(axis=1).max(initial=0))
+
+    def group_means(self, index: Sequence[int], steps: slice = slice(None), centre: Centre | None = None) -> Array:
+        """Mean NEES of a group of components alone, of errors about the ``centre``, over its number of components."""
+        e = self.known_errors
+        if centre is None:
+            centre = e.centre
+        if centre is not None:
+            centre = Centre(centre.mean[steps], centre.factor[steps])
+
+        def of_block(error: Array, P: Array, counted: Array) -> Array:
+            if centre is not None:
+                error = centre.about(error, counted)
+            return means_and_counts(np.where(counted, squared_length(whiten_group(error, P, index)), np.nan))
+
+        means, counts = by_runs(of_block, e.error[:, steps], e.covariance[:, steps], self.counted[:, steps]).T
+        return np.asarray(means[counts > 0] / len(index))
+
+    def centre(self) -> Centre:
+        """Mean error over runs in each step."""
+        error, N = self.known_errors.error, self.counted.sum(axis=0)[:, None]
+        total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), error, self.counted)
+        factor = np.sqrt(N / np.maximum(N - 1, 1))
+        return Centre(total / np.maximum(N, 1), np.where(N > 1, factor, np.nan))
+
+    def centred_means(self, steps: slice) -> Array:
+        """:meth:`means` of errors less their mean over runs in each step."""
+        return self.group_means(range(self.dof), steps, self.centre())
+
+    def centred(self) -> Sample:
+        """Errors less their mean over runs in each step, with the variance that they would have without a bias.
+
+        Overwrites this sample's NEES and whitened errors in place; do not use it afterwards.
+        """
+        e, centre = self.known_errors, self.centre()
+        for here in of_runs(self.counted):
+            w = whiten(centre.about(e.error[here], self.counted[here]), e.covariance[here])
+            e.whitened[here], self.nees[here] = w, squared_length(w)
+        return Sample(self.nees, self.dof, replace(e, centre=centre))
+
+
+def sample_of(record: Record, settings: Settings) -> Sample | None:
+    """Sample of the errors, or of the NEES alone; None without either.
+
+    Raises
+    ------
+    ValueError
+        Names or subsets that do not fit, or NEES without dof.
+    """
+    if record.error is None or record.covariance is None:
+        if record.nees is None:
+            return None
+        if not record.dof:
+            raise ValueError("nees needs dof, the dimension of the error")
+        return Sample(record.nees, record.dof)
+    names = names_of(record)
+    groups = component_groups(names, settings.subsets)
+    error, P = record.error, np.asarray(record.covariance, float)
+    whitened, nees = np.empty(error.shape), np.empty(error.shape[:2])
+    for here in of_runs(nees):
+        w = whiten(error[here], P[here])
+        counted = all_finite(w)
+        if record.nees is not None:
+            counted = np.isfinite(record.nees[here])
+        nees[here] = np.where(counted, squared_length(w), np.nan)
+        w[~np.isfinite(nees[here])] = np.nan
+        whitened[here] = w
+    return Sample(nees, error.shape[-1], Errors(record, whitened, names, groups))
+
+
+def names_of(record: Record) -> tuple[str, ...]:
+    """Names of the components of the error; axis 0, axis 1, ... where they have none.
+
+    Raises
+    ------
+    ValueError
+        Other than one name for each component.
+    """
+    assert record.error is not None
+    n = record.error.shape[-1]
+    if record.axes is None or not len(record.axes):
+        return numbered_axes(n)
+    if len(record.axes) != n:
+        raise ValueError(f"{len(record.axes)} names of axes for {n} components")
+    return tuple(record.axes)
+
+
+def component_groups(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:
+    """Each component, position and attitude where they are more than one and not all, and the subsets."""
+    groups = {axis: [i] for i, axis in enumerate(names)}
+    for label, members in (("position", POSITION), ("attitude", ATTITUDE)):
+        index = [i for i, axis in enumerate(names) if axis in members]
+        if 1 < len(index) < len(names):
+            groups[label] = index
+    for label, chosen in (subsets or {}).items():
+        index = [int(i) for i in chosen]
+        if not index or not all(0 <= i < len(names) for i in index) or len(set(index)) < len(index):
+            raise ValueError(f"subset '{label}': indices must be different and between 0 and {len(names) - 1}")
+        groups[label] = index
+    return groups
+
+
+def runs_and_steps(record: Record) -> tuple[int, int]:
+    """Numbers of runs and steps that all arrays agree on.
+
+    Raises
+    ------
+    ValueError
+        They do not agree, or nothing is there.
+    """
+    dimensions = {"error": 3, "covariance": 4, "nees": 2, "nis": 2, "nis_dof": 2, "innovations": 3}
+    shapes = {}
+    for name in dimensions:
+        array = getattr(record, name)
+        if array is not None:
+            shapes[name] = np.shape(array)
+    if not set(shapes) - {"covariance", "nis_dof"}:
+        raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
+    for name, shape in shapes.items():
+        if len(shape) != dimensions[name]:
+            raise ValueError(f"{name} must be (runs, steps{', n' * (dimensions[name] - 2)}), got shape {shape}")
+    if len({shape[:2] for shape in shapes.values()}) > 1:
+        raise ValueError(f"runs and steps differ: {', '.join(f'{n} {shape}' for n, shape in shapes.items())}")
+    if "error" in shapes and "covariance" in shapes and shapes["covariance"][2:] != shapes["error"][2:] * 2:
+        raise ValueError(f"error {shapes['error']} and covariance {shapes['covariance']} do not fit")
+    runs, steps = next(iter(shapes.values()))[:2]
+    return int(runs), int(steps)
+
+
+def impossible_values(record: Record, counted: Array) -> Array:
+    """(runs, steps) of bool: values that no filter may say, an infinite error or a negative variance."""
+
+    def of_block(error: Array, P: Array, counted: Array) -> Array:
+        odd = np.isinf(error).any(axis=-1) | ~every_entry(lambda entry: ~np.isinf(entry), P)
+        suspect = ~counted & ~odd & every_entry(np.isfinite, P)
+        odd[suspect] = negative(P[suspect])
+        return odd
+
+    assert record.error is not None
+    return by_runs(of_block, record.error, np.asarray(record.covariance, float), counted)

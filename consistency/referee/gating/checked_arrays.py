@@ -1,0 +1,245 @@
+"""Checks of the input of a gate, with messages that name run and step; checked input goes to the referee."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from consistency.referee.diagnostics import Record, nis_of
+from consistency.referee.diagnostics.records.skipping import Skip, skip_of
+from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.numpy_archive import steps_of
+from consistency.referee.readers.pipeline.arrays_in_memory import in_memory, masked_steps, record_of_arrays
+from consistency.referee.readers.runs_to_record import Track, judged_rows, longest_start, symmetric
+from consistency.referee.types import Array, Failure, Indices
+from consistency.referee.verdicts.sources import Source
+
+
+def record_of_checked(
+    name: str,
+    errors: ArrayLike | None = None,
+    covariances: ArrayLike | None = None,
+    deviations: ArrayLike | None = None,
+    nees: ArrayLike | None = None,
+    dof: ArrayLike | None = None,
+    nis: ArrayLike | None = None,
+    nis_dof: ArrayLike | None = None,
+    innovations: ArrayLike | None = None,
+    innovation_covariances: ArrayLike | None = None,
+    axes: Sequence[str] | None = None,
+    subsets: Mapping[str, Sequence[int]] | None = None,
+    optimal_gain: bool = False,
+    skip: str | float | Skip | None = None,
+) -> Record:
+    """One estimator with checked arrays; arguments and errors as :func:`consistency.testing.assert_consistent`."""
+    if covariances is not None and deviations is not None:
+        raise ValueError("give covariances or deviations, not both")
+    key, size = ("covariances", covariances) if deviations is None else ("deviations", deviations)
+    if (errors is None) != (size is None):
+        there, missing = (key, "errors") if errors is None else ("errors", "covariances")
+        raise ValueError(f"{there} without {missing}: give both")
+    if errors is not None and nees is not None:
+        raise ValueError("give errors and covariances, or nees and dof, not both")
+    if nees is not None and dof is None:
+        raise ValueError("nees without dof: give dof, the dimension of the error")
+    for option, value in (("axes", axes), ("subsets", subsets)):
+        if value is not None and errors is None:
+            raise ValueError(f"{option} needs errors and covariances: the nees does not know its components")
+    if subsets is not None and deviations is not None:
+        raise ValueError("subsets needs covariances: of deviations each component is judged by itself")
+    record, given = Record(name), {"errors": errors, key: size, "nees": nees}
+    stated = {key: value for key, value in given.items() if value is not None}
+    if stated:
+        record = record_of_arrays(stated if nees is None or dof is None else {**stated, "dof": dof}, axes, name)
+        if nees is None and dof is not None and dof != record.dof:
+            raise ValueError(f"dof is {dof}, but the errors have {record.dof} components")
+    arrays, failures = _innovations(name, nis, nis_dof, innovations, innovation_covariances, _gone(record))
+    if not stated and not arrays:
+        raise ValueError("nothing to judge: give errors and covariances, or nees and dof, or nis and nis_dof")
+    if not stated and not optimal_gain:
+        raise ValueError(
+            "innovations alone are judged only with optimal_gain=True: those of any other gain are not white, nor of "
+            "the stated size, even if the filter is right"
+        )
+    record = _ended(replace(record, **arrays, optimal_gain=optimal_gain), failures)
+    try:
+        return record.without_first(skip_of(skip))
+    except InputError as error:
+        raise ValueError(str(error).removeprefix("--")) from None
+
+
+def planned_dof(record: Record) -> int:
+    """Degrees of freedom that one run is sure to bring: of an error, or else of the innovations of a run.
+
+    Those of the smallest part where components are judged by themselves.
+    """
+    if record.parts:
+        return min(map(len, record.parts))
+    if record.dof or record.nis_dof is None:
+        return record.dof
+    return max(1, int(record.nis_dof.sum(axis=1).min()))
+
+
+def rate_shares(record: Record) -> int:
+    """Parts that divide the false-alarm rate among them; see ``Record.parts``."""
+    return len(record.parts) + (record.optimal_gain and record.nis is not None) if record.parts else 1
+
+
+def record_of_filter(
+    results: Source, filter_name: str | None, name: str | None = None, skip: str | float | Skip | None = None
+) -> Record:
+    """Return the record of one filter of the bench's own results, with its failed runs.
+
+    Steps whose covariance is rank-deficient are left out, as everywhere in the bench.
+
+    Raises
+    ------
+    ValueError
+        No such filter, or more than one to choose from; ``skip`` leaves nothing.
+    """
+    if filter_name is None:
+        if len(results.filters) != 1:
+            raise ValueError(f"filter: name one of {', '.join(results.filters)}")
+        filter_name = results.filters[0]
+    record = results.record(filter_name).without_first(skip_of(skip))
+    return replace(record.errors_alone, name=name or filter_name)
+
+
+# --- arrays ----------------------------------------------------------------------------------------
+
+OF_RUNS = ("error", "covariance", "nees", "nis", "innovations", "innovation_covariances")  # (runs, steps, ...)
+
+
+def _gone(record: Record) -> Array | None:
+    """Steps of runs from their failure on, (runs, steps) of bool; None without any array of runs."""
+    shapes = [array.shape[:2] for key in OF_RUNS if (array := getattr(record, key)) is not None]
+    if not shapes:
+        return None
+    gone = np.zeros(shapes[0], bool)
+    for failure in record.failures:
+        gone[failure.run, failure.step - 1 :] = True
+    return gone
+
+
+def _ended(record: Record, failures: Sequence[Failure]) -> Record:
+    """The record with further failed runs, each of which ends where anything of it failed first."""
+    if not failures:
+        return record
+    first: dict[int, Failure] = {}
+    for failure in sorted((*record.failures, *failures), key=lambda failure: failure.step):
+        first.setdefault(failure.run, failure)
+    record = replace(record, failures=tuple(first[run] for run in sorted(first)))
+    gone = _gone(record)
+    assert gone is not None
+    arrays: dict[str, Any] = {
+        key: _without(gone, array) for key in OF_RUNS if (array := getattr(record, key)) is not None
+    }
+    return replace(record, **arrays, nis_dof=None if record.nis_dof is None else np.where(gone, 0, record.nis_dof))
+
+
+def _without(gone: Array, array: Array) -> Array:
+    """Values (runs, steps, ...), NaN in steps that are ``gone``."""
+    return np.where(gone.reshape(*gone.shape, *(1,) * (array.ndim - 2)), np.nan, array)
+
+
+def _require_some(name: str, there: Array, good: Array) -> None:
+    """Raise where no run is good in a step in which some are there; both (runs, steps) of bool."""
+    never = there.any(axis=0) & ~(there & good).any(axis=0)
+    if never.any():
+        step = int(np.argmax(never)) + 1
+        raise ValueError(f"{name}, step {step}: not finite in any run; a run that failed has NaN from there on")
+
+
+def _require_runs(name: str, shape: tuple[int, ...], gone: Array | None) -> None:
+    if gone is not None and shape[:2] != gone.shape:
+        raise ValueError(f"{name} has {shape[:2]} runs and steps, the errors have {gone.shape}")
+
+
+def _innovations(
+    name: str, nis: ArrayLike | None, nis_dof: ArrayLike | None, vectors: ArrayLike | None,
+    covariances: ArrayLike | None, gone: Array | None,
+) -> tuple[dict[str, Any], list[Failure]]:  # fmt: skip
+    """Innovations by their names in a record, without the steps that are ``gone``, and the runs that fail in them."""
+    if (nis is None) != (nis_dof is None):
+        raise ValueError("give nis and nis_dof together")
+    if (vectors is None) != (covariances is None):
+        raise ValueError("give innovations and innovation_covariances together")
+    arrays: dict[str, Any] = {}
+    failures: list[Failure] = []
+    if vectors is not None and covariances is not None:
+        v, S, failures = _vectors(name, vectors, covariances, gone)
+        arrays |= {"innovations": v, "innovation_covariances": S}
+        if nis is None:
+            arrays["nis"], arrays["nis_dof"] = nis_of(v, S)
+    if nis is not None and nis_dof is not None:
+        arrays["nis"], arrays["nis_dof"], more = _nis(name, nis, nis_dof, gone)
+        failures += more
+    return arrays, failures
+
+
+def _vectors(
+    name: str, vectors: ArrayLike, covariances: ArrayLike, gone: Array | None
+) -> tuple[Array, Array, list[Failure]]:
+    """Innovations (runs, steps, m), their covariances, and failed runs, as of errors.
+
+    A step without a measurement is masked in either, or, where the innovations are not masked, all NaN.
+    """
+    v, S = in_memory("innovations", vectors), in_memory("innovation_covariances", covariances)
+    _require_runs("innovations", v.shape, gone)
+    if v.ndim != 3 or 0 in v.shape or S.shape != (*v.shape, v.shape[-1]):
+        raise ValueError(
+            "innovations and innovation_covariances must have shapes (runs, steps, m) and (runs, steps, m, m), "
+            f"got {v.shape} and {S.shape}"
+        )
+    absent = masked_steps("innovations", vectors, v.shape[:2])
+    absent |= masked_steps("innovation_covariances", covariances, v.shape[:2])
+    if not isinstance(vectors, np.ma.MaskedArray):
+        absent |= np.isnan(v).all(axis=-1)
+    there: Array = np.asarray(~(absent if gone is None else absent | gone))
+    _require_some("innovations", there, np.asarray(np.isfinite(v).all(axis=-1)))
+    _require_some("innovation_covariances", there, np.asarray(np.isfinite(S).all(axis=(-2, -1))))
+    used, tracks, failures, S = np.zeros(there.shape, bool), [], [], S.copy()
+    for run, steps in enumerate(there):
+        k = np.flatnonzero(steps)
+        place = steps_of("innovation_covariances", run, k)
+        S[run, k] = symmetric(S[run, k], place.__getitem__)
+        tracks.append(Track(run, k, place, v[run, k], S[run, k]))
+    longest = longest_start(tracks)
+    for track in tracks:
+        k, (start, end, reason) = track.column, judged_rows(track, longest, "innovation")
+        used[track.run, k[start:end]] = True
+        if reason:
+            reason = reason.replace("covariance", "innovation covariance")
+            failures.append(Failure(name, track.run, int(k[end]) + 1, reason))
+    return _without(~used, v), _without(~used, S), failures
+
+
+def _nis(name: str, nis: ArrayLike, nis_dof: ArrayLike, gone: Array | None) -> tuple[Array, Indices, list[Failure]]:
+    """NIS and its degrees of freedom, (runs, steps), which are 0 where it does not count, and failed runs."""
+    values, dof = in_memory("nis", nis), in_memory("nis_dof", nis_dof)
+    _require_runs("nis", values.shape, gone)
+    if values.ndim != 2 or 0 in values.shape:
+        raise ValueError(f"nis must have shape (runs, steps), got {values.shape}")
+    if dof.ndim not in (0, 2) or (dof.ndim == 2 and dof.shape != values.shape):
+        raise ValueError(f"nis_dof must be a number or have the shape of nis, {values.shape}, got {dof.shape}")
+    absent = masked_steps("nis", nis, values.shape) | (False if gone is None else gone)
+    if dof.ndim:
+        absent |= masked_steps("nis_dof", nis_dof, values.shape)
+    dof = np.where(absent, 0.0, np.broadcast_to(dof, values.shape))
+    if not (np.isfinite(dof).all() and (dof >= 0).all() and (dof == np.round(dof)).all()):
+        raise ValueError("nis_dof must hold whole numbers, 0 where there was no innovation")
+    there, finite = np.asarray(dof > 0), np.asarray(np.isfinite(values))
+    if (there & (values < 0)).any():
+        run, step = np.argwhere(there & (values < 0))[0]
+        raise ValueError(f"nis: negative in run {run}, step {step + 1}")
+    _require_some("nis", there, finite)
+    broken = there & ~finite
+    failures = [
+        Failure(name, int(run), int(np.argmax(broken[run])) + 1, "NIS is not finite")
+        for run in np.flatnonzero(broken.any(axis=1))
+    ]
+    return values if gone is None else _without(gone, values), dof.astype(np.int64), failures

@@ -1,0 +1,20 @@
+"""Monte Carlo studies: trials through filters, on this machine or on others, and the scripts of experiments."""
+
+from consistency.referee.extras import explained_import
+
+with explained_import(__name__):
+    from consistency.bench.runs.backends.choosing import executor_for
+    from consistency.bench.runs.findings import Study, read_findings, reproduce
+    from consistency.bench.runs.montecarlo import Interrupted, run_log, run_trials
+    from consistency.bench.runs.sequential import run_until_decided
+
+__all__ = [
+    "Interrupted",
+    "Study",
+    "executor_for",
+    "read_findings",
+    "reproduce",
+    "run_log",
+    "run_trials",
+    "run_until_decided",
+]

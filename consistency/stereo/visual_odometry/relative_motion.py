@@ -1,0 +1,312 @@
+"""From two stereo pairs of images to a relative pose with its covariance, Valencia & Andrade-Cetto (2018) ch. 2."""
+
+from __future__ import annotations
+
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array, Indices
+from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, MatchError
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulable, triangulate
+from consistency.stereo.visual_odometry.covariance_propagation import registration_covariance, triangulation_covariance
+from consistency.stereo.visual_odometry.features import (
+    COUNT,
+    EPIPOLAR_PX,
+    RATIO,
+    StereoFeatures,
+    circular_matches,
+    grey,
+    homogeneous,
+    sift,
+    stereo_matches,
+)
+from consistency.stereo.visual_odometry.maximum_likelihood import Refined, refine_reprojection
+from consistency.stereo.visual_odometry.registration import register_horn, register_svd, squared_distances
+from consistency.stereo.visual_odometry.relative_pose import RelativePose
+from consistency.stereo.visual_odometry.resection import inliers_within, resect_ransac, squared_reprojections
+
+ESTIMATORS = ("reprojection", "svd", "horn")
+FEWEST = 8  # closed circles; below, RANSAC would agree with anything
+MISFIT = 5.0  # chi2/dof at most; 0.2 to 1.4 on good images, 8 on swapped ones
+FIRST_ORDER = 0.05  # relative uncertainty of a depth up to which first order holds (docs/front-end.md)
+DOMINATED = 0.5  # of the variance from points beyond: an unweighted registration is theirs
+ROUNDING = 1e-9  # relative, of a disparity: that of exact pixels may be less than it is
+REFITS = 5  # of the pose to its inliers, at most; two or three do
+Pair = tuple[Array, Array]
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """What the front-end does with images; the defaults are those of docs/front-end.md, with their origin."""
+
+    features: int = COUNT  # of an image, at most
+    ratio: float = RATIO
+    epipolar_px: float = EPIPOLAR_PX
+    min_disparity: float = 2.0  # px; nearer to zero, a point's depth is not Gaussian even to first order
+    sigma_per_scale: float = 0.15  # px of feature noise per px of SIFT scale
+    gate: float = 4.0  # sigma of an inlier in the four pixels: 0.3 % of good matches are lost
+    estimator: str = "reprojection"
+
+    def __post_init__(self) -> None:
+        if self.estimator not in ESTIMATORS:
+            raise InputError(f"estimator '{self.estimator}': must be one of {', '.join(ESTIMATORS)}")
+        for name in ("ratio", "epipolar_px", "min_disparity", "sigma_per_scale", "gate"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}, must be a positive number")
+        if self.features < FEWEST:
+            raise InputError(f"features: {self.features}, must be at least {FEWEST}")
+
+
+@dataclass(frozen=True, eq=False)
+class MotionEstimate:
+    """The pose of the left camera at time 1 in that of time 0, p0 = R p1 + t, of M matches."""
+
+    pose: RelativePose
+    covariance: Array  # (6, 6), of x, y, z (m), roll, pitch, yaw (rad)
+    inliers: Array  # (M,) bool
+    chi2: float  # of the inliers' residuals; over dof it is 1 where the noise of the features is as stated
+    dof: int
+    far_share: float = field(default=0.0, kw_only=True)  # of the points' variance: of depths that first order fails for
+
+    @property
+    def doubt(self) -> str:
+        """What is wrong with an unweighted registration of these points; empty where nothing is known."""
+        if self.far_share <= DOMINATED:
+            return ""
+        return (
+            f"points with a depth uncertain by more than {FIRST_ORDER:.0%} bring {self.far_share:.0%} of the variance: "
+            "svd and horn give them full weight, and neither pose nor covariance can be relied on; take "
+            "estimator reprojection"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeMotion(MotionEstimate):
+    """An estimate and what it was found from: M circles of matches through all four images."""
+
+    uv0: Array  # (M, 4), u, v left and right at time 0, px
+    uv1: Array  # (M, 4), at time 1, px
+    sigma0: Array  # (M, 4), of uv0, px
+    sigma1: Array  # (M, 4), of uv1, px
+    rows: Indices  # (M, 2), of the stereo matches at time 0 and 1
+    fault: str = ""  # why the images did not tell it: then M is 0, and the motion is a bridge between its neighbours
+
+
+def relative_motion(
+    rig: StereoRig,
+    before: Pair,
+    after: Pair,
+    *,
+    rng: np.random.Generator,
+    settings: MotionSettings | None = None,
+    estimator: str | None = None,
+) -> RelativeMotion:
+    """Motion of a stereo rig between two pairs of images without distortion.
+
+    SIFT features, matched left0-right0-right1-left1-left0; triangulation (eq. 2.26); P3P inside RANSAC, judged in the
+    images; then the estimator.
+
+    Parameters
+    ----------
+    before, after : (left, right), images (h, w) or (h, w, 3), 8-bit grey or colour
+    rng : the only source of chance, for RANSAC
+    estimator : ``reprojection``, maximum likelihood of the eight pixels of each point with robust weights; ``svd``
+        or ``horn``, the chapter's registrations of points (eq. 2.5-2.21) with the covariance of eq. 2.24-2.31
+
+    Returns
+    -------
+    pose of camera 1 in camera 0 (p0 = R p1 + t) and its covariance; see :class:`RelativeMotion`
+
+    Warns
+    -----
+    UserWarning
+        Far points dominate ``svd`` or ``horn``: see :attr:`Estimate.doubt`.
+
+    Raises
+    ------
+    InputError
+        OpenCV is not installed; images of another size than the rig's; too few matches.
+    ConsensusError, DegenerateError, ConvergenceError
+        The matches do not agree on a motion, or do not fix one; all are InputErrors.
+    """
+    settings = settings or MotionSettings()
+    frames = [
+        stereo_features(rig, *pair, settings=settings, name=name)
+        for pair, name in ((before, "before"), (after, "after"))
+    ]
+    motion = motion_between(rig, *frames, rng=rng, settings=settings, estimator=estimator)
+    if motion.doubt:
+        warnings.warn(motion.doubt, stacklevel=2)
+    return motion
+
+
+def stereo_features(
+    rig: StereoRig, left: Array, right: Array, settings: MotionSettings | None = None, name: str = "pair"
+) -> StereoFeatures:
+    """Features and stereo matches of a pair of images (h, w): what a sequence keeps for the next motion.
+
+    Raises
+    ------
+    InputError
+        As :func:`relative_motion`.
+    """
+    settings = settings or MotionSettings()
+    images = [grey(image, f"{name} {side}") for image, side in ((left, "left"), (right, "right"))]
+    for image, side in zip(images, ("left", "right"), strict=True):
+        if image.shape[::-1] != rig.image_size:
+            found, wanted = (f"{width} x {height} px" for width, height in (image.shape[::-1], rig.image_size))
+            raise InputError(f"{name} {side}: has {found}, but the rig is for {wanted}")
+    with ThreadPoolExecutor(2) as pool:  # OpenCV holds no lock, and uses a core and a half of its own accord
+        one, two = pool.map(lambda image: sift(image, settings.features, name), images)
+    return stereo_matches(rig, one, two, settings.ratio, settings.epipolar_px)
+
+
+def motion_between(
+    rig: StereoRig,
+    before: StereoFeatures,
+    after: StereoFeatures,
+    *,
+    rng: np.random.Generator,
+    settings: MotionSettings | None = None,
+    estimator: str | None = None,
+    names: tuple[str, str] = ("before", "after"),
+) -> RelativeMotion:
+    """:func:`relative_motion` from features that are there already; errors call the pairs by ``names``."""
+    settings = settings or MotionSettings()
+    if estimator is not None:
+        settings = replace(settings, estimator=estimator)
+    rows = circular_matches(before, after, settings.ratio)
+    uv0, uv1 = pixels(before)[rows[:, 0]], pixels(after)[rows[:, 1]]
+    near = usable(rig, uv0, settings.min_disparity) & usable(rig, uv1, settings.min_disparity)
+    rows, uv0, uv1 = rows[near], uv0[near], uv1[near]
+    if len(rows) < FEWEST:
+        raise ConsensusError(
+            f"{names[0]} to {names[1]}: {len(rows)} matches through all four images, at least {FEWEST} are needed; do "
+            "the pairs show the same scene, and is the left image the left one?"
+        )
+    sigma0, sigma1 = (pixel_deviations(f, settings.sigma_per_scale)[rows[:, i]] for i, f in enumerate((before, after)))
+    try:
+        estimate = estimate_motion(rig, uv0, uv1, sigma0, sigma1, settings, rng)
+    except ConsensusError:
+        raise ConsensusError(
+            f"{names[0]} to {names[1]}: too few of {len(rows)} matches through all four images agree on a motion; do "
+            "the pairs show the same scene, one soon after the other, and is the left image the left one?"
+        ) from None
+    except InputError as error:
+        raise type(error)(f"{names[0]} to {names[1]}: {error}") from None
+    if settings.estimator == "reprojection" and estimate.chi2 > MISFIT * estimate.dof:
+        raise ConsensusError(
+            f"{names[0]} to {names[1]}: chi2/dof of the inliers is {estimate.chi2 / estimate.dof:.1f} where 1 is "
+            "right; are the cameras swapped or badly calibrated, or is sigma_per_scale too small?"
+        )
+    return RelativeMotion(**vars(estimate), uv0=uv0, uv1=uv1, sigma0=sigma0, sigma1=sigma1, rows=rows)
+
+
+def estimate_motion(
+    rig: StereoRig,
+    uv0: Array,
+    uv1: Array,
+    sigma0: Array,
+    sigma1: Array,
+    settings: MotionSettings,
+    rng: np.random.Generator,
+) -> MotionEstimate:
+    """Pose and covariance of N matches, some of which may be wrong.
+
+    What is an inlier is asked again of each refined pose; a match whose point the images do not fix is dropped.
+
+    Parameters
+    ----------
+    uv0, uv1 : (N, 4), u, v, u', v' of the same points at time 0 and 1, px; all :func:`triangulable`
+    sigma0, sigma1 : (N, 4), their standard deviations, px
+    settings : of these ``gate`` and ``estimator``
+    rng : the only source of chance
+
+    Raises
+    ------
+    InputError
+        OpenCV is not installed.
+    ConsensusError, DegenerateError, ConvergenceError
+        As :func:`relative_motion`.
+    """
+    pose, inliers = resect_ransac(rig, uv0, uv1, sigma0, sigma1, gate=settings.gate, rng=rng)
+    S0, S1 = diagonal_covariances(sigma0), diagonal_covariances(sigma1)
+    if settings.estimator != "reprojection":
+        before, after = triangulate(rig, uv0[inliers]), triangulate(rig, uv1[inliers])
+        C_before = triangulation_covariance(rig, uv0[inliers], S0[inliers])
+        C_after = triangulation_covariance(rig, uv1[inliers], S1[inliers])
+        pose = (register_horn if settings.estimator == "horn" else register_svd)(before, after)
+        S = registration_covariance(before, after, C_before, C_after, pose)
+        chi2 = float(squared_distances(before, after, pose.R, pose.t, C_before, C_after).sum())
+        far = np.sqrt(C_before[:, 2, 2]) > FIRST_ORDER * before[:, 2]
+        variance = np.trace(C_before, axis1=1, axis2=2)
+        far_share = float(variance[far].sum() / variance.sum())
+        return MotionEstimate(pose, S, inliers, chi2, 3 * len(before) - 6, far_share=far_share)
+    for _ in range(REFITS):
+        refined, used = _refined(rig, uv0, uv1, S0, S1, pose, inliers)
+        pose = refined.pose
+        inliers = inliers_within(squared_reprojections(rig, uv0, uv1, sigma0, sigma1, pose), settings.gate, used)
+        if (inliers == used).all():
+            break
+    return MotionEstimate(pose, refined.covariance, used, refined.chi2, refined.dof)
+
+
+def _refined(
+    rig: StereoRig, uv0: Array, uv1: Array, S0: Array, S1: Array, pose: RelativePose, inliers: Array
+) -> tuple[Refined, Array]:
+    """The refined pose of the inliers (N,) bool, and those that were used: all whose points the images fix."""
+    used = inliers.copy()
+    while True:
+        try:
+            return refine_reprojection(rig, uv0[used], uv1[used], pose, S0[used], S1[used], robust="cauchy"), used
+        except MatchError as error:
+            if error.match is None or used.sum() <= FEWEST:
+                raise
+            used[np.flatnonzero(used)[error.match]] = False
+
+
+def pixels(features: StereoFeatures) -> Array:
+    """u, v left and right of the stereo matches, (M, 4), px."""
+    left, right = features.pairs.T
+    return np.column_stack([features.left.uv[left], features.right.uv[right]])
+
+
+def pixel_deviations(features: StereoFeatures, sigma_per_scale: float) -> Array:
+    """Standard deviations (M, 4) of :func:`pixels`, px: the SIFT scale, sec. 2.3.1, times a calibrated factor."""
+    left, right = features.pairs.T
+    scale = np.column_stack([features.left.scale[left], features.right.scale[right]])
+    return np.asarray(sigma_per_scale * scale.repeat(2, axis=1))
+
+
+def usable(rig: StereoRig, uv: Array, min_disparity: float) -> Array:
+    """Matches (N, 4) in front of both cameras and nearer than the depth of ``min_disparity`` px, (N,) bool.
+
+    The disparity itself counts as well: off the epipolar line least squares makes a near point of a small disparity.
+    """
+    good = triangulable(rig, uv)
+    good[good] = triangulate(rig, uv[good])[:, 2] <= rig.K_left[0, 0] * rig.baseline / min_disparity
+    good[good] = disparities(rig, uv[good]) >= min_disparity * (1.0 - ROUNDING)
+    return np.asarray(good)
+
+
+def disparities(rig: StereoRig, uv: Array) -> Array:
+    """Disparities (N,) of matches (N, 4) in cameras that are turned to have the baseline as their x axis, px.
+
+    The focal length is that of the left camera; in rectified images they are the differences of the columns.
+    """
+    x = rig.t / rig.baseline
+    y = np.cross([0.0, 0.0, 1.0], x)
+    y /= np.linalg.norm(y)
+    turn = np.stack([x, y, np.cross(x, y)])
+    left = homogeneous(uv[:, :2]) @ np.linalg.inv(rig.K_left).T @ turn.T
+    right = homogeneous(uv[:, 2:]) @ np.linalg.inv(rig.K_right).T @ rig.R.T @ turn.T
+    return np.asarray(rig.K_left[0, 0] * (left[:, 0] / left[:, 2] - right[:, 0] / right[:, 2]))
+
+
+def diagonal_covariances(sigma: Array) -> Array:
+    """Covariances (N, k, k) of independent components with standard deviations (N, k)."""
+    return np.asarray(sigma[:, :, None] ** 2 * np.eye(sigma.shape[1]))

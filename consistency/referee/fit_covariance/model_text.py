@@ -259,7 +259,7 @@ def data(model: NoiseModel) -> dict[str, Any]:
         "second_correlation": second.correlation if second is not None else None,
         "second_size": second.size if second is not None else None,
         "spans": [_data_of_span(each, noise.axes) for each in model.spans],
-        "referee": plain(model.verdict),
+        "referee": model.verdict.statistics,
     })  # fmt: skip
     return found
 

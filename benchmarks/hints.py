@@ -32,8 +32,8 @@ from script_options import options_of
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.groups import matrices, vectors
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved, skew
-from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.mix_ups.hints import hints
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 

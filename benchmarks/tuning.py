@@ -27,9 +27,8 @@ from consistency.bench.tuning.fit import FactorFit
 from consistency.bench.tuning.noise_groups import groups_of, scaled
 from consistency.bench.tuning.scores import BeliefScorer
 from consistency.bench.tuning.split import parts_of
-from consistency.bench.tuning.tune import _Tuner
+from consistency.bench.tuning.tune import fitted
 from consistency.bench.types import Trial
-from consistency.referee.diagnostics import Settings
 from consistency.referee.types import Array
 
 SURE = 0.01  # chance that a rate exactly as stated is called broken
@@ -95,7 +94,6 @@ def main() -> None:
         repetitions=(100, None),
         fits=(200, "without verdicts, in each of the other worlds"),
         runs=(20, "of each fit, and of each verdict"),
-        by=("innovations", "innovations or nees"),
         seed=(31_000, "of the first repetition"),
         jobs=(-1, None),
     )
@@ -113,9 +111,7 @@ def coverage(options: argparse.Namespace) -> bool:
     for repetition in range(options.repetitions):
         seed = options.seed + repetition
         true = FACTOR ** np.random.default_rng((seed, 1)).uniform(-1.0, 1.0, 2)
-        tuning = cs.tune(
-            wrong(world, *true), "kf", by=options.by, runs=options.runs, seed=seed, jobs=options.jobs
-        )  # fmt: skip
+        tuning = cs.tune(wrong(world, *true), "kf", runs=options.runs, seed=seed, jobs=options.jobs)
         inside = [factor.interval.holds(value) for factor, value in zip(tuning.factors, true, strict=True)]
         held.update(factor.group.name for factor, holds in zip(tuning.factors, inside, strict=True) if holds)
         widths.append([f.interval.high / f.interval.low for f in tuning.factors])
@@ -171,9 +167,9 @@ def fit_in(world: World, seed: int, jobs: int) -> tuple[FactorFit, Array]:
     parts = parts_of(wrong(world.scenario(), *true), world.runs, seed)
     parts = replace(parts, trials=[world.observed(trial, rng) for trial in parts.trials])
     kf, groups = cs.get_filter("kf"), groups_of("Q,R", parts.belief)
-    with BeliefScorer(kf, parts.trials, parts.belief, "innovations", jobs) as bench:
-        bench.compile()
-        fit = _Tuner(kf, parts, groups, jobs, None, Settings())._fit(bench)
+    with BeliefScorer(kf, parts.trials, parts.belief, jobs) as scorer:
+        scorer.compile()
+        fit = fitted(scorer, parts.belief, groups, parts.world.name)
     return fit, true * [1.0, 2.0 if world.uneven else 1.0]
 
 
@@ -183,7 +179,7 @@ def speed(options: argparse.Namespace) -> None:
         scenario = cs.load_scenario(world)
         trials = [cs.simulate(scenario, run, options.seed) for run in range(SPEED_RUNS)]
         groups = groups_of("Q,R", scenario.belief)
-        with BeliefScorer(cs.get_filter(name), trials, scenario.belief, "innovations", options.jobs) as bench:
+        with BeliefScorer(cs.get_filter(name), trials, scenario.belief, options.jobs) as bench:
             bench.compile()
             began = time.monotonic()
             for log_factors in np.random.default_rng(options.seed).uniform(-1.0, 1.0, (SETTINGS, 2)):

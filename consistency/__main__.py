@@ -1,21 +1,59 @@
-"""``python -m consistency`` and the command ``consistency``: the command line, in a process that can be ended."""
+"""``python -m consistency`` and the command ``consistency``: the command line, in a process that any signal ends."""
 
 import gc
-from typing import Any
+import os
+import signal
+import sys
+import threading
+from contextlib import suppress
+from typing import Any, NoReturn
 
-from consistency.referee.system.stopping import supervised
+GLANCE = 0.1  # s between looks, for a signal that another thread was given
+SHOW_CURSOR = "\x1b[?25h"
+GOES_ON = "; finished runs are kept where there are any: the same command goes on, 'run' with --resume"
 
 
-def main() -> Any:
-    """Entry point; what takes time to import is imported where a signal can end it."""
-    return supervised(_command)
+class Command(threading.Thread):
+    """The command line; ``status`` is what it ends with.
+
+    A thread does it, because Python runs handlers of signals in the main thread, and a compiler or a reader of files
+    in C may keep that from it for minutes. Nothing is tidied up: finished runs are on disk, and what a command leaves
+    in the way is cleared by the next one that wants the place.
+    """
+
+    status: Any = 1
+
+    def run(self) -> None:
+        gc.set_threshold(50_000, 20, 100)  # most of what is made lives as long as the modules that are imported
+        from consistency.commands import main  # slow to load
+
+        try:
+            self.status = main()
+        except SystemExit as end:
+            self.status = end.code
 
 
-def _command() -> Any:
-    gc.set_threshold(50_000, 20, 100)  # most of what is made lives as long as the modules that are imported
-    from consistency.commands import main
+def main() -> NoReturn:
+    """Run the command line until it ends, or until Ctrl-C does; SIGTERM and SIGHUP end the process by themselves."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as of nohup, and of & in a script
+        signal.signal(signal.SIGINT, _stop)
+    command = Command()
+    command.start()
+    while command.is_alive():
+        command.join(GLANCE)
+    sys.exit(command.status)
 
-    return main()
+
+def _stop(*_: Any) -> NoReturn:
+    """Say so in one line and end at once; an exception would be swallowed by serialisers and compilers."""
+    line = "consistency: stopped"
+    if sys.argv[1:2] in (["run"], ["sweep"]):
+        line += GOES_ON
+    with suppress(OSError, ValueError, AttributeError):  # a stream that is closed
+        if sys.stderr.isatty():
+            line = f"{SHOW_CURSOR}\n{line}"
+        os.write(sys.stderr.fileno(), f"{line}\n".encode())
+    os._exit(128 + signal.SIGINT)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
-    from consistency.bench.runs.backends.choosing import backend_for
+    from consistency.bench.runs.backends.choosing import executor_for
     from consistency.bench.runs.findings import Study, read_findings, reproduce
     from consistency.bench.runs.montecarlo import Interrupted, run_log, run_trials
     from consistency.bench.runs.sequential import run_until_decided
@@ -11,7 +11,7 @@ with explained_import(__name__):
 __all__ = [
     "Interrupted",
     "Study",
-    "backend_for",
+    "executor_for",
     "read_findings",
     "reproduce",
     "run_log",

@@ -6,18 +6,18 @@ Only :func:`relative_motion` and what else works on images needs OpenCV, the ext
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
-    from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulable, triangulate
-    from consistency.stereo.visual_odometry.covariance_propagation import (
-        implicit_covariance,
-        registration_covariance,
-        triangulation_covariance,
-    )
-    from consistency.stereo.visual_odometry.input_errors import (
+    from consistency.stereo.visual_odometry.cameras.input_errors import (
         ConsensusError,
         ConvergenceError,
         DegenerateError,
         GimbalLockError,
         PointError,
+    )
+    from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulable, triangulate
+    from consistency.stereo.visual_odometry.covariance_propagation import (
+        implicit_covariance,
+        registration_covariance,
+        triangulation_covariance,
     )
     from consistency.stereo.visual_odometry.maximum_likelihood import Refined, refine_reprojection, register_weighted
     from consistency.stereo.visual_odometry.odometry import trajectory

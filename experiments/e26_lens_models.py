@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import sys
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,15 +20,15 @@ from scipy.stats import ttest_rel
 import consistency as cs
 from consistency.bench.runs.findings import OURS, script
 from consistency.bench.runs.run_scores import run_means
-from consistency.bench.sweeps.rig import read_rig
+from consistency.bench.scenario import PicturedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.characterising.bias_map import GRID
 from consistency.stereo.characterising.boards import MODELS, find_corners, of_model
 from consistency.stereo.characterising.characterise import Characterisation
-from consistency.stereo.characterising.sensor_text import measured_sensor_toml
-from consistency.stereo.visual_odometry.features import opencv
+from consistency.stereo.characterising.sensor_text import believed_sensor
+from consistency.stereo.visual_odometry.cameras.opencv import opencv
 
 FINDINGS = ("chessboard-map", "chessboard-noise")
 LONG = True
@@ -85,12 +84,35 @@ def sensors(folder: Path) -> dict[str, Characterisation]:
     return {model: of_model(corners, model, DATA, GRID) for model in MODELS}
 
 
+def with_camera(world: cs.Scenario, camera: PicturedSensor) -> cs.Scenario:
+    """The world with another stereo camera, in truth and belief alike.
+
+    Image size and range of disparities, where the camera has none, are those of the world, for its focal length and
+    baseline.
+    """
+    before = world.truth.sensor
+    f, B = before.rig
+    image, disparity = camera.image, camera.disparity
+    if image is None:
+        image = tuple(round(pixels * camera.f / f) for pixels in before.image)
+    if disparity is None:
+        disparity = before.disparity[0], before.disparity[1] * camera.f * camera.B / (f * B)
+    own = {"f": camera.f, "B": camera.B, "sigma": camera.sigma, "principal_point": camera.principal_point}
+    own |= {"image": image, "disparity": disparity, "mount": camera.mount.model_dump()}
+    bias = [] if camera.bias is None else [{"kind": "local-bias", **camera.bias.model_dump()}]
+    changes = {f"truth__sensor__{key}": value for key, value in own.items()}
+    return world.variant(
+        "camera",
+        truth__sensor__disparity_growth=camera.disparity_growth,
+        truth__sensor__effects=bias,
+        belief__sensor=camera.belief().model_dump() | {"disparity": disparity},
+        **changes,
+    )
+
+
 def beliefs(model: str, of: Characterisation) -> dict[str, cs.Scenario]:
     """The camera in the world of herath2007-stereo, and what a filter may believe of it."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"lens-{model}.toml"
-        path.write_text(measured_sensor_toml(of), encoding="utf-8")
-        rig = read_rig(path, cs.load_scenario("herath2007-stereo"))
+    rig = with_camera(cs.load_scenario("herath2007-stereo"), believed_sensor(of))
     summary = f"herath2007-stereo with a camera that was calibrated with lens model '{model}'"
     full = rig.variant(f"lens-{model}", summary=f"{summary}; its noise and bias map believed")
     alone = rig.variant(

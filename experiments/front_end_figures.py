@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
 from consistency.referee.document.colours import COLOURS, DASHES, TRUTH, Look
-from consistency.referee.document.drawing import Axis, Line, Panel, Points, Sheet, xy
-from consistency.referee.show import with_matplotlib
+from consistency.referee.show.painting import WIDTH, canvas, dots, path, points
+from consistency.referee.show.svg import png
 from consistency.referee.types import Array
 
 FEATURES = 3.0  # standard deviations of the ellipses, fig. 2.4
@@ -24,17 +23,16 @@ def matches_png(image: Array, uv: Array, covariances: Array, resolution: int = 2
 
     As Valencia & Andrade-Cetto (2018) fig. 2.4.
     """
-    with mpl.rc_context(with_matplotlib.RC):
-        figure = Figure(
-            figsize=(Sheet.width, Sheet.width * image.shape[0] / image.shape[1]),
-            layout="constrained",
-        )
-        axes = figure.subplots()
+
+    def draw() -> Figure:
+        figure, (axes,) = canvas(WIDTH * image.shape[0] / image.shape[1])
         axes.imshow(image, cmap="gray", vmin=0, vmax=255)
         axes.set_axis_off()
         for centre, covariance in zip(uv, covariances, strict=True):
-            with_matplotlib.draw_line(axes, ellipse(centre, covariance, FEATURES, NOISE), 4.0)
-        return with_matplotlib.picture(figure, "png", resolution)
+            path(axes, ellipse(centre, covariance, FEATURES), NOISE)
+        return figure
+
+    return png(draw, resolution)
 
 
 def samples_png(samples: Array, centre: Array, covariance: Array, resolution: int = 200) -> bytes:
@@ -42,27 +40,30 @@ def samples_png(samples: Array, centre: Array, covariance: Array, resolution: in
 
     As Valencia & Andrade-Cetto (2018) fig. 2.5, ellipses of 2 standard deviations.
     """
-    spread, panels = np.cov(samples.T), []
-    for i, j, *labels in PLANES:
-        both, points = np.ix_([i, j], [i, j]), 1e3 * samples[:, [i, j]]
-        mean = points.mean(axis=0)
-        marks = (
-            Points(*xy(points), SAMPLE, whole=True),
-            ellipse(mean, 1e6 * spread[both], POSES, MONTE_CARLO),
-            ellipse(1e3 * centre[[i, j]], 1e6 * covariance[both], POSES, IMPLICIT),
-            Points(*xy(mean[None]), MEAN),
-        )
-        panels.append(Panel(Axis(labels[0]), Axis(labels[1]), marks, f"{labels[0]} and {labels[1]} of the poses"))
-    return with_matplotlib.render(Sheet(tuple(panels), Sheet.width / 3), "png", resolution)
+    spread = np.cov(samples.T)
+
+    def draw() -> Figure:
+        figure, panels = canvas(WIDTH / 3, 3, 3)
+        for axes, (i, j, *labels) in zip(panels, PLANES, strict=True):
+            both, places = np.ix_([i, j], [i, j]), 1e3 * samples[:, [i, j]]
+            mean = places.mean(axis=0)
+            points(axes, places[:, 0], places[:, 1], SAMPLE, limit=len(places))
+            path(axes, ellipse(mean, 1e6 * spread[both], POSES), MONTE_CARLO)
+            path(axes, ellipse(1e3 * centre[[i, j]], 1e6 * covariance[both], POSES), IMPLICIT)
+            axes.plot(*mean[:, None], **dots(MEAN))
+            axes.set(xlabel=labels[0], ylabel=labels[1])
+        return figure
+
+    return png(draw, resolution)
 
 
-def ellipse(centre: Array, covariance: Array, scale: float, look: Look) -> Line:
-    """Iso-uncertainty curve of a covariance (2, 2) about ``centre`` (2,), ``scale`` standard deviations wide.
+def ellipse(centre: Array, covariance: Array, scale: float) -> Array:
+    """Iso-uncertainty curve (73, 2) of a covariance (2, 2) about ``centre`` (2,), ``scale`` standard deviations wide.
 
     Valencia & Andrade-Cetto (2018) fig. 2.4 and 2.5.
     """
     width, axis = np.linalg.eigh(covariance)
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     half = scale * np.sqrt(np.maximum(width, 0.0))
-    curve = axis @ (half[:, None] * np.stack([np.cos(turn), np.sin(turn)])) + np.asarray(centre)[:, None]
-    return Line(curve[0], curve[1], look, path=True)
+    curve: Array = axis @ (half[:, None] * np.stack([np.cos(turn), np.sin(turn)])) + np.asarray(centre)[:, None]
+    return curve.T

@@ -55,46 +55,37 @@ def main(arguments: list[str] | None = None) -> Any:
 
 
 def _run(arguments: list[str] | None) -> Any:
-    """Unusable input ends in one line and exit status 2; SIGTERM and SIGHUP are taken as Ctrl-C."""
-    from consistency.referee.system.stopping import STOPS, stoppable
-
+    """Unusable input ends in one line and exit status 2, KeyboardInterrupt in exit status 130."""
     _open_closed_streams()
-    with stoppable(also=STOPS) as stop:
-        try:
-            status = 0 if _show_help(arguments) else app(arguments, standalone_mode=False)
-            if stop.number is not None:  # typer has an exit status of its own for KeyboardInterrupt
-                raise KeyboardInterrupt
-            sys.stdout.flush()
-            sys.exit(status)
-        except MemoryError:
-            _end("not enough memory; take fewer steps, landmarks or runs", 2)
-        except InputError as error:
-            _end(str(error), 2)
-        except UsageError as error:
-            command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
-            _end(f"{error.format_message()} See: {command} --help", 2)
-        except ModuleNotFoundError as error:
-            words = sys.argv[1:] if arguments is None else arguments
-            missing = explained(error, f"'{words[0]}' with these arguments")
-            if missing is None:
-                raise
-            _end(str(missing), 2)
-        except (BrokenPipeError, SystemExit) as error:  # libraries end with status 1, which is a verdict's here
-            if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
-                raise
-            _drop_output()
-            sys.exit(141)
-        except OSError as error:
-            if error.filename is None and error.errno not in FULL:
-                raise
-            fault = "output cannot be written" if error.filename is None else f"{error.filename}: cannot be used"
-            _end(f"{fault} ({error.strerror})", 2)
-        except (KeyboardInterrupt, Abort):
-            _end("stopped", stop.status)
-        except Exception:
-            if stop.number is None:
-                raise
-            _end("stopped", stop.status)  # and who was called took it for an error of its own
+    try:
+        status = 0 if _show_help(arguments) else app(arguments, standalone_mode=False)
+        sys.stdout.flush()
+        sys.exit(status)
+    except MemoryError:
+        _end("not enough memory; take fewer steps, landmarks or runs", 2)
+    except InputError as error:
+        _end(str(error), 2)
+    except UsageError as error:
+        command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
+        _end(f"{error.format_message()} See: {command} --help", 2)
+    except ModuleNotFoundError as error:
+        words = sys.argv[1:] if arguments is None else arguments
+        missing = explained(error, f"'{words[0]}' with these arguments")
+        if missing is None:
+            raise
+        _end(str(missing), 2)
+    except (BrokenPipeError, SystemExit) as error:  # libraries end with status 1, which is a verdict's here
+        if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
+            raise
+        _drop_output()
+        sys.exit(141)
+    except OSError as error:
+        if error.filename is None and error.errno not in FULL:
+            raise
+        fault = "output cannot be written" if error.filename is None else f"{error.filename}: cannot be used"
+        _end(f"{fault} ({error.strerror})", 2)
+    except (KeyboardInterrupt, Abort):
+        _end("stopped", 130)
 
 
 def _show_help(arguments: list[str] | None) -> bool:

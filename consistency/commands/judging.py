@@ -105,7 +105,7 @@ def analyse_command(
                 data = render(document(verdicts))
                 written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
                 if missing("report"):
-                    print(f"consistency: the interactive page and the PDF need {remedy('report')}", file=sys.stderr)
+                    print(f"consistency: pictures and the PDF need {remedy('report')}", file=sys.stderr)
             except InputError as error:
                 refused = error
     else:

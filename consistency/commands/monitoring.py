@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,7 +55,7 @@ def monitor_command(
 ) -> None:
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
     from consistency.referee.document.monitor import monitor_document
-    from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
+    from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash
     from consistency.referee.verdicts.monitor_sources import make_monitor, watch, watch_lines
 
@@ -79,7 +80,9 @@ def monitor_command(
             require_plot(plot, overwrite)
         watched = watch(log, watcher)
     if plot is not None:
-        write_monitor_plot(plot, watched)
+        from consistency.referee.pages.monitor import monitor_drawing
+
+        plotted(partial(monitor_drawing, watched), plot)
     print_document(
         monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t), as_json
     )
@@ -103,7 +106,7 @@ def _show_ratios(
 ) -> None:
     """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
     from consistency.referee.document.monitor import ratios_document
-    from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
+    from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.ardupilot_log import read_ratios
 
     if plot is not None:
@@ -111,5 +114,7 @@ def _show_ratios(
     ratios, notes = read_ratios(path, sensor, core)
     tell(notes)
     if plot is not None:
-        write_monitor_plot(plot, ratios)
+        from consistency.referee.pages.monitor import monitor_drawing
+
+        plotted(partial(monitor_drawing, ratios), plot)
     print_document(ratios_document(path.stem, ratios), as_json)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -39,10 +38,6 @@ def sweep_command(
         list[str] | None,
         typer.Option("--filter", metavar="NAME", help="In place of the file's filters; may be repeated."),
     ] = None,
-    share: Annotated[
-        str | None,
-        typer.Option("--share", metavar="I/N", help="Only this share of the cells, I from 1 to N; for job arrays."),
-    ] = None,
     jobs: Jobs = -1,
     backend: BackendName = "local",
     scheduler: Scheduler = None,
@@ -53,33 +48,22 @@ def sweep_command(
     ] = False,
 ) -> None:
     """A grid of scenarios, each filter in each until decided; then a map of where which filter is consistent."""
-    from consistency.bench.runs.backends.choosing import backend_for, require_scheduler
+    from consistency.bench.runs.backends.choosing import executor_for
     from consistency.bench.sweeps.plan import load_sweep
     from consistency.bench.sweeps.regime import regime_of, write_regime
     from consistency.bench.sweeps.running import run_sweep
     from consistency.bench.sweeps.sweep_folder import open_sweep
-    from consistency.referee.system.progress import say
-    from consistency.referee.system.stopping import stoppable
 
     if out is None and Path(source).is_dir():
-        if filters or share or overwrite:
+        if filters or overwrite:
             raise InputError(f"{source}: a folder is only reported again; give the sweep and --out to run cells")
         folder = open_sweep(Path(source))
     else:
         if out is None:
             raise InputError(f"--out: missing; give a folder for the cells of {source}")
         plan = load_sweep(source, filters)
-        place = backend_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out)
-        require_scheduler(backend, scheduler, "a sweep")
-        with stoppable() as stop:
-            try:
-                folder, missing = run_sweep(plan, out, *_share(share), jobs, overwrite, place)
-            except KeyboardInterrupt:
-                say(f"stopped: what is finished is in {out}; the same command goes on")
-                sys.exit(stop.status)
-        if missing:
-            print(f"this share is done; {missing} of the whole sweep are missing in {out}")
-            return
+        with executor_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out) as executor:
+            folder = run_sweep(plan, out, overwrite, jobs, executor=executor)
     from consistency.bench.pages import write_regime_reports
     from consistency.bench.sweeps.printing import regime_blocks
     from consistency.referee.show import terminal
@@ -90,23 +74,10 @@ def sweep_command(
         print(path)
 
 
-def _share(text: str | None) -> tuple[int, int]:
-    """Part and number of parts of ``I/N``."""
-    if text is None:
-        return 1, 1
-    part, slash, parts = text.partition("/")
-    if not (slash and part.isdecimal() and parts.isdecimal()):
-        raise InputError(f"--share {text}: must be I/N, as 2/8")
-    return int(part), int(parts)
-
-
 def tune_command(
     filter_name: Annotated[str, typer.Option("--filter", help="Filter name (see 'list').")],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
-    by: Annotated[
-        str, typer.Option("--by", help="innovations: their likelihood, without truth; nees: the errors.")
-    ] = "innovations",
     groups: Annotated[
         str,
         typer.Option("--groups", metavar="A,B", help="Noises with one factor each, as Q.v,Q.omega,R; '+' joins."),
@@ -151,7 +122,7 @@ def tune_command(
     if out is not None:
         require_free(out, overwrite, KIND)
     tuning = tune_filter(
-        load_scenario(str(scenario)) if log is None else read_log(log), filter_name, by=by, groups=groups,
+        load_scenario(str(scenario)) if log is None else read_log(log), filter_name, groups=groups,
         runs=50 if runs is None else runs, seed=0 if seed is None else seed, jobs=jobs, timeout=timeout,
         settings=settings,
     )  # fmt: skip
@@ -205,7 +176,7 @@ def challenge_command(
     """Look for the world in which a filter is most overconfident, and confirm it on fresh runs."""
     from consistency.bench.challenging.challenge import Plan
     from consistency.bench.challenging.challenge import challenge as challenge_filter
-    from consistency.bench.challenging.wording import as_data, lines, require_writable, write_scenario
+    from consistency.bench.challenging.challenge_text import as_data, lines, require_writable, write_scenario
 
     require_word("--fail-on", fail_on, "found")
     if minutes is None and trials is None:

@@ -86,8 +86,8 @@ def run_command(
 ) -> None:
     """Put simulated trials, or a recorded log, through filters."""
     from consistency.bench.runs.analyse_results import analyse
-    from consistency.bench.runs.backends.choosing import backend_for, require_scheduler
-    from consistency.bench.runs.montecarlo import Interrupted, resolve_filters, run_log, run_trials
+    from consistency.bench.runs.backends.choosing import executor_for
+    from consistency.bench.runs.montecarlo import resolve_filters, run_log, run_trials
     from consistency.bench.runs.sequential import run_until_decided
     from consistency.bench.scenario import load_scenario
     from consistency.bench.store.log import read_log
@@ -109,13 +109,10 @@ def run_command(
     verdicts = None
     if resume and overwrite:
         raise InputError("--resume goes on with what --overwrite would replace; give one of them")
-    place = backend_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out)
-    if until_decided:
-        require_scheduler(backend, scheduler, "--until-decided")
-    try:
+    if log is not None and (runs is not None or seed is not None or until_decided):
+        raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
+    with executor_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out) as executor:
         if log is not None:
-            if runs is not None or seed is not None or until_decided:
-                raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
             recorded = read_log(log)
             if screen is not None:
                 from consistency.stereo.visual_odometry.common_motion import screened_log, screening_line
@@ -126,7 +123,7 @@ def run_command(
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
                 raise InputError(f"--out {out}: lies in the log; choose another folder")
             results = run_log(
-                recorded, filters, jobs, timeout, memory, place, out=out, resume=resume, overwrite=overwrite
+                recorded, filters, jobs, timeout, memory, executor, out=out, resume=resume, overwrite=overwrite
             )  # fmt: skip
         else:
             world = load_scenario(str(scenario))
@@ -134,19 +131,14 @@ def run_command(
             resolve_filters(filters, world.belief)
             if until_decided:
                 results, verdicts = run_until_decided(
-                    world, filters, seed=seed, jobs=jobs, timeout=timeout, memory=memory, backend=place,
+                    world, filters, seed=seed, jobs=jobs, timeout=timeout, memory=memory, executor=executor,
                     out=out, resume=resume, overwrite=overwrite, **planned,
                 )  # fmt: skip
             else:
                 results = run_trials(
                     world, filters, runs, seed, jobs, timeout,
-                    out=out, overwrite=overwrite, resume=resume, memory=memory, backend=place,
+                    out=out, overwrite=overwrite, resume=resume, memory=memory, executor=executor,
                 )  # fmt: skip
-    except Interrupted as stop:
-        done = stop.results.manifest["finished_runs"]
-        kept = f"{done} finished runs are in {out}; add --resume to the same command to go on"
-        say(f"stopped: {kept}" if done else "stopped before a run was finished; nothing written")
-        sys.exit(stop.status)
     terminal.show(*document(verdicts or analyse(results), reasons=False).opening)
     print(f"results in {out}; next: consistency report {out}")
 

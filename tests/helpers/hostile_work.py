@@ -20,13 +20,11 @@ from consistency.bench.store.results import open_results
 from consistency.bench.sweeps.cell import CellOutcome, CellResult, runs_table
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.bench.sweeps.regime import read_regime, regime_of, write_regime
-from consistency.bench.sweeps.rig import read_rig
 from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
 
 STUDY, RUNS = ("--filter", "kf", "--jobs", "1", "--seed", "4"), 4
 SIZE = (160, 120)  # px
 TABLES = ("estimates", "truth", "map", "failures", "landmarks")
-SENSOR = {"model": "uvd", "sigma_px": [1.34, 1.53, 0.65], "f": 150.0, "B": 0.09}
 
 
 class Killed(BaseException):
@@ -84,7 +82,6 @@ def _write_maps(folder: Path) -> None:
     grid = {"range": [2.0, 4.0], "odometry": [0.5, 1.0]}
     table = {"summary": "s", "base": "herath2007-stereo", "filters": ["ekf-uvd", "ukf-uvd"], "grid": grid}
     (folder / "sweep.toml").write_text(tomli_w.dumps(table), encoding="utf-8")
-    (folder / "sensor.toml").write_text(tomli_w.dumps(SENSOR), encoding="utf-8")
     sweep = SweepFolder(load_sweep(folder / "sweep.toml"), folder / "map")
     sweep.begin()
     numbers = (48, 0, 3.0, 2.5, 3.5, 1.0, 0.9, 1.1, 0.1, 0.01, 1.0, 20.0)
@@ -97,10 +94,6 @@ def _write_maps(folder: Path) -> None:
 
 def _read_map(at: str) -> Callable[[Path], object]:
     return lambda folder: read_regime(folder / at)
-
-
-def _read_rig(at: str) -> Callable[[Path], object]:
-    return lambda folder: read_rig(folder / at, cs.load_scenario("herath2007-stereo"))
 
 
 # --- images ----------------------------------------------------------------------------------------
@@ -166,7 +159,6 @@ TARGETS = (
     Target("table", ("nis.csv",), _piped, m.ANY | m.TEXT, {}),
     Target("maps", ("map/map.json",), _read_map("map/map.json"), m.ANY | TREE, TWICE),
     Target("maps", ("map/manifest.json",), _read_map("map"), m.ANY | TREE, TWICE),
-    Target("maps", ("sensor.toml",), _read_rig("sensor.toml"), TOML, LINE_TWICE),
     Target("moving", PAIRS, command("frontend", "{}", *CALIBRATED, "{}/log"), m.ANY, {}, seldom=True),
     Target("moving", ("stereo.yaml",), command("frontend", "{}", *CALIBRATED, "{}/log"), m.ANY | m.TEXT, {},
            seldom=True),

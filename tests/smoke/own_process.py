@@ -12,7 +12,7 @@ from forks import Program
 COMPILING = 300.0  # s, of a command that may compile
 IMPORTS = """
 import consistency as cs
-import consistency.commands, consistency.referee.show.html, consistency.referee.show.with_matplotlib
+import consistency.commands, consistency.referee.show.as_html, consistency.referee.show.svg
 import consistency.referee.show.pdf, consistency.referee.verdicts.compare_sources, consistency.bench.runs.sequential
 import consistency.bench.sweeps.running
 

@@ -18,7 +18,6 @@ from own_process import begun, consistency, size_of
 
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import DATABASE, Journal
-from consistency.bench.store.results import open_results
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="signals")]
 FILTER = ("--filter", "kf")
@@ -106,7 +105,7 @@ def test_killed_again_and_again(at: Path, which: str) -> None:
     assert not journal.exists()
 
 
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", -15)])
 @pytest.mark.parametrize("which", ["looks", "log", "sweep"])
 def test_a_signal_keeps_what_is_finished(at: Path, which: str, name: str, status: int) -> None:
     command = {"looks": LOOKS, "log": LOG, "sweep": ("sweep", "grid.toml")}[which]
@@ -121,11 +120,8 @@ def test_a_signal_keeps_what_is_finished(at: Path, which: str, name: str, status
     _, error = process.communicate()
     assert process.returncode == status, error
     assert "Traceback" not in error
-    said = "the same command goes on" if which == "sweep" else "add --resume to the same command to go on"
-    late = "the same command goes on, 'run' with --resume"  # of one that had not ended by itself
-    assert error.rstrip().endswith((said, late))
-    if which != "sweep" and out.exists():
-        assert open_results(out).finished_runs(["kf"])
+    assert error.rstrip().endswith("the same command goes on, 'run' with --resume") == (name == "SIGINT")
+    assert which == "sweep" or not out.exists()
     consistency(*command, "--out", str(out), *["--resume"] * (which != "sweep"), cwd=at)
     require_same(at, out, which)
 

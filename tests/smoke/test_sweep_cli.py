@@ -25,7 +25,7 @@ density = [0.2]
 
 @pytest.fixture(scope="module")
 def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with ``small.toml``, a short world, ``grid.toml``, and ``out``, its sweep in two shares."""
+    """A folder with ``small.toml``, a short world, and ``grid.toml``, a sweep of it."""
     folder = tmp_path_factory.mktemp("sweep")
     text = (data_folder("scenarios") / "herath2007-stereo.toml").read_text()
     (folder / "small.toml").write_text(text.replace("steps = 500", "steps = 40"))
@@ -36,10 +36,8 @@ def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def out(at: Path) -> Path:
-    first = consistency("sweep", "grid.toml", "--out", "out", "--share", "1/2", "--jobs", "1", cwd=at)
-    assert "1 of the whole sweep are missing" in first.stdout
-    second = consistency("sweep", "grid.toml", "--out", "out", "--share", "2/2", "--jobs", "1", cwd=at)
-    assert "out/report.pdf" in second.stdout
+    done = consistency("sweep", "grid.toml", "--out", "out", "--jobs", "1", cwd=at)
+    assert "out/report.pdf" in done.stdout
     return at / "out"
 
 
@@ -62,10 +60,8 @@ BAD = {
     "no folder": (("sweep", "grid.toml"), "--out: missing"),
     "no such sweep": (("sweep", "regimes", "--out", "o"), "did you mean 'regime'"),
     "wrong filter": (("sweep", "grid.toml", "--filter", "kf", "--out", "o"), "filters that fit"),
-    "share": (("sweep", "grid.toml", "--out", "o", "--share", "3/2"), "must be I/N"),
-    "no share": (("sweep", "grid.toml", "--out", "o", "--share", "half"), "must be I/N, as 2/8"),
     "jobs": (("sweep", "grid.toml", "--out", "o", "--jobs", "0"), "jobs must be at least 1"),
-    "folder with options": (("sweep", ".", "--share", "1/2"), "only reported again"),
+    "folder with options": (("sweep", ".", "--overwrite"), "only reported again"),
     "no sweep's folder": (("sweep", "."), "manifest.json: missing"),
 }  # fmt: skip
 

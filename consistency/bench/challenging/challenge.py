@@ -151,7 +151,9 @@ def challenge(
 def opponents(filter_: str | Filter, base: str | Scenario | None) -> tuple[Filter, Scenario]:
     """The filter, and the scenario from which its worlds differ; raises InputError."""
     instance = get_filter(filter_) if isinstance(filter_, str) else filter_
-    scenario = base_of(instance) if base is None else load_scenario(base) if isinstance(base, str) else base
+    scenario = load_scenario(base) if isinstance(base, str) else base
+    if scenario is None:
+        scenario = base_of(instance)
     resolve_filters([instance], scenario.belief)
     require_right_belief(scenario)
     return instance, scenario
@@ -169,12 +171,18 @@ def base_of(filter_: Filter) -> Scenario:
 
 def corners(space: Space) -> list[Scenario]:
     """Worlds that need all the kernels there are: that of the base, and those with few and many landmarks in view."""
-    few = tuple(d.at(0.0) if d.name == "density" else d.plain for d in space.dimensions)
-    many = tuple(d.at(1.0) if d.name in ("density", "range") else d.plain for d in space.dimensions)
-    return [scenario for point in (space.plain, few, many) if (scenario := scenario_of(space, point)) is not None]
+    few, many = list(space.plain), list(space.plain)
+    for i, dimension in enumerate(space.dimensions):
+        if dimension.name == "density":
+            few[i] = dimension.at(0.0)
+        if dimension.name in ("density", "range"):
+            many[i] = dimension.at(1.0)
+    worlds = [scenario_of(space, point) for point in (space.plain, tuple(few), tuple(many))]
+    return [world for world in worlds if world is not None]
 
 
 def scenario_of(space: Space, point: Point) -> Scenario | None:
+    """The world of a point; None where there is none."""
     try:
         return space.world(point)
     except ValueError:
@@ -203,17 +211,17 @@ class ChallengePhases:
         verdict = analyse(results, settings=Settings(plan.false_alarm))[name]
         unusable = sum(not candidate.usable for candidate in self.tried.values())
         return Challenge(
-            name,
-            plan,
-            self.space,
-            worst.point,
-            float(np.exp(np.mean(worst.scores))),
-            world,
-            verdict,
-            len(self.tried) - unusable,
-            self.budget.used,
-            unusable,
-            self.budget.elapsed,
+            filter=name,
+            plan=plan,
+            space=self.space,
+            point=worst.point,
+            ratio=float(np.exp(np.mean(worst.scores))),
+            world=world,
+            verdict=verdict,
+            worlds=len(self.tried) - unusable,
+            trials=self.budget.used,
+            unusable=unusable,
+            seconds=self.budget.elapsed,
         )
 
     def search(self) -> Candidate:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import joblib
 import numpy as np
 
 from consistency.bench.filters.compiled import one_blas_thread
@@ -21,7 +20,6 @@ from consistency.bench.simulation.world import World
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
 
 WORST = float(np.log(1e4))  # of a run that failed, and the most of one that did not
 PATIENCE = 60.0  # s beyond the end of the search, after which a trial of a filter that is not compiled is killed
@@ -45,17 +43,14 @@ class ChallengeScorer:
 
     def __init__(self, filter_: Filter, jobs: int = -1) -> None:
         self.filter, self.workers = filter_, worker_count(jobs)
-        self._stack = ExitStack()
+        # kernels release the GIL; other filters run in processes, for which threads wait
+        self._pool = ThreadPoolExecutor(self.workers)
 
     def __enter__(self) -> ChallengeScorer:
-        self._stack.enter_context(one_blas_thread())
-        # kernels release the GIL; other filters run in processes, for which threads wait
-        self._stack.enter_context(joblib.parallel_config("threading", n_jobs=self.workers))
-        self._parallel = self._stack.enter_context(joblib.Parallel())
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._pool.shutdown(cancel_futures=True)
 
     def compile(self, worlds: Sequence[Scenario]) -> None:
         """Compile what the filter needs in these worlds, so that a search spends no time on it."""
@@ -66,8 +61,8 @@ class ChallengeScorer:
 
         No trial begins after ``until``, a time of ``time.monotonic``.
         """
-        tasks = (joblib.delayed(_score)(self.filter, *job, seed, until) for job in jobs)
-        return list(self._parallel(tasks))
+        with one_blas_thread():
+            return list(self._pool.map(lambda job: _score(self.filter, *job, seed, until), jobs))
 
 
 def _score(filter_: Filter, scenario: Scenario, runs: Sequence[int], seed: int, until: float) -> Done | None:
@@ -98,8 +93,7 @@ def score_of_run(isolation: Isolation, world: World, run: int, seed: int) -> flo
     [columns] = outcome.estimates.values()
     nees = np.asarray(columns.get("own_nees", columns["nees"]), float)
     nees = nees[np.isfinite(nees)]
-    return _log_ratio(nees) if len(nees) else WORST
-
-
-def _log_ratio(nees: Array) -> float:
-    return min(float(np.log(max(nees.mean() / len(POSE), 1.0 / np.exp(WORST)))), WORST)
+    if not len(nees):
+        return WORST
+    with np.errstate(divide="ignore"):
+        return float(np.clip(np.log(nees.mean() / len(POSE)), -WORST, WORST))

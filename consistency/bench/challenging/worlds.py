@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from consistency.bench.scenario import Scenario, Truth, UniformLandmarks, UvdSensor, misbelief
-from consistency.bench.simulation.variation import SHAPES, course_of, mount_of
+from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor, misbelief
+from consistency.bench.scenario.truth_and_belief import with_changes
+from consistency.bench.simulation.variation import (
+    SHAPES,
+    Changes,
+    baseline_changes,
+    course_of,
+    height_changes,
+    in_both,
+    odometry_changes,
+    tilt_changes,
+)
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_toml
 from consistency.referee.types import Array
@@ -141,7 +150,7 @@ class Space:
         """Place of a point in the unit cube, (number of dimensions,)."""
         return np.array([d.where(value) for d, value in zip(self.dimensions, point, strict=True)])
 
-    def world(self, point: Point, name: str = "world", summary: str = "") -> Scenario:
+    def world(self, point: Point, name: str = "world") -> Scenario:
         """The scenario of a point.
 
         Raises
@@ -149,17 +158,17 @@ class Space:
         ValueError
             There is no such world: the scenario is refused.
         """
-        values = {d.name: value for d, value in zip(self.dimensions, point, strict=True) if value != d.base}
-        return self.base.variant(name, summary=summary or self.text(point), **_changes(self.base, values))
+        values = {d.name: value for d, value in self._differences(point)}
+        return with_changes(self.base, name, self.text(point), _changes(self.base, values))
 
     def text(self, point: Point) -> str:
         """What of a point differs from the base, in words."""
-        parts = [
-            f"{d.name} {d.text(value)} instead of {d.text(d.base)}"
-            for d, value in zip(self.dimensions, point, strict=True)
-            if value != d.base
-        ]
+        parts = [f"{d.name} {d.text(value)} instead of {d.text(d.base)}" for d, value in self._differences(point)]
         return f"{self.base.name} with {', '.join(parts)}" if parts else f"{self.base.name} as it is"
+
+    def _differences(self, point: Point) -> list[tuple[Dimension, Value]]:
+        pairs = zip(self.dimensions, point, strict=True)
+        return [(dimension, value) for dimension, value in pairs if value != dimension.base]
 
     def values(self, point: Point) -> dict[str, Value]:
         return {d.name: value for d, value in zip(self.dimensions, point, strict=True)}
@@ -180,23 +189,26 @@ def space_of(base: Scenario, within: Sequence[str] = ()) -> Space:
     """
     require_right_belief(base)
     dimensions = {d.name: d for d in _dimensions(base)}
-    for text in itertools.chain.from_iterable(_bounds_of(w) if w.endswith(".toml") else [w] for w in within):
-        name, separator, bounds = text.partition("=")
+    bounds: list[str] = []
+    for text in within:
+        bounds += _bounds_of_file(text) if text.endswith(".toml") else [text]
+    for text in bounds:
+        name, separator, values = text.partition("=")
         if name not in dimensions or not separator:
             raise InputError(f"--within {text}: give it as NAME=LOW:HIGH with a NAME out of {', '.join(dimensions)}")
-        dimensions[name] = dimensions[name].within(bounds)
+        dimensions[name] = dimensions[name].within(values)
     return Space(base, tuple(dimensions.values()))
 
 
-def _bounds_of(path: str) -> list[str]:
+def _bounds_of_file(path: str) -> list[str]:
     """Bounds of a file as they are typed: an array of two numbers that are not a choice is LOW:HIGH."""
     bounds = []
     for name, value in read_toml(Path(path)).items():
         items = value if isinstance(value, list) else [value]
         if not items or not all(isinstance(each, int | float | str) for each in items):
             raise InputError(f"{path}: key '{name}': give a value, [LOW, HIGH], or an array of values")
-        between = name in FACTORS and len(items) == 2
-        bounds.append(f"{name}={(':' if between else ',').join(_text(each) for each in items)}")
+        separator = ":" if name in FACTORS and len(items) == 2 else ","
+        bounds.append(f"{name}={separator.join(map(_text, items))}")
     return bounds
 
 
@@ -215,30 +227,35 @@ def require_right_belief(base: Scenario) -> None:
 def _dimensions(base: Scenario) -> list[Dimension]:
     """Return the dimensions in which a world may differ from the base."""
     truth = base.truth
+    is_uniform, has_laps = isinstance(truth.landmarks, UniformLandmarks), truth.path.shape in SHAPES
     found: list[Dimension] = []
     if isinstance(truth.landmarks, UniformLandmarks):
-        found += [_choice("seed", truth.landmarks.seed, range(SEEDS))]
-    found += [_scale("sensor", 1.0, "x")]
+        found.append(_choice("seed", truth.landmarks.seed, range(SEEDS)))
+    found.append(_scale("sensor", 1.0, "x"))
     if truth.motion.sigma_v > 0 or truth.motion.sigma_omega > 0:
-        found += [_scale("odometry", 1.0, "x")]
-    found += [_scale("steps", truth.steps, whole=True)]
-    if isinstance(truth.landmarks, UniformLandmarks):
-        own = truth.path.shape
-        found += [_choice("path", own, SHAPES)]
-        found += [_scale("lap", 1.0, "x")] if own in SHAPES else []
-        found += [_scale("density", 1.0, "x")]
-    found += [_scale("dt", truth.dt, " s")]
+        found.append(_scale("odometry", 1.0, "x"))
+    found.append(_scale("steps", truth.steps, whole=True))
+    if is_uniform:
+        found.append(_choice("path", truth.path.shape, SHAPES))
+    if is_uniform and has_laps:
+        found.append(_scale("lap", 1.0, "x"))
+    if is_uniform:
+        found.append(_scale("density", 1.0, "x"))
+    found.append(_scale("dt", truth.dt, " s"))
     if isinstance(truth.sensor, UvdSensor):
         (_, _, z), (_, pitch, _) = truth.sensor.mount.position, truth.sensor.mount.rotation
-        pitch = round(float(np.rad2deg(pitch)), 6)
-        found += [_choice("tilt", pitch, TILTS, " deg"), _choice("height", z, HEIGHTS, " m")]
-        found += [_scale("baseline", truth.sensor.B, " m")]
-    return [*found, _scale("range", truth.sensor.range[1], " m")]
+        found.append(_choice("tilt", round(float(np.rad2deg(pitch)), 6), TILTS, " deg"))
+        found.append(_choice("height", z, HEIGHTS, " m"))
+        found.append(_scale("baseline", truth.sensor.B, " m"))
+    found.append(_scale("range", truth.sensor.range[1], " m"))
+    return found
 
 
 def _scale(name: str, base: float, unit: str = "", whole: bool = False) -> LogScale:
     low, high = (float(f"{factor * base:.{DIGITS}g}") for factor in FACTORS[name])
-    return LogScale(name, base, max(1, round(low)) if whole else low, round(high) if whole else high, unit, whole)
+    if whole:
+        low, high = max(1, round(low)), round(high)
+    return LogScale(name, base, low, high, unit, whole)
 
 
 def _choice(name: str, base: Value, values: Sequence[Value], unit: str = "") -> Choice:
@@ -248,45 +265,43 @@ def _choice(name: str, base: Value, values: Sequence[Value], unit: str = "") -> 
 # --- from values to keys of a scenario -----------------------------------------------------------------
 
 
-def _changes(base: Scenario, values: Mapping[str, Value]) -> dict[str, Any]:
-    """Keys of the scenario that change, in truth and belief alike."""
-    truth, changes = base.truth, _landmarks(base.truth, values)
-    for key in ("sigma_v", "sigma_omega") if "odometry" in values else ():
-        sigma = float(values["odometry"]) * getattr(truth.motion, key)
-        changes |= {f"{half}__motion__{key}": sigma for half in ("truth", "belief")}
-    if "sensor" in values:
-        sigmas = tuple(float(values["sensor"]) * sigma for sigma in truth.sensor.sigma)
-        changes |= {f"{half}__sensor__sigma": sigmas for half in ("truth", "belief")}
-    if "steps" in values:
-        changes["truth__steps"] = int(values["steps"])
-    if "dt" in values:
-        changes["truth__dt"] = float(values["dt"])
-    if "tilt" in values or "height" in values:
-        tilt, height = (float(values[name]) if name in values else None for name in ("tilt", "height"))
-        mount = mount_of(truth.sensor, tilt, height)
-        changes |= {f"{half}__sensor__mount": mount for half in ("truth", "belief")}
-    if "range" in values:
-        changes["truth__sensor__range"] = (truth.sensor.range[0], float(values["range"]))
-    if "baseline" in values and isinstance(truth.sensor, UvdSensor):
-        B = float(values["baseline"])
-        low, high = truth.sensor.disparity
-        search = (low, round(high * B / truth.sensor.B, 1))  # the nearest depth stays
-        changes |= {f"{half}__sensor__B": B for half in ("truth", "belief")}
-        halves = ("truth",) if base.belief.sensor.disparity is None else ("truth", "belief")
-        changes |= {f"{half}__sensor__disparity": search for half in halves}
+def _sensor_noise(base: Scenario, factor: float) -> Changes:
+    return in_both("sensor.sigma", tuple(factor * sigma for sigma in base.truth.sensor.sigma))
+
+
+# what a value changes, in truth and belief alike; path, lap, density and seed change the landmarks together
+CHANGES: dict[str, Callable[[Scenario, Any], Changes]] = {
+    "odometry": odometry_changes,
+    "sensor": _sensor_noise,
+    "steps": lambda base, steps: {"truth.steps": int(steps)},
+    "dt": lambda base, dt: {"truth.dt": dt},
+    "tilt": tilt_changes,
+    "height": height_changes,
+    "range": lambda base, far: {"truth.sensor.range": (base.truth.sensor.range[0], far)},
+    "baseline": baseline_changes,
+}
+
+
+def _changes(base: Scenario, values: Mapping[str, Value]) -> Changes:
+    """Keys of the scenario that change, of values that are not those of the base."""
+    changes = _landmark_changes(base, values)
+    for name, changes_of in CHANGES.items():
+        if name in values:
+            changes |= changes_of(base, values[name])
     return changes
 
 
-def _landmarks(truth: Truth, values: Mapping[str, Value]) -> dict[str, Any]:
+def _landmark_changes(base: Scenario, values: Mapping[str, Value]) -> Changes:
     """Path and landmarks: as dense as in the base times ``density``, as far beyond the path as there."""
-    landmarks, changes = truth.landmarks, dict[str, Any]()
+    landmarks, changes = base.truth.landmarks, Changes()
     if not isinstance(landmarks, UniformLandmarks):
         return changes
     count: float = landmarks.count
     if "path" in values or "lap" in values:
-        shape = str(values.get("path", truth.path.shape))
-        path, x, y, count = course_of(truth, shape, float(values.get("lap", 1.0)))
-        changes |= {"truth__path": path.model_dump(), "truth__landmarks__x": x, "truth__landmarks__y": y}
-    count = max(1, round(count * float(values.get("density", 1.0))))
-    changes |= {"truth__landmarks__count": count} if count != landmarks.count else {}
-    return changes | ({"truth__landmarks__seed": int(values["seed"])} if "seed" in values else {})
+        shape = str(values.get("path", base.truth.path.shape))
+        path, x, y, count = course_of(base.truth, shape, float(values.get("lap", 1.0)))
+        changes |= {"truth.path": path.model_dump(), "truth.landmarks.x": x, "truth.landmarks.y": y}
+    changes["truth.landmarks.count"] = max(1, round(count * float(values.get("density", 1.0))))
+    if "seed" in values:
+        changes["truth.landmarks.seed"] = int(values["seed"])
+    return changes

@@ -22,13 +22,13 @@ from consistency.bench.filters.guard.guarded import Guarded
 from consistency.bench.filters.guard.plain_rules import KINDS
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
-from consistency.bench.filters.kernel.update_steps import HALTED, REASONS
+from consistency.bench.filters.kernel.update_steps import REASONS
 from consistency.bench.protocols import Filter, Problem, TrialTruth
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE
-from consistency.referee.types import Array, Failure, Indices
+from consistency.referee.types import Array, Failure
 
 # models of sensors by what the name of a filter ends in
 SENSORS = {"xyz": ("xyz", "uvd"), "uvd": ("uvd",), "xy": ("relative-xy",), "rb": ("range-bearing",)}
@@ -56,10 +56,6 @@ def one_blas_thread() -> Iterator[None]:
             limit = _inside.pop()
             if not _inside:
                 limit.restore_original_limits()
-
-
-class Halted(Exception):
-    """A trial that was given up while it was done."""
 
 
 class Compiled:
@@ -119,24 +115,11 @@ class Compiled:
         """Compile what ``run`` needs on this trial, or load it from disk."""
         trial_kernel.compile(*self._arguments(trial, belief))
 
-    def run(self, trial: Trial, belief: Belief, halt: Indices | None = None) -> Estimates:
-        """Estimates of all steps of ``trial``.
-
-        Once ``halt`` (1,) is not 0, the trial is given up before its next step.
-
-        Raises
-        ------
-        InputError
-            The trial lacks what the filter needs.
-        Halted
-            The trial was given up.
-        """
-        halt = np.zeros(1, np.int64) if halt is None else halt
-        arguments = self._arguments(trial, belief, halt)
+    def run(self, trial: Trial, belief: Belief) -> Estimates:
+        """Estimates of all steps of ``trial``; raises InputError where it lacks what the filter needs."""
+        arguments = self._arguments(trial, belief)
         with one_blas_thread():
-            out: Outcome = trial_kernel(*arguments, stop=lambda: halt.fill(1))
-        if out.code == HALTED:
-            raise Halted(f"'{self.name}' was told to stop in step {out.step}")
+            out: Outcome = trial_kernel(*arguments)
         failure = Failure(self.name, trial.run, out.step, REASONS[out.code]) if out.step else None
         own = None if self.error == ADDITIVE else out.own
         labels = np.flatnonzero(np.isfinite(out.points[:, 0]))
@@ -146,7 +129,7 @@ class Compiled:
             None if self.guard is None else out.rejected, out.log_det,
         )  # fmt: skip
 
-    def _arguments(self, trial: Trial, belief: Belief, halt: Indices | None = None) -> tuple[Slam, Data, int]:
+    def _arguments(self, trial: Trial, belief: Belief) -> tuple[Slam, Data, int]:
         problem = problem_for(self, trial, belief)
         slam = self.parts(problem, np.array(trial.controls, float))
         z, R = sensor_noise(trial.z, belief.sensor, converted=belief.sensor.model == "uvd" and not self.uvd)
@@ -156,8 +139,7 @@ class Compiled:
             np.array(a, float, order="C") for a in (trial.controls, z, R, shift, trial.start)
         )
         first, landmark = (np.array(a, np.int64, order="C") for a in (trial.first, trial.landmark))
-        halt = np.zeros(1, np.int64) if halt is None else halt
-        data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks, halt)
+        data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks)
         w = landmark_width(slam.landmark)
         slam = self._with_covariance_update(slam, 3 + w * trial.n_landmarks)
         if self.guard is not None:

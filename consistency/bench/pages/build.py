@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.bench.pages.contents import SECTIONS
+from consistency.bench.pages import exhibits
 from consistency.bench.pages.report_input import Report, Study, Track
+from consistency.bench.pages.sections import images, overview, sensor_issues
+from consistency.bench.pages.sections.calibration_rates import calibration_rates
+from consistency.bench.pages.sections.filters_table import filters_table
+from consistency.bench.pages.sections.front_end import front_end
+from consistency.bench.pages.sections.provenance import provenance
+from consistency.bench.pages.sections.stereo_noise import stereo_noise
+from consistency.bench.pages.sections.study_sections import SECTIONS
 from consistency.bench.runs.findings import read_findings
 from consistency.bench.runs.results_to_records import design_of, record_of, steps_of
 from consistency.bench.runs.run_scores import nis_ratio
@@ -25,7 +31,6 @@ from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.wording import listed
 from consistency.referee.errors import InputError
 from consistency.referee.pages.judged import clock_of
-from consistency.referee.pages.section import OPENING, STUDY, Section
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.system.progress import Advance
 
@@ -81,7 +86,7 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
         verdict = judge(record, Settings(), design)
         shown = record.of_runs(np.flatnonzero(record.run_numbers == shown_run))
         ratio = nis_ratio(record, verdict.runs)
-        return Track(name, number, f"{index}:{number}", verdict, record.failures, shown, ratio, read)
+        return Track(name, number, f"{index}-{number}", verdict, record.failures, shown, ratio, read)
 
     tracks = tuple(track(name) for name in results.filters)
     return Study(
@@ -97,23 +102,44 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
     )
 
 
-def compose(report: Report, sections: tuple[Section[Any, Any], ...] | None = None) -> Document:
-    """The document that HTML and PDF show: every section that applies, in the order of ``sections``."""
-    chapters: list[Chapter] = []
-    opening: tuple[Block, ...] = ()
-    for part, group in groupby(SECTIONS if sections is None else sections, key=lambda section: section.part):
-        members = tuple(group)
-        if part is STUDY:
-            for index, study in enumerate(report.studies):
-                shown = tuple(block for section in members for block in section.blocks(study))
-                anchor = f"{STUDY.anchor}-{index}"
-                chapters.append(Chapter(anchor, study.name, study.name, shown, study.summary, study.keys()))
-        elif blocks := tuple(block for section in members for block in section.blocks(report)):
-            if part is OPENING:
-                opening = blocks
-            else:
-                chapters.append(Chapter(part.anchor, part.title, part.link, blocks))
-    return Document(report.title, answer(report.studies, report.findings), tuple(chapters), opening)
+class Part(NamedTuple):
+    """A chapter about the whole report."""
+
+    anchor: str
+    title: str
+    link: str  # in the contents
+    blocks: tuple[Block, ...]
+
+
+def compose(report: Report) -> Document:
+    """The document that HTML and PDF show: every section that applies."""
+    before = (
+        Part("findings", "Findings: published beside measured", "Findings", exhibits.all_findings(report)),
+        Part("filters", "Filters side by side", "Filters", filters_table(report)),
+        Part("verdicts", "Verdicts", "Verdicts", overview.verdicts(report)),
+    )
+    noise, sensor = "What eq. 21 does to Gaussian pixels (fig. 12)", "The stereo sensor: biases and practical issues"
+    after = (
+        Part("distributions", noise, "Stereo noise", stereo_noise(report)),
+        Part("front-end", "Stereo front-end", "Stereo front-end", front_end(report)),
+        Part("sensor-issues", sensor, "Sensor issues", exhibits.shown(report, sensor_issues.EXHIBITS)),
+        Part("images", "The stereo sensor in rendered images", "Rendered images",
+             exhibits.shown(report, images.EXHIBITS)),
+        Part("calibration", "How far the referee can be trusted", "The referee", calibration_rates()),
+        Part("provenance", "Provenance", "Provenance", provenance(report)),
+    )  # fmt: skip
+    chapters = (*_chapters(before), *map(_study_chapter, range(len(report.studies)), report.studies), *_chapters(after))
+    return Document(report.title, answer(report.studies, report.findings), chapters, overview.opening(report))
+
+
+def _chapters(parts: Sequence[Part]) -> list[Chapter]:
+    """Those that have something to show."""
+    return [Chapter(part.anchor, part.title, part.link, part.blocks) for part in parts if part.blocks]
+
+
+def _study_chapter(index: int, study: Study) -> Chapter:
+    blocks = tuple(block for section in SECTIONS for block in section(study))
+    return Chapter(f"study-{index}", study.name, study.name, blocks, study.summary, study.switches)
 
 
 def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:

@@ -5,20 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.report_input import Report, as_given
+from consistency.bench.pages.report_input import Report
 from consistency.bench.store.parquet import read_frame
 from consistency.bench.types import outcome
-from consistency.referee.document.blocks import Block, Cell, Column, Heading, Small, Stack, Status, Table, table
-from consistency.referee.document.drawing import Figure, Key, Panel, Sheet
+from consistency.referee.document.blocks import Block, Cell, Column, Figure, Heading, Small, Stack, Status, Table, table
 from consistency.referee.document.wording import number, p_cell
 from consistency.referee.errors import InputError
-from consistency.referee.pages.section import Part, Section
 from consistency.referee.parsing import one_line, reading
+from consistency.referee.show.painting import add_legend, canvas, rows_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
 
 OF_FINDINGS = (
     Column("Finding", width="2.5cm"),
@@ -50,41 +53,36 @@ class Exhibit:
     sources: tuple[Source, ...]
 
 
-def section(part: Part, exhibits: Sequence[Exhibit]) -> Section[Report, Report]:
-    """The section of these exhibits; an exhibit without any of its tables is left out."""
+def shown(report: Report, exhibits: Sequence[Exhibit]) -> tuple[Block, ...]:
+    """Each exhibit: its heading, its findings with published value, measured value and rule, and its tables.
 
-    def show(report: Report) -> tuple[Block, ...]:
-        """Each exhibit: its heading, its findings with published value, measured value and rule, and its tables."""
-        blocks: list[Block] = []
-        for exhibit in exhibits:
-            tables = []
-            for source in exhibit.sources:
-                path = report.folder / f"{source.name}.parquet"
-                tables.append((source, extra_table(path, source.numbers, source.texts, source.missing)))
-            shown = [source.show(data) for source, data in tables if data is not None]
-            own = [finding for finding in report.findings if finding["id"] in exhibit.findings]
-            if shown:
-                blocks.append(Heading(exhibit.title, paper=exhibit.title))
-                blocks += [findings_table(own, f"Findings on: {exhibit.title}")] if own else []
-                blocks += shown
-        return tuple(blocks)
-
-    return Section(part, as_given, show)
+    An exhibit without any of its tables is left out.
+    """
+    blocks: list[Block] = []
+    for exhibit in exhibits:
+        tables = []
+        for source in exhibit.sources:
+            path = report.folder / f"{source.name}.parquet"
+            tables.append((source, extra_table(path, source.numbers, source.texts, source.missing)))
+        own = [finding for finding in report.findings if finding["id"] in exhibit.findings]
+        found = [source.show(data) for source, data in tables if data is not None]
+        if found:
+            blocks.append(Heading(exhibit.title))
+            blocks += [findings_table(own, f"Findings on: {exhibit.title}")] if own else []
+            blocks += found
+    return tuple(blocks)
 
 
 def findings_table(findings: Sequence[dict[str, Any]], label: str, caption: str = "") -> Table:
     """Claim, rule, published and measured value and verdict of each finding."""
     rows = [_row(finding) for finding in findings]
-    return table(OF_FINDINGS, rows, label, caption=caption, paper=f"{caption}." if caption else "", style="prose")
+    return table(OF_FINDINGS, rows, label, caption=caption, style="prose")
 
 
-def _all_findings(report: Report) -> tuple[Block, ...]:
+def all_findings(report: Report) -> tuple[Block, ...]:
     """Published claims of the folder beside what was measured."""
     caption = "Rules of acceptance are constants of the scripts, fixed before this run"
     return (findings_table(report.findings, "Findings", caption),) if report.findings else ()
-
-
-FINDINGS = Section(Part("findings", "Findings: published beside measured", "Findings"), as_given, _all_findings)
 
 
 def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:
@@ -93,7 +91,7 @@ def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:
         below.append(Small(f"Accepted if: {finding['accept']}", italic=True))
     source, run = str(finding["source"] or ""), _run(finding)
     if source or run:
-        below.append(Small(f"{f'{source}. ' if source else ''}{run}", paper=source))
+        below.append(Small(f"{source}. {run}" if source else run))
     return (
         Stack(str(finding["id"]), (), bold=True),
         Stack(str(finding["claim"]), tuple(below)),
@@ -133,15 +131,24 @@ def _cell(value: Any, form: str) -> Cell:
     return number(value, form) if form else str(value)
 
 
-def single(title: str, caption: str, panel: Panel, keys: tuple[Key, ...] = ()) -> Figure:
-    """A figure of one panel."""
-    return Figure(title, caption, (panel,), (Sheet((panel,), 2.4, keys=keys),), keys, level=4)
+def single(title: str, caption: str, paint: Callable[[Axes], None]) -> Figure:
+    """A figure of one panel; ``paint`` draws it."""
+    return several(title, caption, (paint,))
 
 
-def several(title: str, caption: str, panels: Sequence[Panel], keys: tuple[Key, ...]) -> Figure:
-    """A figure of two or three panels side by side."""
-    layout, own = ("pair" if len(panels) == 2 else "three"), tuple(panels)
-    return Figure(title, caption, own, (Sheet(own, 2.1, keys=keys),), keys, layout, level=4)  # type: ignore[arg-type]
+def several(
+    title: str, caption: str, paints: Sequence[Callable[[Axes], None]], height: float = 1.9, **shared: Any
+) -> Figure:
+    """A figure of panels side by side, each drawn by one of ``paints``; ``shared`` is of :func:`canvas`."""
+
+    def draw() -> Drawing:
+        columns = rows_of(len(paints))
+        figure, panels = canvas(height * -(-len(paints) // columns), columns, len(paints), **shared)
+        for axes, paint in zip(panels, paints, strict=True):
+            paint(axes)
+        return add_legend(figure)
+
+    return Figure(title, caption, (draw,), level=4)
 
 
 def groups(data: pd.DataFrame, column: str) -> list[tuple[str, pd.DataFrame]]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import textwrap
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,9 +13,14 @@ from consistency.bench.sweeps.axes import Axis as GridAxis
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell
 from consistency.bench.sweeps.regime import Regime
-from consistency.referee.document.colours import COLOURS, Look
-from consistency.referee.document.drawing import Axis, Figure, Key, Panel, Sheet, Tiles, Tips
+from consistency.referee.document.blocks import Figure
+from consistency.referee.document.colours import COLOURS
 from consistency.referee.document.wording import brief
+from consistency.referee.show.painting import TITLE, add_legend, canvas, say, wrapped
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
 
 SMALL, LARGE = COLOURS[0], COLOURS[1]  # of a ratio below and above 1: blue and vermilion, told apart by everybody
 NOTHING, PAPER = "#e3e3e3", "#ffffff"
@@ -27,10 +32,9 @@ WORDS = {
     "consistent": "consistent", "overconfident": "overconf.", "conservative": "conserv.", "biased": "biased",
     "heavy-tailed": "heavy tails", "inconsistent": "inconsist.", "undecided": "undecided", "failed": "failed",
 }  # fmt: skip
-TIPS: Tips = (("covariance ratio", "@ratio"), ("95 % interval", "@interval"), ("verdict", "@status"), ("runs", "@runs"))
-TILE, PAPER_TILE, MARGIN = 44, 0.34, 0.75  # height of a row: pixels, inches; inches of title and axis
-PAPER_TITLE, LINE = 52, 0.12  # characters of a title above half a page, and inches of a line of it
-ROOM = 5  # rows of tiles on a sheet of paper, about
+ROW, MARGIN = 0.34, 0.75  # inches: height of a row of tiles, and of title and axis
+ROOM = 15  # rows of tiles in one drawing, about, titles and axes counted as two
+WIDEST = 6  # tiles beside each other where two panels stand side by side
 
 
 View = tuple[list[GridAxis], list[tuple[GridAxis, int]]]  # axes for the sides of a panel, and a place on each other one
@@ -68,73 +72,88 @@ def title_of(fixed: Sequence[tuple[GridAxis, int]]) -> str:
 
 
 def heat_figure(regime: Regime, name: str) -> Figure:
+    """Heat maps of one filter, as many drawings as it takes."""
     found = views(regime)
-    panels = tuple(_panel(regime, name, sides, fixed) for sides, fixed in found)
     rows = max(len(sides[1].values) if len(sides) > 1 else 1 for sides, _ in found)
     widest = max(len(sides[0].values) for sides, _ in found)
-    columns = 1 if len(panels) == 1 or widest > 6 else 2
-    most = columns * max(1, ROOM * 3 // (rows + 2))
-    ends = ((f"{FULL:g} and more: overconfident", LARGE), (f"1/{FULL:g} and less: conservative", SMALL))
-    keys = tuple(Key(text, Look(colour), "band") for text, colour in (*ends, ("no ratio", NOTHING)))
-    paper = [replace(panel, title=on_paper(panel.title, PAPER_TITLE * 2 // columns)) for panel in panels]
-    high = MARGIN + LINE * max(panel.title.count("\n") for panel in paper)
-    sheets = tuple(
-        Sheet(tuple(part), (PAPER_TILE * rows + high) * -(-len(part) // columns) + 0.2, columns=columns, keys=keys)
-        for part in (paper[i : i + most] for i in range(0, len(paper), most))
+    columns = 1 if len(found) == 1 or widest > WIDEST else 2
+    most = columns * max(1, ROOM // (rows + 2))
+    drawings = tuple(
+        partial(_draw, regime, name, found[i : i + most], columns, rows) for i in range(0, len(found), most)
     )
     caption = (
         f"{name}: ratio of true to stated covariance in each cell, and the verdict; 1 is right, more is overconfident. "
         "A dash: no run gave a ratio."
     )
-    layout = "pair" if columns == 2 else ""
-    return Figure(name, caption, panels, sheets, keys, layout=layout, stacked=len(sheets) > 1)  # type: ignore[arg-type]
+    return Figure(name, caption, drawings)
 
 
-def on_paper(title: str, width: int) -> str:
-    """A title in lines of at most ``width`` characters."""
-    return "\n".join(textwrap.wrap(title, width))
+def _draw(regime: Regime, name: str, shown: Sequence[View], columns: int, rows: int) -> Drawing:
+    from matplotlib.patches import Rectangle
+
+    height = (ROW * rows + MARGIN) * -(-len(shown) // columns)
+    figure, panels = canvas(height, columns, len(shown))
+    for axes, (sides, fixed) in zip(panels, shown, strict=True):
+        _draw_tiles(axes, regime, name, sides, fixed)
+    ends = ((f"{FULL:g} and more: overconfident", LARGE), (f"1/{FULL:g} and less: conservative", SMALL))
+    for label, colour in (*ends, ("no ratio", NOTHING)):
+        panels[0].add_patch(Rectangle((0, 0), 0, 0, facecolor=colour, label=label, visible=False))
+    return add_legend(figure)
 
 
-def _panel(regime: Regime, name: str, sides: Sequence[GridAxis], at: Sequence[tuple[GridAxis, int]]) -> Panel:
-    """The heat map at one place on each other axis."""
-    places, title = [regime.sweep.axes.index(axis) for axis in sides], title_of(at)
-    found = [(c, regime.results[c.number, name]) for c in cells_of(regime, at) if (c.number, name) in regime.results]
-    second = _side(sides[1]) if len(sides) > 1 else Axis("", rows=("",))
-    words = f" with {title}" if title else ""
-    return Panel(
-        _side(sides[0], across=True), second, (_tiles(found, places, len(second.rows)),) if found else (),
-        f"Ratio of true to stated covariance of {name}{words}", height=TILE * len(second.rows) + 70, title=title,
-        empty="no cell is there yet",
-    )  # fmt: skip
+def _draw_tiles(
+    axes: Axes, regime: Regime, name: str, sides: Sequence[GridAxis], at: Sequence[tuple[GridAxis, int]]
+) -> None:
+    """The heat map at one place on each other axis: values from the left, and from below."""
+    across, places = sides[0], [regime.sweep.axes.index(axis) for axis in sides]
+    count = len(across.values)
+    axes.grid(visible=False)
+    axes.set(title=wrapped(title_of(at), 46), xlabel=_short(across), xlim=(-0.5, count - 0.5), xticks=range(count))
+    axes.set_xticklabels([wrapped(said(across, i), 12) for i in range(count)])
+    axes.set(ylim=(-0.5, 0.5), yticks=[])
+    if len(sides) > 1:
+        rows = len(sides[1].values)
+        axes.set(ylabel=_short(sides[1]), ylim=(-0.5, rows - 0.5), yticks=range(rows))
+        axes.set_yticklabels([wrapped(said(sides[1], i), 16) for i in range(rows)])
+    found = results_at(regime, name, at)
+    if not found:
+        say(axes, "no cell is there yet")
+    for cell, result in found:
+        row = cell.indices[places[1]] if len(places) > 1 else 0
+        _draw_tile(axes, cell.indices[places[0]], row, result)
 
 
-def _side(axis: GridAxis, across: bool = False) -> Axis:
-    """Values from the left, or from below."""
-    values = tuple(said(axis, i) for i in range(len(axis.values)))
-    short = axis.key.rpartition(".")[2]
-    return Axis(axis.text, short, names=values) if across else Axis(axis.text, short, rows=values[::-1])
+def results_at(regime: Regime, name: str, at: Sequence[tuple[GridAxis, int]]) -> list[tuple[Cell, CellResult]]:
+    """Cells at one place on each of some axes that have a verdict on the filter."""
+    cells = cells_of(regime, at)
+    return [(cell, regime.results[cell.number, name]) for cell in cells if (cell.number, name) in regime.results]
+
+
+def _draw_tile(axes: Axes, x: int, y: int, result: CellResult) -> None:
+    from matplotlib.patches import Rectangle
+
+    face = colour_of(result.ratio)
+    axes.add_patch(Rectangle(
+        (x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", gid=TITLE + words_of(result)
+    ))  # fmt: skip
+    axes.text(x, y, brief(result.ratio), color=ink_on(face), weight="bold", ha="center", va="bottom")
+    axes.text(x, y - 0.08, WORDS[result.status], color=ink_on(face), fontsize=5.0, ha="center", va="top")
+
+
+def words_of(result: CellResult) -> str:
+    """What a reader sees who points at a cell."""
+    ends = f"[{brief(result.ratio_low)}, {brief(result.ratio_high)}]"
+    return f"{result.status}, covariance ratio {brief(result.ratio)} {ends}, {result.runs} runs"
+
+
+def _short(axis: GridAxis) -> str:
+    return axis.key.rpartition(".")[2]
 
 
 def said(axis: GridAxis, index: int) -> str:
     """A value in few characters; by its number where it is long."""
     text = axis.say(index)
     return text if len(text) <= LONGEST else f"({index + 1}) {text[: LONGEST - 5]}…"
-
-
-def _tiles(found: Sequence[tuple[Cell, CellResult]], places: Sequence[int], rows: int) -> Tiles:
-    results = [result for _, result in found]
-    faces = tuple(colour_of(result.ratio) for result in results)
-    return Tiles(
-        np.array([cell.indices[places[0]] for cell, _ in found], float),
-        np.array([rows - 1 - cell.indices[places[1]] if len(places) > 1 else 0 for cell, _ in found], float),
-        tuple(brief(result.ratio) for result in results), tuple(WORDS[result.status] for result in results),
-        faces, tuple(map(ink_on, faces)), TIPS,
-        {
-            "ratio": [brief(r.ratio) for r in results], "status": [r.status for r in results],
-            "interval": [f"[{brief(r.ratio_low)}, {brief(r.ratio_high)}]" for r in results],
-            "runs": [str(r.runs) for r in results],
-        },
-    )  # fmt: skip
 
 
 def colour_of(ratio: float) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from consistency.bench.pages.heat import PAPER_TITLE, cells_of, heat_figure, on_paper, title_of, views
+from consistency.bench.pages.heat import View, cells_of, heat_figure, results_at, title_of, views, words_of
 from consistency.bench.sweeps import axes as grid
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell as GridCell
@@ -22,6 +23,7 @@ from consistency.referee.document.blocks import (
     Column,
     Document,
     Facts,
+    Figure,
     Small,
     Stack,
     Table,
@@ -29,10 +31,13 @@ from consistency.referee.document.blocks import (
     table,
 )
 from consistency.referee.document.colours import COLOURS, Look, style
-from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet, Tips
 from consistency.referee.document.wording import listed, number
 from consistency.referee.pages.provenance import facts
-from consistency.referee.types import Array
+from consistency.referee.show.painting import TITLE, add_legend, canvas, dots, log_axis, say, stroke, wrapped
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
 
 # colour and marker of a verdict: each has a shape of its own, so that a grey print still reads
 LOOKS = {
@@ -50,12 +55,8 @@ HYPHENATED = {
     "consistent": "Con-\nsistent", "overconfident": "Over-\nconfident", "conservative": "Conser-\nvative",
     "heavy-tailed": "Heavy-\ntailed", "inconsistent": "Incon-\nsistent", "undecided": "Un-\ndecided",
 }  # fmt: skip
-ROWS = 3  # of panels on a sheet of paper
+PAIRS = 4  # of panels in one drawing
 ROOM = 1.25  # of a log axis is left beyond the first and the last value, as a factor
-TIPS: Tips = (
-    ("verdict", "@status"), ("ANEES", "@anees{0.00}"), ("covariance ratio", "@ratio{0.00}"),
-    ("RMSE", "@rmse{0.000} m"), ("runs", "@runs"),
-)  # fmt: skip
 
 
 def compose_regime(regime: Regime) -> Document:
@@ -177,98 +178,86 @@ def _figures(regime: Regime, name: str) -> tuple[Figure, ...]:
     found = views(regime, numbers=True)
     if not found:
         return ()
-    panels = [panel for sides, fixed in found for panel in _pair(regime, name, sides, fixed)]
-    shown = found[0][0]
-    statuses = {r.status for (_, n), r in regime.results.items() if n == name}
-    keys = [Key(status, LOOKS[status], "points") for status in STATUSES if status in statuses]
-    lines = shown[1:] or shown[:0]
-    keys += [
-        Key(f"RMSE, {_short(axis.key)} {axis.say(i)}", style(i), marked=True)
-        for axis in lines
-        for i in range(len(axis.values))
-    ]
-    columns = 4 if len(panels) > 2 else 2
-    width = PAPER_TITLE * 2 // columns
-    paper = [replace(p, title=on_paper(p.title, width) if i % 2 == 0 else "RMSE") for i, p in enumerate(panels)]
-    sheets = tuple(
-        Sheet(tuple(part), 1.75 * -(-len(part) // columns) + 0.3, columns=columns, keys=tuple(keys))
-        for part in (paper[i : i + columns * ROWS] for i in range(0, len(paper), columns * ROWS))
-    )
+    drawings = tuple(partial(_draw, regime, name, found[i : i + PAIRS]) for i in range(0, len(found), PAIRS))
     caption = (
         f"{name}: verdict in each cell, by shape and colour; beside it the RMSE of the position, with filled markers "
         "where the filter is consistent."
     )
-    return (Figure(name, caption, tuple(panels), sheets, tuple(keys), layout="pair", stacked=len(sheets) > 1),)
+    return (Figure(name, caption, drawings),)
 
 
-def _pair(regime: Regime, name: str, shown: list[grid.Axis], fixed: list[tuple[grid.Axis, int]]) -> tuple[Panel, Panel]:
-    """The panel of verdicts and the panel of RMSE for the cells at one place on each other axis."""
-    places, title = [regime.sweep.axes.index(axis) for axis in shown], title_of(fixed)
-    found = [(c, regime.results[c.number, name]) for c in cells_of(regime, fixed) if (c.number, name) in regime.results]
-    x = np.array([shown[0].values[cell.indices[places[0]]] for cell, _ in found], float)
-    second = shown[1] if len(shown) > 1 else None
-    rows = np.array([cell.indices[places[1]] if second else 0 for cell, _ in found], int)
-    y = np.array(second.values, float)[rows] if second else np.zeros(len(found))
-    x_axis = _axis(shown[0])
-    words = f" with {title}" if title else ""
-    verdicts = Panel(
-        x_axis, _axis(second) if second else Axis("", rows=("",)), _verdicts(x, y, [r for _, r in found]),
-        f"Verdicts on {name}{words}", height=300, title=title or "verdict", empty="no cell is there yet",
-    )  # fmt: skip
-    rmse = Panel(
-        x_axis, _rmse_axis([r for _, r in found]), _rmse(x, rows, [r for _, r in found]),
-        f"RMSE of {name}{words}", height=300, title=f"RMSE{', ' if title else ''}{title}", empty="no cell is there yet",
-    )  # fmt: skip
-    return verdicts, rmse
+def _draw(regime: Regime, name: str, shown: Sequence[View]) -> Drawing:
+    """A row for each view: verdicts, and the RMSE."""
+    figure, panels = canvas(1.7 * len(shown), 2, 2 * len(shown))
+    for verdicts, rmse, (sides, at) in zip(panels[::2], panels[1::2], shown, strict=True):
+        found, title = results_at(regime, name, at), title_of(at)
+        verdicts.set_title(wrapped(title or "verdict", 46))
+        rmse.set_title("RMSE")
+        if not found:
+            say(verdicts, "no cell is there yet")
+            say(rmse, "no cell is there yet")
+            continue
+        places = [regime.sweep.axes.index(axis) for axis in sides]
+        _draw_verdicts(verdicts, sides, places, found)
+        _draw_rmse(rmse, sides, places, found)
+    return add_legend(figure)
 
 
-def _axis(axis: grid.Axis) -> Axis:
-    values = tuple(map(float, axis.values))
-    if not axis.log:
-        room = 0.08 * (values[-1] - values[0])
-        return Axis(axis.label, _short(axis.key), window=(values[0] - room, values[-1] + room), ticks=values)
-    window = values[0] / ROOM, values[-1] * ROOM
-    short = _short(axis.key) + (f" ({axis.unit})" if axis.unit else "")
-    return Axis(axis.label, short, log=True, window=window, digits=(1, 2, 3, 5))
+def _draw_verdicts(
+    axes: Axes, sides: Sequence[grid.Axis], places: Sequence[int], found: Sequence[tuple[GridCell, CellResult]]
+) -> None:
+    """A marker for each cell, with what was found in words to hover."""
+    seen = set[str]()
+    for cell, result in sorted(found, key=lambda pair: list(STATUSES).index(pair[1].status)):
+        x, y = (float(axis.values[cell.indices[place]]) for axis, place in _both(sides, places))
+        label = "" if result.status in seen else result.status
+        seen.add(result.status)
+        words = f"{words_of(result)}, ANEES {result.anees:.2f}, RMSE {result.rmse_position:.3f} m"
+        axes.plot(x, y, label=label, gid=TITLE + words, **dots(LOOKS[result.status]))
+    _draw_side(axes, "x", sides[0])
+    if len(sides) > 1:
+        _draw_side(axes, "y", sides[1])
+    else:
+        axes.set_yticks([])
 
 
-def _rmse_axis(results: list[CellResult]) -> Axis:
-    """Logarithmic where there is a value."""
-    log = any(r.rmse_position > 0.0 for r in results)
-    return Axis("RMSE of the position (m)", "RMSE (m)", log=log, digits=(1, 2, 5) if log else ())
-
-
-def _columns(results: list[CellResult], rows: Array) -> dict[str, Array | list[str]]:
-    part = [results[i] for i in np.flatnonzero(rows)]
-    return {
-        "status": [r.status for r in part], "anees": np.array([r.anees for r in part]),
-        "ratio": np.array([r.ratio for r in part]), "rmse": np.array([r.rmse_position for r in part]),
-        "runs": np.array([r.runs for r in part], float),
-    }  # fmt: skip
-
-
-def _verdicts(x: Array, y: Array, results: list[CellResult]) -> tuple[Mark, ...]:
-    """A marker a cell."""
-    status = np.array([r.status for r in results])
-    found = ((name, status == name) for name in STATUSES if name in status)
-    return tuple(
-        Points(x[rows], y[rows], LOOKS[name], tips=TIPS, columns=_columns(results, rows), whole=True)
-        for name, rows in found
-    )
-
-
-def _rmse(x: Array, rows: Array, results: list[CellResult]) -> tuple[Mark, ...]:
+def _draw_rmse(
+    axes: Axes, sides: Sequence[grid.Axis], places: Sequence[int], found: Sequence[tuple[GridCell, CellResult]]
+) -> None:
     """A line for each value of the second axis."""
-    rmse = np.array([r.rmse_position for r in results])
-    good = np.array([r.status == "consistent" for r in results], bool)
-    marks: list[Mark] = []
-    for i in sorted({int(row) for row in rows}):
-        look, mine = style(i), rows == i
-        marks.append(Line(x[mine], rmse[mine], look))
-        hollow = replace(look, colour="#ffffff", edge=look.colour)
-        marks += [
-            Points(x[which], rmse[which], dots, tips=TIPS, columns=_columns(results, which), whole=True)
-            for which, dots in ((mine & good, look), (mine & ~good, hollow))
-            if which.any()
-        ]
-    return tuple(marks)
+    rows: dict[int, list[tuple[float, CellResult]]] = {}
+    for cell, result in found:
+        row = cell.indices[places[1]] if len(places) > 1 else 0
+        rows.setdefault(row, []).append((float(sides[0].values[cell.indices[places[0]]]), result))
+    for row, line in sorted(rows.items()):
+        look = replace(style(row), size=3.6)
+        label = f"RMSE, {_short(sides[1].key)} {sides[1].say(row)}" if len(sides) > 1 else ""
+        axes.plot([x for x, _ in line], [r.rmse_position for _, r in line], label=label, **stroke(look))
+        for x, result in line:
+            hollow = result.status != "consistent"
+            axes.plot(
+                x, result.rmse_position, **dots(replace(look, colour="#ffffff", edge=look.colour) if hollow else look)
+            )
+    axes.set_ylabel("RMSE (m)")
+    _draw_side(axes, "x", sides[0])
+    if any(result.rmse_position > 0.0 for _, result in found):
+        log_axis(axes, "y")
+
+
+def _both(sides: Sequence[grid.Axis], places: Sequence[int]) -> list[tuple[grid.Axis, int]]:
+    """The two axes of a panel with their places among those of the sweep; the first one twice where there is one."""
+    pairs = list(zip(sides, places, strict=True))
+    return pairs if len(pairs) > 1 else [*pairs, *pairs]
+
+
+def _draw_side(axes: Axes, side: str, axis: grid.Axis) -> None:
+    """Ticks and range of one axis of numbers."""
+    first, last = float(axis.values[0]), float(axis.values[-1])
+    unit = f" ({axis.unit})" if axis.unit else ""
+    axes.set(**{f"{side}label": _short(axis.key) + unit})
+    if axis.log:
+        axes.set(**{f"{side}lim": (first / ROOM, last * ROOM)})
+        log_axis(axes, side)
+    else:
+        room = 0.08 * (last - first)
+        axes.set(**{f"{side}lim": (first - room, last + room), f"{side}ticks": [float(value) for value in axis.values]})

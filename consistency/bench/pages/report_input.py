@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from consistency.referee.diagnostics import Record
 from consistency.referee.pages.judged import Estimator, Judged
@@ -13,8 +13,6 @@ from consistency.referee.types import Array
 
 if TYPE_CHECKING:
     from consistency.bench.store.results import Tables
-
-Source = TypeVar("Source")
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,3 @@ class Report:
     def title(self) -> str:
         name = "reproduction" if "studies" in self.manifest else self.studies[0].name
         return f"Filter consistency: {name}"
-
-
-def as_given(source: Source) -> Source:
-    """How a section reads that needs no more than the study, or the report, itself."""
-    return source

@@ -14,7 +14,7 @@ import pandas as pd
 from consistency.bench.filters.stepping import error_of, name_of, optimal_gain
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.gather import Gathered, SoFar
-from consistency.bench.runs.trial_work import Backend, TrialWork
+from consistency.bench.runs.trial_work import TrialWork, Workers
 from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.results import Results, StoredResults, Tables, open_results
 from consistency.referee.errors import InputError
@@ -22,7 +22,6 @@ from consistency.referee.geometry.conventions import ADDITIVE
 from consistency.referee.system.folders import NewFolder
 from consistency.referee.system.progress import progress, say
 from consistency.referee.system.provenance import in_words, manifest_of, this_machine
-from consistency.referee.system.stopping import Stop, stoppable
 
 PLAN = "until_decided"
 KEYS = {
@@ -32,11 +31,11 @@ KEYS = {
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C in :func:`run_trials`; ``results`` holds the runs that were finished, ``status`` is for the exit."""
+    """Ctrl-C in :func:`run_trials` without a folder; ``results`` holds the runs that were finished."""
 
-    def __init__(self, results: Results | StoredResults, status: int = 130) -> None:
+    def __init__(self, results: Results | StoredResults) -> None:
         super().__init__("interrupted")
-        self.results, self.status = results, status
+        self.results = results
 
 
 class Campaign:
@@ -44,7 +43,7 @@ class Campaign:
 
     Parameters
     ----------
-    backend, work : who does the runs, and what is done for each
+    workers, work : who does the runs, and what is done for each
     place : where results go, and what is there
     fields : of the manifest
     landmarks : table of those of the world, where they are known
@@ -52,13 +51,13 @@ class Campaign:
 
     def __init__(
         self,
-        backend: Backend,
+        workers: Workers,
         work: TrialWork,
         place: ResultsPlace,
         fields: Mapping[str, Any],
         landmarks: pd.DataFrame | None,
     ) -> None:
-        self.backend, self.work, self.place, self.landmarks = backend, work, place, landmarks
+        self.workers, self.work, self.place, self.landmarks = workers, work, place, landmarks
         names, errors = [name_of(f) for f in work.filters], own_errors(work.filters)
         self.gathered = Gathered(names, errors, place.new, place.journal, place.previous, place.kept)
         gains = [name_of(f) for f in work.filters if optimal_gain(f)]
@@ -77,46 +76,47 @@ class Campaign:
         """Do the runs of each round that are not there, one round after the other, and hand over the results.
 
         Each round has the runs of those before, too. What is there can be read before the next one is asked for.
+        A journal may hold more runs than the rounds ask for; they are handed over with the others.
 
         Raises
         ------
         Interrupted
-            Ctrl-C, or a signal that is taken as such, with what there is.
+            Ctrl-C, where no journal keeps what there is.
         """
         runs: Sequence[int] = ()
-        with stoppable() as stop:
-            started, complete, is_ready = time.monotonic(), True, False
-            try:
-                for runs in rounds:
-                    todo = sorted(set(runs) - self.gathered.finished)
-                    if todo and not is_ready:
-                        self.backend.prepare(self.work, todo[0])
-                        started, is_ready = time.monotonic(), True
-                    if todo:
-                        self._do(todo, stop)
-            except KeyboardInterrupt:
-                complete = False
-            except Exception:
-                if stop.number is None:
-                    raise
-                complete = False
-            wall = time.monotonic() - started
-            machines = self.gathered.machines(self.place.machines[:-1])
-            manifest = manifest_of(
-                wall=wall, complete=complete, runs=len(runs), **self._fields | {"machines": machines}
-            )  # fmt: skip
-            if complete:
-                return self.gathered.results(manifest, self.landmarks)
-            manifest |= {"finished_runs": len(self.gathered.finished)}
-            raise Interrupted(self.gathered.results(manifest, self.landmarks), stop.status)
+        started, is_ready = time.monotonic(), False
+        try:
+            for runs in rounds:
+                todo = sorted(set(runs) - self.gathered.finished)
+                if todo and not is_ready:
+                    self.workers.prepare(self.work, todo[0])
+                    started, is_ready = time.monotonic(), True
+                if todo:
+                    self._do(todo)
+        except KeyboardInterrupt:
+            if self.place.journal is not None:
+                raise
+            raise Interrupted(self._results(runs, started)) from None
+        return self._results(runs, started)
 
-    def _do(self, runs: Sequence[int], stop: Stop) -> None:
-        with closing(self.backend.outcomes(self.work, runs)) as outcomes, progress("runs", len(runs)) as advance:
+    def _do(self, runs: Sequence[int]) -> None:
+        with closing(self.workers.outcomes(self.work, runs)) as outcomes, progress("runs", len(runs)) as advance:
             for outcome in outcomes:
                 self.gathered.add(outcome)
                 advance(1)
-                if stop.number is not None:  # and whoever was called took it for an error of its own
-                    raise KeyboardInterrupt
+
+    def _results(self, runs: Sequence[int], started: float) -> Results | StoredResults:
+        """The results of what is there, of which ``runs`` were asked for."""
+        finished = self.gathered.finished
+        beyond = finished.difference(runs)
+        total = max(beyond) + 1 if beyond else len(runs)
+        fields = self._fields | {"machines": self.gathered.machines(self.place.machines[:-1])}
+        is_complete = len(finished) == total
+        if not is_complete:
+            fields["finished_runs"] = len(finished)
+        wall = time.monotonic() - started
+        manifest = manifest_of(wall=wall, complete=is_complete, runs=total, **fields)
+        return self.gathered.results(manifest, self.landmarks)
 
 
 def own_errors(filters: Sequence[Filter]) -> dict[str, str]:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
+import pickle
 import signal
-import sys
-import threading
 from collections.abc import Iterable, Iterator, Sequence
-from multiprocessing.connection import Connection, wait
+from concurrent.futures import wait
+from multiprocessing.connection import Connection
 from typing import NamedTuple
+
+from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky.backend import get_context
+from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler import disk_cache
@@ -22,9 +25,8 @@ from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.system import progress
-from consistency.referee.system.stopping import STOPS, die_with_parent, undisturbed
+from consistency.referee.system.stopping import away_from_signals, end_with_parent, link_to_parent
 
-GLANCE = 0.1  # s between looks, for a signal that another thread was given
 NAMED = 3  # filters that are named where several are compiled
 Wanted = tuple[Filter, Trial, Belief]  # a filter, and a trial that it is to run on
 
@@ -76,17 +78,20 @@ def first_trials(worlds: Iterable[tuple[Filter, Scenario]]) -> Iterator[Wanted]:
 
 
 def _compile(missing: Sequence[Need], jobs: int) -> None:
-    shared = sorted(
-        (need for need in missing if need.outlook.is_shared), key=lambda need: need.outlook.seconds, reverse=True
-    )
-    # processes start as copies of this one: in a thread beside others a lock may be held for ever
-    may_fork = sys.platform == "linux" and threading.active_count() == 1
-    workers = min(jobs, len(shared)) if len(shared) > 1 and may_fork and not disk_cache.folder_fault() else 1
-    seconds = _wall([need.outlook.seconds for need in missing], workers)
-    with _processes(shared, workers if workers > 1 else 0) as links, progress.foreseen(_label(missing), seconds):
-        _side_by_side(len(shared), links)
-        for need in missing:
-            need.filter.compile(need.trial, need.belief)
+    shared = [need for need in missing if need.outlook.is_shared]
+    workers = min(jobs, len(shared))
+    if disk_cache.refusal():
+        workers = 1
+    with progress.foreseen(_label(missing), _wall([need.outlook.seconds for need in missing], max(workers, 1))):
+        if workers > 1:
+            _compile_side_by_side(shared, workers)
+        away_from_signals(_compile_here, missing)
+
+
+def _compile_here(needs: Sequence[Need]) -> None:
+    """Compile kernels one after the other; those that a process has kept on disk are loaded."""
+    for need in needs:
+        need.filter.compile(need.trial, need.belief)
 
 
 def _label(missing: Sequence[Need]) -> str:
@@ -107,60 +112,32 @@ def _wall(seconds: Sequence[float], workers: int) -> float:
 # --- side by side ---------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def _processes(needs: Sequence[Need], count: int) -> Iterator[list[Connection]]:
-    """Links to processes that compile the kernels whose numbers they are sent; none is left at the end."""
-    links, processes = [], []
+def _compile_side_by_side(needs: Sequence[Need], workers: int) -> None:
+    """Compile in processes, which keep kernels on disk; what they fail at is said where it is compiled again."""
+    context = get_context("loky")
+    longest_first = sorted(needs, key=lambda need: need.outlook.seconds, reverse=True)
+    initargs = link_to_parent(context)
+    pool = ProcessPoolExecutor(workers, context=context, initializer=_begin_compiler, initargs=initargs)
     try:
-        if count:
-            context, before = multiprocessing.get_context("fork"), signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
-            try:
-                for _ in range(count):
-                    link, end = context.Pipe()
-                    links.append(link)
-                    processes.append(context.Process(target=_compiler, args=(needs, end, os.getpid()), daemon=True))
-                    processes[-1].start()
-                    end.close()
-            except OSError:  # no more processes: those that there are do it, or this one
-                links = links[: sum(process.pid is not None for process in processes)]
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        yield links
+        with contextlib.suppress(OSError):  # no more processes
+            wait([pool.submit(_compile_one, _pickled(need)) for need in longest_first])
     finally:
-        with undisturbed():
-            started = [process for process in processes if process.pid is not None]
-            for process in started:
-                process.kill()
-            for process in started:
-                process.join()
+        pool.shutdown(kill_workers=True)
 
 
-def _side_by_side(count: int, links: Sequence[Connection]) -> None:
-    """Have kernels 0 to ``count`` - 1 compiled by the processes; who dies compiles no more."""
-    waiting, idle, busy = list(range(count))[::-1], list(links), list[Connection]()
-    while busy or (waiting and idle):
-        while waiting and idle:
-            link = idle.pop()
-            with contextlib.suppress(OSError):
-                link.send(waiting.pop())
-                busy.append(link)
-        for ready in wait(busy, GLANCE):
-            link = busy.pop(busy.index(ready))  # type: ignore[arg-type]
-            with contextlib.suppress(EOFError, OSError):
-                link.recv()
-                idle.append(link)
+def _pickled(need: Need) -> bytes:
+    return bytes(dumps((need.filter, need.trial, need.belief)))
 
 
-def _compiler(needs: Sequence[Need], link: Connection, parent: int) -> None:
-    """In a process of its own: compile what ``link`` says, and keep it on disk."""
-    for number in STOPS:
-        signal.signal(number, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
-    die_with_parent()
-    nowhere = os.open(os.devnull, os.O_WRONLY)  # what is wrong is said where it is compiled again
+def _begin_compiler(parent: int, alive: Connection) -> None:
+    """In a process of its own: end with the parent, leave Ctrl-C to it, and say nothing."""
+    end_with_parent(parent, alive)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         os.dup2(nowhere, stream)
-    while os.getppid() == parent:
-        need = needs[number := link.recv()]
-        need.filter.compile(need.trial, need.belief)
-        link.send(number)
+
+
+def _compile_one(pickled: bytes) -> None:
+    filter_, trial, belief = pickle.loads(pickled)
+    filter_.compile(trial, belief)

@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import pandas as pd
 from joblib.externals.loky import Future, ProcessPoolExecutor
+from joblib.externals.loky.backend import get_context
 
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.analyse_results import analyse
@@ -34,6 +35,7 @@ from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.progress import quiet, say
 from consistency.referee.system.provenance import manifest_of
+from consistency.referee.system.stopping import end_with_parent, link_to_parent
 
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 WAITING = 30.0  # seconds between lines on a process that is waited for
@@ -222,7 +224,11 @@ def _selection(
 def _findings_of(study: Study, selection: Sequence[tuple[ModuleType, Sequence[str]]]) -> list[Finding]:
     """The wanted findings in order of their scripts, whichever script ends first."""
     apart = [module for module, _ in selection if study.workers > 1 and getattr(module, "OWN_PROCESS", False)]
-    pool = ProcessPoolExecutor(len(apart)) if apart else None
+    context = get_context("loky")
+    pool = None
+    if apart:
+        ends = {"initializer": end_with_parent, "initargs": link_to_parent(context)}
+        pool = ProcessPoolExecutor(len(apart), context=context, **ends)
     futures: dict[ModuleType, Future[_Contribution]] = {}
 
     def main(module: ModuleType) -> list[Finding]:

@@ -23,7 +23,7 @@ from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import NewFolder
 from consistency.referee.system.provenance import this_machine
-from consistency.referee.system.stopping import undisturbed
+from consistency.referee.system.stopping import away_from_signals
 from consistency.referee.types import Failure
 
 
@@ -109,8 +109,7 @@ class Gathered:
         failures, rejections = self.noted()
         manifest = manifest | {"failures": len(failures)}
         if self.new is not None and self.finished:
-            with undisturbed():
-                return self._stored(self.new, manifest, failures, landmarks, rejections)
+            return away_from_signals(self._stored, self.new, manifest, failures, landmarks, rejections)
         estimates, maps = (
             [(name, columns) for name in self.filters for columns in self.pieces(table, name)]
             for table in ("estimates", "map")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, overload
@@ -13,13 +14,14 @@ import pandas as pd
 from consistency.bench.filters import filter_names, get_filter, usable_names
 from consistency.bench.filters.stepping import error_of, name_of
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.backends.local import LocalThreads
+from consistency.bench.runs.batches import ExecutorWorkers
 from consistency.bench.runs.campaign import PLAN, Campaign, ResultsPlace, own_errors, place_for
 from consistency.bench.runs.campaign import Interrupted as Interrupted
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.trial_work import Backend, Recorded, Simulated, TrialWork
+from consistency.bench.runs.local_threads import LocalThreads
+from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork, Workers
 from consistency.bench.scenario import Belief, Scenario
-from consistency.bench.scenario.toml_tables import UNITS
+from consistency.bench.scenario.tables.toml_tables import UNITS
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.log import Log, write_log
@@ -36,13 +38,13 @@ from consistency.referee.system.provenance import manifest_of, this_machine
 def run_trials(
     scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
     timeout: float | None = ..., previous: Tables | None = ..., out: None = ..., overwrite: bool = ...,
-    resume: bool = ..., memory: float | None = ..., backend: Backend | None = ...,
+    resume: bool = ..., memory: float | None = ..., executor: Executor | None = ...,
 ) -> Results: ...
 @overload
 def run_trials(
     scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
     timeout: float | None = ..., previous: Tables | None = ..., *, out: str | Path, overwrite: bool = ...,
-    resume: bool = ..., memory: float | None = ..., backend: Backend | None = ...,
+    resume: bool = ..., memory: float | None = ..., executor: Executor | None = ...,
 ) -> StoredResults: ...
 # fmt: on
 def run_trials(
@@ -57,7 +59,7 @@ def run_trials(
     overwrite: bool = False,
     resume: bool = False,
     memory: float | None = None,
-    backend: Backend | None = None,
+    executor: Executor | None = None,
 ) -> Results | StoredResults:
     """Simulate ``runs`` trials of ``scenario`` and put each through every filter.
 
@@ -66,6 +68,7 @@ def run_trials(
     filters : names of built-in filters, or objects with ``init``, ``predict``, ``update`` and ``pose``
     seed : the results are a function of (scenario, filter, seed, run) alone
     jobs : workers; -1 for one per core. Compiled filters share threads, each other filter has processes of its own.
+        An ``executor`` has workers of its own
     timeout : seconds per trial, after which the process of a filter that is not compiled is killed
     previous : results of the same scenario, filters and seed to go on from; its runs are not done again
     out : folder for the results, which appears as a whole at the end. Finished runs are kept in a journal beside it
@@ -74,7 +77,10 @@ def run_trials(
         ``previous`` is replaced anyway
     resume : continue from the runs in ``out`` and in its journal
     memory : GiB that a filter that is not compiled may allocate in a trial; Linux only
-    backend : machines that do the runs, in place of ``jobs`` workers of this machine
+    executor : any executor of :mod:`concurrent.futures` that does the runs, in place of ``jobs`` threads of this
+        process; it is not shut down. Work is sent to it as bytes, in batches of about 1.5 s or of its own
+        ``batch_seconds``, of which it has at most 1000, or its own ``at_a_time``. A run that its worker does not
+        survive has failed, if it was done alone
 
     Returns
     -------
@@ -86,15 +92,17 @@ def run_trials(
         An unknown filter, one that does not fit the sensor, a number out of range, nothing in view, or a folder that
         cannot be written, holds unfinished work, or is worked on by another process.
     Interrupted
-        Ctrl-C, or a signal that is taken as such; carries the finished runs, and the folder, if any, is written.
+        Ctrl-C, which is answered when the trials in progress have ended; carries the finished runs. With ``out`` it
+        is a plain KeyboardInterrupt, and the journal has them. SIGTERM and SIGHUP end the process.
     """
     require_counts(runs, seed)
     with studied(
-        scenario, filters, seed, backend or LocalThreads(jobs), timeout, memory, out=out, previous=previous,
+        scenario, filters, seed, workers_for(jobs, executor), timeout, memory, out=out, previous=previous,
         resume=resume, overwrite=overwrite,
     ) as campaign:  # fmt: skip
-        done = campaign.gathered.finished
-        if done and max(done) >= runs:
+        done = campaign.place.kept
+        is_resumed = campaign.place.journal is not None and campaign.place.journal.runs
+        if done and max(done) >= runs and not is_resumed:
             raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
         return campaign.finish([range(runs)])
 
@@ -103,13 +111,13 @@ def run_trials(
 @overload
 def run_log(
     log: Log, filters: Sequence[str | Filter], jobs: int = ..., timeout: float | None = ...,
-    memory: float | None = ..., backend: Backend | None = ..., out: None = ..., resume: bool = ...,
+    memory: float | None = ..., executor: Executor | None = ..., out: None = ..., resume: bool = ...,
     overwrite: bool = ...,
 ) -> Results: ...
 @overload
 def run_log(
     log: Log, filters: Sequence[str | Filter], jobs: int = ..., timeout: float | None = ...,
-    memory: float | None = ..., backend: Backend | None = ..., *, out: str | Path, resume: bool = ...,
+    memory: float | None = ..., executor: Executor | None = ..., *, out: str | Path, resume: bool = ...,
     overwrite: bool = ...,
 ) -> StoredResults: ...
 # fmt: on
@@ -119,7 +127,7 @@ def run_log(
     jobs: int = -1,
     timeout: float | None = None,
     memory: float | None = None,
-    backend: Backend | None = None,
+    executor: Executor | None = None,
     out: str | Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
@@ -135,7 +143,12 @@ def run_log(
     own = {"log_sha256": log.sha256} | ({"screening": log.screening} if log.screening else {})
     fields = {"seed": None, "log": log.name, "belief": log.belief.model_dump(mode="json")} | own
     with place_for(_known(instances) | own, None if out is None else Path(out), None, resume, overwrite) as place:
-        return Campaign(backend or LocalThreads(jobs), work, place, fields, log.landmarks).finish([sorted(trials)])
+        return Campaign(workers_for(jobs, executor), work, place, fields, log.landmarks).finish([sorted(trials)])
+
+
+def workers_for(jobs: int, executor: Executor | None) -> Workers:
+    """Those of the executor, or threads of this process where there is none."""
+    return LocalThreads(jobs) if executor is None else ExecutorWorkers(executor)
 
 
 @contextmanager
@@ -143,7 +156,7 @@ def studied(
     scenario: Scenario,
     filters: Sequence[str | Filter],
     seed: int,
-    backend: Backend,
+    workers: Workers,
     timeout: float | None,
     memory: float | None,
     *,
@@ -172,7 +185,7 @@ def studied(
         if journal is None
         else nullcontext(ResultsPlace(None, journal, None, frozenset(), [this_machine()]))  # results stay in memory
     ) as place:
-        yield Campaign(backend, work, place, fields, _landmarks_table(scenario))
+        yield Campaign(workers, work, place, fields, _landmarks_table(scenario))
 
 
 def _known(filters: Sequence[Filter]) -> dict[str, Any]:

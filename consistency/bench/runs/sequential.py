@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.campaign import Campaign
-from consistency.bench.runs.montecarlo import run_trials, studied
+from consistency.bench.runs.montecarlo import run_trials, studied, workers_for
 from consistency.bench.runs.results_to_records import record_of, records_of
 from consistency.bench.runs.run_scores import run_means
-from consistency.bench.runs.trial_work import Backend
 from consistency.bench.scenario import Scenario, load_scenario
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.results import Results, StoredResults, Tables, open_results
@@ -46,7 +45,7 @@ def run_until_decided(
     out: str | Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    backend: Backend | None = None,
+    executor: Executor | None = None,
     journal: Journal | None = None,
 ) -> tuple[Results | StoredResults, dict[str, Verdict]]:
     """Simulate and judge at the inspections of a :class:`Design` until every filter is decided.
@@ -58,7 +57,7 @@ def run_until_decided(
 
     Parameters
     ----------
-    seed, jobs, timeout, previous, memory, out, resume, overwrite, backend : as for :func:`run_trials`. A look then
+    seed, jobs, timeout, previous, memory, out, resume, overwrite, executor : as for :func:`run_trials`. A look then
         holds the arrays of one filter in memory, and nothing else grows with the runs.
     journal : in place of ``out``: what keeps the finished runs while the results stay in memory. It may hold runs of
         the same scenario, filters and seed.
@@ -78,7 +77,7 @@ def run_until_decided(
     plan |= {} if lost is None else {"lost": lost}
     design, decided = plan_of(plan), dict[str, Verdict]()
     with studied(
-        scenario, filters, seed, backend or LocalThreads(jobs), timeout, memory,
+        scenario, filters, seed, workers_for(jobs, executor), timeout, memory,
         out=out, previous=previous, resume=resume, overwrite=overwrite, plan=plan, journal=journal,
     ) as campaign:  # fmt: skip
         _require_less(campaign, max_runs)

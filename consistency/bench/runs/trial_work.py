@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -84,6 +84,12 @@ class TrialWork:
     def filters(self) -> list[Filter]:
         return self.isolation.filters
 
+    def only(self, runs: Sequence[int]) -> TrialWork:
+        """Work with what these runs need: the trials of a log are many, those of a scenario are drawn."""
+        if not isinstance(self.trials, Recorded):
+            return self
+        return replace(self, trials=Recorded({run: self.trials.trials[run] for run in runs}))
+
     def _ahead(self, run: int) -> Trial:
         ahead: Callable[[int], Trial] = getattr(self.trials, "ahead", self.trials)
         return ahead(run)
@@ -105,14 +111,11 @@ class TrialWork:
             compile_all(((filter_, trial, belief) for filter_ in self.isolation.compiled), jobs)
 
 
-class Backend(Protocol):
-    """Where runs are done."""
+class Workers(Protocol):
+    """Who does runs. The bits do not depend on it: BLAS has one thread."""
 
     def prepare(self, work: TrialWork, run: int, /) -> None:
         """Compile what ``run`` needs, where that is done on this machine."""
 
     def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
-        """What each run left, in the order in which they end; to be closed, which stops what is not done.
-
-        The bits do not depend on who does a run: BLAS has one thread.
-        """
+        """What each run left, in the order in which they end; to be closed, which stops what is not done."""

@@ -1,4 +1,4 @@
-"""A scenario's world along another path: as long, as dense, and as far beyond the path as it was."""
+"""What changes in a scenario where its sensor, noise, path or landmarks are others: values by dotted key."""
 
 from __future__ import annotations
 
@@ -6,10 +6,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.bench.scenario import Circle, FigureOfEight, Path_, RoundedRectangle, Truth, UniformLandmarks
+from consistency.bench.scenario import (
+    Circle,
+    FigureOfEight,
+    Path_,
+    RoundedRectangle,
+    Scenario,
+    Truth,
+    UniformLandmarks,
+    UvdSensor,
+)
 from consistency.bench.simulation.path import lap_length, planned_path
 from consistency.referee.types import Array
 
+Changes = dict[str, Any]  # dotted key of the scenario -> value
+HALVES = ("truth", "belief")
 SHAPES = ("circle", "rounded-rectangle", "figure-of-eight")
 
 
@@ -42,11 +53,51 @@ def course_of(truth: Truth, shape: str, lap: float = 1.0) -> Course:
     return Course(path, (x[0], x[1]), (y[0], y[1]), landmarks.count * area)
 
 
-def mount_of(sensor: Any, tilt: float | None = None, height: float | None = None) -> dict[str, tuple[float, ...]]:
-    """The mount of a sensor at another tilt (deg, positive looks down) or height (m)."""
-    (x, y, z), (roll, pitch, heading) = sensor.mount.position, sensor.mount.rotation
-    pitch = pitch if tilt is None else float(np.deg2rad(tilt))
-    return {"position": (x, y, z if height is None else height), "rotation": (roll, pitch, heading)}
+def in_both(key: str, value: Any) -> Changes:
+    """A key of truth and belief alike."""
+    return {f"{half}.{key}": value for half in HALVES}
+
+
+def baseline_changes(base: Scenario, baseline: float) -> Changes:
+    """Another baseline (m); the largest disparity of the search grows with it, so that the nearest depth stays."""
+    if base.truth.sensor.rig is None:
+        raise ValueError(f"a sensor '{base.truth.sensor.model}' has no baseline")
+    ratio = baseline / base.truth.sensor.rig[1]
+    changes = in_both("sensor.B", baseline)
+    for half in HALVES:
+        disparity = getattr(getattr(base, half).sensor, "disparity", None)
+        if disparity is not None:
+            changes[f"{half}.sensor.disparity"] = (disparity[0], disparity[1] * ratio)
+    return changes
+
+
+def odometry_changes(base: Scenario, factor: float) -> Changes:
+    """Noise of the odometry times a factor."""
+    changes: Changes = {}
+    for half in HALVES:
+        motion = getattr(base, half).motion
+        changes[f"{half}.motion.sigma_v"] = factor * motion.sigma_v
+        changes[f"{half}.motion.sigma_omega"] = factor * motion.sigma_omega
+    return changes
+
+
+def tilt_changes(base: Scenario, tilt: float) -> Changes:
+    """A camera turned to a tilt (deg, positive looks down)."""
+    roll, _, heading = _stereo_camera(base).mount.rotation
+    return in_both("sensor.mount.rotation", (roll, float(np.deg2rad(tilt)), heading))
+
+
+def height_changes(base: Scenario, height: float) -> Changes:
+    """A camera moved to a height (m)."""
+    x, y, _ = _stereo_camera(base).mount.position
+    return in_both("sensor.mount.position", (x, y, height))
+
+
+def _stereo_camera(base: Scenario) -> UvdSensor:
+    sensor = base.truth.sensor
+    if not isinstance(sensor, UvdSensor):
+        raise ValueError(f"a sensor '{sensor.model}' has no tilt or height")
+    return sensor
 
 
 def _path(shape: str, truth: Truth, lap: float) -> Path_:

@@ -20,7 +20,7 @@ from filelock import FileLock, Timeout
 from consistency.bench.store.parquet import Columns
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import make_durable
-from consistency.referee.system.folders import require_free, writing
+from consistency.referee.system.folders import require_free, unfinished_of, writing
 from consistency.referee.types import Array
 
 CHECKPOINT_EVERY = 5.0  # s: a power cut costs at most the runs of so long, a killed process none
@@ -263,7 +263,3 @@ class Unfinished:
 def _remove_journals(folder: Path) -> None:
     for name in (EARLIER, DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"):
         (folder / name).unlink(missing_ok=True)
-
-
-def unfinished_of(out: Path) -> Path:
-    return out.absolute().parent / f".{out.absolute().name}.unfinished"

@@ -24,7 +24,7 @@ from consistency.bench.scenario import (
     read_table,
     toml_text,
 )
-from consistency.bench.scenario.toml_tables import SIGMA_UNITS
+from consistency.bench.scenario.tables.toml_tables import SIGMA_UNITS
 from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.log_tables import read_table_file, require_format, table_file
 from consistency.bench.store.trial_rows import controls_table, observations_table, stacked_table, truth_columns

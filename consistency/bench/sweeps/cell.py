@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 import time
 import warnings
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from typing import Any, NamedTuple
 
@@ -15,15 +15,14 @@ import pandas as pd
 from consistency.bench.filters import get_filter
 from consistency.bench.filters.compiled import Compiled, one_blas_thread
 from consistency.bench.filters.stepping import run_filter
-from consistency.bench.protocols import Filter, WholeTrial
+from consistency.bench.protocols import Filter
+from consistency.bench.runs.compiling import compile_all
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.bench.runs.trial_work import Backend
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import simulate
-from consistency.bench.store.journal import Journal
 from consistency.bench.sweeps.plan import Cell, Sweep
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics import Record, Verdict
@@ -59,18 +58,13 @@ NUMBERS = tuple(f.name for f in fields(CellResult) if f.type == "float")
 
 
 class CellOutcome(NamedTuple):
+    """Result of one filter in one cell, with a row for each of its runs."""
+
     result: CellResult
     runs: pd.DataFrame  # RUN_COLUMNS
 
 
-def run_cell(
-    sweep: Sweep,
-    cell: Cell,
-    filter_name: str,
-    jobs: int = -1,
-    backend: Backend | None = None,
-    journal: Journal | None = None,
-) -> CellOutcome:
+def run_cell(sweep: Sweep, cell: Cell, filter_name: str, **how: Any) -> CellOutcome:
     """Run one filter in one cell until it is decided.
 
     The trials depend on the sweep's seed and the cell's scenario alone. An exception is a result, too: the filter has
@@ -78,60 +72,70 @@ def run_cell(
 
     Parameters
     ----------
-    journal : where finished runs are kept; what is in it is of the same cell
+    how : who does the runs and what keeps them, as for :func:`run_until_decided`
 
     Raises
     ------
     OSError, InputError with an OSError as its cause
         No space left, no process can be started, a connection is lost.
     """
+    rule, seed = sweep.rule.model_dump(), sweep.seed_of(cell)
     try:
         with quiet():
-            results, verdicts = run_until_decided(
-                cell.scenario, [filter_name], **sweep.rule.model_dump(), seed=sweep.seed_of(cell), jobs=jobs,
-                backend=backend, journal=journal,
-            )  # fmt: skip
-        verdict, found = verdicts[filter_name], record_of(results, filter_name)
+            results, verdicts = run_until_decided(cell.scenario, [filter_name], **rule, seed=seed, **how)
+        verdict, record = verdicts[filter_name], record_of(results, filter_name)
     except Exception as error:  # what breaks one cell must not end a night of others
         if isinstance(error, OSError) or isinstance(error.__cause__, OSError):  # it would break all of them
             raise
         failed = CellResult("failed", f"failed: {type(error).__name__}: {error}", 0, 0, *[np.nan] * len(NUMBERS))
         return CellOutcome(failed, pd.DataFrame(columns=list(RUN_COLUMNS)))
     try:
-        cost, step_us = cost_of(filter_name, sweep.reference, cell.scenario, sweep.seed_of(cell))
+        cost, step_us = cost_of(filter_name, sweep.reference, cell.scenario, seed)
     except Exception:  # the verdict stands without it
         cost, step_us = np.nan, np.nan
-    return CellOutcome(result_of(verdict, cost, step_us), runs_table(found))
+    return CellOutcome(result_of(verdict, cost, step_us), runs_table(record))
 
 
 def result_of(verdict: Verdict, cost: float, step_us: float) -> CellResult:
     """The numbers of a verdict that a map keeps."""
     accuracy = verdict.in_world.accuracy
+    rmse_position, rmse_heading = np.nan, np.nan
+    if accuracy is not None:
+        rmse_position, rmse_heading = float(accuracy.rmse_position), float(accuracy.rmse_heading)
     low, high = verdict.threshold
+    ratio_low, ratio_high = verdict.inflation_interval
     return CellResult(
-        status=verdict.status, diagnosis=verdict.reasons[0], runs=verdict.runs,
+        status=verdict.status,
+        diagnosis=verdict.reasons[0],
+        runs=verdict.runs,
         failures=len({failure.run for failure in verdict.failures}),
-        anees=float(verdict.statistic), anees_low=float(low), anees_high=float(high), ratio=float(verdict.inflation),
-        ratio_low=float(verdict.inflation_interval[0]), ratio_high=float(verdict.inflation_interval[1]),
-        rmse_position=np.nan if accuracy is None else float(accuracy.rmse_position),
-        rmse_heading=np.nan if accuracy is None else float(accuracy.rmse_heading), cost=cost, step_us=step_us,
-    )  # fmt: skip
+        anees=float(verdict.statistic),
+        anees_low=float(low),
+        anees_high=float(high),
+        ratio=float(verdict.inflation),
+        ratio_low=float(ratio_low),
+        ratio_high=float(ratio_high),
+        rmse_position=rmse_position,
+        rmse_heading=rmse_heading,
+        cost=cost,
+        step_us=step_us,
+    )
 
 
-def runs_table(found: Record) -> pd.DataFrame:
+def runs_table(record: Record) -> pd.DataFrame:
     """A row for each run: mean NEES, RMSE of position (m) and heading (rad) in judged steps, and failure."""
-    error, runs = found.in_world.error, found.run_numbers
+    error, runs = record.in_world.error, record.run_numbers
     assert error is not None
-    assert found.nees is not None
-    failed = {failure.run: failure for failure in found.failures}
-    square = np.where(np.isfinite(found.nees)[..., None], error**2, np.nan)
+    assert record.nees is not None
+    square = np.where(np.isfinite(record.nees)[..., None], error**2, np.nan)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Mean of empty slice")  # a run without an estimate
         mean = np.nanmean(square, axis=1)
+    failed = {failure.run: failure for failure in record.failures}
     steps = [failed[run].step if run in failed else None for run in runs]
     reasons = [failed[run].reason if run in failed else None for run in runs]
-    position = np.sqrt(mean[:, 0] + mean[:, 1])
-    columns = (runs, run_means(found), position, np.sqrt(mean[:, 2]), pd.array(steps, "Int64"), reasons)
+    position, heading = np.sqrt(mean[:, 0] + mean[:, 1]), np.sqrt(mean[:, 2])
+    columns = (runs, run_means(record), position, heading, pd.array(steps, "Int64"), reasons)
     return pd.DataFrame(dict(zip(RUN_COLUMNS, columns, strict=True)))
 
 
@@ -142,41 +146,40 @@ def cost_of(filter_name: str, reference: str, scenario: Scenario, seed: int) -> 
     """CPU time of a step against that of the reference, and in microseconds.
 
     Both take the same trial by turns, in one thread with one BLAS thread, and each counts with its fastest: other work
-    on the machine then matters little. CPU time is that of the thread. The trial is the first of three that neither
-    fails; NaN where there is none.
+    on the machine then matters little. The trial is the first of three that neither fails; NaN where there is none.
     """
     filters = [get_filter(name) for name in dict.fromkeys((filter_name, reference))]
-    spent = (_fastest(filters, simulate(scenario, run, seed), scenario) for run in range(TIMED))
-    best = next((times for times in spent if np.isfinite(times).all()), [np.nan])
-    return best[0] / best[-1], 1e6 * best[0] / scenario.truth.steps
+    for run in range(TIMED):
+        seconds = _fastest(filters, simulate(scenario, run, seed), scenario)
+        if np.isfinite(seconds).all():
+            return seconds[0] / seconds[-1], 1e6 * seconds[0] / scenario.truth.steps
+    return np.nan, np.nan
 
 
 def _fastest(filters: list[Filter], trial: Trial, scenario: Scenario) -> list[float]:
     """Seconds that each filter takes at best; infinite where it fails, which is tried where it can do no harm."""
+    belief = scenario.belief
     if apart := [filter_ for filter_ in filters if not isinstance(filter_, Compiled)]:
-        with Isolation(apart, scenario.belief, PATIENCE) as isolation:
+        with Isolation(apart, belief, PATIENCE) as isolation:
             if any(estimates.failure for estimates in isolation.run(trial)):
                 return [np.inf] * len(filters)
-    for filter_ in filters:
-        if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, scenario.belief):
-            filter_.compile(trial, scenario.belief)
+    compile_all((filter_, trial, belief) for filter_ in filters)
     best = [np.inf] * len(filters)
-    with one_blas_thread():
+    # a thread of its own, in which a kernel runs, too: from the main thread it would run in another one
+    with one_blas_thread(), ThreadPoolExecutor(1) as thread:
         for _ in range(TIMED):
-            best = [min(b, _cpu_time(f, trial, scenario)) for b, f in zip(best, filters, strict=True)]
+            for i, filter_ in enumerate(filters):
+                best[i] = min(best[i], thread.submit(_cpu_time, filter_, trial, scenario).result())
             if sum(best) > SLOW:
                 break
     return best
 
 
 def _cpu_time(filter_: Filter, trial: Trial, scenario: Scenario) -> float:
-    """Seconds that a trial takes; infinite where the run fails."""
-    # from the main thread a kernel runs in a thread of its own, whose time that of the main one does not hold
-    in_main = threading.current_thread() is threading.main_thread()
-    clock = time.process_time if in_main else time.thread_time
-    started = clock()
+    """Seconds of this thread that a trial takes; infinite where the run fails."""
+    started = time.thread_time()
     estimates = run_filter(filter_, trial, scenario.belief)
-    spent = clock() - started
+    spent = time.thread_time() - started
     return np.inf if estimates.failure is not None else spent
 
 
@@ -185,13 +188,21 @@ def plain_numbers(result: CellResult) -> dict[str, Any]:
     data = asdict(result)
     for name in NUMBERS:
         value = data[name]
-        data[name] = None if np.isnan(value) else float(f"{value:.5g}") if np.isfinite(value) else str(float(value))
+        if np.isnan(value):
+            data[name] = None
+        elif np.isinf(value):
+            data[name] = str(float(value))
+        else:
+            data[name] = float(f"{value:.5g}")
     return data
 
 
 def result_from(numbers: Mapping[str, Any]) -> CellResult:
     """The result that :func:`plain_numbers` gave; raises TypeError where a field is missing or unknown."""
-    given: dict[str, Any] = {
-        name: np.nan if value is None else float(value) if name in NUMBERS else value for name, value in numbers.items()
-    }
+    given = dict(numbers)
+    for name in given:
+        if given[name] is None:
+            given[name] = np.nan
+        elif name in NUMBERS:
+            given[name] = float(given[name])
     return CellResult(**given)

@@ -20,7 +20,7 @@ from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.runs.sequential import plan_of
 from consistency.bench.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
 from consistency.bench.scenario.truth_and_belief import unknown, with_changes
-from consistency.bench.sweeps.axes import QUANTITIES, Axis, leaves, require_key
+from consistency.bench.sweeps.axes import QUANTITIES, Axis, is_number, leaves, require_key
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, POWER
 from consistency.referee.errors import InputError
@@ -92,20 +92,10 @@ class Sweep:
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """Every cell, in the order of :func:`points`."""
-        return tuple(self._cell(number, at) for at, number in self._numbers.items())
-
-    @cached_property
-    def _numbers(self) -> dict[tuple[int, ...], int]:
-        return {at: number for number, at in enumerate(points(self.axes))}
-
-    def at(self, place: Sequence[int]) -> Cell | None:
-        """The cell at a place on each axis; None where the sweep has none."""
-        number = self._numbers.get(tuple(place))
-        return None if number is None else self._cell(number, tuple(place))
+        """Every cell, in the order of :func:`points`; raises ValueError where a scenario is refused."""
+        return tuple(self._cell(number, at) for number, at in enumerate(points(self.axes)))
 
     def _cell(self, number: int, at: tuple[int, ...]) -> Cell:
-        """Raises ValueError or pydantic's ValidationError."""
         changes: dict[str, Any] = {}
         for axis, i in _changed(self.axes, at):
             changes |= axis.changes(self.base, axis.values[i])
@@ -122,18 +112,11 @@ class Sweep:
         digest = hashlib.sha256(f"{self.seed} {cell.scenario.hash}".encode()).digest()
         return int.from_bytes(digest[:4], "big")
 
-    def share(self, part: int, parts: int) -> list[Cell]:
-        """Cells of one share of ``parts``, in an order that mixes the grid.
-
-        Slow cells lie together in the grid; mixed, shares take equally long, and the time left is foreseen.
-        """
-        mixed = sorted(self.cells, key=lambda cell: hashlib.sha256(cell.name.encode()).digest())
-        return mixed[part - 1 :: parts]
-
 
 def points(axes: Sequence[Axis]) -> Iterator[tuple[int, ...]]:
     """Places on all axes: those of the grid, the last axis fastest, each with the values of one more axis alone."""
-    for at in itertools.product(*(range(len(a.values)) if a.home is None else (a.home,) for a in axes)):
+    choices = [range(len(axis.values)) if axis.home is None else (axis.home,) for axis in axes]
+    for at in itertools.product(*choices):
         yield at
         for k, axis in enumerate(axes):
             for i in range(len(axis.values)):
@@ -142,8 +125,13 @@ def points(axes: Sequence[Axis]) -> Iterator[tuple[int, ...]]:
 
 
 def number_of_points(axes: Sequence[Axis]) -> int:
-    grid = math.prod(len(axis.values) for axis in axes if axis.home is None)
-    return grid * (1 + sum(len(axis.values) - 1 for axis in axes if axis.home is not None))
+    in_grid, alone = 1, 0
+    for axis in axes:
+        if axis.home is None:
+            in_grid *= len(axis.values)
+        else:
+            alone += len(axis.values) - 1
+    return in_grid * (1 + alone)
 
 
 def values_of(sweep: Sweep, axes: Sequence[Axis], cell: Cell) -> list[str]:
@@ -232,19 +220,23 @@ def _axis(table: str, key: str, values: Any, base: Scenario) -> Axis:
         raise InputError(f"{name}: must be a list of one value or more, got {values!r}")
     if any(values.count(value) > 1 for value in values):
         raise InputError(f"{name}: a value is given twice; each may stand once")
-    if key in QUANTITIES:
-        positive = QUANTITIES[key].positive
-        for value in values:
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not is_number or not (0 if positive else -math.inf) < value < math.inf:
-                raise InputError(f"{name}: values must be {'positive ' * positive}numbers, got {value!r}")
-    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
-    if numbers and not all(-HUGE <= value <= HUGE for value in values):
-        raise InputError(f"{name}: numbers must be finite, and {HUGE:g} at most")
-    values = sorted(map(float, values)) if numbers and any(isinstance(value, float) for value in values) else values
-    axis = Axis(key, tuple(sorted(values) if numbers else values), None if table == "grid" else 0)
+    for value in values:
+        if key in QUANTITIES:
+            _require_quantity(name, key, value)
+        if is_number(value) and not -HUGE <= value <= HUGE:
+            raise InputError(f"{name}: numbers must be finite, and {HUGE:g} at most")
+    if all(map(is_number, values)):
+        is_whole = all(isinstance(value, int) for value in values)
+        values = sorted(values if is_whole else map(float, values))
+    axis = Axis(key, tuple(values), None if table == "grid" else 0)
     require_key(axis, base)
     return axis if table == "grid" else alone(axis, base)
+
+
+def _require_quantity(name: str, key: str, value: Any) -> None:
+    low, kind = (0.0, "positive numbers") if QUANTITIES[key].positive else (-math.inf, "numbers")
+    if not is_number(value) or not low < value < math.inf:
+        raise InputError(f"{name}: values must be {kind}, got {value!r}")
 
 
 def alone(axis: Axis, base: Scenario) -> Axis:
@@ -255,42 +247,48 @@ def alone(axis: Axis, base: Scenario) -> Axis:
     InputError
         The base has no such value.
     """
-    try:
-        own = axis.of(base, base)
-    except (KeyError, ValueError):
-        own = None
+    own = axis.own(base)
     if own is None or own != own:
         raise InputError(f"key 'alone.{axis.key}': {base.name} has no value there to start from; use 'grid'")
     values = axis.values if own in axis.values else (own, *axis.values)
-    if Axis(axis.key, values).numeric:
+    if all(map(is_number, values)):
         values = tuple(sorted(values))
     return Axis(axis.key, values, values.index(own))
 
 
 def _require_cells(sweep: Sweep) -> None:
-    """Every value alone, so that the message names its key; then every cell, and a folder's name for each."""
+    """Check every value alone, so that the message names its key; then every cell, and a folder's name for each."""
     taken: dict[str, str] = {}
     for axis in sweep.axes:
-        for value in axis.values:
-            try:
-                changes = axis.changes(sweep.base, value)
-                with_changes(sweep.base, sweep.base.name, "", changes)
-            except ValueError as error:
-                text = explain(error, Scenario)
-                raise InputError(f"key '{axis.table}.{axis.key}', value {value!r}: {text}") from None
-        for key in changes:
+        keys = _keys_of(axis, sweep.base)
+        for key in keys:
             if key in taken:
                 raise InputError(
                     f"keys 'grid.{taken[key]}' and '{axis.table}.{axis.key}' both set {key}; leave one of them out"
                 )
         if axis.home is None:  # axes that vary alone never meet
-            taken |= dict.fromkeys(changes, axis.key)
+            taken |= dict.fromkeys(keys, axis.key)
     count = number_of_points(sweep.axes)
     if count > MOST_CELLS:
         raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
     try:
-        names = [cell.name for cell in sweep.cells]
+        names = Counter(cell.name for cell in sweep.cells)
     except ValueError as error:
         raise InputError(f"key 'grid': some values do not go together: {explain(error, Scenario)}") from None
-    if twice := sorted(name for name, times in Counter(names).items() if times > 1):
-        raise InputError(f"key 'grid': two values are too much alike to be told apart ({twice[0]})")
+    name, times = names.most_common(1)[0]
+    if times > 1:
+        raise InputError(f"key 'grid': two values are too much alike to be told apart ({name})")
+
+
+def _keys_of(axis: Axis, base: Scenario) -> list[str]:
+    """Keys of the scenario that an axis sets; each of its values is tried in the base."""
+    keys: list[str] = []
+    for value in axis.values:
+        try:
+            changes = axis.changes(base, value)
+            with_changes(base, base.name, "", changes)
+        except ValueError as error:
+            text = explain(error, Scenario)
+            raise InputError(f"key '{axis.table}.{axis.key}', value {value!r}: {text}") from None
+        keys = list(changes)
+    return keys

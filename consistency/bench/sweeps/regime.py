@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -42,8 +42,8 @@ class Regime:
 
     def at(self, cell: Cell) -> dict[str, CellResult]:
         """What is there of a cell, in the order of the filters."""
-        found = ((name, self.results.get((cell.number, name))) for name in self.sweep.filters)
-        return {name: result for name, result in found if result is not None}
+        there = [name for name in self.sweep.filters if (cell.number, name) in self.results]
+        return {name: self.results[cell.number, name] for name in there}
 
     def trusted(self, cell: Cell) -> list[tuple[str, CellResult]]:
         """Filters that are consistent in a cell, the most accurate first."""
@@ -52,24 +52,26 @@ class Regime:
     @cached_property
     def table(self) -> pd.DataFrame:
         """Rows by cell and filter: the value on each axis, the filter, and the fields of :class:`CellResult`."""
-        rows = [
-            [*(_text(axis.values[i]) for axis, i in zip(self.sweep.axes, cell.indices, strict=True)), name,
-             *(getattr(result, field) for field in FIELDS)]
-            for cell in self.sweep.cells for name, result in self.at(cell).items()
-        ]  # fmt: skip
-        return pd.DataFrame(rows, columns=[*(axis.key for axis in self.sweep.axes), "filter", *FIELDS])
+        axes, rows = self.sweep.axes, []
+        for cell in self.sweep.cells:
+            values = [_table_value(axis.values[i]) for axis, i in zip(axes, cell.indices, strict=True)]
+            for name, result in self.at(cell).items():
+                rows.append([*values, name, *(getattr(result, field) for field in FIELDS)])
+        return pd.DataFrame(rows, columns=[*(axis.key for axis in axes), "filter", *FIELDS])
 
 
-def _text(value: Any) -> Any:
+def _table_value(value: Any) -> Any:
     return value if isinstance(value, int | float | str) else json.dumps(value)
 
 
 def ranked(results: Mapping[str, CellResult]) -> list[tuple[str, CellResult]]:
-    """By RMSE of position; of those that differ by 2 % or less the cheaper one first."""
+    """Filters by RMSE of position; of those that differ by 2 % or less the cheaper one first."""
 
     def key(pair: tuple[str, CellResult]) -> tuple[float, float]:
         rmse, cost = pair[1].rmse_position, pair[1].cost
-        step = round(float(np.log(rmse)) / EQUAL) if np.isfinite(rmse) and rmse > 0 else np.inf
+        step = np.inf
+        if np.isfinite(rmse) and rmse > 0:
+            step = round(float(np.log(rmse)) / EQUAL)
         return step, cost if np.isfinite(cost) else np.inf
 
     return sorted(results.items(), key=key)
@@ -98,10 +100,10 @@ def write_regime(regime: Regime, out: Path) -> list[Path]:
 def dumped(regime: Regime) -> str:
     """The map as JSON, a row a line."""
     manifest = dict(regime.manifest) | {"sweep": describe(regime.sweep), "columns": ["cell", "filter", *FIELDS]}
-    rows = [
-        json.dumps([number, name, *plain_numbers(result).values()], ensure_ascii=False)
-        for (number, name), result in sorted(regime.results.items(), key=lambda item: item[0])
-    ]
+    rows = []
+    for number, name in sorted(regime.results):
+        numbers = plain_numbers(regime.results[number, name])
+        rows.append(json.dumps([number, name, *numbers.values()], ensure_ascii=False))
     head = json.dumps(manifest, indent=1, ensure_ascii=False).removesuffix("\n}")
     return f'{head},\n "rows": [\n  ' + ",\n  ".join(rows) + "\n ]\n}\n"
 
@@ -133,13 +135,10 @@ def read_regime(path: Path | None = None) -> Regime:
     if not isinstance(data, dict) or data.get("kind") != MAP_KIND or data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: is not a map; give a folder of 'consistency sweep', or its map.json")
     sweep = sweep_from(data, path)
+    results: dict[tuple[int, str], CellResult] = {}
     with reading(str(path), "key 'rows' is damaged; write the map again"):
-        results = dict(_rows(data))
+        for row in data["rows"]:
+            numbers = dict(zip(data["columns"], row, strict=True))
+            key = int(numbers.pop("cell")), str(numbers.pop("filter"))
+            results[key] = result_from(numbers)
     return Regime(sweep, results, {k: v for k, v in data.items() if k not in ("rows", "columns", "sweep")})
-
-
-def _rows(data: Mapping[str, Any]) -> Iterator[tuple[tuple[int, str], CellResult]]:
-    for row in data["rows"]:
-        fields = dict(zip(data["columns"], row, strict=True))
-        number, name = int(fields.pop("cell")), str(fields.pop("filter"))
-        yield (number, name), result_from(fields)

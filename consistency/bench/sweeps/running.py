@@ -1,131 +1,84 @@
-"""Doing a sweep: every filter in every cell of a share, beside other processes that do the same."""
+"""Doing a sweep: every filter in every cell, beside other processes that do the same."""
 
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from functools import partial
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from consistency.bench.filters import get_filter
 from consistency.bench.runs.backends.local import worker_count
-from consistency.bench.runs.compiling import compile_all, first_trials
-from consistency.bench.runs.trial_work import Backend
-from consistency.bench.store.journal import Busy, Journal, unfinished_of
+from consistency.bench.store.journal import Busy, unfinished_of
 from consistency.bench.sweeps.cell import CellResult, run_cell
 from consistency.bench.sweeps.plan import Sweep
 from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
-from consistency.referee.system.stopping import Stop, stoppable
 
-LOOKED_AT = 400  # cells whose kernels are compiled ahead, 10 ms each; cells of one grid differ little
 PAUSE = 1.0  # s, between looks at whether another process has done what is left
 
 
-def run_sweep(
-    sweep: Sweep,
-    out: Path,
-    part: int = 1,
-    parts: int = 1,
-    jobs: int = -1,
-    overwrite: bool = False,
-    backend: Backend | None = None,
-) -> tuple[SweepFolder, int]:
-    """Do what is not done yet of a share, each filter in each cell by itself.
+def run_sweep(sweep: Sweep, out: Path, overwrite: bool = False, jobs: int = -1, **how: Any) -> SweepFolder:
+    """Do what is not done yet, each filter in each cell by itself.
 
-    Finished runs of a cell are kept in a journal until the cell is done, so that the same call goes on within it.
+    Finished runs of a cell are kept in a journal until the cell is done, so that the same call continues within it.
+    Several processes may write into one folder; no cell is done twice.
 
     Parameters
     ----------
-    out : folder, which may hold a part of the same sweep; several processes may write into it, and do no cell twice
-    part, parts : this share, 1 to ``parts``
+    out : folder, which may hold a part of the same sweep
     overwrite : run cells again that were made with other inputs
-    backend : where the runs are done, if not by ``jobs`` workers of this machine
-
-    Returns
-    -------
-    The folder, and how much of the whole sweep is missing
+    jobs, how : who does the runs, as for :func:`consistency.bench.runs.sequential.run_until_decided`
 
     Raises
     ------
     InputError
         The folder is something else's, or holds cells that were made with other inputs; a number out of range.
-    KeyboardInterrupt
-        Ctrl-C; what is finished is kept.
     """
-    if not 1 <= part <= parts:
-        raise InputError(f"--share {part}/{parts}: must be I/N with I from 1 to N")
     worker_count(jobs)
     folder = SweepFolder(sweep, Path(out))
     folder.require_usable(overwrite)
-    share = folder.all_work(part, parts)
     folder.begin()
+    work = folder.all_work()
     # unfinished work is of a process at work, or of one that was killed as it ended
-    todo = [work for work in share if folder.fresh(work) is None or unfinished_of(folder.place(work)).exists()]
-    if len(todo) < len(share):
-        say(f"{len(share) - len(todo)} of {len(share)} are there already")
-    with stoppable() as stop:
-        if backend is None:
-            with suppress(Exception):  # what breaks a cell is said of it
-                _compile(sweep, todo, jobs)
-            if stop.number is not None:
-                raise KeyboardInterrupt
-        for count, (work, seconds) in enumerate(_in_turn(folder, todo, partial(_do, stop, jobs, backend)), 1):
-            left = _left(seconds * (len(todo) - count))
-            say(f"{count} of {len(todo)}: {work.text}: {_said(folder.done(work))}{left}")
-    missing = sum(folder.fresh(work) is None for work in folder.all_work())
-    return folder, missing
+    todo = [each for each in work if folder.result(each) is None or unfinished_of(folder.place(each)).exists()]
+    if len(todo) < len(work):
+        say(f"{len(work) - len(todo)} of {len(work)} are there already")
+    started = time.monotonic()
+    for count, done in enumerate(_in_turn(folder, todo, {"jobs": jobs, **how}), 1):
+        left = (time.monotonic() - started) / count * (len(todo) - count)
+        say(f"{count} of {len(todo)}: {done.text}: {_outcome_text(folder.result(done))}{_time_left(left)}")
+    return folder
 
 
-def _compile(sweep: Sweep, todo: Sequence[CellWork], jobs: int) -> None:
-    """Compile what the cells need before the first, so that the time left is that of cells."""
-    some = todo[:: len(todo) // LOOKED_AT + 1]
-    names = ((name, work.cell.scenario) for work in some for name in (work.filter, sweep.reference))
-    compile_all(first_trials((get_filter(name), world) for name, world in names), worker_count(jobs))
-
-
-def _in_turn(
-    folder: SweepFolder, todo: Sequence[CellWork], do: Callable[[SweepFolder, CellWork, Journal], None]
-) -> Iterator[tuple[CellWork, float]]:
-    """Do all of it, and give each when it is there, with the mean time of those that were done here.
-
-    What another process is at work on is come back to.
-    """
-    waiting, is_said, count, started = deque(todo), False, 0, time.monotonic()
-    while waiting:
-        busy: deque[CellWork] = deque()
-        for work in waiting:
+def _in_turn(folder: SweepFolder, todo: list[CellWork], how: dict[str, Any]) -> Iterator[CellWork]:
+    """Do each, and yield it when it is there; what another process is at work on is tried again after the others."""
+    is_told = False
+    while todo:
+        busy = []
+        for work in todo:
             try:
-                with _refusals(folder), folder.at_work(work) as journal:
-                    if folder.fresh(work) is None:  # nobody has done it meanwhile
-                        do(folder, work, journal)
-                        count += 1
+                with _system_refusals(folder), folder.at_work(work) as journal:
+                    if folder.result(work) is None:  # nobody has done it meanwhile
+                        begun = time.monotonic()
+                        outcome = run_cell(folder.sweep, work.cell, work.filter, journal=journal, **how)
+                        folder.write(work, outcome, time.monotonic() - begun)
             except Busy:
                 busy.append(work)
             else:
-                yield work, (time.monotonic() - started) / max(count, 1)
-        if len(busy) == len(waiting):
-            if not is_said:
+                yield work
+        if len(busy) == len(todo):
+            if not is_told:
                 say(f"waiting for another process, which is at work on the last {len(busy)}")
-            is_said = True
+            is_told = True
             time.sleep(PAUSE)
-        waiting = busy
-
-
-def _do(stop: Stop, jobs: int, backend: Backend | None, folder: SweepFolder, work: CellWork, journal: Journal) -> None:
-    begun = time.monotonic()
-    outcome = run_cell(folder.sweep, work.cell, work.filter, jobs, backend, journal)
-    if stop.number is not None:  # and the cell took it for an error of its own
-        raise KeyboardInterrupt
-    folder.write(work, outcome, time.monotonic() - begun)
+        todo = busy
 
 
 @contextmanager
-def _refusals(folder: SweepFolder) -> Iterator[None]:
-    """What the system refuses, in one sentence."""
+def _system_refusals(folder: SweepFolder) -> Iterator[None]:
+    """Say what the system refuses in one sentence."""
     try:
         yield
     except OSError as error:
@@ -134,13 +87,13 @@ def _refusals(folder: SweepFolder) -> Iterator[None]:
         ) from error
 
 
-def _said(result: CellResult | None) -> str:
+def _outcome_text(result: CellResult | None) -> str:
     if result is None:
         return "removed meanwhile"
     return f"{result.status} after {result.runs} runs" if result.runs else result.diagnosis
 
 
-def _left(seconds: float) -> str:
-    return (
-        f"; {seconds / 60.0:.0f} min left" if seconds >= 90.0 else f"; {seconds:.0f} s left" if seconds >= 1.0 else ""
-    )
+def _time_left(seconds: float) -> str:
+    if seconds >= 90.0:
+        return f"; {seconds / 60.0:.0f} min left"
+    return f"; {seconds:.0f} s left" if seconds >= 1.0 else ""

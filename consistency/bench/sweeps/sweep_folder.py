@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import itertools
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,13 +35,11 @@ CODE = (
 @functools.cache
 def code_digest() -> str:
     """Hash of the sources that the numbers of a cell depend on."""
-    root = Path(__file__).parents[2]
-    paths = (
-        path for name in CODE for path in ((root / name).rglob("*.py") if (root / name).is_dir() else (root / name,))
-    )
-    digest = hashlib.sha256()
-    for path in sorted(paths):
-        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    root, digest = Path(__file__).parents[2], hashlib.sha256()
+    for name in CODE:
+        place = root / name
+        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -82,34 +79,31 @@ class SweepFolder:
             **sweep.rule.model_dump(), "code": code_digest(),
         }  # fmt: skip
 
-    def done(self, work: CellWork) -> CellResult | None:
-        """The result that is there; None where there is none.
+    def result(self, work: CellWork) -> CellResult | None:
+        """The result that was made with these inputs; None where there is none.
 
         Raises
         ------
         InputError
-            It was made with other inputs, or is damaged.
+            What is there is damaged.
         """
         path = self.place(work)
-        if not path.exists():
+        if not path.exists() or self.changed_input(work):
             return None
-        manifest = read_manifest(path)
-        before, now = manifest.get("inputs"), self.inputs(work)
+        with reading(path / "manifest.json", "key 'result' is damaged; remove that folder"):
+            return result_from(read_manifest(path)["result"])
+
+    def changed_input(self, work: CellWork) -> str:
+        """What the result that is there was made with otherwise than now, in words; empty where all is the same."""
+        path = self.place(work)
+        before = read_manifest(path).get("inputs")
         if not isinstance(before, dict):
             raise InputError(f"{path}/manifest.json: key 'inputs' is missing; remove that folder")
-        for key, value in now.items():
+        for key, value in self.inputs(work).items():
             if before.get(key) != value:
                 what = "source code of the bench" if key == "code" else key
-                raise StaleCell(f"{path}: made with another {what} ({before.get(key)}, now {value})")
-        with reading(path / "manifest.json", "key 'result' is damaged; remove that folder"):
-            return result_from(manifest["result"])
-
-    def fresh(self, work: CellWork) -> CellResult | None:
-        """The result with these inputs; None where there is none, or one with others."""
-        try:
-            return self.done(work)
-        except StaleCell:
-            return None
+                return f"{path}: made with another {what} ({before.get(key)}, now {value})"
+        return ""
 
     def require_usable(self, overwrite: bool) -> None:
         """Refuse before any work a folder of something else, and unless ``overwrite`` cells made with other inputs."""
@@ -121,24 +115,26 @@ class SweepFolder:
             raise InputError(f"--out {self.path}: is not a folder of 'consistency sweep' ({error})") from None
         if kind != KIND:
             raise InputError(f"--out {self.path}: holds {kind}, not a sweep; choose another folder")
-        stale = []
-        for work in () if overwrite else self.all_work():
-            try:
-                self.done(work)
-            except StaleCell as error:
-                stale.append(error)
-        if stale:
-            more = f" (and {len(stale) - 1} more)" if len(stale) > 1 else ""
+        if overwrite:
+            return
+        there = [work for work in self.all_work() if self.place(work).exists()]
+        changed = [text for work in there if (text := self.changed_input(work))]
+        if changed:
+            more = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
             raise InputError(
-                f"{stale[0]}{more}; add --overwrite to run such cells again, or give another --out to keep them"
+                f"{changed[0]}{more}; add --overwrite to run such cells again, or give another --out to keep them"
             )
 
-    def all_work(self, part: int = 1, parts: int = 1) -> list[CellWork]:
-        """Every filter in every cell of a share."""
-        return [CellWork(cell, name) for cell in self.sweep.share(part, parts) for name in self.sweep.filters]
+    def all_work(self) -> list[CellWork]:
+        """Every filter in every cell, in an order that mixes the grid.
+
+        Slow cells lie together in the grid; mixed, the time left is foreseen.
+        """
+        mixed = sorted(self.sweep.cells, key=lambda cell: hashlib.sha256(cell.name.encode()).digest())
+        return [CellWork(cell, name) for cell in mixed for name in self.sweep.filters]
 
     def begin(self) -> None:
-        """Make the folder, or take over the one that is there; other shares may do so at the same time."""
+        """Make the folder, or take over the one that is there; other processes may do so at the same time."""
         manifest = manifest_of(kind=KIND, sweep=describe(self.sweep))
         if not self.path.exists():
             try:
@@ -189,13 +185,13 @@ class SweepFolder:
 
     def results(self) -> dict[tuple[int, str], CellResult]:
         """What is there, by number of the cell and filter; results with other inputs are left out."""
-        places = itertools.product(self.sweep.cells, self.sweep.filters)
-        found = ((cell.number, name, self.fresh(CellWork(cell, name))) for cell, name in places)
-        return {(number, name): result for number, name, result in found if result is not None}
-
-
-class StaleCell(InputError):
-    """A cell that was made with other inputs."""
+        found: dict[tuple[int, str], CellResult] = {}
+        for cell in self.sweep.cells:
+            for name in self.sweep.filters:
+                result = self.result(CellWork(cell, name))
+                if result is not None:
+                    found[cell.number, name] = result
+        return found
 
 
 def describe(sweep: Sweep) -> dict[str, Any]:
@@ -223,23 +219,25 @@ def sweep_from(manifest: dict[str, Any], path: Path) -> Sweep:
     """
     with reading(path, "key 'sweep' is damaged; write it again"):
         data = manifest["sweep"]
-        varied = data.get("alone", {})
-        lists = [data["filters"], *data["grid"].values(), *varied.values()]
-        if not all(isinstance(values, list) and values for values in lists):
-            raise ValueError("filters and values must be lists")
-        if not all(isinstance(name, str) for name in data["filters"]):
-            raise ValueError("filters must be names")
         base = Scenario.model_validate(data["base"])
-        axes = [Axis(key, tuple(values)) for key, values in data["grid"].items()]
-        axes += [alone(Axis(key, tuple(values)), base) for key, values in varied.items()]
+        axes = [Axis(key, _listed(values)) for key, values in data["grid"].items()]
+        axes += [alone(Axis(key, _listed(values)), base) for key, values in data.get("alone", {}).items()]
+        filters = _listed(data["filters"])
+        if not all(isinstance(name, str) for name in filters):
+            raise ValueError("filters must be names")
         if number_of_points(axes) > MOST_CELLS:
             raise ValueError(f"more than {MOST_CELLS} cells")
-        sweep = Sweep(
-            str(data["name"]), str(data["summary"]), base, tuple(axes),
-            tuple(data["filters"]), int(data["seed"]), StoppingRule.model_validate(data["rule"]),
-        )  # fmt: skip
+        rule = StoppingRule.model_validate(data["rule"])
+        name, summary, seed = str(data["name"]), str(data["summary"]), int(data["seed"])
+        sweep = Sweep(name, summary, base, tuple(axes), filters, seed, rule)
         _ = sweep.cells  # each is checked when it is made
         return sweep
+
+
+def _listed(values: Any) -> tuple[Any, ...]:
+    if not isinstance(values, list) or not values:
+        raise ValueError("filters and values must be lists")
+    return tuple(values)
 
 
 def open_sweep(path: Path) -> SweepFolder:

@@ -39,24 +39,27 @@ def groups_of(text: str, belief: Belief) -> tuple[NoiseGroup, ...]:
     InputError
         An unknown channel, one that is named twice, or one whose noise is zero and stays so whatever its factor.
     """
-    known = {"Q": [f"Q.{name}" for name in MOTION], "R": [f"R.{name}" for name in CHANNELS[belief.sensor.model]]}
-    sigma, groups, seen = sigma_by_channel(belief), [], set[str]()
+    sigma, known = sigma_by_channel(belief), dict[str, list[str]]()
+    for noise in ("Q", "R"):
+        members = [channel for channel in sigma if channel.startswith(noise)]
+        known[noise] = [channel for channel in members if sigma[channel] > 0.0]
+        known |= {channel: [channel] for channel in members}
+    groups, seen = [], set[str]()
     for name in (part.strip() for part in text.split(",")):
         channels: list[str] = []
         for member in (part.strip() for part in name.split("+")):
-            if member not in known and member not in sigma:
-                allowed = ", ".join(channel for part in known for channel in (part, *known[part]))
-                raise InputError(f"--groups {text}: unknown noise '{member}'; there are {allowed}")
-            wanted = [channel for channel in known.get(member, [member]) if member not in known or sigma[channel] > 0.0]
-            if not wanted or sigma[wanted[0]] == 0.0:
+            if member not in known:
+                raise InputError(f"--groups {text}: unknown noise '{member}'; there are {', '.join(known)}")
+            if not any(sigma[channel] for channel in known[member]):
                 raise InputError(
                     f"--groups {text}: '{member}' is believed to be zero, which no factor changes; believe in a noise, "
                     "or leave it out"
                 )
-            channels += wanted
-        if twice := sorted(seen & set(channels)) or [c for c in channels if channels.count(c) > 1]:
-            raise InputError(f"--groups {text}: '{twice[0]}' is named twice; it has one factor")
-        seen |= set(channels)
+            channels += known[member]
+        for channel in channels:
+            if channel in seen:
+                raise InputError(f"--groups {text}: '{channel}' is named twice; it has one factor")
+            seen.add(channel)
         groups.append(NoiseGroup(name, tuple(channels)))
     return tuple(groups)
 
@@ -72,9 +75,10 @@ def scaled(belief: Belief, groups: Sequence[NoiseGroup], log_factors: Array) -> 
 
 def rounded(belief: Belief) -> Belief:
     """The belief with the digits that are written of its standard deviations."""
-    return _with_sigma(
-        belief, {channel: float(f"{value:.{DIGITS}g}") for channel, value in sigma_by_channel(belief).items()}
-    )
+    sigma = sigma_by_channel(belief)
+    for channel, value in sigma.items():
+        sigma[channel] = float(f"{value:.{DIGITS}g}")
+    return _with_sigma(belief, sigma)
 
 
 def sigma_by_channel(belief: Belief) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The result of a fit: in words, as rows of a table, as data for programs, and as files to go on with."""
+"""The result of a fit: in words, as rows of a table, as data for programs, and as files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.scenario import Belief, scenario_text, toml_text
-from consistency.bench.scenario.toml_tables import SIGMA_UNITS
+from consistency.bench.scenario.tables.toml_tables import SIGMA_UNITS
 from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.log import Log, sensor_text
 from consistency.bench.tuning.fit import LIMIT
@@ -24,13 +24,12 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.system.provenance import manifest_of
 
-TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}
 KIND = "tuning"
 
 
 @dataclass(frozen=True)
 class Factor:
-    """Factor on the variances of a group of noises, with a 95 % interval, NaN without one.
+    """Factor on the variances of a group of noises, with a 95 % interval.
 
     The interval is open, with an end of 0 or infinity, on a side on which the data do not bound the factor.
     ``edge`` is -1 or 1 where the factor lies at the lower or upper limit of what is tried, which is then no estimate.
@@ -46,7 +45,6 @@ class Factor:
 class Setting:
     """A fit, the belief that it leads to, and the verdict on it."""
 
-    by: str  # "innovations", "nees", or "size": nearest to consistent where errors are as large as stated
     factors: tuple[Factor, ...]
     belief: Belief
     verdict: Verdict
@@ -55,22 +53,12 @@ class Setting:
 
 @dataclass(frozen=True)
 class Tuning:
-    """Result of a fit, with the verdicts before and after it.
-
-    ``chosen`` is the fitted setting. If a fault is found in it and the truth is known, ``other`` is the setting nearest
-    to consistent on the runs of the fit, among settings whose errors have the stated size; ``tried`` is the number of
-    those settings. ``no_setting`` is true if a fault is found in both, and also in other runs of a scenario with its
-    true noises believed.
-    """
+    """Result of a fit, with the verdicts before and after it."""
 
     filter: str
     parts: Parts
     before: Verdict  # with the belief as it was, on the runs that are judged
     chosen: Setting
-    other: Setting | None
-    tried: int
-    no_setting: bool  # no setting is consistent, as far as they were tried
-    why: tuple[str, ...]  # what the referee finds, and the cause
     seconds: float
 
     @property
@@ -81,6 +69,11 @@ class Tuning:
     @property
     def consistent(self) -> bool:
         return self.verdict.consistent
+
+    @property
+    def has_fault(self) -> bool:
+        """Whether a fault is found after the fit; an undecided verdict has none."""
+        return self.verdict.status not in ("consistent", "undecided")
 
     @property
     def factors(self) -> tuple[Factor, ...]:
@@ -99,33 +92,26 @@ def lines(tuning: Tuning, out: Path | None = None) -> list[str]:
     """What to print beside the table of verdicts; ``out`` is the folder that was written."""
     parts, chosen = tuning.parts, tuning.chosen
     text = [
-        f"{tuning.filter} on {parts.world.name}: fitted by {TITLE[chosen.by]} on {parts.about[0]}, judged on "
-        f"{parts.about[1]} ({chosen.settings} settings, {tuning.seconds:.0f} s)",
-        *_factors(chosen, parts.belief),
+        f"{tuning.filter} on {parts.world.name}: fitted by the likelihood of the innovations on {parts.fitted_on}, "
+        f"judged on {parts.judged_on} ({chosen.settings} settings, {tuning.seconds:.0f} s)",
+        *_factor_lines(chosen, parts.belief),
         f"before: {tuning.before.reasons[0]}{_power(tuning.before)}",
         f"after: {chosen.verdict.reasons[0]}{_power(chosen.verdict)}",
     ]
-    if (other := tuning.other) is not None:
-        text += [
-            f"of {tuning.tried} other settings, at which errors are as large as stated, the nearest to consistent is:",
-            *_factors(other, parts.belief), f"on {parts.about[1]}: {other.verdict.reasons[0]}{_power(other.verdict)}",
-        ]  # fmt: skip
-        if not tuning.no_setting:
-            text += [
-                "it leaves no fault, but is not the setting of the greatest score: its noises make up for something "
-                "else, and hold in worlds like this one alone"
-            ]
-    if tuning.no_setting:
-        names = ", ".join(factor.group.name for factor in tuning.factors)
-        text += [f"no setting of {names} is consistent, of {tuning.tried + 1} tried:"]
-    text += [f"  - {reason}" for reason in tuning.why]
+    if tuning.has_fault:
+        names = ", ".join(factor.group.name for factor in chosen.factors)
+        chance = f"one of {1.0 / chosen.verdict.settings.false_alarm:.3g} verdicts on a right filter"
+        text.append(
+            f"the size of {names} is not all that is wrong, unless the fault was found by chance, as in {chance}; "
+            "docs/tuning.md says what else may be"
+        )
     text += ["", noise_table(tuning).rstrip()]
     if out is not None:
         text += ["", f"{out} has {', '.join(files(tuning))}{_next(tuning, out)}"]
     return text
 
 
-def _factors(setting: Setting, before: Belief) -> list[str]:
+def _factor_lines(setting: Setting, before: Belief) -> list[str]:
     old, new = sigma_by_channel(before), sigma_by_channel(setting.belief)
     rows = []
     for factor in setting.factors:
@@ -137,17 +123,20 @@ def _factors(setting: Setting, before: Belief) -> list[str]:
 def factor_text(factor: Factor) -> str:
     """x1.02 [0.97, 1.07], of variances; "at most" or "at least" where the data bound it on one side alone."""
     low, high = factor.interval.low, factor.interval.high
-    bound = f"at most x{short(high)}" if np.isfinite(high) else f"at least x{short(low)}" if low > 0.0 else ""
+    value, sure = f"x{short(factor.value)}", f"with {100.0 * CONFIDENCE:g} %"
+    bound = ""
+    if np.isfinite(high):
+        bound = f"at most x{short(high)}"
+    elif low > 0.0:
+        bound = f"at least x{short(low)}"
     if factor.edge:
         limit = np.exp(factor.edge * LIMIT)
-        return f"is at the limit of what is tried, x{limit:g}; {bound or 'not known'} with {100.0 * CONFIDENCE:g} %"
-    if np.isnan(low):
-        return f"x{short(factor.value)}"
-    if not bound:
-        return f"x{short(factor.value)}, which these data do not bound"
+        return f"is at the limit of what is tried, x{limit:g}; {bound or 'not known'} {sure}"
     if low > 0.0 and np.isfinite(high):
-        return f"x{short(factor.value)} [{short(low)}, {short(high)}]"
-    return f"x{short(factor.value)}, {bound} with {100.0 * CONFIDENCE:g} %"
+        return f"{value} [{short(low)}, {short(high)}]"
+    if bound:
+        return f"{value}, {bound} {sure}"
+    return f"{value}, which these data do not bound"
 
 
 def _power(verdict: Verdict) -> str:
@@ -162,20 +151,22 @@ def noise_table(tuning: Tuning) -> str:
     belief = tuning.belief
     motion = {"sigma_v": belief.motion.sigma_v, "sigma_omega": belief.motion.sigma_omega}
     sigma = {f"sigma{SIGMA_UNITS[belief.sensor.model]}": list(belief.sensor.sigma)}
-    is_log = isinstance(tuning.parts.world, Log)
-    return toml_text(sigma | {"motion": motion} if is_log else {"belief": {"motion": motion, "sensor": sigma}})
+    if isinstance(tuning.parts.world, Log):
+        return toml_text(sigma | {"motion": motion})
+    return toml_text({"belief": {"motion": motion, "sensor": sigma}})
 
 
 def files(tuning: Tuning) -> dict[str, str]:
-    """Texts by name of the file: the tuned world, or sensor, and what came of the fit."""
+    """Text of the tuned world, or sensor, by name of its file."""
     world, belief = tuning.parts.world, tuning.belief
-    comment = f"{tuning.filter} tuned by {TITLE[tuning.chosen.by]} on {tuning.parts.about[0]}: {tuning.verdict.status}"
+    comment = (
+        f"{tuning.filter} tuned by the likelihood of the innovations on {tuning.parts.fitted_on}: "
+        f"{tuning.verdict.status}"
+    )
     if isinstance(world, Log):
-        named = {"sensor.toml": f"# {comment}\n{sensor_text(Path(world.name), belief)}"}
-    else:
-        name = f"{world.name}-tuned"
-        named = {f"{name}.toml": scenario_text(with_belief(world, belief, name), comment)}
-    return named
+        return {"sensor.toml": f"# {comment}\n{sensor_text(Path(world.name), belief)}"}
+    name = f"{world.name}-tuned"
+    return {f"{name}.toml": scenario_text(with_belief(world, belief, name), comment)}
 
 
 def _next(tuning: Tuning, out: Path) -> str:
@@ -189,8 +180,7 @@ def _next(tuning: Tuning, out: Path) -> str:
 
 def verdicts(tuning: Tuning) -> dict[str, Verdict]:
     """Rows of the table of verdicts, by name."""
-    rows = {f"{tuning.filter}, as believed": tuning.before, f"{tuning.filter}, tuned": tuning.verdict}
-    return rows | ({} if tuning.other is None else {f"{tuning.filter}, scaled to its errors": tuning.other.verdict})
+    return {f"{tuning.filter}, as believed": tuning.before, f"{tuning.filter}, tuned": tuning.verdict}
 
 
 def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
@@ -203,7 +193,9 @@ def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
             (at / name).write_text(text, encoding="utf-8")
 
     world = tuning.parts.world
-    origin = {"log": world.name, "log_sha256": world.sha256} if isinstance(world, Log) else {"scenario": world.name}
+    origin = {"scenario": world.name}
+    if isinstance(world, Log):
+        origin = {"log": world.name, "log_sha256": world.sha256}
     manifest = manifest_of(KIND, wall=tuning.seconds, filters=[tuning.filter], **origin)
     write_tables(out, {}, manifest, contents, overwrite)
 
@@ -213,38 +205,36 @@ def as_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:
     data = {
         "filter": tuning.filter,
         "world": tuning.parts.world.name,
-        "fitted_on": tuning.parts.about[0],
-        "judged_on": tuning.parts.about[1],
-        "before": _verdict(tuning.before),
-        "chosen": _setting(tuning.chosen),
-        "nearest": None if tuning.other is None else _setting(tuning.other),
-        "tried": tuning.tried,
+        "fitted_on": tuning.parts.fitted_on,
+        "judged_on": tuning.parts.judged_on,
+        "before": _verdict_data(tuning.before),
+        "chosen": _setting_data(tuning.chosen),
         "consistent": tuning.consistent,
-        "no_setting": tuning.no_setting,
-        "why": list(tuning.why),
         "seconds": tuning.seconds,
         "out": None if out is None else str(out),
     }
     return dict(plain(data))
 
 
-def _setting(setting: Setting) -> Mapping[str, Any]:
-    factors = [
-        {
-            "group": factor.group.name, "channels": list(factor.group.channels), "factor": factor.value,
-            "low": factor.interval.low, "high": factor.interval.high, "edge": factor.edge,
-        }
-        for factor in setting.factors
-    ]  # fmt: skip
+def _setting_data(setting: Setting) -> Mapping[str, Any]:
+    factors = []
+    for factor in setting.factors:
+        group, interval = factor.group, factor.interval
+        row = {"group": group.name, "channels": list(group.channels), "factor": factor.value}
+        factors.append(row | {"low": interval.low, "high": interval.high, "edge": factor.edge})
     return {
-        "by": setting.by, "factors": factors, "sigma": sigma_by_channel(setting.belief), "settings": setting.settings,
-        "verdict": _verdict(setting.verdict),
-    }  # fmt: skip
+        "factors": factors,
+        "sigma": sigma_by_channel(setting.belief),
+        "settings": setting.settings,
+        "verdict": _verdict_data(setting.verdict),
+    }
 
 
-def _verdict(verdict: Verdict) -> Mapping[str, Any]:
+def _verdict_data(verdict: Verdict) -> Mapping[str, Any]:
     return {
-        "status": verdict.status, "reasons": list(verdict.reasons), "runs": verdict.runs,
+        "status": verdict.status,
+        "reasons": list(verdict.reasons),
+        "runs": verdict.runs,
         "statistics": plain(verdict.statistics),
         "detectable": None if verdict.scale is None else verdict.scale.detectable,
-    }  # fmt: skip
+    }

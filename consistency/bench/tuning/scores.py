@@ -1,4 +1,4 @@
-"""How well a filter foresees what comes: the log density that it gives to its innovations, or to its errors."""
+"""How well a filter predicts its observations: the log density that it gives to its innovations."""
 
 from __future__ import annotations
 
@@ -19,51 +19,41 @@ from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.scenario import Belief
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Estimates, Trial
-from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
 from consistency.referee.types import Array
 
-BY = ("innovations", "nees")
 EVERY = 5.0  # seconds between lines of progress
 
 
-class Score(NamedTuple):
-    """Of one run of T steps."""
+class RunScore(NamedTuple):
+    """Score of one run of T steps."""
 
-    log_density: Array  # (T,), 0 in a step that says nothing
-    squares: float  # sum of NIS or NEES,
+    log_density: Array  # (T,), 0 in a step without an innovation
+    nis: float  # sum over the steps,
     dof: float  # which has this expectation if the covariances are right
     failure: str  # why the run failed, or nothing
 
 
-def require_scorable(filter_: Filter, by: str, has_truth: bool) -> None:
-    """Refuse what cannot be scored before any run.
+def require_scorable(filter_: Filter) -> None:
+    """Refuse a filter that leaves observations out: the likelihood of those it keeps prefers a small noise.
 
     Raises
     ------
     InputError
-        An unknown score, no truth for the NEES, or a filter that leaves observations out: the likelihood of those
-        that it keeps prefers a small noise, with which it keeps few.
+        It has a gate or a guard.
     """
-    if by not in BY:
-        raise InputError(f"--by must be {' or '.join(BY)}, got '{by}'")
-    if by == "nees" and not has_truth:
-        raise InputError("--by nees needs the truth, and the log has none; take --by innovations")
-    if by == "innovations" and (rejects(filter_) or getattr(filter_, "guard", None) is not None):
+    if rejects(filter_) or getattr(filter_, "guard", None) is not None:
         raise InputError(
             f"filter '{name_of(filter_)}' leaves observations out, so that its innovations say too little of the "
-            "noise; tune the filter without its guard, or by --by nees"
+            "noise; tune the filter without its guard"
         )
 
 
-def score_of(trial: Trial, estimates: Estimates, by: str) -> Score:
-    """The score of a run.
+def score_of(trial: Trial, estimates: Estimates) -> RunScore:
+    """Return the likelihood of the observations of a run (Schweppe 1965, IEEE Trans. Inf. Theory 11(1), eq. 9).
 
-    By innovations it is the likelihood of the observations (Schweppe 1965, IEEE Trans. Inf. Theory 11(1), eq. 9). What
-    begins a landmark is left out of it, as in a diffuse likelihood: no density is stated for it. By NEES it is the
-    logarithmic score (Good 1952) of the stated Gaussian at the error of the pose, in the error that the filter states
-    the covariance of.
+    The observation that begins a landmark is left out, as in a diffuse likelihood: no density is stated for it.
 
     Raises
     ------
@@ -71,34 +61,26 @@ def score_of(trial: Trial, estimates: Estimates, by: str) -> Score:
         The filter reports no innovations.
     """
     outcome = outcome_of(trial, [replace(estimates, map=None)])
-    reason = "".join(f"step {failure.step}: {failure.reason}" for failure in outcome.failures)
-    if by == "innovations":
-        squares, dof = estimates.nis, estimates.nis_dof.astype(float)
-        if not reason and (estimates.log_det is None or not np.isfinite(estimates.log_det).any()):
+    failure = "".join(f"step {failure.step}: {failure.reason}" for failure in outcome.failures)
+    nis, dof, log_det = estimates.nis, estimates.nis_dof.astype(float), estimates.log_det
+    if log_det is None or not np.isfinite(log_det).any():
+        if not failure:
             raise InputError(
                 f"filter '{estimates.filter}' reports no innovations: its update must return an Info with innovation "
-                "and S; or fit the errors by --by nees"
+                "and S"
             )
-        log_det = np.full(len(squares), np.nan) if estimates.log_det is None else estimates.log_det
-    else:
-        [columns] = outcome.estimates.values()
-        squares = np.full(trial.steps, np.nan)
-        squares[: len(columns["step"])] = columns.get("own_nees", columns["nees"])
-        P = estimates.covariance if estimates.own is None else estimates.own
-        counted = np.isfinite(squares)
-        log_det, dof = np.full(trial.steps, np.nan), np.full(trial.steps, float(len(POSE)))
-        log_det[counted] = np.linalg.slogdet(P[counted])[1]
-    known = np.isfinite(squares) & np.isfinite(log_det) & (dof > 0)
-    density = np.where(known, -0.5 * (squares + log_det + dof * np.log(2.0 * np.pi)), 0.0)
-    return Score(density, float(squares[known].sum()), float(dof[known].sum()), reason)
+        log_det = np.full(len(nis), np.nan)
+    known = np.isfinite(nis) & np.isfinite(log_det) & (dof > 0)
+    density = np.where(known, -0.5 * (nis + log_det + dof * np.log(2.0 * np.pi)), 0.0)
+    return RunScore(density, float(nis[known].sum()), float(dof[known].sum()), failure)
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Of R runs of up to T steps at one setting."""
+    """Scores of R runs of up to T steps at one setting."""
 
     log_density: Array  # (R, T), 0 in steps that a run does not have
-    ratio: float  # total NIS or NEES over its degrees of freedom
+    ratio: float  # total NIS over its degrees of freedom
     failures: tuple[str, ...]  # of runs that failed
 
 
@@ -110,24 +92,17 @@ class BeliefScorer:
     Parameters
     ----------
     belief : that a fit begins with
-    by : one of :data:`BY`
     timeout : seconds a trial of a filter that is not compiled
     """
 
     def __init__(
-        self,
-        filter_: Filter,
-        trials: Sequence[Trial],
-        belief: Belief,
-        by: str,
-        jobs: int = -1,
-        timeout: float | None = None,
+        self, filter_: Filter, trials: Sequence[Trial], belief: Belief, jobs: int = -1, timeout: float | None = None
     ) -> None:
-        self.filter, self.trials, self.by, self.timeout = filter_, list(trials), by, timeout
-        self.workers = min(worker_count(jobs), len(self.trials))
+        self.filter, self.trials = filter_, list(trials)
         self.settings, self.began = 0, time.monotonic()
         self._told = self.began
-        self._pool = ThreadPoolExecutor(self.workers)  # kernels release the GIL; other filters run in processes
+        # kernels release the GIL; other filters run in processes
+        self._pool = ThreadPoolExecutor(min(worker_count(jobs), len(self.trials)))
         self._isolation = Isolation([filter_], belief, timeout)
 
     def __enter__(self) -> BeliefScorer:
@@ -139,10 +114,11 @@ class BeliefScorer:
         self._pool.shutdown(cancel_futures=True)
 
     def compile(self) -> None:
+        """Compile the filter, so that its first setting takes no longer than others."""
         compile_all([(self.filter, self.trials[0], self._isolation.belief)])
 
     def __call__(self, belief: Belief) -> Scores:
-        """Scores of all runs.
+        """Return the scores of all runs.
 
         Raises
         ------
@@ -152,19 +128,28 @@ class BeliefScorer:
         with one_blas_thread():
             scores = list(self._pool.map(lambda trial: self._score(trial, belief), self.trials))
         self.settings += 1
-        now = time.monotonic()
-        if now - self._told >= EVERY:
-            self._told = now
-            count = f"{self.settings} settings on {len(self.trials)} run{'s' * (len(self.trials) != 1)}"
-            say(f"fitting {name_of(self.filter)} by {self.by}: {count} each, {now - self.began:.0f} s")
+        self._tell()
         density = np.zeros((len(scores), max(trial.steps for trial in self.trials)))
-        for row, score in zip(density, scores, strict=True):
+        failures = []
+        for row, trial, score in zip(density, self.trials, scores, strict=True):
             row[: len(score.log_density)] = score.log_density
+            if score.failure:
+                failures.append(f"run {trial.run}, {score.failure}")
         dof = sum(score.dof for score in scores)
-        ratio = sum(score.squares for score in scores) / dof if dof else np.nan
-        failed = [(trial.run, score.failure) for trial, score in zip(self.trials, scores, strict=True) if score.failure]
-        return Scores(density, ratio, tuple(f"run {run}, {reason}" for run, reason in failed))
+        ratio = sum(score.nis for score in scores) / dof if dof else np.nan
+        return Scores(density, ratio, tuple(failures))
 
-    def _score(self, trial: Trial, belief: Belief) -> Score:
+    def _score(self, trial: Trial, belief: Belief) -> RunScore:
         [estimates] = self._isolation.run(trial, belief)
-        return score_of(trial, estimates, self.by)
+        return score_of(trial, estimates)
+
+    def _tell(self) -> None:
+        """Print a line of progress, every few seconds."""
+        now = time.monotonic()
+        if now - self._told < EVERY:
+            return
+        self._told = now
+        say(
+            f"fitting {name_of(self.filter)}: {self.settings} settings on each of {len(self.trials)} runs, "
+            f"{now - self.began:.0f} s"
+        )

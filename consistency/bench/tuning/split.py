@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -26,12 +25,10 @@ class Parts:
 
     world: Scenario | Log
     trials: list[Trial]  # of the fit
-    on_fitted: Judging  # results on these
-    on_fresh: Judging  # and on the other part
-    about: tuple[str, str]  # what is fitted, and what is judged
-    spare_seed: int  # of runs for neither
+    on_fresh: Judging  # results on the other part
+    fitted_on: str  # in words
+    judged_on: str
     again: str  # options by which ``consistency run`` judges again; empty where it cannot
-    has_truth: bool
 
     @property
     def belief(self) -> Belief:
@@ -42,38 +39,36 @@ class Parts:
 def parts_of(world: Scenario | Log, runs: int, seed: int) -> Parts:
     """So many runs of a scenario and as many fresh ones; or the first half of a log and its second.
 
-    A log of one run is divided in the middle of its steps. The second part begins anew, with an empty map.
+    A log of one run is divided in the middle of its steps. The second part begins with an empty map.
 
     Raises
     ------
     InputError
         A number out of its range, nothing in view, or a log that cannot be divided.
     """
-    if isinstance(world, Log):
-        return _of_log(world)
+    return _parts_of_log(world) if isinstance(world, Log) else _parts_of_scenario(world, runs, seed)
+
+
+def _parts_of_scenario(scenario: Scenario, runs: int, seed: int) -> Parts:
     require_counts(runs, seed)
-    for_fit, for_verdict, spare = (int(state) for state in np.random.SeedSequence(seed).generate_state(3))
-    simulated = Simulated(world, for_fit)
-    count = f"{runs} run{'s' * (runs != 1)}"
-    return Parts(
-        world, [simulated(run) for run in range(runs)], partial(_simulated, world, runs, for_fit),
-        partial(_simulated, world, runs, for_verdict),
-        (count, f"{count} that the fit has not seen"), spare, f"--runs {runs} --seed {for_verdict}", True,
-    )  # fmt: skip
+    for_fit, for_verdict = (int(state) for state in np.random.SeedSequence(seed).generate_state(2))
+    simulated = Simulated(scenario, for_fit)
+    trials = [simulated(run) for run in range(runs)]
+
+    def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Results:
+        return run_trials(with_belief(scenario, belief), [filter_], runs, for_verdict, jobs, timeout)
+
+    count = _runs(runs)
+    fresh = f"{count} that the fit has not seen"
+    return Parts(scenario, trials, on_fresh, count, fresh, f"--runs {runs} --seed {for_verdict}")
 
 
-def _simulated(
-    scenario: Scenario, runs: int, seed: int, filter_: Filter, belief: Belief, jobs: int, timeout: float | None
-) -> Results:
-    return run_trials(with_belief(scenario, belief), [filter_], runs, seed, jobs, timeout)
-
-
-def _of_log(log: Log) -> Parts:
+def _parts_of_log(log: Log) -> Parts:
     trials = log.trials
     if len(trials) > 1:
         half = (len(trials) + 1) // 2
         first, second = trials[:half], trials[half:]
-        about = f"the first {half} run{'s' * (half != 1)}", f"the other {len(second)}"
+        fitted_on, judged_on = f"the first {_runs(half)}", f"the other {len(second)}"
     else:
         [only] = trials
         if log.belief.sensor.model == "linear":
@@ -82,29 +77,41 @@ def _of_log(log: Log) -> Parts:
         if middle < 1:
             raise InputError(f"--log {log.name}: one run of one step cannot be divided; give a longer one")
         first, second = [part_of(only, 0, middle)], [part_of(only, middle, only.steps)]
-        about = f"the first {middle} steps", f"the other {only.steps - middle}, which begin with an empty map"
+        fitted_on = f"the first {middle} steps"
+        judged_on = f"the other {only.steps - middle}, which begin with an empty map"
 
-    has_truth = all(trial.truth is not None for trial in trials)
-    return Parts(log, first, partial(_recorded, log, first), partial(_recorded, log, second), about, 0, "", has_truth)
+    def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Results:
+        return run_log(replace(log, trials=second, belief=belief), [filter_], jobs, timeout)
+
+    return Parts(log, first, on_fresh, fitted_on, judged_on, "")
 
 
-def _recorded(
-    log: Log, trials: list[Trial], filter_: Filter, belief: Belief, jobs: int, timeout: float | None
-) -> Results:
-    return run_log(replace(log, trials=trials, belief=belief), [filter_], jobs, timeout)
+def _runs(count: int) -> str:
+    return "1 run" if count == 1 else f"{count} runs"
 
 
 def part_of(trial: Trial, start: int, end: int) -> Trial:
     """Steps ``start`` + 1 to ``end`` as a trial of its own: it begins at the true pose, or at the origin without."""
     rows = slice(trial.first[start], trial.first[end])
-    truth = None if trial.truth is None else trial.truth[start : end + 1]
-    pose = trial.start if start == 0 else np.zeros(3) if truth is None else truth[0]
-    source = None if trial.source is None else trial.source[rows]
+    truth = source = None
+    pose = trial.start if start == 0 else np.zeros(3)
+    if trial.truth is not None:
+        truth = trial.truth[start : end + 1]
+        pose = trial.start if start == 0 else truth[0]
+    if trial.source is not None:
+        source = trial.source[rows]
     return replace(
-        trial, start=pose, controls=trial.controls[start:end], first=trial.first[start : end + 1] - trial.first[start],
-        landmark=trial.landmark[rows], z=trial.z[rows], truth=truth, source=source,
-    )  # fmt: skip
+        trial,
+        start=pose,
+        controls=trial.controls[start:end],
+        first=trial.first[start : end + 1] - trial.first[start],
+        landmark=trial.landmark[rows],
+        z=trial.z[rows],
+        truth=truth,
+        source=source,
+    )
 
 
 def with_belief(scenario: Scenario, belief: Belief, name: str | None = None) -> Scenario:
+    """The scenario with another belief."""
     return scenario.variant(name or scenario.name, belief=belief.model_dump(), summary=scenario.summary)

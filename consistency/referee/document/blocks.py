@@ -1,8 +1,8 @@
-"""What a document is made of, beside figures: text, tables, lists of facts."""
+"""What a document is made of: text, tables, lists of facts, figures."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -10,7 +10,6 @@ import numpy as np
 
 if TYPE_CHECKING:
     from consistency.referee.document.colours import Look
-    from consistency.referee.document.drawing import Figure, Key
 
 
 @dataclass(frozen=True)
@@ -19,7 +18,6 @@ class Heading:
 
     text: str
     level: int = 3
-    paper: str = ""  # text on paper; empty: no heading there
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,6 @@ class Small:
     """A line in small print under the text of a cell."""
 
     text: str
-    paper: str | None = None  # another text on paper
     italic: bool = False
 
 
@@ -120,10 +117,6 @@ class Column:
     number: bool = False  # set at the right
     most: int | None = None  # characters of it on a terminal
 
-    @property
-    def short(self) -> str:
-        return self.paper or self.head
-
 
 @dataclass(frozen=True)
 class Table:
@@ -133,9 +126,7 @@ class Table:
     groups: tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]  # title, or none, and rows
     label: str  # what a screen reader says
     caption: str = ""
-    paper: str = ""  # another caption on paper
     style: Literal["", "narrow", "prose", "marks", "grouped", "plain"] = ""
-    apart: bool = False  # on a screen the caption stands above the table, not in it
     whole: bool = False  # not broken between pages
 
     @property
@@ -168,11 +159,10 @@ class Settings:
 
 @dataclass(frozen=True)
 class Details:
-    """Blocks that a reader of the page unfolds; on paper, blocks under a heading, or under none."""
+    """Blocks that a reader of the page unfolds; on paper, blocks under a heading."""
 
     summary: str
     blocks: tuple[Facts | Settings, ...]
-    paper: str = ""  # heading on paper
     whole: bool = False  # not broken between pages
 
 
@@ -183,7 +173,26 @@ class Bullets:
     texts: tuple[str, ...]
 
 
-Block: TypeAlias = "Figure | Heading | Text | Table | Reasons | Facts | Bullets | Settings | Details"
+@dataclass(frozen=True)
+class Figure:
+    """Drawings with one caption; each is drawn when a page is made."""
+
+    title: str
+    caption: str
+    drawings: tuple[Callable[[], Any], ...]  # each gives a figure of Matplotlib
+    level: int = 3  # of the heading
+
+
+@dataclass(frozen=True)
+class Switch:
+    """A filter that a reader of the page can hide."""
+
+    text: str
+    look: Look
+    tag: str  # of the filter in one study
+
+
+Block: TypeAlias = Figure | Heading | Text | Table | Reasons | Facts | Bullets | Settings | Details
 
 
 @dataclass(frozen=True)
@@ -195,7 +204,7 @@ class Chapter:
     link: str  # in the contents
     blocks: tuple[Block, ...]
     summary: str = ""
-    switches: tuple[Key, ...] = ()  # filters that a reader can hide
+    switches: tuple[Switch, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -215,8 +224,6 @@ class Document:
 
     @property
     def figures(self) -> tuple[Figure, ...]:
-        from consistency.referee.document.drawing import Figure
-
         return tuple(block for part in self.parts for block in part if isinstance(block, Figure))
 
     @property

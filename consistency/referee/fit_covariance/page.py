@@ -2,67 +2,92 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE, DETECT
-from consistency.referee.document.blocks import Block, Chapter, Document
-from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE, ZERO, solid, style
-from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, Span
+from consistency.referee.document.blocks import Chapter, Document, Figure
+from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, ZERO, solid, style
 from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan
 from consistency.referee.fit_covariance.model_text import noise_document
 from consistency.referee.fit_covariance.motion_windows import span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
 from consistency.referee.fit_covariance.white_noise import nees_of
 from consistency.referee.pages.write_pages import plotted
+from consistency.referee.show.painting import (
+    canvas,
+    curve,
+    dots,
+    log_axis,
+    name_rows,
+    panel_legend,
+    path,
+    points,
+    stroke,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
 
 SHOWN = 3  # spans with a panel of errors
-WIDTH, HEIGHT = 3.0, 2.7  # inches, of a panel
+MANY = 2000  # errors of motions that are drawn
 CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
+EACH = replace(style(0), size=2.0, alpha=0.7)
 
 
-def noise_page(model: NoiseModel, with_pictures: bool) -> Document:
+def noise_page(model: NoiseModel) -> Document:
+    """What the model says, and its pictures."""
     said = noise_document(model)
-    blocks: tuple[Block, ...] = noise_figures(model) if with_pictures else ()
-    return Document(said.title, "", (Chapter("pictures", "Pictures", "pictures", blocks),), said.opening, said.data)
+    return Document(said.title, "", (Chapter("", "", "", noise_figures(model)),), said.opening, said.data)
 
 
 def noise_figures(model: NoiseModel) -> tuple[Figure, ...]:
-    captions = (
-        (
-            "Errors of motions",
-            "Errors of corrected motions in x and y, in the body's frame at their end, with the ellipse that holds "
-            "95 % of them where the covariance is right (the mean of all windows).",
-        ),
-        (
-            "Growth and ratios",
-            "Mean squared error of each axis over the span (markers) beside the model, which is fitted at the shortest "
-            "span alone (lines); and the ratio of true to stated covariance of each judged drive.",
-        ),
+    """Errors of motions, growth of the errors, and the drives."""
+    errors = (
+        "Errors of corrected motions in x and y, in the body's frame at their end, with the ellipse that holds "
+        "95 % of them where the covariance is right (the mean of all windows)."
     )
-    return tuple(
-        Figure(title, caption, (), tuple(Sheet((panel,), HEIGHT, WIDTH) for panel in shown))
-        for (title, caption), shown in zip(captions, panels(model), strict=True)
+    growth = (
+        "Mean squared error of each axis over the span (markers) beside the model, which is fitted at the shortest "
+        "span alone (lines); and the ratio of true to stated covariance of each judged drive."
+    )
+    return (
+        Figure("Errors of motions", errors, (partial(_draw, model, above=True),)),
+        Figure("Growth and ratios", growth, (partial(_draw, model, below=True),)),
     )
 
 
-def panels(model: NoiseModel) -> tuple[tuple[Panel, ...], ...]:
-    d = 2 if len(model.noise.axes) == 3 else 3
-    growth = (_growth(model, range(d), "m²"), _growth(model, range(d, len(model.noise.axes)), "rad²"))
-    return tuple(_errors(model, judged) for judged in model.spans[:SHOWN]), (*growth, _drives(model))
-
-
-def plot_noise(model: NoiseModel, path: str | Path | None) -> Any:
+def plot_noise(model: NoiseModel, at: str | Path | None) -> Drawing:
     """All panels in one figure of Matplotlib; see :meth:`NoiseModel.plot`."""
-    errors, rest = panels(model)
-    return plotted(Sheet((*errors, *rest), 5.0, columns=3), path)
+    return plotted(partial(_draw, model, above=True, below=True), at)
 
 
-def _errors(model: NoiseModel, judged: JudgedSpan) -> Panel:
+def _draw(model: NoiseModel, above: bool = False, below: bool = False) -> Drawing:
+    """Errors of the first spans, a panel each, and below them growth and drives."""
+    spans = model.spans[:SHOWN]
+    axes = range(len(model.noise.axes))
+    d = 2 if len(axes) == 3 else 3
+    many = above * len(spans) + below * 3
+    figure, panels = canvas(2.0 * -(-many // 3), 3, many)
+    if above:
+        for panel, judged in zip(panels, spans, strict=False):
+            _draw_errors(panel, model, judged)
+    if below:
+        growth, turns, drives = panels[-3:]
+        _draw_growth(growth, model, axes[:d], "m²")
+        _draw_growth(turns, model, axes[d:], "rad²")
+        _draw_drives(drives, model)
+    return figure
+
+
+def _draw_errors(axes: Axes, model: NoiseModel, judged: JudgedSpan) -> None:
     windows = error_windows(model, judged)
     error, C = windows.errors, model.noise.covariance(windows.pieces).mean(axis=0)[:2, :2]
     values, vectors = np.linalg.eigh(C)
@@ -70,45 +95,40 @@ def _errors(model: NoiseModel, judged: JudgedSpan) -> Panel:
     ellipse = radius * (vectors * np.sqrt(np.maximum(values, 0.0))) @ np.array([np.cos(CIRCLE), np.sin(CIRCLE)])
     squared = nees_of(error[:, :2], model.noise.covariance(windows.pieces)[:, :2, :2])
     inside = float((stats.chi2.cdf(squared, 2) < CONFIDENCE).mean())
-    marks: tuple[Mark, ...] = (
-        Points(error[:, 0], error[:, 1], replace(style(0), size=2.5, alpha=0.7), whole=True),
-        Line(ellipse[0], ellipse[1], solid(style(1)), path=True),
-        Rule("x", 0.0, ZERO), Rule("y", 0.0, ZERO),
-    )  # fmt: skip
+    axes.axvline(0.0, **stroke(ZERO))
+    axes.axhline(0.0, **stroke(ZERO))
+    points(axes, error[:, 0], error[:, 1], EACH, limit=MANY)
+    path(axes, ellipse.T, solid(style(1)))
     title = f"{span_of(judged.span).text}: {100 * inside:.0f} % of {len(error)} inside"
-    return Panel(Axis("error in x (m)"), Axis("error in y (m)"), marks, f"Errors over {judged.span}", title=title)
+    axes.set(xlabel="error in x (m)", ylabel="error in y (m)", title=title)
 
 
-def _growth(model: NoiseModel, axes: range, unit: str) -> Panel:
+def _draw_growth(panel: Axes, model: NoiseModel, axes: Sequence[int], unit: str) -> None:
     found = [error_windows(model, judged) for judged in model.spans]
     spans = np.array([windows.span.size for windows in found])
     squares = np.array([(windows.errors**2).mean(axis=0) for windows in found])
     stated = np.array([
         np.diagonal(model.noise.covariance(windows.pieces), axis1=1, axis2=2).mean(axis=0) for windows in found
     ])  # fmt: skip
-    marks: list[Mark] = []
-    for look, axis in enumerate(axes):
-        marks += [
-            Line(spans, stated[:, axis], solid(style(look))), Points(spans, squares[:, axis], style(look), whole=True),
-        ]  # fmt: skip
-    keys = tuple(Key(model.noise.axes[axis], style(look), "points") for look, axis in enumerate(axes))
+    for number, axis in enumerate(axes):
+        curve(panel, spans, stated[:, axis], solid(style(number)))
+        panel.plot(spans, squares[:, axis], label=model.noise.axes[axis], **dots(style(number)))
     unit_of_span = {"step": "steps"}.get(found[0].span.unit, found[0].span.unit)
-    return Panel(
-        Axis(f"span ({unit_of_span})", log=True), Axis(f"mean squared error ({unit})", log=True), tuple(marks),
-        "Growth of the squared error over spans", keys=keys,
-    )  # fmt: skip
+    panel.set(xlabel=f"span ({unit_of_span})", ylabel=f"mean squared error ({unit})")
+    log_axis(panel, "x")
+    log_axis(panel, "y")
+    panel_legend(panel)
 
 
-def _drives(model: NoiseModel) -> Panel:
+def _draw_drives(axes: Axes, model: NoiseModel) -> None:
+    """Ratio of true to stated covariance, a row for each drive."""
     ratios = model.spans[0].by_drive[:, 0]
     known = np.flatnonzero(np.isfinite(ratios))
-    rows = np.arange(len(known), dtype=float)
-    marks: tuple[Mark, ...] = (
-        Span("x", 1.0 / DETECT, DETECT, SHADE), Rule("x", 1.0, EXPECTED), Rule("x", model.ratio.value, LIMIT),
-        Points(ratios[known], rows, style(0), whole=True),
-    )  # fmt: skip
-    names, most = tuple(model.drives[i].name for i in known), max(2.0, 1.1 * float(ratios[known].max()))
-    return Panel(
-        Axis("true over stated covariance", window=(0.0, most)), Axis("", rows=names), marks,
-        f"Ratios of {len(known)} drives", title=f"ratios over {span_of(model.span).text}",
-    )  # fmt: skip
+    name_rows(axes, [model.drives[i].name for i in known])
+    axes.axvspan(1.0 / DETECT, DETECT, color=BAND, linewidth=0, zorder=0.4)
+    axes.axvline(1.0, **stroke(EXPECTED))
+    axes.axvline(model.ratio.value, **stroke(LIMIT))
+    axes.plot(ratios[known], np.arange(len(known)), **dots(style(0)))
+    most = max(2.0, 1.1 * float(ratios[known].max()))
+    title = f"ratios over {span_of(model.span).text}"
+    axes.set(xlabel="true over stated covariance", xlim=(0.0, most), title=title)

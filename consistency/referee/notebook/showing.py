@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import Any
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.diagnostics.words.numbers import plural
-from consistency.referee.document.blocks import Bullets, Facts
+from consistency.referee.document.blocks import Bullets, Facts, Figure
 from consistency.referee.document.verdict import summary
+from consistency.referee.errors import InputError
 from consistency.referee.show import as_html, text
 
 
@@ -26,8 +28,7 @@ def record_html(record: Record) -> str:
         ("runs", str(len(record.run_numbers))), ("steps", str(len(record.t))), ("error", record.convention or "-"),
         ("components", ", ".join(record.axes)), ("failed runs", str(len(record.failures))),
     )  # fmt: skip
-    table, notes = (as_html.block(each) for each in (Facts(rows), Bullets(record.notes)))
-    return f"<div><strong>{escape(record.name)}</strong>{table}{notes}</div>"
+    return f"<div><strong>{escape(record.name)}</strong>{as_html.fragment(Facts(rows), Bullets(record.notes))}</div>"
 
 
 def verdict_text(verdict: Verdict) -> str:
@@ -36,17 +37,20 @@ def verdict_text(verdict: Verdict) -> str:
 
 def verdict_html(verdict: Verdict) -> str:
     """The sentence, the table, and below it the picture where the record is kept and one can be drawn."""
-    from consistency.referee.pages.core_page import picture
+    from consistency.referee.pages.record_figures import overview
 
-    pictures = () if verdict.record is None else picture(verdict.record, verdict)
-    return as_html.fragment(*summary(verdict)) + "".join(map(as_html.block, pictures))
+    blocks = list(summary(verdict))
+    if verdict.record is not None:
+        with suppress(InputError):  # neither errors nor NEES
+            blocks.append(Figure("Errors, NEES, coverage", "", (overview(verdict.record, verdict),)))
+    return as_html.fragment(*blocks)
 
 
 def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Any:
     """See :meth:`Record.plot`."""
-    from consistency.referee.pages.files_report import record_sheet
+    from consistency.referee.pages.record_figures import overview
     from consistency.referee.pages.write_pages import plotted
 
     if record.error is not None and not record.axes:
         record = replace(record, axes=numbered_axes(record.error.shape[-1]))
-    return plotted(record_sheet(record, verdict), path)
+    return plotted(overview(record, verdict), path)

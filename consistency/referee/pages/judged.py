@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.referee.diagnostics import Verdict
+from consistency.referee.document.blocks import Switch
 from consistency.referee.document.colours import Look, style
-from consistency.referee.document.drawing import Axis, Key, Owner
 from consistency.referee.types import Array, Failure, Indices
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 EPOCH = 1e6  # s; times beyond are shown from the first on
 
@@ -23,21 +27,15 @@ class Clock:
     word: str  # "s" or "step"
     note: str = ""  # where the clock begins, if not at zero
 
-    @property
-    def axis(self) -> Axis:
-        """Shared by all panels along the runs."""
-        return Axis(self.label, share="clock")
+    def name(self, axes: Axes) -> None:
+        """The name of the axis of time, below a panel."""
+        axes.set_xlabel(self.label)
 
-    @property
-    def whole(self) -> Axis:
-        """Axis over the range from zero to the last step."""
-        last = float(self.values[-1]) if len(self.values) else 1.0
-        return Axis(self.label, window=(min(0.0, float(self.values[:1].sum())), last), share="clock")
-
-    @property
-    def tips(self) -> tuple[tuple[str, str], ...]:
-        """Time and step of a point whose columns hold ``step``."""
-        return (("step", "@step"),) if self.word == "step" else (("time", "@x{0.00} s"), ("step", "@step"))
+    def span(self, axes: Axes) -> None:
+        """Draw the axis from zero to the last step."""
+        self.name(axes)
+        if len(self.values):
+            axes.set_xlim(min(0.0, float(self.values[0])), float(self.values[-1]))
 
 
 def clock_of(t: Array) -> Clock:
@@ -63,17 +61,13 @@ class Estimator:
 
     name: str
     style: int  # the same number for the same filter in the whole report
-    tag: str  # of the filter in this study, for what belongs to it on a page
+    tag: str  # of the filter in this study, which its checkbox has
     verdict: Verdict
     failures: tuple[Failure, ...]  # of all runs, also of those after the look that decided
 
     @property
     def look(self) -> Look:
         return style(self.style)
-
-    @property
-    def owner(self) -> Owner:
-        return Owner(self.name, self.tag)
 
     @property
     def innovations_judged(self) -> bool:
@@ -126,9 +120,10 @@ class Judged:
             for failure in track.failures
         ]
 
-    def keys(self, marked: bool = False) -> tuple[Key, ...]:
-        """Entries of a legend, one a filter; ``marked``: with the filter's marker."""
-        return tuple(Key(track.name, track.look, marked=marked, owner=track.owner) for track in self.tracks)
+    @property
+    def switches(self) -> tuple[Switch, ...]:
+        """Filters that a reader can hide."""
+        return tuple(Switch(track.name, track.look, track.tag) for track in self.tracks)
 
 
 def wide(values: list[Array]) -> bool:

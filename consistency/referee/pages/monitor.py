@@ -4,67 +4,74 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
 from consistency.referee.document.colours import EXPECTED, LIMIT, style
-from consistency.referee.document.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span, thin
-from consistency.referee.show import with_matplotlib
+from consistency.referee.show.painting import canvas, curve, log_axis, points, stroke
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitor_sources import Watched
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
+
 HEIGHT = 3.6  # inches
+LONG = 2000  # test ratios drawn of a sensor
 POINTS = 600  # at most, of the NIS: few enough to see a change among them
+EACH = replace(style(0), size=1.8, alpha=0.7)
 FAULT = replace(style(1), dash=(), width=1.1)
 
 
-def monitor_plot(shown: Watched | Sequence[GateRatios], kind: str) -> bytes:
-    """NIS / dof above, the e-value below, over the steps of the file, or test ratios; ``kind`` is png, pdf or svg."""
+def monitor_drawing(shown: Watched | Sequence[GateRatios]) -> Drawing:
+    """NIS / dof above, the e-value below, over the steps of the file, or test ratios, a sensor above the other."""
     if isinstance(shown, Watched):
-        return with_matplotlib.render(sheet(shown), kind)
-    return with_matplotlib.render(Sheet(tuple(map(_ratios, shown)), HEIGHT * len(shown) / 2.0, columns=1), kind)
+        figure, (above, below) = canvas(HEIGHT, panels=2, sharex=True)
+        _draw_sizes(above, shown)
+        _draw_evidence(below, shown)
+        return figure
+    figure, panels = canvas(HEIGHT * len(shown) / 2.0, panels=len(shown), sharex=True)
+    for axes, each in zip(panels, shown, strict=True):
+        _draw_ratios(axes, each)
+    panels[-1].set_xlabel("t / s")
+    return figure
 
 
-def _ratios(each: GateRatios) -> Panel:
+def _draw_ratios(axes: Axes, each: GateRatios) -> None:
     """Test ratios of a sensor over time, the gate, and what a right filter seldom exceeds."""
-    keep = thin(each.ratio)
-    marks: list[Mark] = [Points(each.t[keep], each.ratio[keep], replace(style(0), size=2.0, alpha=0.7))]
-    marks += [Rule("y", at, look) for at, look in ((1.0, LIMIT), (each.unusual, EXPECTED)) if np.isfinite(at)]
-    alt = f"Test ratios of {each.sensor} over time"
-    return Panel(Axis("t / s", share="t"), Axis("test ratio"), tuple(marks), alt, title=each.sensor)
+    points(axes, each.t, each.ratio, EACH, limit=LONG)
+    for at, look in ((1.0, LIMIT), (each.unusual, EXPECTED)):
+        if np.isfinite(at):
+            axes.axhline(at, **stroke(look))
+    axes.set(ylabel="test ratio", title=each.sensor)
 
 
-def sheet(watched: Watched) -> Sheet:
-    """One panel above the other, over the same steps."""
-    return Sheet((_sizes(watched), _evidence(watched)), HEIGHT, columns=1)
-
-
-def _sizes(watched: Watched) -> Panel:
+def _draw_sizes(axes: Axes, watched: Watched) -> None:
+    """NIS over its degrees of freedom."""
     step, ratio, together = averaged(watched.step, watched.nis_over_dof)
-    label = "NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})"
-    points = Points(step, ratio, replace(style(0), size=2.0, alpha=0.7))
-    return Panel(
-        Axis("step", share="step"), Axis(label, log=bool((ratio > 0).any())), (points, Rule("y", 1.0, EXPECTED)),
-        f"NIS over degrees of freedom of {watched.name} over steps", title=watched.name,
-    )  # fmt: skip
+    points(axes, step, ratio, EACH, limit=POINTS)
+    axes.axhline(1.0, **stroke(EXPECTED))
+    axes.set(ylabel="NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})", title=watched.name)
+    if (ratio > 0).any():
+        log_axis(axes, "y")
 
 
-def _evidence(watched: Watched) -> Panel:
+def _draw_evidence(axes: Axes, watched: Watched) -> None:
     """E-value after each step with the value at which an alarm is raised; since the fault it is shaded.
 
     What goes on beyond the square of that value is cut off.
     """
     threshold, alarm = watched.monitor.threshold, watched.alarm
-    marks: list[Mark] = []
     if alarm is not None:
-        marks.append(Span("x", float(alarm.since), float(alarm.step), replace(FAULT, alpha=0.15)))
-        marks.append(Rule("x", float(alarm.step), FAULT))
-    marks += [Rule("y", threshold, LIMIT), Line(watched.step, watched.evidence, style(0))]
-    return Panel(
-        Axis("step", share="step"), Axis("e-value", log=True, most=threshold**2), tuple(marks),
-        f"E-value of {watched.name} over steps",
-    )  # fmt: skip
+        axes.axvspan(float(alarm.since), float(alarm.step), color=FAULT.colour, alpha=0.15, linewidth=0)
+        axes.axvline(float(alarm.step), **stroke(FAULT))
+    axes.axhline(threshold, **stroke(LIMIT))
+    curve(axes, watched.step, watched.evidence, style(0))
+    axes.set(xlabel="step", ylabel="e-value")
+    log_axis(axes, "y")
+    axes.set_ylim(top=min(axes.get_ylim()[1], threshold**2))
 
 
 def averaged(step: Array, ratio: Array) -> tuple[Array, Array, int]:

@@ -10,7 +10,6 @@ from consistency.referee.document import blocks
 from consistency.referee.document.blocks import Block, Column, Heading, Small, Stack, Text, table
 from consistency.referee.document.wording import p_cell
 from consistency.referee.pages.judged import Judged
-from consistency.referee.pages.section import STUDY, Section
 
 FOUND, TOLERATED, NOT_FOUND, NOT_ASKED = "✗", "≈", "○", "–"
 MARKS = {FOUND: "found", TOLERATED: "found, within the tolerance", NOT_FOUND: "not found", NOT_ASKED: "not asked"}
@@ -26,36 +25,27 @@ class Question:
     answers: tuple[Answer | None, ...]  # None: could not be asked
 
 
-@dataclass(frozen=True)
-class Questions:
-    """All questions, in the referee's order."""
-
-    study: Judged
-    asked: tuple[Question, ...]
-
-
-def read(study: Judged) -> Questions:
-    """The answers that the verdicts hold."""
+def asked(study: Judged) -> tuple[Question, ...]:
+    """All questions in the referee's order, with the answers that the verdicts hold."""
     by_filter = [{a.question: a for a in track.verdict.answers} for track in study.tracks]
     known = list(ABOUT) + [q for answers in by_filter for q in answers if q not in ABOUT]
     names = [q for q in dict.fromkeys(known) if any(q in answers for answers in by_filter)]
-    questions = (Question(q, ABOUT.get(q, ""), tuple(answers.get(q) for answers in by_filter)) for q in names)
-    return Questions(study, tuple(questions))
+    return tuple(Question(q, ABOUT.get(q, ""), tuple(answers.get(q) for answers in by_filter)) for q in names)
 
 
-def show(questions: Questions) -> tuple[Block, ...]:
+def diagnosis(study: Judged) -> tuple[Block, ...]:
     """Table with a row for each question and a column for each filter."""
-    study = questions.study
-    heading = Heading("Diagnosis", paper=f"Diagnosis of {study.name}")
-    if not questions.asked:
+    heading, questions = Heading("Diagnosis"), asked(study)
+    if not questions:
         return heading, Text("There was nothing to ask.")
-    first = Column("Question, and what is compared", width="3.2fr" if len(study.tracks) > NARROW else "2.2fr")
-    columns = (first, *(Column(track.name, width="1fr", number=True) for track in study.tracks))
+    width = "3.2fr" if len(study.tracks) > NARROW else "2.2fr"
+    filters = (Column(track.name, width="1fr", number=True) for track in study.tracks)
+    columns = (Column("Question, and what is compared", width=width), *filters)
     rows: list[tuple[blocks.Cell, ...]] = [
-        (Stack(q.name, (Small(q.about),), bold=True), *(_cell(answer) for answer in q.answers)) for q in questions.asked
+        (Stack(q.name, (Small(q.about),), bold=True), *map(_cell, q.answers)) for q in questions
     ]
     label = f"Questions asked of the filters of {study.name}"
-    return heading, table(columns, rows, label, caption=caption(questions), style="marks", apart=True, whole=True)
+    return heading, table(columns, rows, label, caption=caption(study), style="marks", whole=True)
 
 
 def answer_cell(answer: Answer | None) -> tuple[str, str]:
@@ -72,9 +62,9 @@ def _cell(answer: Answer | None) -> blocks.Answer:
     return blocks.Answer(mark, MARKS[mark], p, emphasis)  # type: ignore[arg-type]
 
 
-def caption(questions: Questions) -> str:
+def caption(study: Judged) -> str:
     """How to read the table."""
-    tracks = questions.study.tracks
+    tracks = study.tracks
     rate = 100 * tracks[0].verdict.settings.false_alarm if tracks else 5.0
     tolerance = next((track.verdict.settings.tolerated for track in tracks), 1.0)
     within = f"{TOLERATED} one was found, but is shown to lie within the tolerance of ×{tolerance:g}, "
@@ -84,9 +74,6 @@ def caption(questions: Questions) -> str:
         f"{NOT_ASKED} could not be asked. The number is the corrected p value: the false-alarm rate of the whole "
         f"verdict at which the fault would just be found ({rate:.2g} % or less is a fault)."
     )
-    if questions.study.until_decided:
+    if study.until_decided:
         text += f" A verdict between two looks asks {MAIN} alone; the p values of the others are then 1."
     return text
-
-
-SECTION = Section(STUDY, read, show)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.document.colours import TRUTH, Look, style
-from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet
-from consistency.referee.pages.one_step import has_one_step
+from consistency.referee.show.painting import dots, make_map, path
 from consistency.referee.types import Array, Indices
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 IN_WORLD = ("so2", "so3", "so3-body", "vector")  # errors whose position is about the axes of the world
+NAMES = "xyz"
 MOST = 5  # ellipses
 SHARE = 0.95  # of a right estimator's errors in a step that lie inside its ellipse
 CORNERS = 73
@@ -28,52 +33,61 @@ def shown_run(record: Evidence) -> int:
     return int(np.argmax(np.isfinite(record.error).all(axis=-1).sum(axis=1)))
 
 
-def trajectory(record: Evidence) -> Figure | None:
-    """Figure of the run that is drawn; None where positions are not known, or of runs of one step.
+def trajectory_panel(record: Evidence) -> tuple[str, Callable[[Axes], None]] | None:
+    """Caption, and what draws the shown run on axes; None where positions are not known.
 
     It shows the two axes over which the path reaches furthest.
     """
-    if record.path is None or record.error is None or record.window is not None or has_one_step(record):
+    if record.path is None or record.error is None or record.window is not None:
         return None
     row = shown_run(record)
     true, estimated = record.path[row, :, 0], record.path[row, :, 1]
     known = np.isfinite(record.path[row]).all(axis=(1, 2))
-    names = [axis for axis in ("x", "y", "z") if axis in record.axes]
-    if known.sum() < 2 or len(names) < 2:
+    if known.sum() < 2 or sum(axis in record.axes for axis in NAMES) < 2:
         return None
-    reach = np.ptp(true[known], axis=0)
-    axes = itertools.combinations(["xyz".index(name) for name in names], 2)
-    i, j = pair = list(max(axes, key=lambda two: float(np.prod(reach[list(two)]))))  # the first where they are alike
-    tips = (("x", "@x{0.000} m"), ("y", "@y{0.000} m"))
-    marks: list[Mark] = [
-        Line(true[:, i], true[:, j], TRUE, path=True, tips=tips),
-        Line(estimated[:, i], estimated[:, j], ESTIMATED, path=True, tips=tips),
-    ]
-    keys = [Key("truth", TRUE), Key("estimate", ESTIMATED)]
+    pair = furthest(record, np.ptp(true[known], axis=0))
     steps = _worst(record, row) if record.convention in IN_WORLD else np.empty(0, np.int64)
+
+    def paint(axes: Axes) -> None:
+        path(axes, true[:, pair], TRUE, "truth")
+        path(axes, estimated[:, pair], ESTIMATED, "estimate")
+        label = "95 % ellipse"
+        for outline in ellipses_at(record, row, steps, pair):
+            path(axes, outline, ELLIPSE, label)
+            label = ""
+        if len(steps):
+            axes.plot(*true[steps][:, pair].T, label="truth there", **dots(AT))
+        axes.set(xlabel=f"{NAMES[pair[0]]} (m)", ylabel=f"{NAMES[pair[1]]} (m)")
+        make_map(axes)
+
+    caption = f"Trajectory of {record.unit} {record.run_numbers[row]}, true and estimated."
     if len(steps):
-        assert record.covariance is not None
-        index = [list(record.axes).index("xyz"[axis]) for axis in pair]
-        P = np.asarray(record.covariance[row], float)[steps][:, index][:, :, index]
-        for centre, own in zip(estimated[steps][:, pair], P, strict=True):
-            outline = ellipse(centre, own)
-            marks.append(Line(outline[:, 0], outline[:, 1], ELLIPSE, path=True))
-        marks.append(Points(true[steps, i], true[steps, j], AT, whole=True, tips=tips))
-        keys += [Key("95 % ellipse", ELLIPSE), Key("truth there", AT, "points")]
-    where = ", ".join(str(step + 1) for step in sorted(steps))
-    caption = f"Trajectory of {record.unit} {record.run_numbers[row]}, true and estimated." + (
-        f" Ellipses: where the truth lies with 95 % by the stated covariance, in the steps whose errors are largest "
-        f"against it ({where}); crosses are the truth there."
-        if len(steps)
-        else " No ellipses: the stated covariance is not about the axes of the world."
-        if record.convention not in IN_WORLD
-        else ""
-    )
-    panel = Panel(
-        Axis(f"{'xyz'[i]} (m)"), Axis(f"{'xyz'[j]} (m)"), tuple(marks), f"Trajectory of {record.name}", height=420,
-        shape="map", equal=True,
-    )  # fmt: skip
-    return Figure("Trajectory", caption, (panel,), (Sheet((panel,), 3.0, keys=tuple(keys)),), tuple(keys))
+        where = ", ".join(str(step + 1) for step in sorted(steps))
+        caption += (
+            " Ellipses: where the truth lies with 95 % by the stated covariance, in the steps whose errors are "
+            f"largest against it ({where}); crosses are the truth there."
+        )
+    elif record.convention not in IN_WORLD:
+        caption += " No ellipses: the stated covariance is not about the axes of the world."
+    return caption, paint
+
+
+def furthest(record: Evidence, reach: Array) -> list[int]:
+    """Two of the position's axes that are judged, with the largest product of their reach (3,); else the first."""
+    judged = [i for i, name in enumerate(NAMES) if name in record.axes]
+    return list(max(itertools.combinations(judged, 2), key=lambda two: float(np.prod(reach[list(two)]))))
+
+
+def ellipses_at(record: Evidence, row: int, steps: Indices, pair: Sequence[int]) -> list[Array]:
+    """Outlines (corners, 2) of the 95 % regions of one run in some steps, about the estimates."""
+    if not len(steps):
+        return []
+    assert record.path is not None
+    assert record.covariance is not None
+    index = [list(record.axes).index(NAMES[axis]) for axis in pair]
+    P = np.asarray(record.covariance[row], float)[steps][:, index][:, :, index]
+    centres = record.path[row, steps, 1][:, list(pair)]
+    return [ellipse(centre, own) for centre, own in zip(centres, P, strict=True)]
 
 
 def ellipse(centre: Array, P: Array) -> Array:

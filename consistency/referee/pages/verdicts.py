@@ -23,11 +23,8 @@ def judgement(study: Judged) -> list[Block]:
     reasons = Reasons(tuple(reason(track.verdict, track.name, track.look) for track in study.tracks))
     view = with_values(page(equivalence_interval(study)), [track.verdict for track in study.tracks])
     cells_of = [(Name(track.name, track.look), *cells(view, track.verdict)) for track in study.tracks]
-    text = caption(study)
-    shown = table(
-        (FILTER, *columns(view)), cells_of, f"Verdicts of {study.name}", caption=text, paper=f"{study.name}: {text}",
-        style="narrow", apart=True,
-    )  # fmt: skip
+    label = f"Verdicts of {study.name}"
+    shown = table((FILTER, *columns(view)), cells_of, label, caption=caption(study), style="narrow")
     blocks: list[Block] = [Heading(study.name), shown, reasons]
     if study.failures:
         rows: list[tuple[Cell, ...]] = [(name, str(run), str(step), why) for name, run, step, why in study.failures]

@@ -6,9 +6,8 @@ Renderers of ``show`` write them. No statistic is computed here that the diagnos
 from __future__ import annotations
 
 import tempfile
-from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
@@ -16,14 +15,13 @@ from consistency.referee.show import rendered
 from consistency.referee.system.atomic import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
+
+    from matplotlib.figure import Figure as Drawing
 
     from consistency.referee.diagnostics import Evidence, Verdict
-    from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
     from consistency.referee.document.blocks import Document
-    from consistency.referee.document.drawing import Sheet
     from consistency.referee.system.progress import Advance
-    from consistency.referee.verdicts.monitor_sources import Watched
 
 KINDS = (".png", ".pdf", ".svg")  # of a plot
 
@@ -63,7 +61,7 @@ def write_file_reports(
 ) -> list[Path]:
     """``report.html``, ``report.pdf`` and ``verdict.json`` in a folder that appears whole or not at all.
 
-    Without the packages of [report] the page is a static one, and there is no PDF.
+    Without Matplotlib the page has no pictures, and without the packages of [report] there is no PDF.
 
     Parameters
     ----------
@@ -75,25 +73,15 @@ def write_file_reports(
     InputError
         The folder exists or cannot be written.
     """
+    from consistency.referee.pages.files_report import compose_files
     from consistency.referee.system.folders import write_folder
     from consistency.referee.system.provenance import manifest_of
 
-    manifest, is_static = manifest_of(kind="verdict", source=title), missing("report")
-    if is_static:
-        from consistency.referee.pages.core_page import compose_plain
-
-        document = compose_plain(records, judged, title)
-    else:
-        from consistency.referee.pages.files_report import compose_files
-
-        document = compose_files(records, judged, title, manifest)
+    manifest = manifest_of(kind="verdict", source=title)
+    document = compose_files(records, judged, title, manifest)
 
     def contents(at: Path) -> None:
-        html = at / "report.html"
-        if is_static:
-            write_file(html, rendered(document, html).encode("utf-8"))
-        else:
-            write_document(document, html, at / "report.pdf")
+        write_document(document, at / "report.html", at / "report.pdf" if not missing("report") else None)
         write_file(at / "verdict.json", data.encode("utf-8"))
 
     write_folder(folder, manifest, contents, overwrite)
@@ -118,17 +106,19 @@ def write_document(
     document: Document, html: Path | None, pdf: Path | None, *, advance: Advance = lambda _: None
 ) -> None:
     """The document in both formats, each file whole or not at all; None leaves one out."""
-    from consistency.referee.show.html import render_html
-    from consistency.referee.show.pdf import pdf_beside
+    from consistency.referee.show import as_html
+    from consistency.referee.show.svg import paint
 
     contents: list[tuple[Path, bytes]] = []
-    with pdf_beside(document) if pdf is not None else nullcontext(bytes) as finished:
-        if html is not None:
-            contents.append((html, render_html(document).encode("utf-8")))
-            advance(1)
-        if pdf is not None:
-            contents.append((pdf, finished()))
-            advance(1)
+    pictures = paint(document)
+    if html is not None:
+        contents.append((html, as_html.render(document, pictures).encode("utf-8")))
+        advance(1)
+    if pdf is not None:
+        from consistency.referee.show.pdf import render_pdf
+
+        contents.append((pdf, render_pdf(document, pictures)))
+        advance(1)
     for path, content in contents:
         write_file(path, content)
 
@@ -147,24 +137,23 @@ def require_plot(path: Path, overwrite: bool) -> None:
     require_writable(path, overwrite)
 
 
-def plotted(sheet: Sheet, path: str | Path | None) -> Any:
-    """A figure of Matplotlib, which is written to ``path`` as well; needs ``[plot]``."""
-    require("a plot", "plot")
-    from consistency.referee.show.with_matplotlib import drawn, picture
+def plotted(draw: Callable[[], Drawing], path: str | Path | None) -> Drawing:
+    """A figure of Matplotlib, which is written to ``path`` as well; needs ``[plot]``.
 
-    figure = drawn(sheet)
+    Raises
+    ------
+    InputError
+        Matplotlib is not installed, the kind of file is unknown, or it cannot be written.
+    """
+    require("a plot", "plot")
+    from consistency.referee.show.svg import drawn, saved
+
+    figure = drawn(draw)
     if path is not None:
         path = Path(path)
         require_plot(path, overwrite=True)
-        write_file(path, picture(figure, path.suffix.lower().removeprefix(".")))
+        write_file(path, saved(figure, path.suffix.lower().removeprefix(".")))
     return figure
-
-
-def write_monitor_plot(path: Path, shown: Watched | Sequence[GateRatios]) -> None:
-    """NIS and evidence of a run over its steps, or test ratios, as PNG, PDF or SVG by the suffix of ``path``."""
-    from consistency.referee.pages.monitor import monitor_plot
-
-    write_file(path, monitor_plot(shown, path.suffix.lower().removeprefix(".")))
 
 
 def require_writable(path: Path, overwrite: bool) -> None:

@@ -18,8 +18,8 @@ from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.words.numbers import p_text, plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
-from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.mix_ups.hints import Change, Pairs, hints
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble
 from consistency.referee.readers.truth_matching import Poses, common_times
 from consistency.referee.readers.windows import Relative, windows
@@ -162,11 +162,8 @@ def relative_recording(
     notes = _notes(name, found, axes, stretches[0].convention, relative)
     of = independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
     notes += _doubt(name, of, relative) if relative.independent else []
-    causes = _causes(name, stretches, axes, judged, relative)
-    notes += causes
     names = tuple(axes[i] for i in part)
     record = assemble(name, tracks, t, names, file, KIND, notes, may_end=relative.independent)
-    record = replace(record, causes=tuple(causes))
     if not relative.independent:
         return replace(record, window=relative.text)
     caption = f"the {_whose(relative)} do not seem to be independent, on which this rests" if of.doubtful else ""
@@ -174,7 +171,7 @@ def relative_recording(
     return replace(record, window=relative.text, independent=True, caption=caption, unshown=unshown)
 
 
-def _causes(
+def causes_of_motions(
     name: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
 ) -> list[str]:
     """Mix-ups of motions, or of poses with cross-covariances, without which the errors of the windows fit."""

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import glob
 import os
+import platform
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+
+PARTIAL = ".partial"  # at the end of the name of what is being written
 
 
 def write_whole(path: Path, content: bytes, mode: int | None = None) -> None:
     """Write beside ``path`` and rename; ``mode`` of the file, None for what the umask leaves. Raises OSError."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    for left in left_beside(path, path.parent):
+        left.unlink()
+    handle, name = tempfile.mkstemp(PARTIAL, f"{_prefix(path)}{os.getpid()}.", path.parent)
     partial = Path(name)
     try:
         with os.fdopen(handle, "wb") as file:
@@ -25,6 +32,35 @@ def write_whole(path: Path, content: bytes, mode: int | None = None) -> None:
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def partial_folder(path: Path, above: Path) -> Path:
+    """Make a folder in ``above`` for what is to stand at ``path``. Raises OSError."""
+    return Path(tempfile.mkdtemp(PARTIAL, f"{_prefix(path)}{os.getpid()}.", above))
+
+
+def left_beside(path: Path, above: Path) -> Iterator[Path]:
+    """Yield what processes of this machine that were killed have left in ``above`` of what was to stand at ``path``."""
+    for left in above.glob(f"{glob.escape(_prefix(path))}*{PARTIAL}"):
+        process = left.name.removeprefix(_prefix(path)).partition(".")[0]
+        if process.isdecimal() and not _lives(int(process)):
+            yield left
+
+
+def _prefix(path: Path) -> str:
+    return f".{path.name}.{platform.node()}-"
+
+
+def _lives(process: int) -> bool:
+    if os.name == "nt":  # where the question would end the process
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def make_durable(path: Path) -> None:

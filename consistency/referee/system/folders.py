@@ -6,7 +6,6 @@ import itertools
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,9 +13,8 @@ from typing import Any
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line, read_json
-from consistency.referee.system.atomic import make_durable
+from consistency.referee.system.atomic import left_beside, make_durable, partial_folder
 from consistency.referee.system.provenance import SCHEMA_VERSION
-from consistency.referee.system.stopping import undisturbed
 
 # --- writing -------------------------------------------------------------------------------------
 
@@ -28,10 +26,12 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results", option: s
     ``kind`` (results, log, findings).
     """
     try:
-        there = folder.exists() or folder.is_symlink()
+        folder.exists()
     except (OSError, ValueError) as error:
         raise InputError(f"{option} {one_line(folder)}: no folder can have that name ({one_line(error, 60)})") from None
-    if there:
+    with writing(folder, option):
+        _clear(folder)
+    if folder.exists() or folder.is_symlink():
         if not overwrite:
             raise InputError(f"{option} {folder}: exists already; choose another folder or add --overwrite")
         try:
@@ -42,8 +42,17 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results", option: s
             raise InputError(
                 f"{option} {folder}: is not an output folder of this bench; not overwritten ({error})"
             ) from None
-    with writing(folder, option), tempfile.TemporaryDirectory(dir=_above(folder), prefix=f".{folder.name}."):
-        pass
+    with writing(folder, option):
+        partial_folder(folder, _above(folder)).rmdir()
+
+
+def _clear(folder: Path) -> None:
+    """Remove what commands that were killed have left, and put back the folder that one was replacing."""
+    for left in left_beside(folder, _above(folder)):
+        replaced = left / "replaced"
+        if replaced.exists() and not folder.exists():
+            os.replace(replaced, folder)
+        shutil.rmtree(left)
 
 
 @contextmanager
@@ -79,7 +88,7 @@ class NewFolder:
             shutil.rmtree(self.path, ignore_errors=True)  # of a process that was ended
             return
         with self.writing():
-            self.path = Path(tempfile.mkdtemp(dir=_above(folder), prefix=f".{folder.name}."))
+            self.path = partial_folder(folder, _above(folder))
 
     def __enter__(self) -> NewFolder:
         return self
@@ -139,7 +148,7 @@ def write_folder(
 
     ``complete`` gives the manifest with what is known of the files when they are written.
     """
-    with undisturbed(), NewFolder(folder, manifest["kind"], overwrite, keep_others) as new:
+    with NewFolder(folder, manifest["kind"], overwrite, keep_others) as new:
         with new.writing():
             contents(new.path)
         new.put_in_place(complete(new, manifest))
@@ -154,12 +163,17 @@ def _put_in_place(partial: Path, folder: Path, keep_others: bool, within: Path |
             if not (partial / path.name).exists():
                 copy = shutil.copytree if path.is_dir() else shutil.copy2
                 copy(path, partial / path.name)
-    aside = within or Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    aside = within or partial_folder(folder, folder.parent)
     shutil.rmtree(aside / "replaced", ignore_errors=True)
     os.replace(folder, aside / "replaced")
     os.replace(partial, folder)
     if within is None:
         shutil.rmtree(aside)
+
+
+def unfinished_of(out: Path) -> Path:
+    """Return the folder beside an output folder in which unfinished work on it is kept."""
+    return out.absolute().parent / f".{out.absolute().name}.unfinished"
 
 
 # --- reading -------------------------------------------------------------------------------------
@@ -168,6 +182,11 @@ def _put_in_place(partial: Path, folder: Path, keep_others: bool, within: Path |
 def read_manifest(folder: Path) -> dict[str, Any]:
     """``manifest.json`` of an output folder."""
     path = folder / "manifest.json"
+    if not folder.exists() and unfinished_of(folder).is_dir():
+        raise InputError(
+            f"{folder}: not written yet, its runs are in a journal; the same 'consistency run' with --resume goes on, "
+            "and with --resume --runs 1 writes what is finished"
+        )
     if not folder.is_dir():
         raise InputError(f"{folder}: {'a file, not a folder' if folder.exists() else 'no such folder'}")
     if not path.exists():

@@ -52,7 +52,7 @@ def _cpu() -> str:
 
 SCHEMA_VERSION = 1
 PACKAGES = (
-    "filter-consistency", "numpy", "scipy", "numba", "filterpy", "pandas", "pyarrow", "joblib", "bokeh", "matplotlib",
+    "filter-consistency", "numpy", "scipy", "numba", "filterpy", "pandas", "pyarrow", "joblib", "matplotlib",
     "typst",
 )  # fmt: skip
 

@@ -16,8 +16,7 @@ from consistency.stereo.characterising.log_residuals import MAD
 from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
 from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
 from consistency.stereo.frontend.planar_log import CAMERA, observations
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig
-from consistency.stereo.visual_odometry.features import is_rectified
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence

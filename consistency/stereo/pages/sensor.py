@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import stats
 
-from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Table, Text, table
-from consistency.referee.document.colours import COLOURS, EXPECTED, SHADE, Look, style
-from consistency.referee.document.drawing import (
-    Axis,
-    Band,
-    Bars,
-    Figure,
-    Key,
-    Line,
-    Mark,
-    Panel,
-    Points,
-    Rule,
-    Sheet,
-    Span,
-    Stems,
-)
+from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Figure, Table, Text, table
+from consistency.referee.document.colours import BAND, COLOURS, EXPECTED, Look, style
 from consistency.referee.pages.provenance import facts
+from consistency.referee.show.painting import add_legend, band, canvas, dots, log_axis, stroke
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
 from consistency.stereo.characterising.sensor_text import counted, interval, sentences
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
 
 MEASURED, NORMAL, STUDENT = Look(COLOURS[0]), Look("#333333"), Look(COLOURS[1], (5.0, 2.0))
 LOCAL = Look("#7f7f7f", marker="s", size=3.4)
@@ -70,26 +60,26 @@ def _estimates(of: Characterisation) -> Table:
 
 def _over_disparity(of: Characterisation) -> Figure:
     """Standard deviation of disparity over disparity, as fig. 5c of Herath et al. (2007)."""
-    d, sd = local_spread(of)
-    marks: list[Mark] = []
-    if of.growth is not None:
-        nodes = of.growth.nodes
-        value, low, high = (np.array([getattr(s, key) for s in of.growth.sigma]) for key in ("value", "low", "high"))
-        marks += [Band(nodes, low, high, SHADE), Line(nodes, value, MEASURED), Points(nodes, value, MEASURED)]
-    marks.append(Points(d, sd, LOCAL, tips=(("disparity", "@x{0.0} px"), ("sd", "@y{0.000} px"))))
-    marks.append(Rule("y", of.coordinates[2].sigma.value, EXPECTED))
-    axis = Axis("disparity (px)", log=True, digits=(1, 2, 5))
-    panel = Panel(axis, Axis("sd of d (px)", start=0.0), tuple(marks), "Standard deviation of disparity over disparity")
-    keys = (
-        Key("sigma of d", MEASURED, marked=True),
-        Key("interval", SHADE, "band"),
-        Key("all of a group", LOCAL, "points"),
-    )
+
+    def draw() -> Drawing:
+        figure, (axes,) = canvas(2.2)
+        if of.growth is not None:
+            sigma = np.array([(s.value, s.low, s.high) for s in of.growth.sigma])
+            nodes = np.asarray(of.growth.nodes)
+            band(axes, nodes, sigma[:, 1:], "interval")
+            axes.plot(nodes, sigma[:, 0], label="sigma of d", marker="o", markersize=3.4, **stroke(MEASURED))
+        axes.plot(*local_spread(of), label="all of a group", **dots(LOCAL))
+        axes.axhline(of.coordinates[2].sigma.value, **stroke(EXPECTED))
+        axes.set(xlabel="disparity (px)", ylabel="sd of d (px)")
+        axes.set_ylim(bottom=0.0)
+        log_axis(axes, "x")
+        return add_legend(figure)
+
     caption = (
         "Standard deviation of disparity over disparity (fig. 5c). Line: noise at the nodes, with its interval. "
         "Squares: standard deviation of groups of equal size, bias and offsets in it. Rule: sigma of all together."
     )
-    return Figure("Noise over disparity", caption, (panel,), (Sheet((panel,), 2.2, keys=keys),), keys)
+    return Figure("Noise over disparity", caption, (draw,))
 
 
 def local_spread(of: Characterisation) -> tuple[Array, Array]:
@@ -101,72 +91,80 @@ def local_spread(of: Characterisation) -> tuple[Array, Array]:
 
 
 def _bias_map(of: Characterisation) -> Figure:
+    """Lines over u of the bias of u, v and d, one for each row of nodes."""
     assert of.bias is not None
-    grid = of.bias.grid
-    reach = 1.15 * max(float(np.nanmax(np.abs(of.bias.value) + of.bias.half)), 0.1)
-    panels = []
-    for k, name in enumerate(NAMES):
-        value, half = (a[k].reshape(len(grid.v), -1) for a in (of.bias.value, of.bias.half))
-        marks: list[Mark] = [Rule("y", 0.0, EXPECTED)]
-        for row in range(len(grid.v)):
-            look = style(row)
-            marks.append(Line(grid.u, value[row], look))
-            tips = (("u", "@x"), ("bias", "@y{0.00} px"), ("interval", "± @half{0.00} px"))
-            marks.append(Points(grid.u, value[row], look, tips=tips, columns={"half": half[row]}))
-        y = Axis(f"bias of {name} (px)", window=(-reach, reach))
-        panels.append(Panel(Axis("u (px)"), y, tuple(marks), f"Bias of {name} over the image", title=name))
-    keys = tuple(Key(f"v = {v:.0f} px", style(row), marked=True) for row, v in enumerate(grid.v))
-    middle = float(np.nanmedian(of.bias.half))
+    bias, grid = of.bias, of.bias.grid
+    reach = 1.15 * max(float(np.nanmax(np.abs(bias.value) + bias.half)), 0.1)
+
+    def draw() -> Drawing:
+        figure, panels = canvas(1.9, 3, 3)
+        for k, (name, axes) in enumerate(zip(NAMES, panels, strict=True)):
+            axes.axhline(0.0, **stroke(EXPECTED))
+            for row, values in enumerate(bias.value[k].reshape(len(grid.v), -1)):
+                look = style(row)
+                label = f"v = {grid.v[row]:.0f} px"
+                axes.plot(grid.u, values, label=label, marker=look.marker, markersize=3.0, **stroke(look))
+            axes.set(xlabel="u (px)", ylabel=f"bias of {name} (px)", ylim=(-reach, reach))
+        return add_legend(figure)
+
+    middle = float(np.nanmedian(bias.half))
     caption = (
         f"Bias of u, v and d at the nodes of the map (fig. 8), before any shrinkage; the median of the intervals is "
         f"±{middle:.2g} px. Nodes with too few data are left out."
     )
-    sheets = (Sheet(tuple(panels), 2.2, keys=keys),)
-    return Figure("Bias map", caption, tuple(panels), sheets, keys, layout="three")
+    return Figure("Bias map", caption, (draw,))
 
 
 def _distribution(of: Characterisation) -> Figure:
     """Standardised residuals beside the normal distribution, as fig. 5a and 6."""
-    panels = tuple(_histogram(c) for c in of.coordinates)
-    keys = (Key("normal", NORMAL), Key("Student's", STUDENT))
     caption = (
         "Residuals over their standard deviation (fig. 5a and 6), with the normal density and, where tails are "
         "heavier, Student's of the estimated degrees of freedom."
     )
-    return Figure("Distribution", caption, panels, (Sheet(panels, 2.0, keys=keys),), keys, layout="three")
+    return Figure("Distribution", caption, (partial(_draw_residuals, of),))
 
 
-def _histogram(c: Coordinate) -> Panel:
+def _draw_residuals(of: Characterisation) -> Drawing:
+    figure, panels = canvas(1.7, 3, 3)
+    for c, axes in zip(of.coordinates, panels, strict=True):
+        _draw_histogram(axes, c)
+    return add_legend(figure)
+
+
+def _draw_histogram(axes: Axes, c: Coordinate) -> None:
     edges = np.linspace(-REACH, REACH, BINS + 1)
     height, _ = np.histogram(np.clip(c.residuals, -REACH, REACH), edges, density=True)
     x = np.linspace(-REACH, REACH, 201)
-    marks: list[Mark] = [Bars(edges, height, replace(MEASURED, alpha=0.5)), Line(x, stats.norm.pdf(x), NORMAL)]
+    axes.stairs(height, edges, fill=True, color=MEASURED.colour, alpha=0.5)
+    axes.plot(x, stats.norm.pdf(x), label="normal", **stroke(NORMAL))
     if c.tails.weight.low > 0:
         nu = 1.0 / c.tails.weight.value
-        marks.append(Line(x, stats.t.pdf(x, nu, scale=np.sqrt(max(1.0 - 2.0 / nu, 0.05))), STUDENT))
-    alt = f"Distribution of the residuals of {c.name}"
-    return Panel(Axis("residual / sd"), Axis("density", start=0.0), tuple(marks), alt, title=c.name)
+        density = stats.t.pdf(x, nu, scale=np.sqrt(max(1.0 - 2.0 / nu, 0.05)))
+        axes.plot(x, density, label="Student's", **stroke(STUDENT))
+    axes.set(xlabel="residual / sd", ylabel="density", title=c.name)
 
 
 def _correlation(of: Characterisation) -> tuple[Figure, ...]:
     """Autocorrelation along tracks; none where rows have no order in time."""
     if not any(np.isfinite(c.lags).any() for c in of.coordinates) or of.coordinates[0].correlation is None:
         return ()
-    found = np.concatenate([np.abs(c.lags[np.isfinite(c.lags)]) for c in of.coordinates])
-    reach = 1.15 * max(float(found.max()), 0.1)
-    panels = []
-    for c in of.coordinates:
-        lags = np.flatnonzero(np.isfinite(c.lags)) + 1
-        bound = float(np.nanmax(c.bounds))
-        tips = (("lag", "@x"), ("autocorrelation", "@y{0.000}"))
-        marks: tuple[Mark, ...] = (
-            Span("y", -bound, bound, SHADE), Rule("y", 0.0, EXPECTED),
-            Stems(lags, c.lags[lags - 1], MEASURED, tips=tips),
-        )  # fmt: skip
-        x = Axis("lag (steps)", window=(0.4, lags.max() + 0.6), whole=True)
-        y = Axis("autocorrelation", "correlation", window=(-reach, reach))
-        panels.append(Panel(x, y, marks, f"Autocorrelation of {c.name} along tracks", title=c.name))
     caption = (
         "Autocorrelation along tracks, pooled over all; if the noise is white, 95 % of the lags stay in the shading."
     )
-    return (Figure("Autocorrelation", caption, tuple(panels), (Sheet(tuple(panels), 1.6),), layout="three"),)
+    return (Figure("Autocorrelation", caption, (partial(_draw_lags, of),)),)
+
+
+def _draw_lags(of: Characterisation) -> Drawing:
+    found = np.concatenate([np.abs(c.lags[np.isfinite(c.lags)]) for c in of.coordinates])
+    reach = 1.15 * max(float(found.max()), 0.1)
+    figure, panels = canvas(1.5, 3, 3)
+    for c, axes in zip(of.coordinates, panels, strict=True):
+        lags = np.flatnonzero(np.isfinite(c.lags)) + 1
+        bound = float(np.nanmax(c.bounds))
+        axes.axhspan(-bound, bound, color=BAND, linewidth=0, zorder=0.4)
+        axes.axhline(0.0, **stroke(EXPECTED))
+        axes.vlines(lags, 0.0, c.lags[lags - 1], color=MEASURED.colour, linewidth=MEASURED.width)
+        axes.plot(lags, c.lags[lags - 1], **dots(MEASURED))
+        ticks = lags[:: max(1, len(lags) // 5)]
+        axes.set(xlabel="lag (steps)", ylabel="correlation", title=c.name, ylim=(-reach, reach), xticks=ticks)
+    return figure

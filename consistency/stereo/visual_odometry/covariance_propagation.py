@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import batch_inverses, input_checks
+from consistency.stereo.visual_odometry.cameras import array_checks, batch_inverses
+from consistency.stereo.visual_odometry.cameras.input_errors import ConvergenceError, DegenerateError
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, solved
-from consistency.stereo.visual_odometry.input_errors import ConvergenceError, DegenerateError
 from consistency.stereo.visual_odometry.registration import checked_clouds
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, rotation_derivatives
 
@@ -68,8 +68,8 @@ def triangulation_covariance(rig: StereoRig, uv: Array, S_uv: Array) -> Array:
     InputError
         A shape, a value that is not finite, S_uv not symmetric positive semidefinite.
     """
-    uv = input_checks.checked_rows("uv", uv, 4)
-    S_uv = input_checks.covariances("S_uv", S_uv, len(uv), 4)
+    uv = array_checks.checked_rows("uv", uv, 4)
+    S_uv = array_checks.covariances("S_uv", S_uv, len(uv), 4)
     C_pp, C_pu = triangulation_derivatives(rig, *solved(rig, uv))
     return implicit_covariance(C_pp, C_pu[:, None], S_uv[:, None])
 
@@ -112,7 +112,7 @@ def registration_covariance(p1: Array, p2: Array, S1: Array, S2: Array, pose: Re
         ``pose`` is not the minimum for these points.
     """
     p1, p2 = checked_clouds(p1, p2)
-    S1, S2 = input_checks.covariances("S1", S1, len(p1), 3), input_checks.covariances("S2", S2, len(p1), 3)
+    S1, S2 = array_checks.covariances("S1", S1, len(p1), 3), array_checks.covariances("S2", S2, len(p1), 3)
     C_d, C_dd, C_dp = registration_derivatives(p1, p2, pose)
     S = implicit_covariance(C_dd, C_dp, np.concatenate([S1, S2]))
     step = np.linalg.solve(C_dd, C_d)

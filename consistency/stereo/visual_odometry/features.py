@@ -6,14 +6,13 @@ Matches pass a ratio and a mutual test, an epipolar gate, and the circle over fo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.types import Array, Indices
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig
+from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
 from consistency.stereo.visual_odometry.relative_pose import cross_matrix
 
 COUNT = 3000  # strongest features of an image; at 1226 x 370 px that is nearly all of them
@@ -34,21 +33,6 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.uv)
-
-
-def opencv() -> Any:
-    """The module ``cv2``.
-
-    Raises
-    ------
-    InputError
-        OpenCV is not installed.
-    """
-    try:
-        import cv2
-    except ImportError:
-        raise MissingPackageError(f"an image needs {remedy('vision', package='opencv-python-headless')}") from None
-    return cv2
 
 
 def grey(image: Array, name: str = "image") -> Array:
@@ -154,14 +138,6 @@ def fundamental(rig: StereoRig) -> Array:
     """F (3, 3) with x_right' F x_left = 0 for homogeneous pixels of one point, Hartley & Zisserman (2003) eq. 9.2."""
     cross = cross_matrix(-rig.R.T @ rig.t)
     return np.asarray(np.linalg.inv(rig.K_right).T @ cross @ rig.R.T @ np.linalg.inv(rig.K_left))
-
-
-def is_rectified(rig: StereoRig) -> bool:
-    """Whether rows of both images correspond: same axes and focal lengths, baseline along x within 1 %."""
-    same = np.allclose(rig.R, np.eye(3), atol=1e-6)
-    focal = np.allclose(np.delete(rig.K_left, 2, axis=1), np.delete(rig.K_right, 2, axis=1), rtol=1e-6)
-    rows = abs(rig.K_left[1, 2] - rig.K_right[1, 2]) < 1e-3
-    return bool(same and focal and rows and np.linalg.norm(rig.t[1:]) <= 0.01 * rig.t[0])
 
 
 def homogeneous(uv: Array) -> Array:

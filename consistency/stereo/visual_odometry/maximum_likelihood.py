@@ -16,10 +16,10 @@ from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import batch_inverses, input_checks
+from consistency.stereo.visual_odometry.cameras import array_checks, batch_inverses
+from consistency.stereo.visual_odometry.cameras.input_errors import ConvergenceError, DegenerateError
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
 from consistency.stereo.visual_odometry.covariance_propagation import implicit_covariance
-from consistency.stereo.visual_odometry.input_errors import ConvergenceError, DegenerateError
 from consistency.stereo.visual_odometry.registration import checked_clouds, register_svd
 from consistency.stereo.visual_odometry.relative_pose import RelativePose
 from consistency.stereo.visual_odometry.two_frame_cost import (
@@ -112,7 +112,7 @@ def register_weighted(
         No minimum was reached.
     """
     p1, p2 = checked_clouds(p1, p2)
-    S1, S2 = input_checks.covariances("S1", S1, len(p1), 3), input_checks.covariances("S2", S2, len(p1), 3)
+    S1, S2 = array_checks.covariances("S1", S1, len(p1), 3), array_checks.covariances("S2", S2, len(p1), 3)
     frames = TwoFrames(PointMatches(), p1, p2, _weights("S1", S1), _weights("S2", S2))
     return _refined(frames, S1, S2, pose or register_svd(p1, p2), p2, robust)
 
@@ -147,10 +147,10 @@ def refine_reprojection(
     InputError, DegenerateError, GimbalLockError, ConvergenceError
         As :func:`register_weighted`.
     """
-    uv1, uv2 = input_checks.checked_rows("uv1", uv1, 4), input_checks.checked_rows("uv2", uv2, 4)
-    input_checks.same_length("uv1, uv2", uv1, uv2)
-    S1 = input_checks.covariances("S_uv", S_uv, len(uv1), 4)
-    S2 = S1 if S_uv2 is None else input_checks.covariances("S_uv2", S_uv2, len(uv1), 4)
+    uv1, uv2 = array_checks.checked_rows("uv1", uv1, 4), array_checks.checked_rows("uv2", uv2, 4)
+    array_checks.same_length("uv1, uv2", uv1, uv2)
+    S1 = array_checks.covariances("S_uv", S_uv, len(uv1), 4)
+    S2 = S1 if S_uv2 is None else array_checks.covariances("S_uv2", S_uv2, len(uv1), 4)
     _, q = checked_clouds(triangulate(rig, uv1), triangulate(rig, uv2))
     rig.project(pose.apply(q))
     frames = TwoFrames(PixelMatches(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))

@@ -10,6 +10,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
+from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, MatchError
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulable, triangulate
 from consistency.stereo.visual_odometry.covariance_propagation import registration_covariance, triangulation_covariance
 from consistency.stereo.visual_odometry.features import (
@@ -23,7 +24,6 @@ from consistency.stereo.visual_odometry.features import (
     sift,
     stereo_matches,
 )
-from consistency.stereo.visual_odometry.input_errors import ConsensusError, MatchError
 from consistency.stereo.visual_odometry.maximum_likelihood import Refined, refine_reprojection
 from consistency.stereo.visual_odometry.registration import register_horn, register_svd, squared_distances
 from consistency.stereo.visual_odometry.relative_pose import RelativePose

@@ -1,26 +1,30 @@
-"""Batches of runs with an engine that is a list: sizes, retries, splitting, and who is blamed."""
+"""Runs in batches on any executor: shares, what becomes of batches that fail, and who is refused."""
 
 from __future__ import annotations
 
+import pickle
 import re
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from misbehaving import Still
+from misbehaving import Deadly, Still
 
 import consistency as cs
-from consistency.bench.runs.backends import remote
-from consistency.bench.runs.backends.batches import Batch, Batches, Event, failed, in_batches
-from consistency.bench.runs.backends.choosing import backend_for
-from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
+from consistency.bench.runs import batches, remote_batch
+from consistency.bench.runs.backends.choosing import executor_for
+from consistency.bench.runs.batches import ExecutorWorkers, failed
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
+from consistency.bench.runs.local_threads import LocalThreads
+from consistency.bench.runs.remote_batch import BatchResult, do_batch
+from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork
 from consistency.bench.store.results import open_results
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system.provenance import this_machine
@@ -30,44 +34,62 @@ RUNS = 40
 HERE = {"cpu": "abacus", "blas": "beads"}
 
 
-class Counted:
-    """Trials that leave nothing but their number."""
-
-    def part(self, runs: Sequence[int], refusal: str = "", seconds: float = 0.0) -> Part:
-        outcomes = [RunOutcome(run, {}, None, ()) for run in runs]
-        pickled = remote.pickle.dumps(outcomes)
-        return Part(pickled, seconds, "host", HERE, remote.versions_here(), refusal)
+def result(runs: Sequence[int], **changes: Any) -> BatchResult:
+    """Of trials that leave nothing but their number."""
+    outcomes = [RunOutcome(run, {}, None, ()) for run in runs]
+    return replace(BatchResult(pickle.dumps(outcomes), "host", HERE, remote_batch.versions_here()), **changes)
 
 
-class Fake:
-    """An engine with a worker that some runs kill, together with all that waits for it; the last sent comes first.
+class Killed(Exception):
+    """As of an engine whose worker has died."""
 
-    A batch gives back ``most`` runs at a time and leaves the rest.
+
+class Fake(Executor):
+    """An executor with a worker that some runs kill, together with the batch that waits behind it.
+
+    What waits is done when somebody waits for it. A batch gives back ``most`` runs at a time.
     """
 
-    def __init__(
-        self, killers: Sequence[int] = (), shares: bool = True, most: int = 1000, per_run: float = 0.1
-    ) -> None:
-        self.killers, self.shares, self.most, self.per_run = set(killers), shares, most, per_run
-        self.waiting: list[Batch] = []
+    at_a_time = 4
+
+    def __init__(self, killers: Sequence[int] = (), most: int = 1000, **changes: Any) -> None:
+        self.killers, self.most, self.changes = set(killers), most, changes
         self.sent: list[tuple[int, ...]] = []
-        self.together: list[int] = []
+        self.seconds: list[float] = []
+        self.waiting: list[tuple[tuple[int, ...], Future[BatchResult]]] = []
+        self.together: list[int] = []  # batches that wait, each time that somebody waits for them
 
-    room = 4
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
+        assert function is do_batch
+        _, runs, seconds, _ = arguments
+        future: Future[BatchResult] = Future()
+        self.sent.append(runs)
+        self.seconds.append(seconds)
+        self.waiting.append((runs, future))
+        return future
 
-    def submit(self, batches: Sequence[Batch]) -> None:
-        self.waiting += batches
-        self.sent += [batch.runs for batch in batches]
+    def work(self) -> None:
         self.together.append(len(self.waiting))
+        runs, future = self.waiting.pop(0)
+        if not self.killers & {*runs}:
+            future.set_result(self.answer(runs[: self.most]))
+            return
+        future.set_exception(Killed())
+        if self.waiting:
+            self.waiting.pop(0)[1].set_exception(Killed())
 
-    def events(self) -> list[Event]:
-        batch = self.waiting.pop()
-        if self.killers & set(batch.left):
-            dead = [batch, *(self.waiting if self.shares else [])]
-            self.waiting = [] if self.shares else self.waiting
-            return [(each, "killed") for each in dead]
-        done = batch.left[: self.most]
-        return [(batch, Counted().part(done, seconds=self.per_run * len(done))), (batch, None)]
+    def answer(self, runs: Sequence[int]) -> BatchResult:
+        return result(runs, **self.changes)
+
+    def outcomes(self, work: TrialWork) -> Generator[RunOutcome, None, None]:
+        def next_of(finished: Any) -> Any:
+            if finished.empty():
+                self.work()
+            return finished.get(timeout=5.0)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(batches, "_next_of", next_of)
+            yield from ExecutorWorkers(self).outcomes(work, range(RUNS))
 
 
 @pytest.fixture(scope="module")
@@ -75,153 +97,119 @@ def work(xyz: cs.Scenario) -> TrialWork:
     return TrialWork(Simulated(xyz, 0), Isolation([Still("still")], xyz.belief))
 
 
-def done(engine: Fake, work: TrialWork, retries: int = 0, seconds: float = 1.0) -> dict[int, RunOutcome]:
+def done(executor: Fake, work: TrialWork) -> dict[int, RunOutcome]:
     """What came of the runs; each came once."""
-    outcomes = list(in_batches(engine, Batches(range(RUNS), seconds, retries, engine.shares), work))
+    outcomes = list(executor.outcomes(work))
     assert sorted(outcome.run for outcome in outcomes) == list(range(RUNS))
     return {outcome.run: outcome for outcome in outcomes}
 
 
-def test_batches_grow_to_so_much_work_and_shrink_at_the_end(work: TrialWork) -> None:
-    engine = Fake(per_run=0.2)
-    outcomes = done(engine, work)
-    sizes = [len(runs) for runs in engine.sent]
-    assert sizes[: engine.room] == [1] * engine.room  # until it is known what a run takes
-    assert max(sizes) == 5  # 1 s of 0.2 s each
-    assert sizes.count(5) == 4  # until fewer are left than four times as many
-    assert sizes[-1] == 1
-    assert max(engine.together) == engine.room
+def test_runs_are_sent_in_equal_shares(work: TrialWork) -> None:
+    executor = Fake()
+    outcomes = done(executor, work)
+    assert sum(executor.sent, ()) == tuple(range(RUNS))
+    assert len(executor.sent[0]) == RUNS / executor.at_a_time
     assert all(outcome.machine == HERE and not outcome.failures for outcome in outcomes.values())
 
 
-def test_a_batch_has_a_run_at_least(work: TrialWork) -> None:
-    engine = Fake(per_run=100.0)
-    done(engine, work)
-    assert {len(runs) for runs in engine.sent} == {1}
-
-
-def test_without_a_length_there_are_equal_shares(work: TrialWork) -> None:
-    engine = Fake()
-    list(in_batches(engine, Batches(range(RUNS)), work))
-    assert engine.sent == [tuple(range(first, first + 10)) for first in range(0, RUNS, 10)]
+def test_an_executor_says_how_long_a_batch_takes_and_how_many_it_has(work: TrialWork) -> None:
+    plain, own = Fake(), Fake()
+    own.at_a_time, own.batch_seconds = RUNS, 7.0  # type: ignore[attr-defined]
+    done(plain, work)
+    done(own, work)
+    assert set(plain.seconds) == {1.5}
+    assert set(own.seconds) == {7.0}
+    assert len(own.sent) == RUNS
 
 
 def test_what_a_batch_leaves_is_done_next(work: TrialWork) -> None:
-    engine = Fake(most=2, per_run=0.2)
-    done(engine, work)
-    assert max(len(runs) for runs in engine.sent) == 5
+    executor = Fake(most=2)
+    done(executor, work)
+    assert executor.sent[executor.at_a_time][0] == 2
 
 
-@pytest.mark.parametrize("shares", [True, False])
-@pytest.mark.parametrize("retries", [0, 1])
-@pytest.mark.parametrize("killers", [(0,), (17, 18), (3, 39)])
-def test_a_run_that_kills_has_failed_and_no_other(
-    work: TrialWork, shares: bool, retries: int, killers: tuple[int, ...]
-) -> None:
-    engine = Fake(killers, shares)
-    outcomes = done(engine, work, retries)
+@pytest.mark.parametrize("killers", [(0,), (17, 18), (3, 39), tuple(range(RUNS))])
+def test_a_run_that_kills_has_failed_and_no_other(work: TrialWork, killers: tuple[int, ...]) -> None:
+    executor = Fake(killers)
+    outcomes = done(executor, work)
     assert {run for run, outcome in outcomes.items() if outcome.failures} == set(killers)
     for run in killers:
-        assert outcomes[run].failures == (Failure("still", run, 1, "killed"),)
+        assert outcomes[run].failures == (Failure("still", run, 1, "its worker died (Killed)"),)
         assert outcomes[run].truth is not None
+        assert Counter(executor.sent)[(run,)] >= 2, "by itself, and alone"
 
 
-def test_a_batch_is_sent_again_before_it_is_split(work: TrialWork) -> None:
-    for retries in (0, 1, 2):
-        engine = Fake([20], shares=False, per_run=0.2)
-        done(engine, work, retries)
-        whole = next(runs for runs in engine.sent if 20 in runs)
-        assert len(whole) > 1
-        assert engine.sent.count(whole) == 1 + retries
-        assert engine.sent.count((20,)) == 1  # once more
-
-
-def test_a_suspect_runs_alone_where_workers_share_their_fate(work: TrialWork) -> None:
-    engine = Fake([20], per_run=0.2)
-    done(engine, work)
-    assert all(
-        count == 1
-        for count, runs in zip(engine.together[-6:], engine.sent[-6:], strict=True)
-        if len(runs) == 1 and runs in engine.sent[:-1]
-    )
-    assert engine.sent.count((20,)) == 2
-
-
-def test_a_suspect_that_a_dying_worker_was_given_is_tried_again() -> None:
-    batches = Batches([7], 1.0)
-    (batch,) = batches.take(3)
-    assert batches.lost(batch) == []
-    (suspect,) = batches.take(3)
-    assert batches.lost(suspect) == []
-    (again,) = batches.take(3)
-    assert again.is_suspect
-    assert batches.lost(again) == [7]
-    assert batches.are_done
-
-
-def test_a_loss_after_progress_is_no_second_loss() -> None:
-    batches = Batches(range(6), 1.0, retries=1, shares=False)
-    batches._per_run = 0.1
-    (batch,) = batches.take(1)
-    assert batch.runs == tuple(range(6))
-    assert batches.lost(batch) == []
-    (again,) = batches.take(1)
-    assert (again.runs, again.losses) == (batch.runs, 1)
-    assert batches.came(again, [0, 1], 0.2) == [0, 1]
-    assert batches.came(again, [0, 1], 0.2) == []  # sent twice, kept once
-    assert batches.lost(again) == []
-    (rest,) = batches.take(1)
-    assert (rest.runs, rest.losses) == ((2, 3, 4, 5), 1)
-    assert batches.lost(rest) == []
-    assert [suspect.runs for suspect in batches.take(9)] == [(2,), (3,), (4,), (5,)]
+def test_a_doubtful_run_is_alone(work: TrialWork) -> None:
+    executor = Fake([20])
+    outcomes = done(executor, work)
+    assert max(executor.together) == executor.at_a_time
+    assert {run for run, outcome in outcomes.items() if outcome.failures} == {20}
+    doubtful = {runs for runs in executor.sent if executor.sent.count(runs) == 2}
+    assert (20,) in doubtful
+    assert executor.together[-len(doubtful) :] == [1] * len(doubtful)
 
 
 def test_bad_input_keeps_what_is_finished(work: TrialWork) -> None:
     class Refusing(Fake):
-        def events(self) -> list[Event]:
-            batch = self.waiting.pop(0)
-            return [(batch, Counted().part(batch.runs, "nothing in view" if batch.runs == (2,) else "")), (batch, None)]
+        def answer(self, runs: Sequence[int]) -> BatchResult:
+            kept = [run for run in runs if run < 3]
+            return result(kept, refusal="" if len(kept) == len(runs) else "nothing in view")
 
-    outcomes = in_batches(Refusing(), Batches(range(RUNS), 1.0), work)
+    outcomes = Refusing(most=5).outcomes(work)
     assert [next(outcomes).run for _ in range(3)] == [0, 1, 2]
     with pytest.raises(cs.InputError, match=r"^nothing in view$"):
         next(outcomes)
 
 
-def test_what_comes_twice_is_kept_once(work: TrialWork) -> None:
-    class Twice(Fake):
-        def events(self) -> list[Event]:
-            part, end = super().events()
-            return [part, part, end]
+@pytest.mark.parametrize(
+    ("error", "raised", "sentence"),
+    [
+        (BrokenExecutor("no more"), cs.InputError, r"^the executor has ended \(BrokenExecutor: no more\)$"),
+        (CancelledError(), cs.InputError, r"^the executor has ended \(CancelledError"),
+        (ModuleNotFoundError("no consistency"), cs.InputError, "a worker lacks this package .*; install there"),
+        (cs.InputError("Slurm does not take the jobs"), cs.InputError, "^Slurm does not take the jobs$"),
+    ],
+)
+def test_an_executor_that_cannot_go_on(work: TrialWork, error: Exception, raised: Any, sentence: str) -> None:
+    class Ends(Fake):
+        def work(self) -> None:
+            self.waiting.pop()[1].set_exception(error)
 
-    done(Twice(), work)
+    with pytest.raises(raised, match=sentence) as told:
+        done(Ends(), work)
+    if "ended" in sentence:  # no fault of the runs: what is finished is named, and a resume goes on
+        assert isinstance(told.value.__cause__, OSError)
+
+
+def test_what_is_not_done_is_cancelled(work: TrialWork) -> None:
+    executor = Fake()
+    outcomes = executor.outcomes(work)
+    assert next(outcomes).run == 0
+    assert executor.waiting
+    outcomes.close()
+    assert all(future.cancelled() for _, future in executor.waiting)
 
 
 @pytest.mark.parametrize("name", ["numpy", "filter-consistency", "Python"])
 def test_other_versions_are_refused(work: TrialWork, name: str) -> None:
-    class Older(Fake):
-        def events(self) -> list[Event]:
-            batch = self.waiting.pop()
-            part = Counted().part(batch.runs)
-            return [(batch, replace(part, versions=part.versions | {name: "0.1"})), (batch, None)]
-
+    older = Fake(versions=remote_batch.versions_here() | {name: "0.1"})
     with pytest.raises(cs.InputError, match=rf"the worker on host has {name} 0.1, here it is .*; install the same"):
-        next(in_batches(Older(), Batches(range(RUNS), 1.0), work))
+        done(older, work)
 
 
 def test_all_that_the_bits_depend_on_is_compared() -> None:
-    assert set(remote.versions_here()) == {"filter-consistency", "Python", "numpy", "scipy", "numba"}
+    assert set(remote_batch.versions_here()) == {"filter-consistency", "Python", "numpy", "scipy", "numba"}
 
 
 def test_sources_that_the_bits_depend_on_count_and_others_do_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def own() -> str:
-        return str(remote.versions_here.__wrapped__()["filter-consistency"])
+        return str(remote_batch.versions_here.__wrapped__()["filter-consistency"])
 
-    assert Path(cs.__file__).parent == remote.PACKAGE
-    assert remote.versions_here()["Python"] == f"{sys.version_info.major}.{sys.version_info.minor}"
-    monkeypatch.setattr(remote, "PACKAGE", tmp_path)
+    assert Path(cs.__file__).parent == remote_batch.PACKAGE
+    assert remote_batch.versions_here()["Python"] == f"{sys.version_info.major}.{sys.version_info.minor}"
+    monkeypatch.setattr(remote_batch, "PACKAGE", tmp_path)
     seen = [own()]
     for room in ("referee/geometry", "bench/models", "bench/scenario", "bench/simulation", "bench/filters"):
         (tmp_path / room / "inner").mkdir(parents=True)
@@ -236,12 +224,12 @@ def test_sources_that_the_bits_depend_on_count_and_others_do_not(
 
 def test_differing_machines_are_said_once(work: TrialWork, capsys: pytest.CaptureFixture[str]) -> None:
     class Mixed(Fake):
-        def events(self) -> list[Event]:
-            batch = self.waiting.pop()
-            part = Counted().part(batch.runs)
-            return [(batch, replace(part, machine={"cpu": f"cpu{batch.runs[0] % 2}", "blas": "b"})), (batch, None)]
+        def answer(self, runs: Sequence[int]) -> BatchResult:
+            return result(runs, machine={"cpu": f"cpu{runs[0] % 2}", "blas": "b"})
 
-    done(Mixed(), work)
+    mixed = Mixed()
+    mixed.at_a_time = RUNS
+    done(mixed, work)
     (line,) = capsys.readouterr().err.splitlines()
     assert "the workers differ" in line
     assert "cpu0 (BLAS: b)" in line
@@ -251,37 +239,48 @@ def test_differing_machines_are_said_once(work: TrialWork, capsys: pytest.Captur
 # --- the far side ---------------------------------------------------------------------------------
 
 
-def test_a_desk_does_what_local_workers_do(linear: cs.Scenario) -> None:
+def sent(work: TrialWork) -> bytes:
+    return bytes(pickle.dumps(work))
+
+
+def test_a_worker_does_what_local_threads_do(linear: cs.Scenario) -> None:
     work = TrialWork(Simulated(linear, 5), Isolation([Still("still"), cs.get_filter("kf")], linear.belief))
     expected = {outcome.run: outcome for outcome in LocalThreads(1).outcomes(work, range(4))}
-    worker = Worker(pickled_work(work))
-    try:
-        whole = list(worker.parts([3, 1], 1000.0))
-        each = list(worker.parts([0, 2], 0.0))
-    finally:
-        worker.close()
-    assert [[outcome.run for outcome in part.outcomes()] for part in whole + each] == [[3, 1], [0], [2]]
-    for outcome in (outcome for part in whole + each for outcome in part.outcomes()):
-        assert outcome.machine == remote.this_machine()
+    whole, part = do_batch(sent(work), [3, 1], 1000.0, 0), do_batch(sent(work), [0, 2], 0.0, 1)
+    assert [[outcome.run for outcome in each.outcomes()] for each in (whole, part)] == [[3, 1], [0]]
+    for outcome in whole.outcomes() + part.outcomes():
+        assert outcome.machine == this_machine()
         for name, columns in outcome.estimates.items():
             for column, values in columns.items():
                 np.testing.assert_array_equal(values, expected[outcome.run].estimates[name][column])
-    assert all(part.seconds > 0.0 and not part.refusal for part in whole + each)
+    assert not whole.refusal + whole.fault + part.refusal + part.fault
 
 
-def test_bad_input_ends_a_desk(linear: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("error", "refusal", "fault"),
+    [
+        (cs.InputError("no"), "no", ""),
+        (OSError("no such luck"), "", "OSError: no such luck"),
+        (ModuleNotFoundError("No module named 'mine'"), "a worker cannot load the work (No module named 'mine')", ""),
+    ],
+)
+def test_an_error_ends_a_batch(
+    linear: cs.Scenario, monkeypatch: pytest.MonkeyPatch, error: Exception, refusal: str, fault: str
+) -> None:
     def refuse(_: TrialWork, run: int) -> RunOutcome:
         if run == 2:
-            raise cs.InputError("no")
+            raise error
         return RunOutcome(run, {}, None, ())
 
     monkeypatch.setattr(TrialWork, "__call__", refuse)
-    worker = Worker(pickled_work(TrialWork(Simulated(linear, 0), Isolation([Still("still")], linear.belief))))
-    (part,) = worker.parts([0, 1, 2, 3], 1000.0)
+    work = TrialWork(Simulated(linear, 0), Isolation([Still("still")], linear.belief))
+    part = do_batch(sent(work), [0, 1, 2, 3], 1000.0, 0)
     assert [outcome.run for outcome in part.outcomes()] == [0, 1]
-    assert part.refusal == "no"
-    (part,) = worker.parts([2], 1000.0)
-    assert (part.outcomes(), part.refusal) == ([], "no")
+    assert part.refusal.startswith(refusal)
+    assert bool(part.refusal) == bool(refusal)
+    assert part.fault == fault
+    with ThreadPoolExecutor(1) as executor, pytest.raises((cs.InputError, RuntimeError), match=re.escape(str(error))):
+        list(ExecutorWorkers(executor).outcomes(work, [2]))
 
 
 def test_a_failed_run_has_truth_and_a_reason_for_each_filter(work: TrialWork) -> None:
@@ -292,36 +291,51 @@ def test_a_failed_run_has_truth_and_a_reason_for_each_filter(work: TrialWork) ->
     assert outcome.truth is not None
 
 
-@dataclass(frozen=True)
-class Elsewhere:
-    """A backend on another machine, which is stopped after so many runs."""
+def test_of_a_log_only_the_trials_of_a_batch_are_sent(linear: cs.Scenario) -> None:
+    trials = {run: cs.simulate(linear, run) for run in (3, 5, 8)}
+    isolation = Isolation([cs.get_filter("kf")], linear.belief)
+    recorded, drawn = TrialWork(Recorded(trials), isolation), TrialWork(Simulated(linear, 0), isolation)
+    part = recorded.only([5])
+    assert isinstance(part.trials, Recorded)
+    assert list(part.trials.trials) == [5]
+    assert drawn.only([5]) is drawn
 
-    machine: dict[str, str] | None
-    most: int = 1000
-    prepared: list[int] = field(default_factory=list)
 
-    def prepare(self, work: TrialWork, run: int, /) -> None:
-        self.prepared.append(run)
+# --- executors of others --------------------------------------------------------------------------
 
-    def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
-        for outcome in LocalThreads(1).outcomes(work, runs[: self.most]):
-            yield replace(outcome, machine=self.machine)
-        if len(runs) > self.most:
-            raise KeyboardInterrupt
+
+def test_any_executor_gives_the_tables_of_threads(linear: cs.Scenario) -> None:
+    local = cs.run_trials(linear, ["kf", Still("still")], 8, jobs=2)
+    with ThreadPoolExecutor(2) as threads, ProcessPoolExecutor(1, get_context("spawn")) as processes:
+        for executor in (threads, processes):
+            done = cs.run_trials(linear, ["kf", Still("still")], 8, executor=executor)
+            for name in ("estimates", "truth", "map"):
+                assert getattr(done, name).equals(getattr(local, name)), name
+
+
+def test_a_pool_that_breaks_keeps_what_is_finished(linear: cs.Scenario, tmp_path: Path) -> None:
+    import os
+
+    trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
+    work = TrialWork(Deadly(trials, (1,), os.getpid()), isolation)
+    with (
+        ProcessPoolExecutor(1, get_context("spawn")) as executor,
+        pytest.raises(cs.InputError, match="the executor has ended"),
+    ):
+        list(ExecutorWorkers(executor).outcomes(work, [1]))
 
 
 def test_the_manifest_has_the_machines_that_did_runs(
-    xyz: cs.Scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    xyz: cs.Scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here, out, still = this_machine(), tmp_path / "out", [Still("still")]
     assert here != HERE
-    backend = Elsewhere(HERE)
-    results = cs.run_trials(xyz, still, 3, backend=backend)
-    assert results.manifest["machines"] == [HERE]  # and not this one, which did none
-    assert backend.prepared == [0]
-    assert cs.run_trials(xyz, still, 3, backend=Elsewhere(None)).manifest["machines"] == [here]
-    with pytest.raises(Interrupted):
-        cs.run_trials(xyz, still, 6, out=out, backend=Elsewhere(HERE, 2))
+    with ThreadPoolExecutor(1) as executor:
+        assert cs.run_trials(xyz, still, 3, executor=executor).manifest["machines"] == [here]
+        with monkeypatch.context() as patch:
+            patch.setattr(remote_batch, "this_machine", lambda: HERE)
+            assert cs.run_trials(xyz, still, 3, executor=executor).manifest["machines"] == [HERE]  # and not this one
+            cs.run_trials(xyz, still, 3, out=out, executor=executor)
     assert open_results(out).manifest["machines"] == [HERE]
     assert capsys.readouterr().err.count("computed the runs that are there") == 0
     resumed = cs.run_trials(xyz, still, 6, out=out, resume=True, jobs=1)
@@ -333,7 +347,8 @@ def test_the_manifest_has_the_machines_that_did_runs(
 
 
 def test_a_backend_is_chosen_by_name() -> None:
-    assert backend_for("local", 3) == LocalThreads(3)
+    with executor_for("local", 3) as executor:
+        assert executor is None
     for options, sentence in (
         ({"name": "ray"}, "--backend must be one of local, dask, slurm, got 'ray'"),
         ({"scheduler": "tcp://a:1"}, "--scheduler goes with --backend dask, not with local"),
@@ -341,13 +356,15 @@ def test_a_backend_is_chosen_by_name() -> None:
         ({"slurm": ["time=3"], "name": "dask"}, "--slurm goes with --backend slurm, not with dask"),
         ({"slurm": ["time"], "name": "slurm"}, "--slurm takes KEY=VALUE, such as .*, got 'time'"),
         ({"name": "dask", "jobs": 0}, "jobs must be at least 1"),
+        ({"name": "slurm", "jobs": 0}, "jobs must be at least 1"),
+        ({"jobs": -3}, "jobs must be at least 1"),
     ):
-        with pytest.raises(cs.InputError, match=f"^{sentence}"):
-            backend_for(**options)  # type: ignore[arg-type]
+        with pytest.raises(cs.InputError, match=f"^{sentence}"), executor_for(**options):  # type: ignore[arg-type]
+            pass
 
 
 def test_without_the_extra_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.delitem(sys.modules, "consistency.bench.runs.backends.dask", raising=False)
-    with pytest.raises(cs.InputError, match="needs distributed: pip install "):
-        backend_for("dask")
+    with pytest.raises(cs.InputError, match="needs distributed: pip install "), executor_for("dask"):
+        pass

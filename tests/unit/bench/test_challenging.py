@@ -19,6 +19,7 @@ import pytest
 import consistency as cs
 from consistency.bench.challenging import world_scores as scoring
 from consistency.bench.challenging.challenge import BASES, ChallengePhases, Plan, base_of, challenge, is_overconfident
+from consistency.bench.challenging.challenge_text import as_data, lines, write_scenario
 from consistency.bench.challenging.search import (
     BATCH,
     RUNGS,
@@ -28,7 +29,6 @@ from consistency.bench.challenging.search import (
     search,
     standard_error,
 )
-from consistency.bench.challenging.wording import as_data, lines, write_scenario
 from consistency.bench.challenging.world_scores import WORST, ChallengeScorer, Done, score_of_run
 from consistency.bench.challenging.worlds import Choice, LogScale, Point, Space, space_of
 from consistency.bench.runs.isolation.filter_process import Isolation

@@ -23,9 +23,6 @@ from consistency.bench.runs import compiling
 from consistency.bench.runs.findings import experiments
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import load_scenario
-from consistency.bench.sweeps import running
-from consistency.bench.sweeps.plan import load_sweep
-from consistency.bench.sweeps.sweep_folder import SweepFolder
 
 Done = Callable[..., tuple[str, str]]
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="kernels are compiled side by side on Linux")
@@ -265,14 +262,6 @@ def test_seconds_of_several() -> None:
 
 
 # --- before what takes long -------------------------------------------------------------------------
-
-
-def test_a_sweep_compiles_what_its_cells_need(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked: list[tuple[str, int]] = []
-    monkeypatch.setattr(running, "compile_all", lambda wanted, jobs: asked.extend((f.name, jobs) for f, _, _ in wanted))
-    sweep = load_sweep("small", ["ukf-uvd"])
-    running._compile(sweep, SweepFolder(sweep, tmp_path).all_work(), 2)
-    assert sorted(asked) == sorted([("ukf-uvd", 2), ("ekf-uvd", 2)] * len(sweep.cells))
 
 
 def test_what_experiments_say_that_they_need_fits() -> None:

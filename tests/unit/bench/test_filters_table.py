@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.bench.pages.sections import filters
+from consistency.bench.pages.sections.filters_table import filters_table
 from consistency.bench.runs.findings import Study, experiments
 from consistency.referee.document.blocks import Status
 
@@ -92,12 +92,12 @@ def test_a_row_says_what_the_verdicts_say(e16: ModuleType) -> None:
 
 def test_the_report_shows_the_table(tmp_path: Path) -> None:
     report: Any = SimpleNamespace(folder=tmp_path)
-    assert filters.SECTION.blocks(report) == ()
+    assert filters_table(report) == ()
     rows = table(
         {}, {"filter": "bound", "realisable": "no", "map_status": "-", "map_nees": np.nan, "joint_nees": np.nan}
     )
     rows.assign(runs=20, false_alarm=0.01, scenario="world").to_parquet(tmp_path / "filters.parquet")
-    (shown,) = filters.SECTION.blocks(report)
+    (shown,) = filters_table(report)
     ((_, (first, second)),) = shown.groups
     assert first[0].text == "a"
     assert [small.text for small in first[0].below] == ["Pose: consistent: one; two.", "Map: consistent: x."]

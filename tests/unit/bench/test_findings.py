@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import os
 import time
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from joblib.externals.loky import ProcessPoolExecutor
 
 from consistency import Finding, InputError
 from consistency.bench.runs import findings as module
@@ -45,14 +42,6 @@ def scripts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write(folder, 3, ("three",), "OWN_PROCESS = True\nLONG = True")
     write(folder, 4, ("four",))
     return folder
-
-
-@pytest.fixture
-def forked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes of scripts begin as copies of one that has imported what they need."""
-    context = get_context("forkserver")
-    context.set_forkserver_preload([module.__name__])
-    monkeypatch.setattr(module, "ProcessPoolExecutor", partial(ProcessPoolExecutor, context=context))
 
 
 def write(folder: Path, number: int, ids: tuple[str, ...], constants: str = "", before: str = "pass") -> None:
@@ -110,7 +99,6 @@ def test_scripts_are_said_as_they_begin(
     assert "inside" not in lines
 
 
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_script_that_breaks_is_a_finding(scripts: Path, tmp_path: Path, jobs: int) -> None:
     write(scripts, 2, ("two",), "OWN_PROCESS = True", "raise ZeroDivisionError('no')")
@@ -120,7 +108,6 @@ def test_a_script_that_breaks_is_a_finding(scripts: Path, tmp_path: Path, jobs: 
     assert findings["four"].verdict == "reproduced"
 
 
-@pytest.mark.usefixtures("forked")
 def test_a_process_that_dies_is_a_finding(scripts: Path, tmp_path: Path) -> None:
     write(scripts, 2, ("two",), "OWN_PROCESS = True", "os._exit(7)")
     found = measured(reproduce(["two", "four"], 5, 0, 2, tmp_path / "out"))
@@ -129,7 +116,6 @@ def test_a_process_that_dies_is_a_finding(scripts: Path, tmp_path: Path) -> None
     assert found["four"] != found["two"]
 
 
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_unusable_input_ends_everything(scripts: Path, tmp_path: Path, jobs: int) -> None:
     write(scripts, 2, ("two",), "OWN_PROCESS = True", "raise InputError('file.toml: key x')")
@@ -138,7 +124,6 @@ def test_unusable_input_ends_everything(scripts: Path, tmp_path: Path, jobs: int
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.usefixtures("forked")
 def test_a_script_apart_runs_no_filter(scripts: Path, tmp_path: Path) -> None:
     write(scripts, 2, ("two",), "OWN_PROCESS = True", "study.kept['world'] = None")
     found = measured(reproduce(["two"], 5, 0, 2, tmp_path / "out"))
@@ -159,7 +144,6 @@ def test_jobs_out_of_range() -> None:
         Study(jobs=0)
 
 
-@pytest.mark.usefixtures("forked")
 def test_processes_end_with_the_work(scripts: Path, tmp_path: Path) -> None:
     """As Ctrl-C does it: the process of the long script is not waited for."""
     mark = tmp_path / "started"

@@ -20,7 +20,7 @@ from consistency.bench.filters.guard.guarded import Guarded
 from consistency.bench.filters.stepping import optimal_gain, run_filter, step_through
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.sections.study_tables import REJECTIONS
+from consistency.bench.pages.sections.study_sections import rejections
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.scenario.effects import EFFECTS
@@ -380,7 +380,7 @@ def test_verdicts_tell_precision_and_recall(
 def test_a_report_has_a_row_for_each_guard(wrong: cs.Scenario, tmp_path: Path) -> None:
     cs.run_trials(wrong, FILTERS, runs=3, seed=1, jobs=1, out=tmp_path / "out")
     study = build_report(tmp_path / "out").studies[0]
-    _, table = REJECTIONS.blocks(study)
+    _, table = rejections(study)
     assert isinstance(table, Table)
     ((_, (row,)),) = table.groups
     score = study.tracks[1].verdict.rejection
@@ -391,7 +391,7 @@ def test_a_report_has_a_row_for_each_guard(wrong: cs.Scenario, tmp_path: Path) -
     assert [written(cell).partition(" ")[0] for cell in row[4:]] == [brief(100 * share.value) for share in shares]
     write_reports(tmp_path / "out", tmp_path / "r.html", None, False)
     assert "Rejected observations" in (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert REJECTIONS.blocks(replace(study, tracks=study.tracks[:1])) == ()
+    assert rejections(replace(study, tracks=study.tracks[:1])) == ()
 
 
 def test_a_clean_world_has_a_share_of_rejections_alone(uvd: cs.Scenario) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes as Panel
+from painted import panels, titles
 
 import consistency as cs
 from consistency.bench.pages import heat, write_regime_reports
@@ -18,9 +19,9 @@ from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.plan import Sweep, load_sweep
 from consistency.bench.sweeps.printing import regime_blocks
 from consistency.bench.sweeps.regime import Regime
-from consistency.referee.document.drawing import Figure, Tiles
+from consistency.referee.document.blocks import Figure
+from consistency.referee.show.svg import svg
 from consistency.referee.show.terminal import show
-from consistency.referee.show.with_matplotlib import render
 
 LONG = [{"kind": "mismatch", "rate": 0.05}]
 
@@ -56,58 +57,66 @@ def regime_of(sweep: Sweep) -> Regime:
     return Regime(sweep, results, {})
 
 
-def tiles(figure: Figure) -> list[Tiles]:
-    return [mark for panel in figure.panels for mark in panel.marks if isinstance(mark, Tiles)]
+def every_panel(figure: Figure) -> list[Panel]:
+    return [axes for number in range(len(figure.drawings)) for axes in panels(figure, number)]
+
+
+def tiles(axes: Panel) -> dict[tuple[int, int], tuple[str, str]]:
+    """Number and word of each tile by its place."""
+    texts = [text for text in axes.texts if text.get_text()]
+    pairs = zip(texts[::2], texts[1::2], strict=True)
+    return {
+        (int(number.get_position()[0]), int(number.get_position()[1])): (number.get_text(), word.get_text())
+        for number, word in pairs
+    }
+
+
+def ticks(labels: list[Any]) -> list[str]:
+    return [label.get_text() for label in labels]
 
 
 def test_a_tile_stands_where_its_cell_does() -> None:
     """Speeds from the left, noises from below; the number is that of the cell."""
-    regime = regime_of(sweep_over(**SPEED, **NOISE))
-    (panel,) = heat_figure(regime, "a").panels
-    (mark,) = tiles(heat_figure(regime, "a"))
-    assert panel.x.names == ("0.25", "0.5", "1")
-    assert panel.y.rows == ("0.2", "0.1"), "rows are named from the top"
-    placed = {
-        (panel.x.names[int(x)], panel.y.rows[int(y)]): t for x, y, t in zip(mark.x, mark.y, mark.text, strict=True)
-    }
-    assert placed == {
-        ("0.25", "0.1"): "1.00", ("0.25", "0.2"): "2.00", ("0.5", "0.1"): "3.00", ("0.5", "0.2"): "4.00",
-        ("1", "0.1"): "5.00", ("1", "0.2"): "∞",
+    (axes,) = every_panel(heat_figure(regime_of(sweep_over(**SPEED, **NOISE)), "a"))
+    assert ticks(axes.get_xticklabels()) == ["0.25", "0.5", "1"]
+    assert ticks(axes.get_yticklabels()) == ["0.1", "0.2"], "rows are named from below"
+    assert {place: number for place, (number, _) in tiles(axes).items()} == {
+        (0, 0): "1.00", (0, 1): "2.00", (1, 0): "3.00", (1, 1): "4.00", (2, 0): "5.00", (2, 1): "∞",
     }  # fmt: skip
-    assert set(mark.below) == {"overconf."}
-    assert mark.columns["status"][0] == "overconfident"
-    assert mark.columns["interval"][0] == "[0.50, ∞]"
+    assert {word for _, word in tiles(axes).values()} == {"overconf."}
+    assert heat.words_of(result(1.0)) == "overconfident, covariance ratio 1.00 [0.50, ∞], 12 runs"
+    assert axes.patches[0].get_gid() == f"title:{heat.words_of(result(1.0))}"
 
 
-@pytest.mark.parametrize(("name", "panels"), [("one", 1), ("text", 1), ("two", 1), ("four", 4)])
-def test_every_cell_is_shown_once(name: str, panels: int) -> None:
+@pytest.mark.parametrize(("name", "many"), [("one", 1), ("text", 1), ("two", 1), ("four", 4)])
+def test_every_cell_is_shown_once(name: str, many: int) -> None:
     regime = regime_of(sweep_over(**GRIDS[name]))
-    figure = heat_figure(regime, "a")
-    assert len(figure.panels) == panels
-    shown = [text for mark in tiles(figure) for text in mark.text]
+    found = every_panel(heat_figure(regime, "a"))
+    assert len(found) == many
+    shown = [number for axes in found for number, _ in tiles(axes).values()]
     assert len(shown) == len(regime.sweep.cells)
     assert len(set(shown)) == len(shown)
-    assert sum(len(sheet.panels) for sheet in figure.sheets) == panels
-    titles = {panel.title for panel in figure.panels}
-    assert len(titles) == panels
-    (mark,) = tiles(heat_figure(regime, "b"))
-    assert (mark.text, mark.below, mark.faces) == (("–",), ("failed",), (heat.NOTHING,))
+    assert len(set(titles(found))) == many
+    first, *empty = every_panel(heat_figure(regime, "b"))
+    assert list(tiles(first).values()) == [("–", "failed")]
+    assert [text.get_text() for axes in empty for text in axes.texts] == ["no cell is there yet"] * len(empty)
 
 
 def test_axes_that_vary_alone_have_a_map_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Beside the axis of the grid; each map has the cells in which no other axis is away from its base."""
     regime = regime_of(replace(load_sweep("beyond"), filters=("a", "b")))
-    sweep, figure = regime.sweep, heat_figure(regime, "a")
-    assert [panel.x.label for panel in figure.panels] == [axis.text for axis in sweep.alone]
-    for axis, mark in zip(sweep.alone, tiles(figure), strict=True):
+    sweep, found = regime.sweep, every_panel(heat_figure(regime, "a"))
+    assert [axes.get_xlabel() for axes in found] == [axis.key.rpartition(".")[2] for axis in sweep.alone]
+    for axis, axes in zip(sweep.alone, found, strict=True):
         k = sweep.axes.index(axis)
         shown = [
             c for c in sweep.cells if all(c.indices[j] == a.home for j, a in enumerate(sweep.axes) if j not in (0, k))
         ]
-        placed = {(int(x), int(y)): text for x, y, text in zip(mark.x, mark.y, mark.text, strict=True)}
-        numbers = {(c.indices[k], 2 - c.indices[0]): c.number for c in shown}
+        numbers = {(c.indices[k], c.indices[0]): c.number for c in shown}
         last = len(sweep.cells) - 1
-        assert placed == {at: "∞" if n == last else heat.brief(1.0 + n) for at, n in numbers.items()}
+        assert {place: number for place, (number, _) in tiles(axes).items()} == {
+            at: "∞" if n == last else heat.brief(1.0 + n) for at, n in numbers.items()
+        }
     page, _ = write_regime_reports(regime, tmp_path)
     text = page.read_text(encoding="utf-8")
     assert "Otherwise" in text
@@ -140,17 +149,15 @@ def test_colours_say_which_way() -> None:
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_both_painters_draw_it(name: str, tmp_path: Path) -> None:
+def test_page_and_paper_show_it(name: str, tmp_path: Path) -> None:
     regime = regime_of(sweep_over(**GRIDS[name]))
     page, sheets = write_regime_reports(regime, tmp_path)
-    assert "overconf." in page.read_text(encoding="utf-8") or name == "four", "long columns are packed"
+    text = page.read_text(encoding="utf-8")
+    assert text.count(">overconf.</text>") == len(regime.sweep.cells)
+    assert "<title>overconfident, covariance ratio 1.00 [0.50, ∞], 12 runs" in text
     assert sheets.stat().st_size > 10_000
-    for sheet in heat_figure(regime, "a").sheets:
-        assert "overconf." in _words(render(sheet))
-
-
-def _words(svg: bytes) -> str:
-    return io.BytesIO(svg).read().decode()
+    for draw in heat_figure(regime, "a").drawings:
+        assert "overconf." in svg(draw)
 
 
 @pytest.mark.parametrize("name", GRIDS)

@@ -8,10 +8,8 @@ import os
 import shutil
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +27,8 @@ from consistency.bench.store import journal as journals
 from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.results import open_results
 from consistency.bench.store.trial_rows import RunOutcome
-from consistency.referee.system import folders, stopping
+from consistency.referee.system import folders
 from consistency.referee.system.progress import progress, say
-from consistency.referee.system.stopping import stoppable
 
 FILTER = ["ekf-uvd"]
 RUNS = 6
@@ -333,110 +330,54 @@ def test_a_place_that_was_removed_meanwhile_is_made_again(
     assert content(tmp_path / "deep" / "out") == content(whole)
 
 
-# --- signals -------------------------------------------------------------------------------------------
+# --- Ctrl-C in a script ------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def handled() -> Iterator[None]:
-    """Ctrl-C as in a terminal; all as it was at the end."""
-    before = {number: signal.getsignal(number) for number in stopping.STOPS}
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Ctrl-C as in a terminal; as it was at the end."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("handled")
-def test_a_second_ctrl_c_soon_is_the_same_wish(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [100.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    with stoppable() as stop:
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        now[0] += 0.9 * stopping.AGAIN
-        signal.raise_signal(signal.SIGINT)
-        now[0] += 0.2 * stopping.AGAIN
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert (stop.number, stop.status) == (signal.SIGINT, 130)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals")
-@pytest.mark.usefixtures("handled")
-def test_signals_that_a_program_takes_itself_stay_its_own() -> None:
-    def own(*_: object) -> None: ...
-
-    signal.signal(signal.SIGTERM, own)
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
-    with stoppable(also=stopping.STOPS) as stop, stoppable() as inner:
-        assert inner is stop
-        assert signal.getsignal(signal.SIGINT) is stop
-        assert signal.getsignal(signal.SIGTERM) is own
-        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    with stoppable(also=stopping.STOPS) as stop:
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGHUP)
-        assert stop.status == 129
-    with stoppable():
-        assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL, "a library leaves it alone"
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("handled")
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_two_ctrl_c_lose_nothing(uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any, jobs: int) -> None:
-    def press() -> None:
-        for _ in range(2):
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.005)
+def test_ctrl_c_loses_nothing(uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any, jobs: int) -> None:
+    """The trial in progress is done to its end; the journal has all that came before."""
+    ended: list[int] = []
 
-    def twice() -> None:
-        thread = threading.Thread(target=press)
-        thread.start()
-        thread.join()
+    def pressed() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.3)
+        ended.append(4)
 
-    at_run(4, twice)
-    with pytest.raises(Interrupted) as stopped:
+    at_run(4, pressed)
+    with pytest.raises(KeyboardInterrupt) as stop:
         cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=jobs, out=tmp_path / "out")
-    assert stopped.value.status == 130
-    there = (tmp_path / "out").exists()
-    assert there or jobs == 2, "of two workers one may be in run 4 before an outcome is taken"
-    if there:
-        done = open_results(tmp_path / "out").finished_runs(FILTER)
-        assert 4 not in done
-        assert jobs == 2 or done == {0, 1, 2, 3}, "of two workers one may be behind"
+    assert not isinstance(stop.value, Interrupted)
+    assert ended == [4]
+    assert not (tmp_path / "out").exists()
+    with Unfinished(tmp_path / "out", resume=True) as unfinished:
+        done = unfinished.journal.runs
+    assert 4 not in done
+    assert jobs == 2 or done == {0, 1, 2, 3}, "of two workers one may be behind"
     at_run(4, int)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=there)
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=bool(done))
     assert content(tmp_path / "out") == content(whole)
 
 
 @pytest.mark.usefixtures("handled")
-def test_a_stop_that_was_swallowed_stops_nevertheless(uvd: cs.Scenario, tmp_path: Path, at_run: Any) -> None:
-    def swallowed() -> None:
-        with suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
+def test_ctrl_c_without_a_folder_hands_over_what_is_finished(uvd: cs.Scenario, at_run: Any) -> None:
+    def pressed() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.3)
 
-    at_run(2, swallowed)
-    with pytest.raises(Interrupted):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out")
-    assert open_results(tmp_path / "out").finished_runs(FILTER) == {0, 1, 2}
-
-
-@pytest.mark.usefixtures("handled")
-def test_an_error_that_a_stop_caused_is_a_stop(uvd: cs.Scenario, tmp_path: Path, at_run: Any) -> None:
-    """As where a worker was ended by the same signal."""
-
-    def fails() -> None:
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt as stop:
-            raise RuntimeError("worker died") from stop
-
-    at_run(2, fails)
-    with pytest.raises(Interrupted):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out")
-    assert open_results(tmp_path / "out").finished_runs(FILTER) == {0, 1}
+    at_run(4, pressed)
+    with pytest.raises(Interrupted) as stop:
+        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1)
+    assert stop.value.results.finished_runs(FILTER) == {0, 1, 2, 3}
+    assert stop.value.results.manifest["finished_runs"] == 4
 
 
 # --- what cannot be written ------------------------------------------------------------------------
@@ -517,11 +458,3 @@ def test_another_processor_is_named(uvd: cs.Scenario, whole: Path, tmp_path: Pat
     cs.run_trials(uvd, FILTER, RUNS + 2, seed=3, jobs=1, out=out, resume=True)
     assert "Z80 (BLAS: Prescott) computed the runs that are there" in capsys.readouterr().err
     assert open_results(out).manifest["machines"] == [old, here]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals")
-def test_no_signal_disturbs_what_must_be_whole() -> None:
-    """Each of those that are taken for Ctrl-C, SIGTERM and SIGHUP among them."""
-    with stopping.undisturbed():
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            assert signal.getsignal(number) is signal.SIG_IGN, number

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.trial_work import TrialWork as Runs
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal, Unfinished
@@ -109,7 +109,7 @@ def test_what_is_left_of_a_cell_that_was_just_written_goes(
 def test_a_sweep_goes_on_within_a_cell(
     at: Path, stop_after: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
-    whole, _ = run_sweep(grid(at), at / "whole", jobs=1)
+    whole = run_sweep(grid(at), at / "whole", jobs=1)
     assert hidden(at / "whole") == []
     stop_after(14 + 9, error)
     with pytest.raises(type(error)):
@@ -118,9 +118,8 @@ def test_a_sweep_goes_on_within_a_cell(
     monkeypatch.setattr(cells, "cost_of", lambda *_: (1.0, 5.0))
     assert len(content(at / "out")) == 1
     done = stop_after(-1, error)
-    folder, missing = run_sweep(grid(at), at / "out", jobs=1)
+    folder = run_sweep(grid(at), at / "out", jobs=1)
     assert done == [*range(9, 14), *range(14)]
-    assert missing == 0
     assert content(at / "out") == content(at / "whole")
     assert repr(folder.results()) == repr(whole.results())
     assert hidden(at / "out") == []
@@ -184,27 +183,26 @@ def test_a_cell_that_another_process_works_on(at: Path, monkeypatch: pytest.Monk
     run_sweep(grid(at), at / "whole", jobs=1)
     run_cell, done, free = cells.run_cell, list[str](), threading.Event()
 
-    def counted(sweep: Sweep, cell: Any, *rest: Any) -> Any:
+    def counted(sweep: Sweep, cell: Any, *rest: Any, **how: Any) -> Any:
         done.append(cell.name)
         if len(done) == 2:
             free.set()
-        return run_cell(sweep, cell, *rest)
+        return run_cell(sweep, cell, *rest, **how)
 
     def other() -> None:
         with folder.at_work(first) as journal:
             held.set()
             assert free.wait(60.0)
             if is_done:
-                folder.write(first, run_cell(folder.sweep, first.cell, "kf", 1, None, journal), 1.0)
+                folder.write(first, run_cell(folder.sweep, first.cell, "kf", jobs=1, journal=journal), 1.0)
 
     held = threading.Event()
     thread = threading.Thread(target=other)
     thread.start()
     assert held.wait(60.0)
     monkeypatch.setattr(running, "run_cell", counted)
-    _, missing = run_sweep(grid(at), at / "out", jobs=1)
+    run_sweep(grid(at), at / "out", jobs=1)
     thread.join()
-    assert missing == 0
     order = [work.cell.name for work in folder.all_work()]
     assert done == (order[1:] if is_done else [*order[1:], order[0]])
     assert content(at / "out") == content(at / "whole")
@@ -216,29 +214,27 @@ def test_a_cell_that_was_done_after_the_sweep_began(at: Path, monkeypatch: pytes
     folder, last = others_cell(at, -1)
     run_cell, done = cells.run_cell, list[str]()
 
-    def meanwhile(sweep: Sweep, cell: Any, *rest: Any) -> Any:
+    def meanwhile(sweep: Sweep, cell: Any, *rest: Any, **how: Any) -> Any:
         if not done:
-            folder.write(last, run_cell(folder.sweep, last.cell, "kf", 1), 1.0)
+            folder.write(last, run_cell(folder.sweep, last.cell, "kf", jobs=1), 1.0)
         done.append(cell.name)
-        return run_cell(sweep, cell, *rest)
+        return run_cell(sweep, cell, *rest, **how)
 
     monkeypatch.setattr(running, "run_cell", meanwhile)
-    _, missing = run_sweep(grid(at), at / "out", jobs=1)
-    assert (missing, len(done)) == (0, 2)
+    run_sweep(grid(at), at / "out", jobs=1)
+    assert len(done) == 2
 
 
-def test_the_backend_does_the_runs(at: Path) -> None:
+def test_the_executor_does_the_runs(at: Path) -> None:
     done: list[int] = []
 
-    class Backend:
-        def prepare(self, work: Runs, run: int, /) -> None:
-            LocalThreads(1).prepare(work, run)
+    class Noted(ThreadPoolExecutor):
+        def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+            done.extend(arguments[1])
+            return super().submit(function, *arguments, **options)
 
-        def outcomes(self, work: Runs, runs: Sequence[int], /) -> Iterator[RunOutcome]:
-            done.extend(runs)
-            yield from LocalThreads(1).outcomes(work, runs)
-
-    run_sweep(grid(at), at / "out", backend=Backend())
+    with Noted(1) as executor:
+        run_sweep(grid(at), at / "out", executor=executor)
     assert done == [*range(14)] * 3
 
 

@@ -9,8 +9,8 @@ import pytest
 
 import consistency as cs
 from consistency.bench.runs import memory_needed as module
-from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.isolation.filter_process import Isolation
+from consistency.bench.runs.local_threads import LocalThreads
 from consistency.bench.runs.memory_needed import memory_here, workers_that_fit
 from consistency.bench.runs.trial_work import Recorded, TrialWork
 from consistency.referee.errors import InputError
@@ -65,7 +65,7 @@ def test_jobs_that_were_asked_for_are_not_made_fewer(
     for jobs, workers in ((-1, 2), (4, 4)):
         local = LocalThreads(jobs)
         local.prepare(TrialWork(Recorded({0: trial}), Isolation([cs.get_filter("kf")], linear.belief)), 0)
-        assert local._room == workers
+        assert local._workers == workers
 
 
 def test_the_limit_of_a_container_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

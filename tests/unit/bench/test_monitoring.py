@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,11 @@ from consistency.bench.runs.results_to_records import innovations_of
 from consistency.referee.document.blocks import Document
 from consistency.referee.document.monitor import monitor_document
 from consistency.referee.errors import InputError
-from consistency.referee.pages.monitor import POINTS, averaged, monitor_plot, sheet
-from consistency.referee.pages.write_pages import require_plot, write_monitor_plot
+from consistency.referee.pages.monitor import POINTS, averaged, monitor_drawing
+from consistency.referee.pages.write_pages import plotted, require_plot
 from consistency.referee.readers.formats.innovation_files import NisLog
-from consistency.referee.show import with_matplotlib
 from consistency.referee.show.as_json import render
+from consistency.referee.show.svg import drawn, saved, svg
 from consistency.referee.show.terminal import show
 from consistency.referee.verdicts.monitor_sources import Watched, make_monitor, read_innovations, watch, watch_lines
 
@@ -301,10 +302,10 @@ def test_many_innovations_are_averaged_before_they_are_drawn() -> None:
 def test_the_plot(kind: str, tmp_path: Path) -> None:
     path = tmp_path / f"plot.{kind}"
     require_plot(path, overwrite=False)
-    write_monitor_plot(path, changed())
+    plotted(partial(monitor_drawing, changed()), path)
     content = path.read_bytes()
     assert content[:4] == {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xm"}[kind]
-    assert content == monitor_plot(changed(), kind)
+    assert content == saved(drawn(partial(monitor_drawing, changed())), kind)
     if kind == "png":
         assert image.imread(BytesIO(content)).std() > 0.05
     with pytest.raises(InputError, match="exists already"):
@@ -315,15 +316,16 @@ def test_the_plot(kind: str, tmp_path: Path) -> None:
 
 def test_a_run_without_any_innovation_can_be_drawn() -> None:
     log = NisLog("f", np.arange(1.0, 6), np.full(5, np.nan), np.full(5, np.nan), np.zeros(5))
-    assert monitor_plot(watch(log, make_monitor("optimal")), "svg")
+    assert svg(partial(monitor_drawing, watch(log, make_monitor("optimal"))))
 
 
 def test_evidence_is_drawn_with_its_threshold_and_alarm() -> None:
     watched = changed()
     alarm, threshold = watched.alarm, watched.monitor.threshold
-    axes = with_matplotlib.draw(sheet(watched)).axes[1]
-    line = next(line for line in axes.lines if len(line.get_ydata()) == len(watched.evidence))
-    np.testing.assert_array_equal(line.get_ydata(), watched.evidence)
+    axes = drawn(partial(monitor_drawing, watched)).axes[1]
+    line = axes.lines[-1]
+    np.testing.assert_array_equal(line.get_ydata(), watched.evidence[np.searchsorted(watched.step, line.get_xdata())])
+    assert line.get_ydata().max() == watched.evidence.max()
     assert [line.get_ydata()[0] for line in axes.lines if list(line.get_xdata()) == [0, 1]] == [threshold]
     assert axes.get_yscale() == "log"
     assert axes.get_ylim()[1] <= threshold**2 < watched.evidence.max()
@@ -333,4 +335,4 @@ def test_evidence_is_drawn_with_its_threshold_and_alarm() -> None:
     quiet = watch(
         NisLog("f", np.arange(1.0, 6), np.full(5, np.nan), np.full(5, 3.0), np.full(5, 3.0)), make_monitor("optimal")
     )
-    assert not with_matplotlib.draw(sheet(quiet)).axes[1].patches
+    assert not drawn(partial(monitor_drawing, quiet)).axes[1].patches

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from painted import lines, panels
 
 import consistency as cs
 from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.report_input import Report
 from consistency.bench.pages.sections import overview
-from consistency.referee.document.blocks import Name, Status, Table
-from consistency.referee.document.drawing import Figure, Intervals, Span
+from consistency.referee.document.blocks import Figure, Name, Status, Table
 from consistency.referee.document.wording import written
 from consistency.referee.show import pdf
-from consistency.referee.show.html import render_html
+from consistency.referee.show.as_html import render
 
 FILTERS = ("ekf-uvd", "ekf-xyz")
 
@@ -34,7 +34,7 @@ def report(uvd, tmp_path_factory) -> Report:
 
 
 def opening(report: Report) -> tuple[Figure, Table]:
-    picture, verdicts = overview.SECTION.blocks(report)
+    picture, verdicts = overview.opening(report)
     assert isinstance(picture, Figure)
     assert isinstance(verdicts, Table)
     return picture, verdicts
@@ -54,29 +54,29 @@ def test_every_verdict_is_in_the_table(report: Report) -> None:
 
 
 def test_the_picture_has_every_ratio_in_the_row_of_its_world(report: Report) -> None:
-    (panel,) = opening(report)[0].panels
-    assert panel.y.rows == ("first", "second")
-    found = {}
-    for mark in panel.marks:
-        if isinstance(mark, Intervals):
-            for k, world in enumerate(mark.columns["world"]):
-                assert panel.y.rows[round(float(mark.y[k]))] == world
-                found[world, mark.columns["filter"][k]] = mark.x[k], mark.low[k], mark.high[k]
-    expected = {
-        (study.name, track.name): tuple(track.verdict.scale.inflation)
-        for study in report.studies
-        for track in study.tracks
+    (axes,) = panels(opening(report)[0])
+    worlds = [label.get_text() for label in axes.get_yticklabels()]
+    assert worlds == ["first", "second"]
+    drawn = {
+        (worlds[round(float(y))], name): x
+        for name in FILTERS
+        for line in lines(axes, name)
+        for x, y in line.get_xydata()
     }
-    assert found == expected
-    low, high = panel.x.window
-    assert all(low < value < high for value, _, _ in found.values())
+    ratios = {
+        (study.name, track.name): track.verdict.scale.inflation for study in report.studies for track in study.tracks
+    }
+    assert drawn == {key: ratio.value for key, ratio in ratios.items()}
+    assert {place.ratio for place in overview.places(report)} == set(ratios.values())
+    low, high = axes.get_xlim()
+    assert all(low < ratio.value < high for ratio in ratios.values())
 
 
 def test_what_is_tolerated_is_shaded(report: Report) -> None:
-    (panel,) = opening(report)[0].panels
+    (axes,) = panels(opening(report)[0])
     factor = report.studies[0].tracks[0].verdict.settings.factor
-    (shade,) = [mark for mark in panel.marks if isinstance(mark, Span)]
-    assert (shade.low, shade.high) == pytest.approx((1.0 / factor, factor))
+    (shade,) = [patch for patch in axes.patches if str(patch.get_label()).startswith("tolerated")]
+    assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx((1.0 / factor, factor))
 
 
 def test_a_filter_without_a_ratio_stays_in_the_table(report: Report) -> None:
@@ -84,20 +84,21 @@ def test_a_filter_without_a_ratio_stays_in_the_table(report: Report) -> None:
     blind = replace(study.tracks[0], verdict=replace(study.tracks[0].verdict, scale=None))
     changed = replace(report, studies=(report.studies[0], replace(study, tracks=(blind,))))
     picture, verdicts = opening(changed)
-    assert "second" not in [w for m in picture.panels[0].marks if isinstance(m, Intervals) for w in m.columns["world"]]
+    assert all(round(place.y) == 0 for place in overview.places(changed))
+    assert len(lines(panels(picture)[0], "ekf-uvd")[0].get_xdata()) == 1
     assert tuple(map(written, verdicts.groups[0][1][-1][3:])) == ("–", "–")
 
 
 def test_one_study_opens_with_its_answer_alone(report: Report) -> None:
     single = replace(report, studies=report.studies[:1])
-    assert overview.SECTION.blocks(single) == ()
+    assert overview.opening(single) == ()
     assert compose(single).opening == ()
 
 
 def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> None:
     document = compose(report)
     assert document.figures[0].title == overview.TITLE
-    page = render_html(document)
+    page = render(document)
     first = page.index("<section")
     assert (
         page.index('class="answer"') < page.index(overview.TITLE) < page.index("Every verdict of this report") < first
@@ -107,10 +108,9 @@ def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> N
 
 def test_the_opening_is_printed(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pdf.typst, "compile", lambda path, **_: Path(path).with_name("data.json").read_bytes())
-    monkeypatch.setattr(pdf.with_matplotlib, "render", lambda sheet: b"")
     data = json.loads(pdf.render_pdf(compose(report)))
     assert [block["kind"] for block in data["opening"]] == ["Figure", "Table"]
-    assert data["opening"][0]["caption"].startswith(overview.TITLE)
+    assert pdf.soft(overview.TITLE) == data["opening"][0]["title"]
 
 
 def test_the_answer_counts_where_the_table_names(report: Report) -> None:
@@ -126,5 +126,5 @@ def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report: Repor
     wide = replace(scale, inflation=scale.inflation._replace(value=2.0, low=0.5, high=np.inf))
     changed = replace(track, verdict=replace(track.verdict, scale=wide))
     studies = (replace(report.studies[0], tracks=(changed,)), replace(report.studies[1], tracks=(changed,)))
-    (panel,) = opening(replace(report, studies=studies))[0].panels
-    assert panel.x.window[1] == pytest.approx(3.0)
+    (axes,) = panels(opening(replace(report, studies=studies))[0])
+    assert axes.get_xlim()[1] == pytest.approx(3.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -11,11 +10,13 @@ from misbehaving import Deadly, is_gone
 
 import consistency as cs
 from consistency.bench.runs.backends import slurm
-from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.backends.slurm import Slurm, options_of
+from consistency.bench.runs.backends.slurm import SlurmExecutor, options_of
+from consistency.bench.runs.batches import ExecutorWorkers
 from consistency.bench.runs.isolation.filter_process import Isolation
+from consistency.bench.runs.local_threads import LocalThreads
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.runs.trial_work import Outcomes, Simulated, TrialWork
+from consistency.bench.runs.trial_work import Simulated, TrialWork
+from consistency.bench.store.trial_rows import RunOutcome
 
 pytestmark = [
     pytest.mark.skipif(os.name == "nt", reason="signals"),
@@ -30,22 +31,25 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slurm, "GLANCE", 0.2)
 
 
-def same(outcomes: Outcomes, expected: Outcomes, but: Sequence[int] = ()) -> None:
-    """Bit by bit, whatever the order."""
-    by_run, expected_by_run = ({outcome.run: outcome for outcome in each} for each in (outcomes, expected))
-    assert sorted(by_run) == sorted(expected_by_run)
-    for run in sorted(set(by_run) - set(but)):
-        assert not by_run[run].failures
-        for column, values in by_run[run].estimates["kf"].items():
-            assert values.tobytes() == expected_by_run[run].estimates["kf"][column].tobytes()
-    for run in but:
-        assert [failure.reason[:12] for failure in by_run[run].failures] == ["its job died"]
+def on_jobs(folder: Path, work: TrialWork, jobs: int, runs: int = RUNS) -> dict[int, RunOutcome]:
+    with SlurmExecutor(folder, LOCAL, jobs) as executor:
+        outcomes = {outcome.run: outcome for outcome in ExecutorWorkers(executor).outcomes(work, range(runs))}
+    assert sorted(outcomes) == list(range(runs))
+    return outcomes
+
+
+def require_same(outcomes: dict[int, RunOutcome], work: TrialWork) -> None:
+    """Bit by bit, those that have not failed."""
+    for expected in LocalThreads(1).outcomes(work, range(len(outcomes))):
+        outcome = outcomes[expected.run]
+        for column, values in outcome.estimates["kf"].items():
+            assert outcome.failures or values.tobytes() == expected.estimates["kf"][column].tobytes()
 
 
 def test_the_bytes_are_those_of_local_runs(linear: cs.Scenario, tmp_path: Path) -> None:
     local = run_trials(linear, ["kf"], RUNS, jobs=1, out=tmp_path / "local")
-    backend = Slurm(tmp_path / "jobs", LOCAL, jobs=2)
-    jobs = run_trials(linear, ["kf"], RUNS, out=tmp_path / "slurm", backend=backend)
+    with SlurmExecutor(tmp_path / "jobs", LOCAL, jobs=2) as executor:
+        jobs = run_trials(linear, ["kf"], RUNS, out=tmp_path / "slurm", executor=executor)
     for path in local.folder.glob("*.parquet"):
         assert path.read_bytes() == (jobs.folder / path.name).read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["local", "slurm"]
@@ -58,40 +62,61 @@ def test_a_job_that_dies_once_is_done_again(
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
     fuse = tmp_path / "fuse"
     fuse.touch()
-    work = TrialWork(Deadly(trials, (4,), os.getpid(), str(fuse)), isolation)
-    outcomes = Slurm(tmp_path / "jobs", LOCAL, 1).outcomes(work, range(RUNS))
-    same(outcomes, LocalThreads(1).outcomes(TrialWork(trials, isolation), range(RUNS)))
+    outcomes = on_jobs(tmp_path / "jobs", TrialWork(Deadly(trials, (4,), os.getpid(), str(fuse)), isolation), 1)
+    assert not any(outcome.failures for outcome in outcomes.values())
+    require_same(outcomes, TrialWork(trials, isolation))
     assert f"consistency: 1 jobs died; their logs are in {tmp_path / 'jobs'}\n" == capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_a_run_that_kills_its_job_has_failed(linear: cs.Scenario, tmp_path: Path) -> None:
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
-    work = TrialWork(Deadly(trials, (1,), os.getpid()), isolation)
-    outcomes = Slurm(tmp_path / "jobs", LOCAL, 1).outcomes(work, range(2))
-    same(outcomes, LocalThreads(1).outcomes(TrialWork(trials, isolation), range(2)), but=[1])
+    outcomes = on_jobs(tmp_path / "jobs", TrialWork(Deadly(trials, (1,), os.getpid()), isolation), 1, 2)
+    assert [failure.reason for failure in outcomes[1].failures] == ["its worker died (UncompletedJobError)"]
+    assert not outcomes[0].failures
+    require_same(outcomes, TrialWork(trials, isolation))
 
 
 def test_an_end_in_the_middle_leaves_nothing(
     linear: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(slurm, "EVERY", 0.0)
+    monkeypatch.setattr(SlurmExecutor, "batch_seconds", 0.0)
     pids: list[int] = []
-    map_array = slurm.submitit.AutoExecutor.map_array
+    submit_array = slurm.submitit.AutoExecutor.submit_array
 
     def noted(*arguments: object) -> list[object]:
-        jobs: list[object] = map_array(*arguments)
+        jobs: list[object] = submit_array(*arguments)
         pids.extend(int(job.job_id) for job in jobs)  # type: ignore[attr-defined]
         return jobs
 
-    monkeypatch.setattr(slurm.submitit.AutoExecutor, "map_array", noted)
+    monkeypatch.setattr(slurm.submitit.AutoExecutor, "submit_array", noted)
     work = TrialWork(Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief))
-    outcomes = Slurm(tmp_path / "jobs", LOCAL, 1).outcomes(work, range(100_000))
-    assert next(outcomes).run == 0
-    outcomes.close()
+    with SlurmExecutor(tmp_path / "jobs", LOCAL, 1) as executor:
+        outcomes = ExecutorWorkers(executor).outcomes(work, range(100_000))
+        assert next(outcomes).run == 0
+        outcomes.close()
     assert pids
     assert all(is_gone(pid, 60.0) for pid in pids)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_waits_is_sent_as_one_array(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[int] = []
+    submit_array = slurm.submitit.AutoExecutor.submit_array
+
+    def noted(self: object, calls: list[object]) -> list[object]:
+        sizes.append(len(calls))
+        jobs: list[object] = submit_array(self, calls)
+        return jobs
+
+    monkeypatch.setattr(slurm.submitit.AutoExecutor, "submit_array", noted)
+    with SlurmExecutor(tmp_path / "jobs", LOCAL) as executor:
+        futures = [executor.submit(divmod, number, 3) for number in (7, 8)]
+        broken = executor.submit(divmod, 1, 0)
+        assert [future.result(60) for future in futures] == [(2, 1), (2, 2)]
+        with pytest.raises(Exception, match="ZeroDivisionError"):
+            broken.result(60)
+    assert sizes[0] == 3
 
 
 @pytest.mark.parametrize(
@@ -106,7 +131,7 @@ def test_what_submitit_does_not_know_is_said(
     linear: cs.Scenario, tmp_path: Path, options: dict[str, object], sentence: str
 ) -> None:
     with pytest.raises(cs.InputError, match=f"^{sentence}"):
-        run_trials(linear, ["kf"], RUNS, out=tmp_path / "out", backend=Slurm(tmp_path / "jobs", options))
+        run_trials(linear, ["kf"], RUNS, out=tmp_path / "out", executor=SlurmExecutor(tmp_path / "jobs", options))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -108,10 +108,10 @@ def test_the_core_is_small() -> None:
 @pytest.mark.usefixtures("nowhere")
 def test_a_sentence_names_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     require("this", "bench", "report")
-    without(monkeypatch, "numba", "tomli_w", "bokeh")
+    without(monkeypatch, "numba", "tomli_w", "typst")
     with pytest.raises(MissingPackageError) as refusal:
         require("this", "bench", "report")
-    assert str(refusal.value) == "this needs numba, tomli-w, bokeh: pip install numba tomli-w bokeh"
+    assert str(refusal.value) == "this needs numba, tomli-w, typst: pip install numba tomli-w typst"
     assert isinstance(refusal.value, ImportError)
     assert isinstance(refusal.value, cs.InputError)
     assert extras.is_installed("ros")
@@ -190,9 +190,9 @@ def test_the_place_that_it_came_from(
     monkeypatch.setattr(metadata, "distribution", lambda name: found.get(name) or installed(name))
     words = [word.replace("{at}", str(place)) for word in expected]
     assert extras._from_origin(("bench", "plot")) == words
-    without(monkeypatch, "bokeh")
-    expected = [word.replace("bench,plot", "report") for word in words] or ["bokeh"]
-    assert shlex.split(remedy("report")) == ["bokeh:", "pip", "install", *expected]
+    without(monkeypatch, "typst")
+    expected = [word.replace("bench,plot", "report") for word in words] or ["typst"]
+    assert shlex.split(remedy("report")) == ["typst:", "pip", "install", *expected]
 
 
 def test_no_text_installs_from_an_index() -> None:
@@ -248,7 +248,7 @@ def test_a_command_without_its_packages(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Whatever its options are; its help is there."""
-    module = "bokeh" if name == "report" else "numba"
+    module = "typst" if name == "report" else "numba"
     without(monkeypatch, module)
     err = refused(capsys, name, "--no-such-option")
     assert err.startswith(f"consistency: '{name}' needs {module}: pip install ")
@@ -262,7 +262,7 @@ def test_a_command_without_its_packages(
 def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     before, _ = consistency(capsys, "--help")
     assert "[bench]" not in before
-    without(monkeypatch, "numba", "bokeh")
+    without(monkeypatch, "numba", "typst")
     after, _ = consistency(capsys, "--help")
     lines = dict(re.findall(r"^  ([a-z-]+) +(\S.*)$", after, re.MULTILINE))
     assert set(COMMANDS) <= set(lines)
@@ -270,7 +270,7 @@ def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pyt
         mark = f"[{','.join(row.extras)}] " if row.extras else ""
         assert lines[name].startswith(mark), name
         assert row.extras or not lines[name].startswith("[")
-    assert "[report,bench,vision]: needs bokeh, numba: pip install " in after
+    assert "[report,bench,vision]: needs typst, numba: pip install " in after
     assert consistency(capsys, "-h")[0] == after
 
 

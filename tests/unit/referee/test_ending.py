@@ -1,169 +1,288 @@
-"""A command that is gone within two seconds of a signal, and what it leaves; by the standard library alone."""
+"""A command that any signal ends at once, workers that end with it, and what is cleared by the next command."""
 
 from __future__ import annotations
 
 import os
+import pty
+import re
+import select
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable
+import traceback
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from consistency.referee.errors import InputError
 from consistency.referee.system import stopping
-from consistency.referee.system.stopping import STOPS, stoppable
+from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.folders import NewFolder, read_manifest, require_free, unfinished_of, write_folder
+from consistency.referee.system.stopping import away_from_signals, end_with_parent, link_to_parent
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="fork")
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SLEEPS = "print('there', flush=True); time.sleep(60)"
+IN_C = "print('there', flush=True); ctypes.CDLL(None).sleep(60)"  # as a compiler, which releases the GIL
+SWALLOWS = """
+print('there', flush=True)
+while True:
+    try:
+        time.sleep(60)
+    except BaseException:
+        pass
+"""
+COMMAND = """
+import ctypes, os, sys, time
+import consistency.commands as cli
+from consistency.__main__ import main
+sys.argv = ["consistency", {word!r}]
+cli.main = lambda: exec({work!r}, globals())
+main()
+"""
 
-HANGS = "import signal; [signal.signal(n, signal.SIG_IGN) for n in (1, 2, 15)]; "  # as a compiler does that never looks
-SLEEPS = "import time; print('there', flush=True); time.sleep(60)"
-CHILD = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)']); "
 
-
-def begun(work: str, ignored: int | None = None) -> subprocess.Popen[str]:
-    """``work`` under supervision, once it is there, with signals as in a terminal."""
+def begun(
+    work: str, word: str = "list", ignored: int | None = None, err: int = subprocess.PIPE
+) -> subprocess.Popen[str]:
+    """The command line whose command is ``work``, once that is there, with signals as in a terminal."""
 
     def as_in_a_terminal() -> None:
         for number in STOPS:
             signal.signal(number, signal.SIG_IGN if number == ignored else signal.SIG_DFL)
 
-    code = f"from consistency.referee.system.stopping import supervised\nsupervised(lambda: exec({work!r}, {{}}))"
     process = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        [sys.executable, "-c", COMMAND.format(word=word, work=work)], stdout=subprocess.PIPE, stderr=err, text=True,
         start_new_session=True, preexec_fn=as_in_a_terminal,
     )  # fmt: skip
+    assert process.stdout is not None
     process.stdout.readline()
     return process
 
 
-def session(leader: int) -> list[str]:
-    """Processes of a session, of /proc."""
-    stats = {path.parent.name: path for path in Path("/proc").glob("[0-9]*/stat")}
-    left = []
-    for pid, path in stats.items():
-        try:
-            state, _, _, sid, *_ = path.read_text(errors="replace").rpartition(")")[2].split()
-        except OSError:
-            continue
-        left += [pid] * (int(sid) == leader and state != "Z")
-    return left
-
-
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_what_does_not_look_is_killed(number: int, status: int) -> None:
-    process = begun(HANGS + CHILD + SLEEPS)
-    begin = time.monotonic()
+@pytest.mark.parametrize("work", [SLEEPS, IN_C, SWALLOWS], ids=["sleeps", "in C", "swallows"])
+@pytest.mark.parametrize(
+    ("number", "status", "line"),
+    [
+        (signal.SIGINT, 130, "consistency: stopped\n"),
+        (signal.SIGTERM, -signal.SIGTERM, ""),
+        (signal.SIGHUP, -signal.SIGHUP, ""),
+    ],
+)
+def test_a_signal_ends_a_command_whatever_it_does(work: str, number: int, status: int, line: str) -> None:
+    process = begun(work)
     process.send_signal(number)
-    _, error = process.communicate(timeout=30)
-    assert time.monotonic() - begin > stopping.GRACE - 0.1
+    assert process.communicate(timeout=30)[1] == line
     assert process.returncode == status
-    assert error == "consistency: stopped\n"
-    assert sys.platform != "linux" or session(process.pid) == []
 
 
-def test_the_grace_and_the_rest_are_two_seconds() -> None:
-    assert stopping.GRACE + stopping.LEAVE < 2.0
+def test_ctrl_c_says_where_finished_runs_are_and_shows_the_cursor() -> None:
+    terminal, theirs = pty.openpty()
+    process = begun(SLEEPS, "run", err=theirs)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=30) == ("", None)
+    assert process.returncode == 130
+    said = os.read(terminal, 1000).decode()
+    assert said.startswith("\x1b[?25h")
+    assert re.search(r"^consistency: stopped; finished runs are kept .* --resume\r\n$", said, re.MULTILINE)
+    os.close(terminal)
+    os.close(theirs)
 
 
-def test_before_the_command_takes_signals_it_ends_at_once() -> None:
-    process = begun(CHILD + SLEEPS)
-    process.send_signal(signal.SIGTERM)
-    assert process.communicate(timeout=30)[1] == "consistency: stopped\n"
-    assert process.returncode == 143
-    assert sys.platform != "linux" or session(process.pid) == []
-
-
-def test_the_first_signal_is_the_status_and_what_was_said_is_enough() -> None:
-    takes = "import signal, sys; signal.signal(15, lambda *_: sys.exit('own words')); "
-    process = begun(takes + SLEEPS)
-    process.send_signal(signal.SIGTERM)
-    assert process.communicate(timeout=30) == ("", "own words\n")
-    assert process.returncode == 143
-
-
-def test_a_signal_that_the_caller_ignores_stays_ignored() -> None:
-    process = begun("import time; print('there', flush=True); time.sleep(0.5); print('done')", ignored=signal.SIGHUP)
-    process.send_signal(signal.SIGHUP)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_signal_that_the_caller_ignores_stays_ignored(number: int) -> None:
+    process = begun("print('there', flush=True); time.sleep(0.5); print('done')", ignored=number)
+    process.send_signal(number)
     assert process.communicate(timeout=30) == ("done\n", "")
     assert process.returncode == 0
 
 
-@pytest.mark.parametrize(
-    ("ends", "status"),
-    [("pass", 0), ("raise SystemExit(2)", 2), ("1 / 0", 1), ("import os; os.kill(os.getpid(), 9)", -9)],
-)
+@pytest.mark.parametrize(("ends", "status"), [("pass", 0), ("raise SystemExit(2)", 2), ("sys.exit()", 0), ("1 / 0", 1)])
 def test_without_a_signal_it_ends_as_its_work_did(ends: str, status: int) -> None:
     process = begun(f"print('there', flush=True)\n{ends}")
     process.communicate(timeout=30)
     assert process.returncode == status
 
 
-def test_the_work_dies_with_the_parent() -> None:
-    process = begun(SLEEPS)
-    process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=30)  # its pipes are closed once all that had them are dead
-    assert process.returncode == -signal.SIGKILL
+def test_the_command_line_never_ends_its_caller(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A notebook or a test that calls ``main`` gets SystemExit, and its handlers stay."""
+    from consistency.commands import main
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    before = [signal.getsignal(number) for number in STOPS]
+    monkeypatch.setattr(sys.modules["consistency.commands.app"], "app", interrupted)
+    with pytest.raises(SystemExit) as end:
+        main(["list", "--json"])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "consistency: stopped\n"
+    assert [signal.getsignal(number) for number in STOPS] == before
 
 
-def test_a_program_with_handlers_of_its_own_is_not_supervised() -> None:
-    here: list[int] = []
-    before = signal.signal(signal.SIGTERM, lambda *_: None)
-    try:
-        stopping.supervised(lambda: here.append(os.getpid()))
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert here == [os.getpid()]
+# --- calls that no signal disturbs ----------------------------------------------------------------------
 
 
-def test_a_program_that_was_stopped_ends_soon_and_flushes_what_is_open(tmp_path: Path) -> None:
-    program = """if True:
-        import atexit, gc, signal, sys
-        from consistency.referee.system.stopping import stoppable
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        class Cycle: pass
-        held = Cycle()
-        held.own, held.file = held, open(sys.argv[1], "w")
-        held.file.write("all of it")
-        for _ in range(2):
-            try:
-                with stoppable():
-                    signal.raise_signal(signal.SIGINT)
-            except KeyboardInterrupt:
-                pass
-        assert gc.get_freeze_count() == 0
-        del held
-        gc.disable()
-        atexit._run_exitfuncs()
-        assert gc.get_freeze_count() > 1000
-    """
-    words = [sys.executable, "-c", program, str(tmp_path / "file")]
-    done = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert (tmp_path / "file").read_text() == "all of it"
-    assert done.stderr == ""
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Ctrl-C as in a terminal."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.filterwarnings("error")
-def test_an_interrupt_that_a_callback_drops_is_remembered_in_silence(capsys: pytest.CaptureFixture[str]) -> None:
-    class Dropped:
-        def __init__(self, action: Callable[[], object]) -> None:
-            self.action = action
+def test_the_main_thread_does_not_make_the_call_itself() -> None:
+    assert away_from_signals(threading.current_thread) is not threading.main_thread()
+    outer, inner = away_from_signals(lambda: (threading.current_thread(), away_from_signals(threading.current_thread)))
+    assert outer is inner, "a thread that takes no signals needs no other"
 
-        def __del__(self) -> None:
-            self.action()
 
-    before, hook = sys.unraisablehook, sys.__unraisablehook__
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.unraisablehook = hook  # pytest's own collects them
-    try:
-        with stoppable() as stop:
-            Dropped(lambda: signal.raise_signal(signal.SIGINT))
-            assert stop.number == signal.SIGINT
-            assert capsys.readouterr().err == ""
-            Dropped(lambda: 1 / 0)  # what else is dropped is printed as before
-            assert "ZeroDivisionError" in capsys.readouterr().err
-        assert sys.unraisablehook is hook
-    finally:
-        sys.unraisablehook = before
-        signal.signal(signal.SIGINT, handler)
+def test_results_and_exceptions_come_back() -> None:
+    assert away_from_signals(divmod, 7, 2) == (3, 1)
+    with pytest.raises(ZeroDivisionError):
+        away_from_signals(divmod, 7, 0)
+
+
+def functions_of(thread: threading.Thread) -> list[str]:
+    """Names of the functions in which a thread is."""
+    return [frame.f_code.co_name for frame, _ in traceback.walk_stack(sys._current_frames()[thread.ident or 0])]
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_ctrl_c_comes_after_the_call() -> None:
+    over: list[bool] = []
+
+    def work() -> None:
+        until = time.monotonic() + 20.0
+        while "result" not in functions_of(threading.main_thread()) and time.monotonic() < until:
+            time.sleep(0.001)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.3)
+        over.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        away_from_signals(work)
+    assert over == [True]
+
+
+# --- workers ---------------------------------------------------------------------------------------------
+
+WORKER = """
+import multiprocessing, os, sys, time
+from consistency.referee.system import stopping
+stopping.IS_LINUX = stopping.IS_LINUX and {prctl}
+
+def work(*link):
+    stopping.end_with_parent(*link)
+    print('there', flush=True)
+    time.sleep(60)
+
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    context.Process(target=work, args=stopping.link_to_parent(context)).start()
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("prctl", [True, False])
+def test_a_worker_ends_with_its_parent(prctl: bool, tmp_path: Path) -> None:
+    """By the system, and by a pipe where the system cannot."""
+    script = tmp_path / "script.py"
+    script.write_text(WORKER.format(prctl=prctl))
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "there\n"
+        process.kill()
+        assert select.select([process.stdout], [], [], 20.0)[0], "the worker has the pipe as long as it lives"
+        assert process.stdout.read() == ""
+
+
+@pytest.mark.skipif(not stopping.IS_LINUX, reason="prctl")
+def test_a_worker_whose_parent_has_ended_before_ends() -> None:
+    child = os.fork()
+    if child == 0:
+        end_with_parent(os.getpid(), None)  # not the number of the parent
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+
+
+def test_workers_share_one_pipe() -> None:
+    import multiprocessing
+
+    context = multiprocessing.get_context("spawn")
+    assert link_to_parent(context)[1] is link_to_parent(context)[1]
+    assert link_to_parent(context)[0] == os.getpid()
+
+
+# --- what killed commands leave ------------------------------------------------------------------------
+
+
+def killed_while(work: object) -> None:
+    """Do ``work`` in a process that is killed then."""
+    child = os.fork()
+    if child == 0:
+        work()  # type: ignore[operator]
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_what_is_left_in_the_way_is_cleared_by_the_next_command(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    killed_while(lambda: (NewFolder(out, "log").path / "table").touch())
+    assert len(names(tmp_path)) == 1
+    others = tmp_path / ".out-2.elsewhere-1.x.partial"  # of another place, and of another machine
+    others.mkdir()
+    with NewFolder(out, "log") as ours:
+        require_free(out, overwrite=False)
+        assert names(tmp_path) == sorted([others.name, ours.path.name]), "who lives keeps what it has"
+    assert names(tmp_path) == [others.name]
+
+
+def test_a_folder_that_was_being_replaced_is_put_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, manifest = tmp_path / "out", {"kind": "log", "schema_version": 1}
+    write_folder(out, manifest, lambda path: (path / "old").touch())
+    replace = os.replace
+
+    def killed(source: Path, target: Path) -> None:
+        replace(source, target)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def overwritten() -> None:
+        monkeypatch.setattr(os, "replace", killed)
+        write_folder(out, manifest, lambda path: (path / "new").touch(), overwrite=True)
+
+    killed_while(overwritten)
+    assert not out.exists()
+    with pytest.raises(InputError, match="exists already"):
+        require_free(out, overwrite=False)
+    assert names(tmp_path) == ["out"]
+    assert "old" in names(out)
+
+
+def test_a_file_that_was_being_written_is_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def half() -> None:
+        monkeypatch.setattr(os, "fsync", lambda _: os.kill(os.getpid(), signal.SIGKILL))
+        write_whole(tmp_path / "page.html", b"half")
+
+    killed_while(half)
+    assert len(names(tmp_path)) == 1
+    write_whole(tmp_path / "page.html", b"whole")
+    assert names(tmp_path) == ["page.html"]
+
+
+def test_a_place_that_has_only_a_journal_says_so(tmp_path: Path) -> None:
+    out = tmp_path / "night"
+    unfinished_of(out).mkdir()
+    with pytest.raises(
+        InputError, match=r"night: not written yet, its runs are in a journal; .* --resume --runs 1 writes"
+    ):
+        read_manifest(out)

@@ -29,13 +29,13 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     on_body,
 )
-from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.mix_ups import hints as readers_hints
 from consistency.referee.readers.mix_ups import reading_fit
 from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.mix_ups.known import Guess, _ned
 from consistency.referee.readers.mix_ups.reading_fit import FACTOR, ReadingFit, fit_of
-from consistency.referee.readers.relative_motions import Stretch, relative_recording
+from consistency.referee.readers.places import Places
+from consistency.referee.readers.relative_motions import Stretch, causes_of_motions
 from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.readers.windows import Relative
@@ -530,6 +530,10 @@ def test_a_bias_of_few_standard_deviations_explains_a_large_nees(rng: np.random.
     run = replace(poses(np.arange(400.0), np.zeros_like(e), R, e, "vector", "vector"), covariance=P)
     assert decades([run])[0] > 5.0
     assert hints("est", ("a", "b"), [run]) == []
+    found, unbiased = fit_of([(e, P)]), fit_of([(e - [3.0, 0.0] * grown, P)])
+    assert found is not None
+    assert unbiased is not None
+    assert found.simple() >= unbiased.likelihood
 
 
 def test_one_number_for_all_variances_is_no_covariance_of_an_estimator(rng: np.random.Generator) -> None:
@@ -615,7 +619,7 @@ def test_mix_ups_of_poses_with_cross_covariances_are_named(rng: np.random.Genera
             0, "est", Places("line {}".format, np.arange(400)), np.arange(400.0), pose, P_, C, np.arange(400),
             pose + e, "so2",
         )  # fmt: skip
-        return list(relative_recording("est", "est", [track], THREE, range(3), Relative(1.0, "step")).causes)
+        return causes_of_motions("est", [track], THREE, range(3), Relative(1.0, "step"))
 
     assert causes([0, 1, 2]) == []
     (said,) = causes(order)

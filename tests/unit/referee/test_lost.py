@@ -26,8 +26,8 @@ from consistency.referee.diagnostics import (
     pilot_plan,
 )
 from consistency.referee.diagnostics.questions.lost_runs import lost_evidence, lost_of
-from consistency.referee.gating.watch import RunningTest, watching
 from consistency.referee.diagnostics.statistics.number_of_runs import share_limit
+from consistency.referee.gating.watch import RunningTest, watching
 from consistency.referee.types import Array, Failure
 from consistency.testing import InsufficientTrials, assert_consistent
 

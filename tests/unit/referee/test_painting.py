@@ -1,62 +1,60 @@
-"""Both painters draw what a description holds, and show every name literally."""
+"""Marks are drawn with the values that they have, names are shown literally, and files of figures are small."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
+from collections.abc import Callable
+from functools import partial
 
-import matplotlib as mpl
 import numpy as np
 import pytest
-from bokeh.models import DataRange1d, GlyphRenderer, HoverTool, Range1d
-from bokeh.models.annotations import BoxAnnotation
-from bokeh.models.annotations import Span as Across
+from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure as Drawing
+from painted import legend_of, places, shaded
 
-from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SHADE, style
-from consistency.referee.document.drawing import (
-    Axis,
-    Band,
-    Bars,
-    Intervals,
-    Key,
-    Line,
-    Mark,
-    Owner,
-    Panel,
-    Points,
-    Rule,
-    Sheet,
-    Span,
-    Stems,
-    dodge,
-    kept,
-    numbers,
+from consistency.referee.document.blocks import Document, Figure
+from consistency.referee.document.colours import EXPECTED, LIMIT, Look, style
+from consistency.referee.show import as_html
+from consistency.referee.show.painting import (
+    LIMIT as MOST,
 )
-from consistency.referee.show import with_matplotlib
-from consistency.referee.show.with_bokeh import MARKERS, Screen
+from consistency.referee.show.painting import (
+    NARROWEST,
+    TITLE,
+    add_legend,
+    band,
+    canvas,
+    curve,
+    dodge,
+    dots,
+    edges,
+    intervals,
+    log_axis,
+    make_map,
+    name_rows,
+    panel_legend,
+    path,
+    points,
+    rows_of,
+    thin,
+)
+from consistency.referee.show.svg import MOST_TITLES, drawn, paint, png, saved, svg
 
 ODD = ("$x^2$ and \\frac", "_hidden", "<script>", "#*@", "$$y$$")
-STEPS = np.arange(1, 6)
-OWNER = Owner("f", "0:1")
-ROWS = Axis("", rows=("$x$", "y"))
+STEPS = np.arange(1.0, 6.0)
+TAG = "0-1"
 
 
-def panel(*marks: Mark, **axes: Axis) -> Panel:
-    return Panel(axes.get("x", Axis("step")), axes.get("y", Axis("value")), marks, "a chart")
+def axes_of(*marks: Callable[[Axes], None]) -> Axes:
+    return drawn(partial(draw, *marks)).axes[0]
 
 
-def drawn(*marks: Mark, **axes: Axis):
-    """Matplotlib axes of one panel."""
-    return with_matplotlib.draw(Sheet((panel(*marks, **axes),), 2.0)).axes[0]
-
-
-def shown(*marks: Mark, limit: int = 100, **axes: Axis):
-    """Bokeh figure of one panel."""
-    return Screen(limit).draw(panel(*marks, **axes))
-
-
-def glyphs(chart) -> list:
-    return [r for r in chart.renderers if isinstance(r, GlyphRenderer)]
+def draw(*marks: Callable[[Axes], None], legend: bool = False) -> Drawing:
+    figure, (axes,) = canvas(2.0)
+    for mark in marks:
+        mark(axes)
+    return add_legend(figure) if legend else figure
 
 
 # --- looks ------------------------------------------------------------------------------------
@@ -72,8 +70,8 @@ def test_the_first_filters_differ_in_grey_print():
     assert len({look.marker for look in first}) == 5
 
 
-def test_every_marker_has_a_name_on_the_screen():
-    assert {style(i).marker for i in range(30)} == set(MARKERS)
+def test_every_marker_has_a_shape_on_a_page():
+    assert {style(i).marker for i in range(30)} == set(as_html.SHAPES)
 
 
 def test_filters_in_a_row_keep_apart_and_stay_in_it():
@@ -87,206 +85,210 @@ def test_filters_in_a_row_keep_apart_and_stay_in_it():
 # --- what is drawn ----------------------------------------------------------------------------
 
 
-def test_a_line_has_its_values_and_look_in_both():
+def test_a_line_has_its_values_its_look_and_its_filter():
     values = np.array([1.0, 2.0, 300.0, np.nan, 4.0])
-    mark = Line(STEPS, values, style(1), OWNER, (("step", "@x"), ("extra", "@more")), {"more": values / 2})
-    line = drawn(mark, y=Axis("ANEES", log=True)).lines[0]
+    axes = axes_of(lambda axes: curve(axes, STEPS, values, style(1), "f", TAG), lambda axes: log_axis(axes, "y"))
+    (line,) = axes.lines
     np.testing.assert_array_equal(line.get_ydata(), values)
     assert to_hex(line.get_color()).upper() == style(1).colour
     assert line.is_dashed()
-    assert line.axes.get_yscale() == "log"
-    assert line.axes.get_ylabel() == "ANEES"
-    chart = shown(mark, y=Axis("ANEES", log=True))
-    (glyph,) = glyphs(chart)
-    np.testing.assert_array_equal(glyph.data_source.data["y"], values.astype(np.float32))
-    np.testing.assert_array_equal(glyph.data_source.data["more"], (values / 2).astype(np.float32))
-    assert (glyph.name, glyph.tags, glyph.glyph.line_color) == ("f", ["0:1"], style(1).colour)
-    (hover,) = chart.select(HoverTool)
-    assert hover.tooltips == [("filter", "$name"), ("step", "@x"), ("extra", "@more")]
-    assert hover.renderers == [glyph]
+    assert (line.get_label(), line.get_gid()) == ("f", "filter:0-1")
+    assert axes.get_yscale() == "log"
 
 
-def test_a_bound_is_drawn_on_both_sides_of_zero():
-    bound = np.array([0.1, 0.2, 0.3, 0.2, np.nan])
-    mark = Line(STEPS, bound / 2, style(0), OWNER, bound=bound)
-    axes = drawn(mark)
-    np.testing.assert_allclose([line.get_ydata() for line in axes.lines], [-bound, bound, bound / 2])
-    assert len(axes.collections) == 1  # shaded
-    edges = [r for r in glyphs(shown(mark)) if r.glyph.y in ("bound", "below")]
-    assert len(edges) == 2
-    np.testing.assert_allclose(edges[0].data_source.data["below"], -edges[0].data_source.data["bound"])
-    assert all(edge.tags == ["0:1"] for edge in edges)  # hidden with the filter
+def test_bands_and_their_edges_are_drawn_where_they_are():
+    ends = np.tile([2.36, 3.72], (5, 1))
+    wider = np.tile([1.36, 4.72], (5, 1))
+    axes = axes_of(lambda axes: band(axes, STEPS, ends), lambda axes: edges(axes, STEPS, wider, LIMIT, "l"))
+    assert shaded(axes) == (2.36, 3.72)
+    assert [line.get_ydata()[0] for line in axes.lines] == pytest.approx([1.36, 4.72])
+    assert [line.get_label() for line in axes.lines].count("l") == 1
 
 
-def test_bands_are_drawn_where_they_are():
-    low, high = np.full(5, 2.36), np.full(5, 3.72)
-    axes = drawn(Band(STEPS, low, high, SHADE), Band(STEPS, low - 1, high + 1, LIMIT, outline=True))
-    shaded = axes.collections[0].get_paths()[0].vertices[:, 1]
-    assert (shaded.min(), shaded.max()) == (2.36, 3.72)
-    assert {float(line.get_ydata()[0]) for line in axes.lines} == {1.3599999999999999, 4.720000000000001}
-    fill, first, second = glyphs(shown(Band(STEPS, low, high, SHADE), Band(STEPS, low, high, LIMIT, outline=True)))
-    assert (fill.glyph.y1, fill.glyph.y2, fill.glyph.fill_color) == ("low", "high", BAND)
-    assert (first.glyph.y, second.glyph.y) == ("low", "high")
-
-
-@pytest.mark.parametrize("side", ["x", "y"])
-def test_rules_and_spans_cross_the_panel_at_their_place(side):
-    axes = drawn(Rule(side, 1.0, EXPECTED), Span(side, 2.0, 3.0, SHADE))
-    at = axes.lines[0].get_ydata() if side == "y" else axes.lines[0].get_xdata()
-    assert list(at) == [1.0, 1.0]
-    box = axes.patches[0].get_extents().transformed(axes.transData.inverted())
-    np.testing.assert_allclose([box.y0, box.y1] if side == "y" else [box.x0, box.x1], [2.0, 3.0])
-    centre = shown(Rule(side, 1.0, EXPECTED), Span(side, 2.0, 3.0, SHADE)).center
-    (across,) = [item for item in centre if isinstance(item, Across)]
-    assert (across.location, across.dimension) == (1.0, "width" if side == "y" else "height")
-    (shade,) = [item for item in centre if isinstance(item, BoxAnnotation)]
-    assert ((shade.bottom, shade.top) if side == "y" else (shade.left, shade.right)) == (2.0, 3.0)
+def test_small_points_are_one_path_of_those_that_are_known():
+    y = np.array([1.0, np.nan, 3.0, 4.0, np.inf])
+    axes = axes_of(lambda axes: points(axes, STEPS, y, style(0), "p", TAG))
+    (found,) = places(axes)
+    np.testing.assert_array_equal(found, [[1, 1], [3, 3], [4, 4]])
+    assert axes.get_ylim()[0] < 1.0 < 4.0 < axes.get_ylim()[1]
+    text = svg(partial(draw, lambda axes: points(axes, STEPS, y, style(0), "p", TAG)))
+    (marks,) = re.findall(r'<g class="filter-0-1"><path d="([^"]*)"', text)
+    assert (marks.count("M"), len(marks.split())) == (3, 15)
+    axes_of(lambda axes: points(axes, STEPS, np.full(5, np.nan), style(0)))
 
 
 def test_intervals_have_a_row_each_and_an_arrow_where_they_go_on():
-    window = Axis("ratio", log=True, window=(0.1, 10.0))
-    mark = Intervals(
-        np.array([0.0, 1.0]), np.array([2.0, 0.5]), np.array([1.5, 0.0]), np.array([3.0, np.inf]), style(0), OWNER,
-        (("axis", "@axis"),), {"axis": ["x", "y"]},
-    )  # fmt: skip
-    axes = drawn(mark, x=window, y=ROWS)
+    def mark(axes: Axes) -> None:
+        axes.set_xlim(0.1, 10.0)
+        name_rows(axes, ["$x$", "y"])
+        intervals(axes, np.array([0.0, 1.0]), np.array([[2.0, 1.5, 3.0], [0.5, 0.0, np.inf]]), style(0), "f", TAG)
+        log_axis(axes, "x")
+
+    axes = axes_of(mark)
     assert [label.get_text() for label in axes.get_yticklabels()] == ["$x$", "y"]
     assert axes.get_ylim() == (1.5, -0.5)  # the first row is on top
-    assert axes.get_xscale() == "log"
+    assert (axes.get_xscale(), axes.get_xlim()) == ("log", (0.1, 10.0))
     bars = [segment[:, 0].tolist() for segment in axes.collections[0].get_segments()]
     assert bars == [[1.5, 3.0], [0.1, 10.0]]
     arrows = [(line.get_marker(), line.get_xdata().tolist()) for line in axes.lines if line.get_marker() in "<>"]
     assert arrows == [("<", [0.1]), (">", [10.0])]
-    chart = shown(mark, x=window, y=ROWS)
-    low, high = (glyphs(chart)[0].data_source.data[name].tolist() for name in ("low", "high"))
-    np.testing.assert_allclose([low, high], [[1.5, 0.1], [3.0, 10.0]])
-    assert sum(getattr(r.glyph, "marker", None) == "triangle" for r in glyphs(chart)) == 2
-    assert chart.x_range.start < 0.1
-    assert chart.x_range.end > 10.0
-    assert (chart.y_range.start, chart.y_range.end) == (1.5, -0.5)
-    assert chart.yaxis[0].major_label_overrides == {0: "$x$", 1: "y"}
-
-
-def test_stems_stand_on_zero():
-    mark = Stems(STEPS, STEPS - 3.0, style(3), OWNER)
-    axes = drawn(mark)
-    assert [segment[0][1] for segment in axes.collections[0].get_segments()] == [0.0] * 5
-    np.testing.assert_array_equal(axes.lines[0].get_ydata(), STEPS - 3.0)
-    stems, dots = glyphs(shown(mark))
-    assert stems.glyph.y0 == 0
-    assert dots.glyph.marker == MARKERS[style(3).marker]
-
-
-def test_bars_and_steps():
-    axes = drawn(Bars(np.arange(4.0), np.array([1.0, 2.0, 3.0]), SHADE), Line(STEPS, STEPS, style(0), steps=True))
-    np.testing.assert_array_equal(axes.patches[0].get_data().values, [1.0, 2.0, 3.0])
-    assert axes.lines[0].get_drawstyle() == "steps-post"
-    bars, step = glyphs(shown(Bars(np.arange(4.0), np.ones(3), SHADE), Line(STEPS, STEPS, style(0), steps=True)))
-    np.testing.assert_array_equal(bars.data_source.data["right"], [1.0, 2.0, 3.0])
-    assert step.glyph.mode == "after"
-
-
-# --- axes -------------------------------------------------------------------------------------
-
-
-def test_the_range_follows_the_filters_shown_where_it_is_asked_to():
-    mark = Points(STEPS, STEPS, style(0), OWNER)
-    follows = shown(mark, y=Axis("value", follows=True, window=(0.0, 1.0), least=0.5)).y_range
-    assert isinstance(follows, DataRange1d)
-    assert (follows.only_visible, follows.min_interval) == (True, 0.5)
-    fixed = shown(mark, y=Axis("value", window=(0.0, 1.0))).y_range
-    assert isinstance(fixed, Range1d)
-    assert (fixed.start, fixed.end) == (0.0, 1.0)
-
-
-def test_axes_of_one_name_are_one():
-    mark, shared = Points(STEPS, STEPS, style(0)), Axis("step", share="step")
-    screen = Screen(100)
-    first, second = (screen.draw(panel(mark, x=shared)) for _ in range(2))
-    assert first.x_range is second.x_range
-    assert first.y_range is not second.y_range
-    left, right = with_matplotlib.draw(Sheet((panel(mark, y=shared), panel(mark, y=shared)), 2.0)).axes
-    assert left.get_shared_y_axes().joined(left, right)
-    assert (left.get_ylabel(), right.get_ylabel()) == ("step", "")
+    assert {line.get_gid() for line in axes.lines} == {"filter:0-1"}
+    np.testing.assert_array_equal(axes.lines[-1].get_xydata(), [[2.0, 0.0], [0.5, 1.0]])
 
 
 def test_a_panel_with_none_below_it_has_numbers_on_its_axis():
-    mark, shared = Points(STEPS, STEPS, style(0)), Axis("step", share="step")
-    axes = with_matplotlib.draw(Sheet(3 * (panel(mark, x=shared),), 3.0, columns=2)).axes
-    assert [a.xaxis.get_tick_params()["labelbottom"] for a in axes[:3]] == [False, True, True]
-    assert not axes[3].axison
+    figure = drawn(lambda: canvas(3.0, 2, 3, sharex=True)[0])
+    assert [a.xaxis.get_tick_params()["labelbottom"] for a in figure.axes[:3]] == [False, True, True]
+    assert not figure.axes[3].axison
+    assert [rows_of(n) for n in (1, 2, 3, 4, 5, 9)] == [1, 2, 3, 2, 3, 3]
 
 
 def test_a_map_has_equal_axes_and_height():
-    flat = Line(np.array([0.0, 10.0]), np.zeros(2), style(0), path=True)
-    axes = with_matplotlib.draw(Sheet((replace(panel(flat), equal=True),), 2.0)).axes[0]
+    line = np.array([[0.0, 0.0], [10.0, 0.0]])
+    axes = axes_of(lambda axes: path(axes, line, style(0)), make_map)
     assert axes.get_aspect() == 1.0
-    assert np.ptp(axes.get_ylim()) == pytest.approx(with_matplotlib.NARROWEST * np.ptp(axes.get_xlim()))
+    assert np.ptp(axes.get_ylim()) == pytest.approx(NARROWEST * np.ptp(axes.get_xlim()))
 
 
-def test_a_panel_without_values_says_so():
-    lost = replace(panel(Line(STEPS, np.full(5, np.nan), style(0))), empty="no estimate")
-    none = replace(panel(), empty="too few")
-    left, right = with_matplotlib.draw(Sheet((lost, none), 2.0)).axes
-    assert [text.get_text() for axes in (left, right) for text in axes.texts] == ["no estimate", "too few"]
-    assert left.axison
-    assert not right.axison
+def test_a_log_axis_has_plain_numbers():
+    def mark(axes: Axes) -> None:
+        axes.set_ylim(0.5, 40.0)
+        log_axis(axes, "y")
+
+    labels = [label.get_text() for label in axes_of(mark).get_yticklabels()]
+    assert {"0.5", "1", "20"} <= set(labels)
+    assert not any("$" in label for label in labels)
 
 
-# --- names and size ---------------------------------------------------------------------------
+def test_thin_keeps_extremes_ends_and_short_lines():
+    line = np.sin(np.linspace(0, 60, 30_000))
+    line[12_345], line[23_456] = 7.0, -7.0
+    line[5_000:6_000] = np.nan
+    keep = thin(line)
+    assert len(keep) <= MOST
+    assert {0, 12_345, 23_456, 29_999} <= set(keep.tolist())
+    assert (np.diff(keep) > 0).all()
+    np.testing.assert_array_equal(thin(line[:200]), np.arange(200))
+
+
+@pytest.mark.parametrize("mark", ["curve", "path", "band", "edges"])
+def test_a_long_mark_is_thinned_and_keeps_its_peak(mark: str):
+    x, y = np.arange(9000.0), np.zeros(9000)
+    y[4321] = 7.0
+    ends = np.column_stack([-y, y])
+    marks: dict[str, Callable[[Axes], None]] = {
+        "curve": lambda axes: curve(axes, x, y, style(0)),
+        "path": lambda axes: path(axes, np.column_stack([y, np.zeros(9000)]), style(0)),
+        "band": lambda axes: band(axes, x, ends),
+        "edges": lambda axes: edges(axes, x, ends, style(0)),
+    }
+    axes = axes_of(marks[mark])
+    if mark == "band":
+        assert shaded(axes) == (-7.0, 7.0)
+    else:
+        found = np.concatenate([line.get_xydata() for line in axes.lines])
+        assert len(found) <= MOST * len(axes.lines)
+        assert 7.0 in found
+
+
+# --- names and legends ------------------------------------------------------------------------
 
 
 def test_names_are_shown_literally():
-    keys = tuple(Key(name, style(i)) for i, name in enumerate(ODD))
-    sheet = Sheet((replace(panel(Rule("y", 1.0, EXPECTED)), title=ODD[0]),), 2.0, title=ODD[2], keys=keys)
-    figure = with_matplotlib.draw(sheet)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(ODD)
-    with mpl.rc_context({"svg.fonttype": "none"}):
-        svg = with_matplotlib.picture(figure, "svg").decode()
-    assert "$x^2$ and \\frac" in svg
-    assert "&lt;script&gt;" in svg
+    marks = [partial(curve, x=STEPS, y=STEPS, look=style(i), label=name) for i, name in enumerate(ODD)]
+    title: list[Callable[[Axes], None]] = [lambda axes: axes.set_title(ODD[0])]
+    figure = drawn(partial(draw, *marks, *title, legend=True))
+    assert legend_of(figure) == list(ODD)
+    text = svg(partial(draw, *marks, *title, legend=True))
+    assert text.count("$x^2$ and \\frac") == 2
+    assert "&lt;script&gt;" in text
 
 
-def test_a_panel_has_a_legend_of_its_own_and_room_for_it():
-    keys = (
-        *(Key(name, style(i)) for i, name in enumerate(ODD)),
-        Key("a name that is longer than a panel is wide", SHADE, "band"),
-    )
-    plain, keyed = panel(Rule("y", 1.0, EXPECTED)), replace(panel(Rule("y", 1.0, EXPECTED)), keys=keys)
-    alone, figure = (with_matplotlib.draw(Sheet((plain, second), 2.0)) for second in (plain, keyed))
-    left, right = figure.axes
-    assert left.get_legend() is None
-    texts = [text.get_text() for text in right.get_legend().get_texts()]
-    assert [text.replace("\n", " ") for text in texts] == [key.text for key in keys]
-    assert "\n" in texts[-1]
+def test_a_legend_has_each_label_once_and_room_of_its_own():
+    def both(legend: bool) -> Drawing:
+        figure, panels = canvas(2.0, 2, 2)
+        for axes in panels:
+            curve(axes, STEPS, STEPS, style(0), "a filter", TAG)
+            axes.axhline(1.0, label="a name that is longer than the legend of a figure is wide")
+        return add_legend(figure) if legend else figure
+
+    figure, alone = drawn(partial(both, True)), drawn(partial(both, False))
+    assert len(legend_of(figure)) == 2
+    assert "\n" in legend_of(figure)[1]
     assert figure.get_figheight() > alone.get_figheight()
     figure.draw_without_rendering()
-    assert right.get_legend().get_window_extent().y0 >= right.get_window_extent().y1
+    assert figure.legends[0].get_window_extent().y0 >= max(axes.get_window_extent().y1 for axes in figure.axes)
+    assert figure.legends[0].get_texts()[0].get_gid() == "filter:0-1"  # hidden with the filter
+    assert not legend_of(drawn(partial(draw, legend=True)))
 
 
-def test_the_same_sheet_gives_the_same_bytes():
-    sheet = Sheet((panel(Line(STEPS, STEPS, style(0)), y=Axis("value", log=True)),), 2.0, keys=(Key("f", style(0)),))
-    first, second = (with_matplotlib.render(sheet) for _ in range(2))
+def test_a_panel_has_a_legend_of_its_own():
+    axes = axes_of(lambda axes: curve(axes, STEPS, STEPS, style(0), "$x$"), panel_legend)
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["$x$"]
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def line_of(name: str = "f", tag: str = "") -> Callable[[], Drawing]:
+    return partial(draw, lambda axes: curve(axes, STEPS, np.sqrt(STEPS), style(0), name, tag), legend=True)
+
+
+def test_the_same_drawing_gives_the_same_characters_and_clips_of_its_own():
+    assert svg(line_of(), "a") == svg(line_of(), "a")
+    clips = [set(re.findall(r'<clipPath id="(\w+)"', svg(line_of(), name))) for name in "ab"]
+    assert clips[0]
+    assert not clips[0] & clips[1]
+
+
+def test_coordinates_have_one_digit_and_groups_no_names():
+    text = svg(line_of(tag=TAG))
+    numbers = re.findall(r"\d+\.\d+", " ".join(re.findall(r'<path d="[^"]*"', text)))
+    assert numbers
+    assert {len(number.split(".")[1]) for number in numbers} == {1}
+    assert "<g id=" not in text
+    assert text.count('<g class="filter-0-1">') == 3  # the line, and its entry in the legend
+    assert ">f</text>" in text
+
+
+def test_what_has_words_to_hover_has_a_title_up_to_a_limit():
+    def tiles(count: int) -> Drawing:
+        figure, (axes,) = canvas(2.0)
+        for number in range(count):
+            axes.plot(number, 0, "o", gid=f"{TITLE}<{number}> & more")
+        return figure
+
+    found = Figure("a", "", (partial(tiles, 2), partial(tiles, MOST_TITLES)))
+    document = Document("d", "", (), (found, Figure("b", "", (partial(tiles, 1),))))
+    pictures = paint(document)
+    first, second = pictures[id(found)]
+    assert "<g><title>&lt;1&gt; &amp; more</title>" in first
+    assert first.count("<title>") + second.count("<title>") == MOST_TITLES
+    assert "<title>" not in pictures[id(document.figures[1])][0]
+
+
+@pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_files_of_a_figure_hold_no_date(kind: str, begin: bytes):
+    first, second = (saved(drawn(line_of()), kind) for _ in range(2))
+    assert first.startswith(begin)
     assert first == second
 
 
-def test_a_long_mark_is_thinned_and_keeps_its_peak():
-    y = np.zeros(9000)
-    y[4321] = 7.0
-    mark = Line(np.arange(9000), y, style(0))
-    assert len(kept(mark, 100)) <= 100
-    assert 4321 in kept(mark, 100)
-    assert 4321 in kept(replace(mark, x=y, y=np.zeros(9000), path=True), 100)
-    assert 4321 in kept(replace(mark, y=np.zeros(9000), bound=y), 100)
-    assert 4321 in kept(Band(mark.x, -y, y, SHADE), 100)
-    assert len(kept(Points(mark.x, y, style(0), whole=True), 100)) == 9000
-    assert len(glyphs(shown(mark))[0].data_source.data["x"]) <= 100
+def test_small_points_are_seen_in_a_png():
+    import io
+
+    from matplotlib import image
+
+    dark = partial(draw, lambda axes: points(axes, STEPS, STEPS, Look("#ff0000", size=4.0)))
+    pixels = image.imread(io.BytesIO(png(dark, 100)))
+    assert ((pixels[..., 0] > 0.9) & (pixels[..., 1] < 0.1)).sum() > 50
 
 
-def test_columns_are_counted_as_they_are_written():
-    line = Line(STEPS, STEPS, style(0), bound=np.ones(5), columns={"a": STEPS})
-    marks = (line, Points(STEPS, STEPS, style(0)), Band(STEPS, STEPS, STEPS, SHADE), Bars(np.arange(6.0), STEPS, SHADE))
-    for mark in marks:
-        columns = glyphs(shown(mark))[0].data_source.data
-        assert numbers(mark) == (5, len(columns))
-    assert numbers(Rule("x", 0.0, EXPECTED)) == (0, 0)
+def test_a_picture_is_as_fine_as_it_is_asked_to_be():
+    assert len(png(line_of(), 200)) > len(png(line_of(), 50))
+
+
+def test_a_marker_with_an_edge_is_hollow():
+    look = Look("#ffffff", edge=EXPECTED.colour)
+    (line,) = axes_of(lambda axes: axes.plot(STEPS, STEPS, **dots(look))).lines
+    assert (line.get_markerfacecolor(), line.get_markeredgecolor()) == ("#ffffff", EXPECTED.colour)

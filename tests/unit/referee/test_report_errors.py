@@ -13,7 +13,7 @@ from consistency.bench.pages import write_reports
 from consistency.bench.pages.build import build_report
 from consistency.bench.pages.report_input import Study
 from consistency.bench.pages.sections import anees
-from consistency.bench.pages.sections.study_tables import MAPS, OWN_ERRORS, of_own_errors
+from consistency.bench.pages.sections.study_sections import maps, of_own_errors, own_errors
 from consistency.referee.diagnostics import Interval, MapScore
 from consistency.referee.document.blocks import Cell, Name, Quantity, Status, Table
 from consistency.referee.document.verdict import page
@@ -47,7 +47,7 @@ def rows_of(blocks: tuple[object, ...]) -> tuple[tuple[Cell, ...], ...]:
 def test_both_errors_stand_below_each_other(study: Study) -> None:
     track = study.tracks[1]
     v = track.verdict
-    own, world = rows_of(OWN_ERRORS.blocks(study))
+    own, world = rows_of(own_errors(study))
     name = Name("right", track.look)
     assert own[:4] == (name, "right, its own", Status(v.status), Quantity(v.scale.mean_anees))
     assert world[:4] == ("", "so2, additive", Status(v.world.status), Quantity(v.world.scale.mean_anees))
@@ -62,7 +62,7 @@ def test_captions_name_the_filters_with_an_error_of_their_own(study: Study) -> N
     alone = replace(study, tracks=study.tracks[:1])
     assert "own" not in anees.caption(anees.read(alone)).replace("shown", "")
     assert "error of their own" not in verdicts.caption(alone)
-    assert OWN_ERRORS.blocks(alone) == ()
+    assert own_errors(alone) == ()
 
 
 def test_the_rmse_is_that_of_the_pose_in_the_world(study: Study) -> None:
@@ -78,18 +78,18 @@ def _of_map(score: MapScore) -> tuple[Interval, ...]:
 
 
 def test_maps_of_all_filters(study: Study) -> None:
-    rows = rows_of(MAPS.blocks(study))
+    rows = rows_of(maps(study))
     score = study.tracks[0].verdict.map
     ends = [f"{brief(i.value)} [{brief(i.low)}, {brief(i.high)}]" for i in _of_map(score)]
     count = len(study.results.map) // 2
     assert rows[0][0] == Name("ekf-uvd", study.tracks[0].look)
     assert tuple(map(written, rows[0][1:])) == (score.verdict.status, *ends, "6", str(count), "0")
     assert len(rows) == 2
-    sentences = [getattr(block, "text", "") for block in MAPS.blocks(study)]
+    sentences = [getattr(block, "text", "") for block in maps(study)]
     assert f"Map of ekf-uvd: {score.verdict.reasons[0]}." in sentences
     without = tuple(replace(track, verdict=replace(track.verdict, map=None)) for track in study.tracks)
-    assert len(rows_of(MAPS.blocks(replace(study, tracks=(study.tracks[0], without[1]))))) == 1
-    assert MAPS.blocks(replace(study, tracks=without)) == ()
+    assert len(rows_of(maps(replace(study, tracks=(study.tracks[0], without[1]))))) == 1
+    assert maps(replace(study, tracks=without)) == ()
 
 
 def test_both_formats_hold_both_sections(folder: Path, tmp_path: Path) -> None:

@@ -6,14 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from painted import by_title, legend_of, lines, panels
 from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.document.drawing import Line, Points
-from consistency.referee.pages.files_report import record_figures, record_sheet, unit_of
-from consistency.referee.pages.trajectory import ELLIPSE, MOST, ellipse, trajectory
+from consistency.referee.document.blocks import Figure
+from consistency.referee.pages.record_figures import overview, record_figures, unit_of
+from consistency.referee.pages.trajectory import MOST, ellipse, trajectory_panel
+from consistency.referee.show.svg import drawn
 from consistency.referee.types import Array
 
 STEPS = 60
@@ -36,26 +39,29 @@ def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> 
     )
 
 
-def ellipses(one: Evidence) -> list[Line]:
-    figure = trajectory(one)
-    (panel,) = figure.panels
-    return [mark for mark in panel.marks if isinstance(mark, Line) and mark.look == ELLIPSE]
+def figure(one: Evidence) -> Figure:
+    return by_title(record_figures(one, cs.judge(one)))["Trajectory"]
+
+
+def axes_of(one: Evidence) -> Axes:
+    (axes,) = panels(figure(one))
+    return axes
 
 
 def test_ellipses_stand_where_the_errors_are_largest() -> None:
     one = record()
-    figure = trajectory(one)
-    (panel,) = figure.panels
-    assert (panel.x.label, panel.y.label, panel.equal) == ("x (m)", "z (m)", True)
-    found = ellipses(one)
-    assert len(found) == MOST
-    worst = found[0]  # about the estimate of step 11, the 10th from 0
-    np.testing.assert_allclose([worst.x[:-1].mean(), worst.y[:-1].mean()], one.path[0, 10, 1][[0, 2]], atol=1e-9)
-    (points,) = [mark for mark in panel.marks if isinstance(mark, Points)]
-    np.testing.assert_allclose([points.x[0], points.y[0]], one.path[0, 10, 0][[0, 2]])
-    assert (points.x[1], 11.0) == (40.0, 11.0)  # step 12 is beside the first and is not drawn
-    assert "errors are largest against it (" in figure.caption
-    assert {key.text for key in figure.keys} == {"truth", "estimate", "95 % ellipse", "truth there"}
+    axes = axes_of(one)
+    assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == ("x (m)", "z (m)", 1.0)
+    truth, estimate, *outlines, crosses = lines(axes)
+    np.testing.assert_array_equal(truth.get_xydata(), one.path[0, :, 0][:, [0, 2]])
+    np.testing.assert_array_equal(estimate.get_xydata(), one.path[0, :, 1][:, [0, 2]])
+    assert len(outlines) == MOST
+    worst = outlines[0].get_xydata()[:-1].mean(axis=0)  # about the estimate of step 11, the 10th from 0
+    np.testing.assert_allclose(worst, one.path[0, 10, 1][[0, 2]], atol=1e-9)
+    np.testing.assert_allclose(crosses.get_xydata()[0], one.path[0, 10, 0][[0, 2]])
+    assert crosses.get_xdata()[1] == 40.0  # step 12 is beside the first and is not drawn
+    assert "errors are largest against it (" in figure(one).caption
+    assert set(legend_of(axes.figure)) == {"truth", "estimate", "95 % ellipse", "truth there"}
 
 
 def test_an_ellipse_holds_95_percent() -> None:
@@ -72,17 +78,15 @@ def test_an_ellipse_holds_95_percent() -> None:
 
 def test_no_ellipse_of_errors_about_other_axes() -> None:
     one = record("left")
-    assert not ellipses(one)
-    figure = trajectory(one)
-    assert figure.caption.endswith("No ellipses: the stated covariance is not about the axes of the world.")
+    assert len(lines(axes_of(one))) == 2
+    assert figure(one).caption.endswith("No ellipses: the stated covariance is not about the axes of the world.")
 
 
 def test_only_what_is_judged_is_drawn() -> None:
-    figure = trajectory(record(axes=("x", "y")))
-    assert figure.panels[0].y.label == "y (m)"
-    assert trajectory(record(axes=("z",))) is None
+    assert axes_of(record(axes=("x", "y"))).get_ylabel() == "y (m)"
+    assert trajectory_panel(record(axes=("z",))) is None
     bare = record()
-    assert trajectory(Evidence("est", bare.error, bare.covariance, axes=bare.axes)) is None
+    assert trajectory_panel(Evidence("est", bare.error, bare.covariance, axes=bare.axes)) is None
 
 
 def test_units() -> None:
@@ -110,8 +114,8 @@ def test_readers_keep_the_path_for_the_pictures(tmp_path: Path) -> None:
     v = cs.judge(one)
     titles = [figure.title for figure in record_figures(one, v)]
     assert titles == ["Errors and stated bounds", "NEES", "Trajectory", "Coverage"]
-    sheet = record_sheet(one, v)
-    assert any(panel.alt == "Trajectory of est" and panel.keys for panel in sheet.panels)
+    labels = [line.get_label() for axes in drawn(overview(one, v)).axes for line in axes.lines]
+    assert {"truth", "estimate", "all together"} <= set(labels)
     assert one.of_runs(slice(0, 1)).path is not None
     (pieces,) = read_recordings(*write(tmp_path), split="20")
     np.testing.assert_array_equal(pieces.path.reshape(-1, 2, 3), one.path[0])
@@ -123,4 +127,4 @@ def test_tables_keep_it_too(tmp_path: Path) -> None:
     (tmp_path / "truth.csv").write_text("t,x,y,heading\n" + "".join(f"{k},{k + 1},{2 * k},0.1\n" for k in range(1, 9)))
     (one,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
     np.testing.assert_array_equal(one.path[0, 3], [[5.0, 8.0], [4.0, 8.0]])
-    assert trajectory(one) is not None
+    assert trajectory_panel(one) is not None

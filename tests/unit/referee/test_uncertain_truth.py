@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command import consistency, refused
 from draws import autoregression
+from painted import lines, panels
 from recorded import read_recordings
 
 import consistency as cs
@@ -21,8 +22,7 @@ from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
     uncertain_truth,
     upper_weights,
 )
-from consistency.referee.document.drawing import Line
-from consistency.referee.pages.files_report import record_figures
+from consistency.referee.pages.record_figures import record_figures
 from consistency.referee.types import Array
 
 RUNS, STEPS, N = 50, 8, 3
@@ -194,8 +194,8 @@ def test_pictures_are_of_both_covariances() -> None:
     figures = record_figures(replace(one, t=np.arange(float(STEPS)), dof=N), v)
     assert {figure.title for figure in figures} == {"Errors and stated bounds", "NEES", "Coverage"}
     assert all(figure.caption.endswith("Covariances are those of estimate and truth together.") for figure in figures)
-    (bounds,) = [mark.bound for mark in figures[0].panels[0].marks if isinstance(mark, Line) and mark.bound is not None]
-    np.testing.assert_allclose(bounds, 2.0 * np.sqrt((P + truth_of_share(0.2))[0, 0]))
+    (below,) = lines(panels(figures[0])[0], "2-sigma bounds")
+    np.testing.assert_allclose(-below.get_ydata(), 2.0 * np.sqrt((P + truth_of_share(0.2))[0, 0]))
     assert of_both(drawn) is drawn
 
 

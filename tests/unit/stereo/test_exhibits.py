@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from painted import by_title, legend_of, lines, panels, titles
 from scripts import experiment
 
 import consistency as cs
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, section
+from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, shown
+from consistency.bench.pages.sections import images, sensor_issues
 from consistency.referee.document.blocks import Block, Column, Heading, Stack, Status, Table
-from consistency.referee.document.drawing import Figure, Line, Points, Rule
-from consistency.referee.pages.section import Part
-from consistency.stereo.pages import images, sensor_issues
 
 SECTIONS = (sensor_issues, images)
 SCRIPTS = ("e20_bias_or_noise", "e21_sensor_issues", "e24_image_noise", "e25_image_tracks", "e26_lens_models")
@@ -37,36 +36,34 @@ def rows_of(table: Table) -> tuple[tuple[Any, ...], ...]:
     return rows
 
 
-def figures_of(blocks: tuple[Block, ...]) -> dict[str, Figure]:
-    return {block.title: block for block in blocks if isinstance(block, Figure)}
+def issues(folder: Path) -> tuple[Block, ...]:
+    return shown(build_report(folder), sensor_issues.EXHIBITS)
 
 
 def test_every_finding_on_the_sensor_has_one_exhibit_with_its_name_as_title() -> None:
     exhibits = [exhibit for module in SECTIONS for exhibit in module.EXHIBITS]
-    shown = [name for exhibit in exhibits for name in exhibit.findings]
+    named = [name for exhibit in exhibits for name in exhibit.findings]
     wanted = [name for script in SCRIPTS for name in experiment(script).FINDINGS]
-    assert sorted(shown) == sorted(wanted)
+    assert sorted(named) == sorted(wanted)
     for exhibit in exhibits:
         assert exhibit.title.startswith(", ".join(exhibit.findings) + ": ")
 
 
 def test_an_exhibit_has_its_own_findings_and_none_without_a_table(tmp_path: Path) -> None:
-    def shown(data: pd.DataFrame) -> Table:
+    def numbers(data: pd.DataFrame) -> Table:
         return listing(data, {"x": ("X", ".1f")}, "numbers")
 
-    part = Part("test", "Test", "Test")
-    exhibits = (Exhibit(("a", "b"), "a, b: two", (Source("first", ("x",), (), shown),)),
-                Exhibit(("c",), "c: one", (Source("second", ("x",), (), shown),)))  # fmt: skip
-    of = section(part, exhibits)
+    exhibits = (Exhibit(("a", "b"), "a, b: two", (Source("first", ("x",), (), numbers),)),
+                Exhibit(("c",), "c: one", (Source("second", ("x",), (), numbers),)))  # fmt: skip
     folder = written(tmp_path / "out", {"first": pd.DataFrame({"x": [1.25]})}, ("c", "b", "a"))
-    heading, findings, table = of.blocks(build_report(folder))
-    assert heading == Heading("a, b: two", paper="a, b: two")
+    heading, findings, table = shown(build_report(folder), exhibits)
+    assert heading == Heading("a, b: two")
     assert [row[0] for row in rows_of(findings)] == [Stack("b", (), bold=True), Stack("a", (), bold=True)]
     assert "Accepted if: rule of b" in [line.text for line in rows_of(findings)[0][1].below]
     assert rows_of(findings)[0][-1] == Status("reproduced")
     assert rows_of(table) == (("1.2",),)
     (folder / "first.parquet").unlink()
-    assert of.blocks(build_report(folder)) == ()
+    assert shown(build_report(folder), exhibits) == ()
 
 
 def test_a_listing_writes_text_numbers_and_verdicts() -> None:
@@ -88,14 +85,14 @@ def test_spurious_features_are_shown_with_their_bounds(tmp_path: Path) -> None:
     rows = pd.DataFrame([OUTCOME | {"case": "plain", "rmse_position_m": 0.1, "rmse_heading_deg": 2.0}])
     guarded = rows.assign(precision=0.9, recall=0.8)
     tables = {"fig10a": rows, "fig10a_errors": steps, "fig10b": guarded, "fig10b_errors": steps}
-    blocks = sensor_issues.SECTION.blocks(build_report(written(tmp_path / "out", tables)))
+    blocks = issues(written(tmp_path / "out", tables))
     plain, behind = (block for block in blocks if isinstance(block, Table))
     assert rows_of(plain) == (("plain", Status("biased"), "4.00", "0.100", "2.00"),)
     assert rows_of(behind) == (("plain", Status("biased"), "4.00", "0.100", "2.00", "0.900", "0.800"),)
-    lines = [panel.marks[0] for panel in figures_of(blocks)["Errors and bounds"].panels]
-    np.testing.assert_allclose(lines[1].y, [0.2, 0.3])
-    np.testing.assert_allclose(lines[1].bound, [1.0, 1.2])
-    np.testing.assert_allclose(lines[2].bound, [14.0, 16.0])
+    _, y, heading = panels(by_title(blocks)["Errors and bounds"])
+    np.testing.assert_allclose(lines(y, "error")[0].get_ydata(), [0.2, 0.3])
+    np.testing.assert_allclose(lines(y, "2-sigma bounds")[0].get_ydata(), [-1.0, -1.2])
+    np.testing.assert_allclose(lines(heading, "2-sigma bounds")[0].get_ydata(), [-14.0, -16.0])
 
 
 def test_lenses_and_features_are_drawn(tmp_path: Path) -> None:
@@ -107,15 +104,16 @@ def test_lenses_and_features_are_drawn(tmp_path: Path) -> None:
                         for case, m, deg in (("near", 0.1, 2.0), ("far", 0.2, 1.0))])  # fmt: skip
     counts = mix.assign(count=[2, 8], p=[np.nan, 1e-3])
     tables = {"field_of_view": lenses, "near_far_mix": mix, "feature_count": counts}
-    blocks = sensor_issues.SECTION.blocks(build_report(written(tmp_path / "out", tables)))
-    figures = figures_of(blocks)
-    heading, nees = figures["Field of view"].panels
-    np.testing.assert_allclose([mark.y for mark in heading.marks if isinstance(mark, Line)][1], [3.0, 4.0])
-    np.testing.assert_allclose([mark.y for mark in nees.marks if isinstance(mark, Points)][3], [9.0, 10.0])
-    assert [mark.at for mark in nees.marks if isinstance(mark, Rule)] == [3.0]
-    assert [key.text for key in figures["Field of view"].keys][1] == "one, k1 left over 0.1"
-    position, turn = (panel.marks[0] for panel in figures["Errors over the number of features"].panels)
-    np.testing.assert_allclose([position.x, position.y, turn.y], [[2, 8], [0.1, 0.2], [2.0, 1.0]])
+    blocks = issues(written(tmp_path / "out", tables))
+    figures = by_title(blocks)
+    heading, nees = panels(figures["Field of view"])
+    np.testing.assert_allclose(lines(heading)[1].get_ydata(), [3.0, 4.0])
+    np.testing.assert_allclose(lines(nees)[3].get_ydata(), [9.0, 10.0])
+    assert lines(nees)[-1].get_ydata()[0] == 3.0
+    assert legend_of(heading.figure)[1] == "one, k1 left over 0.1"
+    position, turn = panels(figures["Errors over the number of features"])
+    np.testing.assert_allclose(lines(position)[0].get_xydata(), [[2, 0.1], [8, 0.2]])
+    np.testing.assert_allclose(lines(turn)[0].get_ydata(), [2.0, 1.0])
     tables_of = {block.label: rows_of(block) for block in blocks if isinstance(block, Table)}
     assert [row[-1] for row in tables_of["Counts of features"]] == ["–", "0.001"]
     assert tables_of["Outcomes"][1] == ("far", Status("biased"), "4.00", "0.200", "1.00")
@@ -127,20 +125,20 @@ def test_a_bias_map_is_drawn_row_by_row(tmp_path: Path) -> None:
     few = many[many["v"].isin([-60.0, 0.0, 10.0])].assign(model="none")
     curves = pd.DataFrame({"belief": ["a", "a", "b"], "step": [1, 2, 2], "nees": [3.0, 4.0, 9.0]})
     tables = {"bias_or_noise_map": many, "lens_models_bias": few, "bias_or_noise_nees": curves}
-    figures = figures_of(sensor_issues.SECTION.blocks(build_report(written(tmp_path / "out", tables))))
-    lines = [mark for mark in figures["Bias of disparity"].panels[0].marks if isinstance(mark, Line)]
-    np.testing.assert_allclose([line.y[2] for line in lines], [0.0, 20.0, 40.0, 60.0])
-    np.testing.assert_allclose(lines[1].x, [-1.0, 0.0, 1.0])
-    (panel,) = figures["Bias of disparity by lens model"].panels
-    np.testing.assert_allclose([mark.y[0] for mark in panel.marks if isinstance(mark, Line)], [60.0, 0.0, -10.0])
-    assert panel.title == "lens model: none"
-    assert panel.y.window == pytest.approx((-69.0, 69.0))
-    rule, first, second = figures["ANEES by belief"].panels[0].marks
-    assert (rule.at, first.y.tolist(), second.x.tolist()) == (3.0, [3.0, 4.0], [2])
+    figures = by_title(issues(written(tmp_path / "out", tables)))
+    _, *rows = lines(panels(figures["Bias of disparity"])[0])
+    np.testing.assert_allclose([row.get_ydata()[2] for row in rows], [0.0, 20.0, 40.0, 60.0])
+    np.testing.assert_allclose(rows[1].get_xdata(), [-1.0, 0.0, 1.0])
+    (panel,) = panels(figures["Bias of disparity by lens model"])
+    np.testing.assert_allclose([row.get_ydata()[0] for row in lines(panel)[1:]], [60.0, 0.0, -10.0])
+    assert titles([panel]) == ["lens model: none"]
+    assert panel.get_ylim() == pytest.approx((-69.0, 69.0))
+    rule, first, second = lines(panels(figures["ANEES by belief"])[0])
+    assert (rule.get_ydata()[0], first.get_ydata().tolist(), second.get_xdata().tolist()) == (3.0, [3.0, 4.0], [2])
 
 
 @pytest.mark.parametrize(("name", "module"), [("bias_survivors", sensor_issues), ("guarded", sensor_issues)])
 def test_a_table_that_lacks_a_column_is_refused(tmp_path: Path, name: str, module: Any) -> None:
     folder = written(tmp_path / "out", {name: pd.DataFrame({"filter": ["x"]})})
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: column '\w+' is missing"):
-        module.SECTION.blocks(build_report(folder))
+        shown(build_report(folder), module.EXHIBITS)

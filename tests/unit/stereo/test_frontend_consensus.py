@@ -7,7 +7,7 @@ import pytest
 
 import consistency as cs
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.input_errors import MatchError
+from consistency.stereo.visual_odometry.cameras.input_errors import MatchError
 from consistency.stereo.visual_odometry.odometry import bridged
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion, estimate_motion
 from consistency.stereo.visual_odometry.resection import inliers_within, resect_ransac, squared_reprojections

@@ -9,13 +9,14 @@ from types import ModuleType
 import numpy as np
 import pandas as pd
 import pytest
+from painted import by_title, lines, panels
 from scripts import experiment
 
 import consistency as cs
 from consistency.bench.pages.build import build_report
+from consistency.bench.pages.exhibits import shown
+from consistency.bench.pages.sections import images
 from consistency.referee.document.blocks import Heading, Table
-from consistency.referee.document.drawing import Bars, Figure, Line, Points, Stems
-from consistency.stereo.pages import images
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Tracks
 from consistency.stereo.rendered_images.scene import Layer, Scene
 from consistency.stereo.rendered_images.stops import Stops, wall_texture
@@ -82,29 +83,29 @@ def test_tracks_and_their_report(moving: ModuleType, noise: ModuleType, tmp_path
     noise.main(study)
     study.write(tmp_path / "out", found, 0.0)
     report = build_report(tmp_path / "out")
-    blocks = images.SECTION.blocks(report)
-    figures = {block.title: block for block in blocks if isinstance(block, Figure)}
+    blocks = shown(report, images.EXHIBITS)
+    figures = {title: panels(figure) for title, figure in by_title(blocks).items()}
     tables = {block.label: block for block in blocks if isinstance(block, Table)}
     headings = [block.text for block in blocks if isinstance(block, Heading)]
     assert len(headings) == len(images.EXHIBITS)
-    curves = [mark for mark in figures["Noise of disparity"].panels[0].marks if isinstance(mark, Line)]
+    curves = lines(figures["Noise of disparity"][0])
     stops = study.tables["images_stops"].sort_values("disparity")
-    np.testing.assert_allclose(curves[2].y, stops[stops["residual"] == 0.005]["within"])
-    np.testing.assert_allclose(curves[3].y, stops[stops["residual"] == 0.005]["pooled"])
-    kept = [mark for mark in figures["Features kept at each stop"].panels[0].marks if isinstance(mark, Points)]
-    np.testing.assert_allclose(kept[1].y, stops[stops["residual"] == 0.005]["features"])
-    (lags,) = (mark for mark in figures["Whiteness"].panels[0].marks if isinstance(mark, Stems))
-    np.testing.assert_allclose(lags.y, study.tables["images_fig5a_lags"]["autocorrelation"])
+    np.testing.assert_allclose(curves[3].get_ydata(), stops[stops["residual"] == 0.005]["within"])
+    np.testing.assert_allclose(curves[4].get_ydata(), stops[stops["residual"] == 0.005]["pooled"])
+    kept = lines(figures["Features kept at each stop"][0])
+    np.testing.assert_allclose(kept[2].get_ydata(), stops[stops["residual"] == 0.005]["features"])
+    lags = lines(figures["Whiteness"][0])[-1]
+    np.testing.assert_allclose(lags.get_ydata(), study.tables["images_fig5a_lags"]["autocorrelation"])
     for title in "Errors of disparity about track means", "Errors of tracking":
-        bars = next(mark for mark in figures[title].panels[0].marks if isinstance(mark, Bars))
-        assert (bars.height * np.diff(bars.edges)).sum() == pytest.approx(1.0, abs=0.05)
-    points, junctions = (mark for mark in figures["Junctions"].panels[0].marks if isinstance(mark, Points))
+        height, edges, _ = figures[title][0].patches[0].get_data()
+        assert (height * np.diff(edges)).sum() == pytest.approx(1.0, abs=0.05)
+    points, junctions = lines(figures["Junctions"][0])
     features = study.tables["images_fig9"]
-    assert len(junctions.x) == features["junction"].sum()
-    assert len(points.x) == (~features["junction"]).sum()
-    survivors = [panel.marks[0] for panel in figures["Tracks over images"].panels]
+    assert len(junctions.get_xdata()) == features["junction"].sum()
+    assert len(points.get_xdata()) == (~features["junction"]).sum()
+    survivors = figures["Tracks over images"][2]
     moving_only = study.tables["images_exp1"].query("camera == 'moving'")
-    np.testing.assert_allclose(survivors[2].y, moving_only["tracks"])
+    np.testing.assert_allclose(lines(survivors, "moving")[0].get_ydata(), moving_only["tracks"])
     largest = study.tables["images_bias"].query("left == 'k1 +-0.005'")["bias_d"].abs().max()
     (row,) = (cells for cells in rows_of(tables["Largest biases of disparity"]) if cells[0] == "k1 +-0.005")
     assert row[1] == row[2] == f"{largest:.2f}"  # one wall
@@ -129,9 +130,9 @@ def test_a_report_without_images_has_no_section(tmp_path: Path) -> None:
     study.tables["images_exp1"] = pd.DataFrame({"frame": [0.0], "tracks": [3.0], "rms_u": [0.1]})
     study.write(tmp_path / "out", [], 0.0)
     with pytest.raises(cs.InputError, match=r"images_exp1\.parquet: column 'rms_v' is missing"):
-        images.SECTION.blocks(build_report(tmp_path / "out"))
+        shown(build_report(tmp_path / "out"), images.EXHIBITS)
     (tmp_path / "out" / "images_exp1.parquet").unlink()
-    assert not images.SECTION.blocks(build_report(tmp_path / "out"))
+    assert not shown(build_report(tmp_path / "out"), images.EXHIBITS)
 
 
 def test_a_junction_ranks_above_a_point(moving: ModuleType) -> None:

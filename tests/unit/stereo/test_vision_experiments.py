@@ -12,9 +12,7 @@ from scripts import experiment
 
 import consistency as cs
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.sections import first_order as first_order_section
-from consistency.bench.pages.sections import shares
-from consistency.stereo.pages import scenes
+from consistency.bench.pages.sections import front_end
 from consistency.vision import RelativePose
 
 rigs = experiment("published_rig")
@@ -86,8 +84,8 @@ def test_the_report_shows_the_tables(name: str, figures: ModuleType, first_order
     found = figures.main(study) if name == "e10" else first_order.main(study)
     study.write(tmp_path / "out", found, 1.0)
     report = build_report(tmp_path / "out")
-    assert (shares.read(report) is not None) == (scenes.read(report) is not None) == (name == "e10")
-    assert (first_order_section.read(report) is not None) == (name == "e12")
+    assert (front_end.shares(report) is not None) == (front_end.scenes(report) is not None) == (name == "e10")
+    assert (front_end.cells_of(report) is not None) == (name == "e12")
 
 
 def test_points_that_all_images_see(rng: np.random.Generator) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from consistency.stereo.visual_odometry import batch_inverses
+from consistency.stereo.visual_odometry.cameras import batch_inverses
 
 
 @pytest.mark.parametrize("m", [2, 3, 6])

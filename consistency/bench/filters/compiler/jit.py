@@ -16,9 +16,9 @@ from numba.extending import register_jitable
 from consistency.bench.filters.compiler import disk_cache
 from consistency.bench.filters.compiler.content_key import Content
 from consistency.bench.filters.compiler.dispatch import INNER, OPTIONS, Function
-from consistency.bench.filters.compiler.uninterrupted import apart
 from consistency.bench.filters.compiler.whole_program import one_program
 from consistency.bench.models import jitable
+from consistency.referee.system.stopping import away_from_signals
 
 _result: Any = CompileResult  # untyped
 _typeof: Callable[[Any], Any] = numba.typeof
@@ -52,8 +52,7 @@ class Kernel:
     """A whole-trial entry: compiled on first use for each combination of parts, kept on disk for later processes.
 
     What was compiled of the same content is loaded, whoever compiled it and wherever its sources lay. One process
-    compiles a content; those that waited for it read what it has kept. Nothing of this is done in the main thread, see
-    :mod:`consistency.bench.filters.compiler.uninterrupted`; where that is told to end, ``stop`` is called.
+    compiles a content; those that waited for it read what it has kept. Nothing of this is done in the main thread.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -63,12 +62,15 @@ class Kernel:
         self._contents: dict[Any, Content] = {}  # by signature, as far as somebody has asked
         self._functions: set[str] = set()  # that this process has compiled
 
-    def __call__(self, *args: Any, stop: Callable[[], None] = lambda: None) -> Any:
-        return apart(lambda: self._entry(*args)(*args), stop=stop)
+    def __call__(self, *args: Any) -> Any:
+        return away_from_signals(self._run, *args)
 
     def compile(self, *args: Any) -> Callable[..., Any]:
         """The entry, compiled for these arguments or loaded from disk."""
-        return apart(self._entry, *args)
+        return away_from_signals(self._entry, *args)
+
+    def _run(self, *args: Any) -> Any:
+        return self._entry(*args)(*args)
 
     def _entry(self, *args: Any) -> Callable[..., Any]:
         signature = _signature(args)

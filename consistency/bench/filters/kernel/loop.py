@@ -46,7 +46,7 @@ from consistency.bench.filters.kernel.part_functions import (
     to_error,
     world_point,
 )
-from consistency.bench.filters.kernel.update_steps import HALTED, NOT_FINITE, POSE
+from consistency.bench.filters.kernel.update_steps import NOT_FINITE, POSE
 from consistency.bench.filters.kernel.work_arrays import Work, make_work
 from consistency.bench.filters.motion.unicycle import robot_frame
 from consistency.referee.types import Array, Indices
@@ -62,7 +62,7 @@ class Outcome(NamedTuple):
     nis_dof: Indices  # (T,)
     log_det: Array  # (T,), of S
     step: int  # of the failure, or 0
-    code: int  # of REASONS, HALTED, or 0
+    code: int  # of REASONS, or 0
     points: Array  # (n_landmarks, 3), landmarks in the world after the last step, NaN where none was seen
     spread: Array  # (n_landmarks, 3, 3), and their covariances
     joint: Array  # (3 + 3 K, 3 + 3 K), covariance of the robot and the K landmarks of these, additive errors
@@ -268,9 +268,6 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     state = State(memory.x, memory.P, 3, 0, memory.active)  # of a step: the whole, unless it has a base
     full_rank, step, code = False, 0, 0
     for k in range(T):
-        if data.halt[0] != 0:
-            step, code = k + 1, HALTED
-            break
         seen = data.landmark[data.first[k] : data.first[k + 1]]
         whole, state = prepare(slam.covariance, slam, whole, state, seen, local)
         state, code, m, nis, log_det = _step(slam, state, data, k, local, work, watch)

@@ -55,7 +55,6 @@ class Data(NamedTuple):
     shift: Array  # (M,), bias in px that was subtracted from each disparity, by which its search range has moved
     start: Array  # (3,), known exactly
     n_landmarks: int
-    halt: Indices  # (1,), not 0 once the trial is given up
 
 
 class State(NamedTuple):

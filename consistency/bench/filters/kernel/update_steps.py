@@ -46,7 +46,7 @@ from consistency.bench.filters.motion.unicycle import Frame, robot_frame
 from consistency.bench.models import point
 from consistency.referee.types import Array
 
-NOT_FINITE, INNOVATION, POSE, HALTED = 1, 2, 3, 4
+NOT_FINITE, INNOVATION, POSE = 1, 2, 3
 REASONS = {
     NOT_FINITE: "the estimate is not finite",
     INNOVATION: "the innovation covariance is not positive definite",

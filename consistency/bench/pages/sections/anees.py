@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.bench.pages.report_input import Study, Track
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.verdict.answers import STEP
-from consistency.referee.document.colours import EXPECTED, LIMIT, SHADE
-from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Rule, Sheet, xy
+from consistency.referee.document.blocks import Figure
+from consistency.referee.document.colours import EXPECTED, LIMIT
 from consistency.referee.document.wording import listed
 from consistency.referee.pages.judged import wide
-from consistency.referee.pages.section import STUDY, Section
+from consistency.referee.show.painting import add_legend, band, canvas, curve, edges, log_axis, stroke
 from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
 
 DIMENSION = "3"  # of a pose: what is expected where no filter has a band
 
@@ -81,58 +86,45 @@ def _fewer(verdict: Verdict, shared: Verdict | None) -> bool:
     return not same and (bool(verdict.failures) or verdict.runs < shared.runs)
 
 
-def figures(anees: Anees) -> tuple[Figure, ...]:
-    study = anees.study
+def anees_curves(study: Study) -> tuple[Figure, ...]:
+    """The curve of each filter with the band of the study; nothing where the truth is not known."""
+    anees = read(study)
+    if anees is None:
+        return ()
     name = f"{study.statistic} of the pose"
-    marks = [*_bands(anees), *(_line(curve, study) for curve in anees.curves)]
-    alt = f"{study.statistic} of {study.name} over time"
-    panel = Panel(study.clock.whole, Axis(name, log=anees.log), tuple(marks), alt, height=360)
-    keys = (
-        Key("95 % band of one step", SHADE, "band"), Key("band of all steps at once", LIMIT), Key("expected", EXPECTED),
-        *study.keys(),
-    )  # fmt: skip
-    return (Figure(name, caption(anees), (panel,), (Sheet((panel,), 2.2, keys=keys),), keys),)
+
+    def draw() -> Drawing:
+        figure, (axes,) = canvas(2.2)
+        _draw_bands(axes, anees)
+        for curve_of in anees.curves:
+            track = curve_of.track
+            curve(axes, study.clock.values, curve_of.values, track.look, track.name, track.tag)
+        axes.set_ylabel(name)
+        study.clock.span(axes)
+        if anees.log:
+            log_axis(axes, "y")
+        return add_legend(figure)
+
+    return (Figure(name, caption(anees), (draw,)),)
 
 
-def _bands(anees: Anees) -> list[Mark]:
+def _draw_bands(axes: Axes, anees: Anees) -> None:
     """The bands of the study shaded and dashed, those that differ as thin lines in the filter's colour."""
-    marks: list[Mark] = []
     steps, shared = anees.study.clock.values, anees.common
     if shared is not None:
-        marks.append(Band(steps, *xy(shared.band), SHADE))
+        band(axes, steps, shared.band, "95 % band of one step")
         if shared.simultaneous is not None:
-            marks.append(Band(steps, *xy(shared.simultaneous), LIMIT, outline=True))
-        marks.append(Rule("y", shared.expected, EXPECTED))
-    for curve in anees.curves:
-        if curve.own_band:
-            marks += _own_bands(curve, steps)
-    return marks
-
-
-def _own_bands(curve: Curve, steps: Array) -> list[Mark]:
-    marks: list[Mark] = []
-    look, owner = curve.track.look, curve.track.owner
-    if curve.simultaneous is not None:
-        dashed = replace(look, dash=LIMIT.dash, width=0.9)
-        marks.append(Band(steps, *xy(curve.simultaneous), dashed, owner, outline=True))
-    dotted = replace(look, dash=(1.0, 2.0), width=0.7)
-    return [*marks, Band(steps, *xy(curve.band), dotted, owner, outline=True)]
-
-
-def _line(curve: Curve, study: Study) -> Line:
-    tips = [
-        *study.clock.tips,
-        (study.statistic, "@y{0.000}"),
-        ("95 % band, one step", "@low{0.00} to @high{0.00}"),
-    ]
-    columns = {"step": study.steps, "low": curve.band[:, 0], "high": curve.band[:, 1]}
-    if curve.simultaneous is not None:
-        tips.append(("band of all steps", "@least{0.00} to @most{0.00}"))
-        columns |= {"least": curve.simultaneous[:, 0], "most": curve.simultaneous[:, 1]}
-    return Line(study.clock.values, curve.values, curve.track.look, curve.track.owner, tuple(tips), columns)
+            edges(axes, steps, shared.simultaneous, LIMIT, "band of all steps at once")
+        axes.axhline(shared.expected, **stroke(EXPECTED), label="expected")
+    for own in (of for of in anees.curves if of.own_band):
+        look = own.track.look
+        if own.simultaneous is not None:
+            edges(axes, steps, own.simultaneous, replace(look, dash=LIMIT.dash, width=0.9), tag=own.track.tag)
+        edges(axes, steps, own.band, replace(look, dash=(1.0, 2.0), width=0.7), tag=own.track.tag)
 
 
 def caption(anees: Anees) -> str:
+    """What the figure shows."""
     study, shared = anees.study, anees.common
     runs = shared.track.verdict.runs if shared else study.runs
     what = f"NEES of the single run {study.shown_run}" if study.single else f"Average NEES over {runs} runs"
@@ -167,6 +159,3 @@ def _simultaneous(anees: Anees) -> str:
         f"probability at most {100 * shares[0] * track.verdict.settings.false_alarm:.2g} %, its share of the verdict's "
         f"false-alarm rate{others if len(anees.study.tracks) > 1 else ''}."
     )
-
-
-SECTION = Section(STUDY, read, figures)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.pages.report_input import Report, Track, as_given
+from consistency.bench.pages.report_input import Report, Track
 from consistency.referee.diagnostics import Interval
-from consistency.referee.document.blocks import Block, Column, Name, Table, Text, table
-from consistency.referee.document.colours import EXPECTED, SHADE, solid
-from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span, dodge
-from consistency.referee.document.verdict import BRIEF, cells, columns, factor
-from consistency.referee.document.wording import written
-from consistency.referee.pages.section import OPENING, Part, Section
+from consistency.referee.document.blocks import Block, Column, Figure, Name, Table, Text, table
+from consistency.referee.document.colours import BAND, EXPECTED, solid
+from consistency.referee.document.verdict import BRIEF, cells, columns
 from consistency.referee.pages.verdicts import judgement, method
+from consistency.referee.show.painting import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
 
 TITLE = "Which filter tells the truth about its uncertainty, and where?"
 LABEL = "covariance ratio (truth / stated)"
@@ -32,18 +34,17 @@ class Place:
     """Where the interval of a filter in a world is drawn."""
 
     track: Track
-    world: str
-    y: float
+    y: float  # row of its world, and beside the others in it
     ratio: Interval
 
 
-def read(report: Report) -> Report | None:
-    """The report; None where it has one study, whose verdicts are at hand anyway."""
-    return report if len(report.studies) > 1 and any(study.has_truth for study in report.studies) else None
+def opening(report: Report) -> tuple[Block, ...]:
+    """A row of the picture for each world, a row of the table for each filter in it.
 
-
-def show(report: Report) -> tuple[Block, ...]:
-    """A row of the picture for each world, a row of the table for each filter in it."""
+    Nothing where there is one study, whose verdicts are at hand anyway.
+    """
+    if len(report.studies) < 2 or not any(study.has_truth for study in report.studies):
+        return ()
     return _picture(report), _table(report)
 
 
@@ -54,37 +55,50 @@ def _table(report: Report) -> Table:
         for track in study.tracks
     ]
     caption = "Every verdict of this report; a right filter has a mean ANEES of 3 for a pose in the plane."
-    return table(COLUMNS, rows, "Verdicts of all studies", caption=caption, paper=caption, style="narrow", apart=True)
+    return table(COLUMNS, rows, "Verdicts of all studies", caption=caption, style="narrow")
 
 
-def _picture(report: Report) -> Figure:
-    worlds = tuple(study.name for study in report.studies)
-    filters = {track.name: track for study in report.studies for track in study.tracks}
-    places = [
-        Place(track, study.name, row + dodge(slot, len(study.tracks)), ratio)
+def places(report: Report) -> list[Place]:
+    """Of every ratio that is known."""
+    return [
+        Place(track, row + dodge(slot, len(study.tracks)), ratio)
         for row, study in enumerate(report.studies)
         for slot, track in enumerate(study.tracks)
         if (ratio := _ratio(track)) is not None
     ]
-    factor = next(iter(filters.values())).verdict.settings.factor
-    values = [1.0 / factor, factor, *(place.ratio[0] for place in places)]
-    panel = Panel(
-        Axis(LABEL, log=True, window=(min(values) / ROOM, max(values) * ROOM)),
-        Axis("", rows=worlds),
-        (Span("x", 1.0 / factor, factor, SHADE), Rule("x", 1.0, EXPECTED), *_intervals(places)),
-        "Covariance ratio of every filter in every world, with its interval",
-        height=70 + 34 * len(worlds),
-    )
-    shade = Key(f"tolerated: 1 / {factor:g} to {factor:g}", SHADE, "band")
-    named = tuple(Key(name, solid(track.look), "points") for name, track in filters.items())
-    keys = (shade, Key("right", EXPECTED), *named)
+
+
+def window_of(found: list[Place], factor: float) -> tuple[float, float]:
+    """Drawn range of the ratios; ends of intervals are no reason for a wider one."""
+    values = [1.0 / factor, factor, *(place.ratio.value for place in found)]
+    return min(values) / ROOM, max(values) * ROOM
+
+
+def _picture(report: Report) -> Figure:
+    found = places(report)
+    factor = next(track for study in report.studies for track in study.tracks).verdict.settings.factor
+
+    def draw() -> Drawing:
+        figure, (axes,) = canvas(0.5 + 0.22 * len(report.studies))
+        axes.set(xlabel=LABEL, xlim=window_of(found, factor))
+        name_rows(axes, [study.name for study in report.studies])
+        axes.axvspan(
+            1.0 / factor, factor, color=BAND, linewidth=0, zorder=0.4, label=f"tolerated: 1 / {factor:g} to {factor:g}"
+        )
+        axes.axvline(1.0, **stroke(EXPECTED), label="right")
+        for name in dict.fromkeys(place.track.name for place in found):
+            own = [place for place in found if place.track.name == name]
+            look = replace(solid(own[0].track.look), size=3.6, width=1.1)
+            intervals(axes, np.array([p.y for p in own]), np.array([p.ratio for p in own]), look, name)
+        log_axis(axes, "x")
+        return add_legend(figure)
+
     caption = (
         "By how much the covariance of the pose must grow to match the errors, with 95 % intervals; log axis. A filter "
         "is shown to be honest where its whole interval lies in the shade and no other question found a fault; to the "
         "right of it is overconfident. An arrow goes on beyond the drawn range."
     )
-    sheet = Sheet((panel,), 0.6 + 0.2 * len(worlds), keys=keys)
-    return Figure(TITLE, caption, (panel,), (sheet,), keys, level=2, paper=f"{TITLE} {caption}")
+    return Figure(TITLE, caption, (draw,), level=2)
 
 
 def _ratio(track: Track) -> Interval | None:
@@ -93,32 +107,9 @@ def _ratio(track: Track) -> Interval | None:
     return scale.inflation if known and scale is not None else None
 
 
-def _intervals(places: list[Place]) -> list[Intervals]:
-    """The intervals of each filter, in all worlds."""
-    marks = []
-    for name in dict.fromkeys(place.track.name for place in places):
-        own = [place for place in places if place.track.name == name]
-        value, low, high = np.array([place.ratio for place in own]).T
-        columns = {
-            "world": [place.world for place in own],
-            "filter": [name] * len(own),
-            "verdict": [place.track.verdict.status for place in own],
-            "text": [written(factor(place.track.verdict)) for place in own],
-        }
-        tips = (("world", "@world"), ("filter", "@filter"), ("verdict", "@verdict"), ("covariance", "@text"))
-        look = replace(own[0].track.look, size=5.0, width=1.3)
-        y = np.array([place.y for place in own])
-        marks.append(Intervals(y, value, low, high, look, None, tips, columns))
-    return marks
-
-
 def verdicts(report: Report) -> tuple[Block, ...]:
     """Verdicts of all filters in all studies, and how a verdict comes about."""
     if not report.studies:
         return (Text("No study was run for these findings."),)
     blocks = [block for study in report.studies for block in judgement(study)]
     return (*blocks, Text(method(report.studies), "How a verdict comes about.", "note"))
-
-
-SECTION = Section(OPENING, read, show)
-VERDICTS = Section(Part("verdicts", "Verdicts", "Verdicts"), as_given, verdicts)

@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from consistency.bench.pages.report_input import Report, Study, as_given
+from consistency.bench.pages.report_input import Report, Study
 from consistency.referee.document.blocks import Block, Details, Facts, Settings
 from consistency.referee.pages.provenance import facts
-from consistency.referee.pages.section import Part, Section
 
-PROVENANCE = Part("provenance", "Provenance", "Provenance")
 SHORT = 4000  # characters of settings that surely fit on one page
 
 
-def show(report: Report) -> tuple[Block, ...]:
+def provenance(report: Report) -> tuple[Block, ...]:
+    """What the manifest says, and of each study what it adds."""
     rows = facts(report.manifest)
     return Facts(rows), *(_study(study, rows, len(report.studies) > 1) for study in report.studies)
 
@@ -23,12 +22,11 @@ def _study(study: Study, stated: tuple[tuple[str, str], ...], several: bool) -> 
     """Facts of one study that the report does not state already, and its settings."""
     rows = tuple(row for row in facts(study.results.manifest) if row not in stated)
     settings = resolved(study)
-    return Details(
-        f"{study.name}: {'provenance and ' if several else ''}resolved {'belief' if study.is_log else 'scenario'}",
-        (*((Facts(rows),) if rows else ()), Settings(settings)),
-        paper=f"{study.name}: {'provenance and ' if several else ''}resolved settings",
-        whole=len(settings) < SHORT,
-    )
+    what = "resolved belief" if study.is_log else "resolved scenario"
+    if several:
+        what = f"provenance and {what}"
+    blocks = (Facts(rows), Settings(settings)) if rows else (Settings(settings),)
+    return Details(f"{study.name}: {what}", blocks, whole=len(settings) < SHORT)
 
 
 def resolved(study: Study) -> str:
@@ -44,6 +42,3 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [_rounded(item) for item in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value
-
-
-SECTION = Section(PROVENANCE, as_given, show)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.pages.report_input import Study, Track
 from consistency.bench.simulation import simulate
+from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import ODOMETRY, TRUTH, Look
-from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet, xy
-from consistency.referee.pages.section import STUDY, Section
+from consistency.referee.show.painting import add_legend, canvas, dots, make_map, path
 from consistency.referee.types import Array, Indices
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
 
 LANDMARK = Look("#8c8c8c", marker="*", size=4.0)
 ALONE = Look(ODOMETRY, (6.0, 3.0), width=1.1)
@@ -32,6 +36,7 @@ class World:
 
 
 def read(study: Study) -> World:
+    """What the results hold of the shown run."""
     landmarks = study.results.landmarks
     return World(
         study,
@@ -72,46 +77,27 @@ def _odometry(study: Study) -> Array | None:
     return dead_reckoning(trial.start, trial.controls)[:, :2]
 
 
-def figures(world: World) -> tuple[Figure, ...]:
-    study = world.study
-    start = [] if world.truth is None else [Points(*xy(world.truth[:1]), START)]
-    panel = Panel(
-        Axis("x (m)"), Axis("y (m)"), (*_surroundings(world), *_estimates(world), *start),
-        f"Map of {study.name}", height=520, shape="map", equal=True,
-    )  # fmt: skip
-    keys = (*_keys(world), *study.keys())
-    title = f"Scenario and estimates, run {study.shown_run}"
-    return (Figure(title, caption(world), (panel,), (Sheet((panel,), 2.5, keys=keys, beside=True),), keys),)
+def world_map(study: Study) -> tuple[Figure, ...]:
+    """Landmarks, and the paths of truth, odometry and filters."""
+    world = read(study)
 
+    def draw() -> Drawing:
+        figure, (axes,) = canvas(2.9)
+        if world.landmarks is not None:
+            axes.plot(*world.landmarks.T, label="landmark", **dots(LANDMARK))
+        if world.odometry is not None:
+            path(axes, world.odometry, ALONE, "odometry alone")
+        if world.truth is not None:
+            path(axes, world.truth, TRUE, "true path")
+        for track, estimates in world.paths:
+            path(axes, estimates, track.look, track.name, track.tag)
+        if world.truth is not None:
+            axes.plot(*world.truth[:1].T, label="start", **dots(START))
+        axes.set(xlabel="x (m)", ylabel="y (m)")
+        make_map(axes)
+        return add_legend(figure, beside=True)
 
-def _surroundings(world: World) -> list[Mark]:
-    marks: list[Mark] = []
-    if world.landmarks is not None:
-        marks.append(Points(*xy(world.landmarks), LANDMARK))
-    if world.odometry is not None:
-        marks.append(Line(*xy(world.odometry), ALONE, path=True))
-    if world.truth is not None:
-        marks.append(Line(*xy(world.truth), TRUE, path=True))
-    return marks
-
-
-def _estimates(world: World) -> list[Mark]:
-    tips = (("step", "@step"), ("x", "@x{0.00} m"), ("y", "@y{0.00} m"))
-    return [
-        Line(*xy(path), track.look, track.owner, tips, {"step": world.study.steps}, path=True)
-        for track, path in world.paths
-    ]
-
-
-def _keys(world: World) -> list[Key]:
-    keys = []
-    if world.truth is not None:
-        keys += [Key("true path", TRUE), Key("start", START, "points")]
-    if world.odometry is not None:
-        keys.append(Key("odometry alone", ALONE))
-    if world.landmarks is not None:
-        keys.append(Key("landmark", LANDMARK, "points"))
-    return keys
+    return (Figure(f"Scenario and estimates, run {study.shown_run}", caption(world), (draw,)),)
 
 
 def caption(world: World) -> str:
@@ -125,6 +111,3 @@ def caption(world: World) -> str:
     parts.append("estimates in the filters' colours")
     note = "" if world.odometry is not None else " The odometry path is left out: results of a log hold no controls."
     return f"{world.study.name} from above, run {world.study.shown_run}: {', '.join(parts)}.{note}"
-
-
-SECTION = Section(STUDY, read, figures)

@@ -1,1 +1,1 @@
-"""Where the runs of a study are done."""
+"""Where the runs of a study are done: executors, which know nothing of runs."""

@@ -1,34 +1,37 @@
-"""Backends by name; what an extra brings is loaded when its backend is chosen."""
+"""Executors by name; what an extra brings is loaded when its backend is chosen."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from pathlib import Path
 
-from consistency.bench.runs.backends.local import LocalThreads
-from consistency.bench.runs.trial_work import Backend
+from consistency.bench.runs.backends.local import worker_count
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 
 ENGINES = {"dask": "distributed", "slurm": "submitit"}  # package of each that is not local
 NAMES = ("local", *ENGINES)
+WAIT = 60.0  # s
 
 
-def backend_for(
+@contextmanager
+def executor_for(
     name: str = "local",
     jobs: int = -1,
     scheduler: str | None = None,
     slurm: Sequence[str] = (),
     wait: float | None = None,
     out: Path = Path("results"),
-) -> Backend:
-    """The backend of that name.
+) -> Iterator[Executor | None]:
+    """Yield the executor of a backend, which is shut down at the end; None for threads of this process.
 
     Parameters
     ----------
-    jobs : workers of this machine, or jobs of Slurm at a time; -1 for as many as the backend thinks right
-    scheduler : of ``dask``, see :class:`consistency.bench.runs.backends.dask.Dask`
-    slurm : options of ``slurm``, each ``key=value``, see :class:`consistency.bench.runs.backends.slurm.Slurm`
+    jobs : processes of this machine, or jobs of Slurm at a time; -1 for as many as the backend thinks right
+    scheduler : of ``dask``, see :class:`consistency.bench.runs.backends.dask.DaskExecutor`
+    slurm : options of ``slurm``, each ``key=value``, see :class:`consistency.bench.runs.backends.slurm.SlurmExecutor`
     wait : seconds to wait for the scheduler of ``dask``, 60 if not given
     out : folder of the results; ``slurm`` keeps the files of its jobs beside it, on a disk that they see
 
@@ -37,6 +40,17 @@ def backend_for(
     InputError
         Another name, an option of another backend, or a package that is not installed.
     """
+    executor = _executor(name, jobs, scheduler, slurm, wait, out)
+    if executor is None:
+        yield None
+    else:
+        with executor:
+            yield executor
+
+
+def _executor(
+    name: str, jobs: int, scheduler: str | None, slurm: Sequence[str], wait: float | None, out: Path
+) -> Executor | None:
     if name not in NAMES:
         raise InputError(f"--backend must be one of {', '.join(NAMES)}, got '{name}'")
     for option, owner, is_given in (
@@ -47,20 +61,15 @@ def backend_for(
         if is_given and name != owner:
             raise InputError(f"{option} goes with --backend {owner}, not with {name}")
     if name == "local":
-        return LocalThreads(jobs)
+        worker_count(jobs)
+        return None
     try:
         if name == "dask":
-            from consistency.bench.runs.backends.dask import Dask
+            from consistency.bench.runs.backends.dask import DaskExecutor
 
-            return Dask(scheduler, jobs) if wait is None else Dask(scheduler, jobs, wait)
-        from consistency.bench.runs.backends.slurm import Slurm, options_of
+            return DaskExecutor(scheduler, jobs, WAIT if wait is None else wait)
+        from consistency.bench.runs.backends.slurm import SlurmExecutor, options_of
 
-        return Slurm(out.absolute().with_name(f".{out.absolute().name}.jobs"), options_of(slurm), jobs)
+        return SlurmExecutor(out.absolute().with_name(f".{out.absolute().name}.jobs"), options_of(slurm), jobs)
     except ImportError:
         raise MissingPackageError(f"--backend {name} needs {remedy('cluster', package=ENGINES[name])}") from None
-
-
-def require_scheduler(name: str, scheduler: str | None, what: str) -> None:
-    """Refuse to start workers anew for each of the many looks of ``what``."""
-    if name == "dask" and scheduler is None:
-        raise InputError(f"--scheduler: missing; {what} looks often, and workers would be started for each look")

@@ -7,7 +7,6 @@ that a script needs no guard on ``__main__``.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import os
 import signal
@@ -15,11 +14,11 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, TimeoutError, wait
+from functools import cache
 from multiprocessing import current_process
 from multiprocessing.connection import Connection
+from multiprocessing.util import Finalize
 from typing import Any
-
-import numpy as np
 
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.stepping import error_of, name_of, reason_of, rejects
@@ -28,6 +27,7 @@ from consistency.bench.runs.isolation.worker import Isolated, begin, load, nothi
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
+from consistency.referee.system.stopping import link_to_parent
 
 KILLED = (-signal.SIGTERM, -getattr(signal, "SIGKILL", signal.SIGTERM))  # exit codes; no filter ends itself so
 GLANCE = 0.5  # s between looks at whether a process still lives
@@ -38,8 +38,13 @@ ONE_THREAD = dict.fromkeys(  # of BLAS in a process of a filter: the last bits d
 )
 _lock = threading.Lock()
 _idle: list[_Worker] = []  # of earlier studies, as starting one takes seconds
-# a worker dies when the thread that started it ends (Linux), so one thread starts them all and never ends
-_starter = ThreadPoolExecutor(1)
+
+
+@cache
+def _starter() -> ThreadPoolExecutor:
+    """Return a thread that never ends and starts all workers: on Linux they end with the thread that started them."""
+    Finalize(None, dismiss, exitpriority=10)  # before a worker of multiprocessing, which has no atexit, waits for them
+    return ThreadPoolExecutor(1)
 
 
 class Isolation:
@@ -74,18 +79,17 @@ class Isolation:
         self._isolated = {name_of(each): _isolated(each) for each in filters if not isinstance(each, Compiled)}
         self._free: list[_Worker] = []
         self._busy: set[_Worker] = set()
-        self._is_open, self._halt = False, np.zeros(1, np.int64)
+        self._is_open = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Isolation, (self.filters, self.belief, self.timeout, self.memory)
 
     def __enter__(self) -> Isolation:
-        self._is_open, self._halt = True, np.zeros(1, np.int64)
+        self._is_open = True
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End compiled trials before their next step and kill processes that work; idle ones are kept."""
-        self._halt[0] = 1
+        """Kill the processes that still work and keep the idle ones."""
         with _lock:
             self._is_open = False
             for worker in self._busy:  # whose thread waits for its result
@@ -111,7 +115,7 @@ class Isolation:
         estimates = []
         for filter_ in self.filters:
             if isinstance(filter_, Compiled):
-                estimates.append(filter_.run(trial, belief, self._halt))
+                estimates.append(filter_.run(trial, belief))
             else:
                 estimates.append(self._run_apart(self._isolated[name_of(filter_)], trial, belief))
         return estimates
@@ -171,8 +175,9 @@ class _Worker:
         threading.Thread(target=_show, args=(printed,), daemon=True).start()
         self._loaded: set[bytes] = set()
         self._pid = 0
-        self._pool: Any = ProcessPool(1, initializer=begin, initargs=(output, os.getpid()), context=context)
-        _starter.submit(self._pool.schedule, nothing).result()
+        initargs = (output, *link_to_parent(context))
+        self._pool: Any = ProcessPool(1, initializer=begin, initargs=initargs, context=context)
+        _starter().submit(self._pool.schedule, nothing).result()
 
     @property
     def is_alive(self) -> bool:
@@ -286,7 +291,6 @@ def _show(printed: Connection) -> None:
                 left -= len(text)
 
 
-@atexit.register
 def dismiss() -> None:
     """End the processes that wait for a study."""
     while _idle:
@@ -295,3 +299,4 @@ def dismiss() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_idle.clear)
+    os.register_at_fork(after_in_child=_starter.cache_clear)  # no thread is there after a fork

@@ -22,7 +22,7 @@ from consistency.bench.filters.stepping import reason_of, run_filter
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
-from consistency.referee.system.stopping import die_with_parent
+from consistency.referee.system.stopping import end_with_parent
 
 GIB = 2**30
 
@@ -42,14 +42,11 @@ class Isolated:
         return record.estimates(self.name, trial.run, self.error, reason=reason, guarded=self.guarded)
 
 
-def begin(output: Connection, parent: int) -> None:
-    """Die with the parent, ignore its Ctrl-C, leave no core, use one BLAS thread, print into ``output``."""
+def begin(output: Connection, parent: int, alive: Connection) -> None:
+    """End with the parent, ignore its Ctrl-C, leave no core, use one BLAS thread, print into ``output``."""
     from threadpoolctl import threadpool_limits
 
-    if sys.platform == "linux":
-        die_with_parent()
-        if os.getppid() != parent:
-            os._exit(1)
+    end_with_parent(parent, alive)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # Pebble has a handler, which code in C would keep waiting
     if resource is not None:

@@ -158,7 +158,7 @@ def _rotation_vectors(p: Poses, first: int, w: int) -> Poses:
     P = J @ p.covariance[known.rows] @ np.swapaxes(J, 1, 2)
     truth = np.hstack([known.truth[:, rest], small])
     estimate = np.hstack([p.estimate[known.rows][:, rest], np.zeros_like(small)])
-    return replace(p._of(known.rows), estimate=estimate, covariance=P, true_t=p.t[known.rows], truth=truth)
+    return replace(p.of_rows(known.rows), estimate=estimate, covariance=P, true_t=p.t[known.rows], truth=truth)
 
 
 def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator[Guess]:

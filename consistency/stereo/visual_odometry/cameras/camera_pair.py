@@ -13,9 +13,9 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig
+from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
 from consistency.stereo.visual_odometry.cameras.yaml_file import read_matrix
-from consistency.stereo.visual_odometry.features import is_rectified, opencv
 
 WIDEST = 30.0  # m between two cameras on one rig; calibrations are often in millimetres by mistake
 EUROC_BODY, CAMERA_0 = "body of EuRoC", "camera 0 of KITTI raw"

@@ -9,8 +9,8 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry import batch_inverses, input_checks
-from consistency.stereo.visual_odometry.input_errors import PointError
+from consistency.stereo.visual_odometry.cameras import array_checks, batch_inverses
+from consistency.stereo.visual_odometry.cameras.input_errors import PointError
 
 NEAREST = 1e-3  # depth in baselines up to which a point is at the camera: a disparity of a thousand focal lengths
 FARTHEST = 1e6  # depth in baselines from which on a point is at infinity
@@ -48,7 +48,7 @@ class StereoRig:
     image_size: tuple[int, int]  # width, height, px
 
     def __post_init__(self) -> None:
-        input_checks.freeze(self, K_left=(3, 3), K_right=(3, 3), R=(3, 3), t=(3,))
+        array_checks.freeze(self, K_left=(3, 3), K_right=(3, 3), R=(3, 3), t=(3,))
         for name, K in (("K_left", self.K_left), ("K_right", self.K_right)):
             if np.tril(K, -1).any() or K[2, 2] != 1.0 or min(K[0, 0], K[1, 1]) <= 0.0:
                 raise InputError(f"{name}: give [[fu, skew, u0], [0, fv, v0], [0, 0, 1]] with positive fu and fv")
@@ -85,7 +85,7 @@ class StereoRig:
         PointError
             A point at or behind a camera.
         """
-        p = input_checks.checked_rows("points", points, 3)
+        p = array_checks.checked_rows("points", points, 3)
         h = p @ np.swapaxes(self.cameras[:, :, :3], 1, 2) + self.cameras[:, None, :, 3]  # (2, N, 3)
         depth = h[:, :, 2]
         if (bad := (depth <= NEAREST * self.baseline).any(axis=0)).any():
@@ -114,7 +114,7 @@ def triangulate(rig: StereoRig, uv: Array) -> Array:
     PointError
         Rays that meet at infinity, at a camera or behind one: zero or negative disparity. See :func:`triangulable`.
     """
-    points, good = _points(rig, input_checks.checked_rows("uv", uv, 4))
+    points, good = _points(rig, array_checks.checked_rows("uv", uv, 4))
     if not good.all():
         k = int(np.argmin(good))
         raise PointError(
@@ -127,7 +127,7 @@ def triangulate(rig: StereoRig, uv: Array) -> Array:
 
 def triangulable(rig: StereoRig, uv: Array) -> Array:
     """(N, 4) px to (N,) bool: the matches that :func:`triangulate` gives a point in front of both cameras."""
-    return _points(rig, input_checks.checked_rows("uv", uv, 4))[1]
+    return _points(rig, array_checks.checked_rows("uv", uv, 4))[1]
 
 
 def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
@@ -163,3 +163,11 @@ def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
     depth = rig.cameras[:, 2, :3] @ points + rig.cameras[:, 2, 3:]
     near, far = NEAREST * rig.baseline, FARTHEST * rig.baseline
     return np.ascontiguousarray(points.T), definite & ((depth > near) & (depth < far)).all(axis=0)
+
+
+def is_rectified(rig: StereoRig) -> bool:
+    """Whether rows of both images correspond: same axes and focal lengths, baseline along x within 1 %."""
+    same = np.allclose(rig.R, np.eye(3), atol=1e-6)
+    focal = np.allclose(np.delete(rig.K_left, 2, axis=1), np.delete(rig.K_right, 2, axis=1), rtol=1e-6)
+    rows = abs(rig.K_left[1, 2] - rig.K_right[1, 2]) < 1e-3
+    return bool(same and focal and rows and np.linalg.norm(rig.t[1:]) <= 0.01 * rig.t[0])

@@ -1,0 +1,149 @@
+"""How a stereo observation is distributed after eq. 21, Herath et al. (2007) fig. 12."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from consistency.bench.models.stereo import project, triangulate_jacobian
+from consistency.bench.pages.exhibits import extra_table
+from consistency.bench.pages.report_input import Report
+from consistency.bench.types import Gaussian
+from consistency.referee.document.blocks import Figure
+from consistency.referee.document.colours import Look, style
+from consistency.referee.show.painting import add_legend, canvas, path, points, stroke
+from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
+FILE = "fig12.parquet"
+POINT, FOCAL = (10.0, 1.0), 150.0  # m, px: Herath et al. (2007) sec. 4.5
+SIGMA_U, SIGMA_D = 1.34, 0.65  # px, ibid.
+COLUMNS = ["baseline", "x", "y", "u", "d"]
+DRAWN, BINS = 1000, 60
+SAMPLES, DOTS = Look("#c4c4c4"), Look("#555555", size=1.0, alpha=0.6)
+LINEAR, FITTED = replace(style(0), width=1.4), replace(style(1), width=1.4)
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Eq. 21 applied to Gaussian (u, d) for one baseline, as Herath et al. (2007) fig. 12."""
+
+    baseline: float  # m
+    samples: int
+    points: Array  # (n, 2), m, the samples drawn
+    window: tuple[tuple[float, float], tuple[float, float]]  # drawn range of x and y, m
+    outside: float  # share of samples beyond the drawn range
+    edges: Array  # (b + 1,), m
+    density: Array  # (b,), 1/m
+    grid: Array  # (g,), m
+    linear: Gaussian  # J diag(sigma^2) J' at the true point
+    fitted: Gaussian  # moments of the samples
+    linear_ellipse: Array  # (m, 2), 2 sigma
+    fitted_ellipse: Array
+    linear_density: Array  # (g,), 1/m
+    fitted_density: Array
+
+
+def read(report: Report) -> tuple[Distribution, ...]:
+    """One record a baseline; none where the file does not exist.
+
+    Raises
+    ------
+    InputError
+        The file is damaged or lacks a column.
+    """
+    table = extra_table(report.folder / FILE, COLUMNS)
+    if table is None:
+        return ()
+    parts = (part for _, part in table.groupby("baseline", sort=True))
+    return tuple(_distribution(float(part["baseline"].iloc[0]), part) for part in parts)
+
+
+def _distribution(baseline: float, table: pd.DataFrame) -> Distribution:
+    points = table[["x", "y"]].to_numpy(float)
+    linear = Gaussian(np.array(POINT), _linear_covariance(baseline))
+    fitted = Gaussian(points.mean(axis=0), np.cov(points.T))
+    window = (_range(points[:, 0], linear, 0), _range(points[:, 1], linear, 1))
+    inside = np.all([(low <= c) & (c <= high) for c, (low, high) in zip(points.T, window, strict=True)], axis=0)
+    edges, grid = np.linspace(*window[0], BINS + 1), np.linspace(*window[0], 201)
+    count, _ = np.histogram(points[:, 0], edges)
+    return Distribution(
+        baseline=baseline,
+        samples=len(points),
+        points=points[:DRAWN][inside[:DRAWN]],
+        window=window,
+        outside=float(1.0 - inside.mean()),
+        edges=edges,
+        density=count / (len(points) * np.diff(edges)),
+        grid=grid,
+        linear=linear,
+        fitted=fitted,
+        linear_ellipse=_ellipse(linear),
+        fitted_ellipse=_ellipse(fitted),
+        linear_density=stats.norm.pdf(grid, linear.mean[0], np.sqrt(linear.covariance[0, 0])),
+        fitted_density=stats.norm.pdf(grid, fitted.mean[0], np.sqrt(fitted.covariance[0, 0])),
+    )
+
+
+def _linear_covariance(baseline: float) -> Array:
+    """J diag(sigma_u^2, sigma_d^2) J' of (x, y) at the true point."""
+    u, v, d = project(*POINT, 0.0, FOCAL, baseline)
+    J = np.reshape(triangulate_jacobian(u, v, d, FOCAL, baseline), (3, 3))[:2][:, [0, 2]]
+    covariance: Array = J @ np.diag([SIGMA_U**2, SIGMA_D**2]) @ J.T
+    return covariance
+
+
+def _range(values: Array, linear: Gaussian, axis: int) -> tuple[float, float]:
+    """All of the linearised Gaussian that is seen, and the samples unless they lie very far out."""
+    mean, std = linear.mean[axis], np.sqrt(linear.covariance[axis, axis])
+    low, high = np.quantile(values, [0.002, 0.998])
+    return (
+        float(max(min(mean - 3.2 * std, low), mean - 9 * std)),
+        float(min(max(mean + 3.2 * std, high), mean + 9 * std)),
+    )
+
+
+def _ellipse(gaussian: Gaussian) -> Array:
+    """Points (73, 2) at two standard deviations."""
+    angle = np.linspace(0.0, 2 * np.pi, 73)
+    values, vectors = np.linalg.eigh(gaussian.covariance)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(gaussian.mean + 2.0 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+def stereo_noise(report: Report) -> tuple[Figure, ...]:
+    """For each baseline samples with two ellipses, and the histogram of x with two densities."""
+    return tuple(Figure(f"Baseline {d.baseline:g} m", caption(d), (partial(_draw, d),)) for d in read(report))
+
+
+def _draw(d: Distribution) -> Drawing:
+    figure, (cloud, histogram) = canvas(2.0, 2, 2)
+    points(cloud, d.points[:, 0], d.points[:, 1], DOTS, limit=DRAWN)
+    cloud.set(xlabel="x (m)", ylabel="y (m)", xlim=d.window[0], ylim=d.window[1])
+    histogram.stairs(d.density, d.edges, fill=True, color=SAMPLES.colour, label="samples")
+    for look, outline, density, label in (
+        (LINEAR, d.linear_ellipse, d.linear_density, "linearised Gaussian"),
+        (FITTED, d.fitted_ellipse, d.fitted_density, "Gaussian with the samples' moments"),
+    ):
+        path(cloud, outline, look)
+        histogram.plot(d.grid, density, label=label, **stroke(look))
+    histogram.set(xlabel="x (m)", ylabel="density (1/m)", xlim=d.window[0])
+    return add_legend(figure)
+
+
+def caption(d: Distribution) -> str:
+    """What one panel pair of fig. 12 shows, with its numbers."""
+    linear, fitted = (float(np.sqrt(g.covariance[0, 0])) for g in (d.linear, d.fitted))
+    beyond = f" {100 * d.outside:.1f} % of the samples lie beyond the axes." if d.outside >= 0.0005 else ""
+    return (
+        f"Baseline {d.baseline:g} m: {d.samples} samples of eq. 21 within the search range, for a point at x = 10 m, "
+        f"y = 1 m ({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the "
+        f"samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
+    )

@@ -1,0 +1,385 @@
+"""Figures of one estimator: errors with their bounds, NEES, trajectory, coverage, innovations.
+
+Where runs have one step, as those of a factor or a calibration, the runs stand along the axis, each a point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import special
+
+from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import of_both
+from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.document.blocks import Figure
+from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SIGMAS, ZERO, Look, style
+from consistency.referee.errors import InputError
+from consistency.referee.pages.judged import Clock, clock_of, wide
+from consistency.referee.pages.trajectory import shown_run, trajectory_panel
+from consistency.referee.show.painting import (
+    WIDTH,
+    add_legend,
+    band,
+    canvas,
+    curve,
+    edges,
+    log_axis,
+    panel_legend,
+    points,
+    rows_of,
+    stroke,
+)
+from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
+
+MOST_PANELS = 12  # components of an error that are drawn
+MOST_RUNS = 20  # runs that are drawn beside the shown one
+ANGLES = {"heading", "yaw", "pitch", "roll"}
+METRES = {"x", "y", "z"}
+DERIVED = {"v": "m/s", "bg": "rad/s", "ba": "m/s^2"}  # velocities and biases, by what comes before x, y, z
+OF_BOTH = "Covariances are those of estimate and truth together."
+SHOWN, OTHERS = replace(style(0), width=1.0), Look("#c0c0c0", width=0.5)
+BOUND = replace(SHOWN, dash=(4.0, 3.0), width=0.8)
+JOINT = Look("#333333", width=1.4)
+EACH = replace(style(0), size=2.0, alpha=0.7)
+
+Paint = Callable[["Axes"], None]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Panels with one caption; each draws itself on its axes."""
+
+    title: str
+    caption: str
+    panels: tuple[Paint, ...]
+    height: float = 1.3  # inches, of a row of panels
+
+    def figure(self) -> Figure:
+        return Figure(self.title, self.caption, (self.draw,))
+
+    def draw(self) -> Drawing:
+        many = len(self.panels)
+        columns = rows_of(many)
+        figure, panels = canvas(self.height * -(-many // columns), columns, many, sharex=many > 1)
+        for number, (axes, paint) in enumerate(zip(panels, self.panels, strict=True)):
+            paint(axes)
+            if number + columns < many:
+                axes.set_xlabel("")
+        return add_legend(figure)
+
+
+def record_figures(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
+    """Errors with their bounds, NEES, trajectory, coverage, and innovations; those that the record has."""
+    both = of_both(record)
+    pictures = (*_pictures(both, verdict), _innovations(both, verdict))
+    note = f" {OF_BOTH}" if record.truth_covariance is not None else ""
+    return tuple(
+        replace(picture, caption=picture.caption + note).figure() for picture in pictures if picture is not None
+    )
+
+
+def overview(record: Evidence, verdict: Verdict | None = None) -> Callable[[], Drawing]:
+    """Draws errors with their bounds, trajectory, coverage, and with a ``verdict`` the NEES with its band.
+
+    Raises
+    ------
+    InputError
+        The record has neither errors nor NEES.
+    """
+    pictures = [picture for picture in _pictures(of_both(record), verdict) if picture is not None]
+    if not pictures:
+        raise InputError(f"{record.name}: has neither errors nor NEES to draw; give --truth, or truth= in Python")
+    paints = [paint for picture in pictures for paint in picture.panels]
+
+    def draw() -> Drawing:
+        columns = rows_of(len(paints))
+        figure, panels = canvas(0.3 + 1.5 * -(-len(paints) // columns), columns, len(paints), width=1.3 * WIDTH)
+        for axes, paint in zip(panels, paints, strict=True):
+            paint(axes)
+            panel_legend(axes)
+        figure.suptitle(record.name, x=0.0, ha="left")
+        return figure
+
+    return draw
+
+
+def _pictures(record: Evidence, verdict: Verdict | None) -> tuple[Picture | None, ...]:
+    nees = None if verdict is None else _nees(record, verdict)
+    return _errors(record), nees, _trajectory(record), _coverage(record)
+
+
+def has_one_step(record: Evidence) -> bool:
+    """Whether a curve along the steps would be a point, and one along the runs is not."""
+    return len(record.t) == 1 and len(record.run_numbers) > 1
+
+
+def _span_runs(axes: Axes, record: Evidence) -> None:
+    """Draw the axis from the first run to the last."""
+    axes.set(xlabel="run", xlim=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
+
+
+# --- errors -----------------------------------------------------------------------------------------
+
+
+def unit_of(axis: str) -> tuple[str, float]:
+    """Unit that a component is shown in, and the factor to it; none where it is not known."""
+    if axis in ANGLES:
+        return "deg", 180.0 / np.pi
+    if axis in METRES:
+        return "m", 1.0
+    if axis[-1:] in METRES:
+        return DERIVED.get(axis[:-1], ""), 1.0
+    return "", 1.0
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one component of R runs of T steps in the unit that it is shown in, and their 2-sigma bounds."""
+
+    label: str  # of the component with its unit
+    error: Array  # (R, T)
+    bound: Array  # (R, T)
+
+
+def errors_of(record: Evidence) -> list[Errors]:
+    """Of each component that is drawn."""
+    assert record.error is not None
+    assert record.covariance is not None
+    found = []
+    for i, name in enumerate(record.axes[:MOST_PANELS]):
+        unit, factor = unit_of(name)
+        bound = SIGMAS * factor * np.sqrt(np.maximum(record.covariance[:, :, i, i], 0.0))
+        found.append(Errors(f"{name} ({unit})" if unit else name, factor * record.error[..., i], bound))
+    return found
+
+
+def _errors(record: Evidence) -> Picture | None:
+    """Error of each component with its 2-sigma bounds, as fig. 2b of Herath et al. (2007)."""
+    if record.error is None or record.covariance is None:
+        return None
+    components = errors_of(record)
+    left_out = len(record.axes) - len(components)
+    more = f" {plural(left_out, 'further component')} not drawn." if left_out else ""
+    if has_one_step(record):
+        caption = (
+            "Error (truth minus estimate) of each run with the 2-sigma bounds that the estimator states (shaded). "
+            f"About 95 % of honest errors are inside.{more}"
+        )
+        return Picture("Errors and stated bounds", caption, tuple(_errors_of_runs(record, c) for c in components))
+    clock, row = clock_of(record.t), shown_run(record)
+    meaning = "truth minus estimate" if record.window is None else f"of the motion over each window of {record.window}"
+    caption = (
+        f"Error ({meaning}) of run {record.run_numbers[row]} with the 2-sigma bounds that the estimator "
+        f"states (dashed). Honest errors stay inside about 95 % of the time.{more}{clock.note}"
+    )
+    return Picture("Errors and stated bounds", caption, tuple(_error_curves(record, clock, row, c) for c in components))
+
+
+def _errors_of_runs(record: Evidence, of: Errors) -> Paint:
+    def paint(axes: Axes) -> None:
+        runs, bound = record.run_numbers.astype(float), of.bound[:, 0]
+        band(axes, runs, np.column_stack([-bound, bound]), "2-sigma bounds")
+        axes.axhline(0.0, **stroke(ZERO))
+        points(axes, runs, of.error[:, 0], EACH, "error of a run")
+        axes.set_ylabel(of.label)
+        _span_runs(axes, record)
+
+    return paint
+
+
+def _error_curves(record: Evidence, clock: Clock, row: int, of: Errors) -> Paint:
+    others = np.linspace(0, len(of.error) - 1, MOST_RUNS + 1).astype(int)
+
+    def paint(axes: Axes) -> None:
+        label = "other runs"
+        for other in dict.fromkeys(others[others != row]):
+            curve(axes, clock.values, of.error[other], OTHERS, label)
+            label = ""
+        axes.axhline(0.0, **stroke(ZERO))
+        draw_bounded(axes, clock.values, of.error[row], of.bound[row], f"run {record.run_numbers[row]}")
+        axes.set_ylabel(of.label)
+        clock.name(axes)
+
+    return paint
+
+
+def draw_bounded(axes: Axes, x: Array, error: Array, bound: Array, label: str) -> None:
+    """An error (T,) with dashed lines at plus and minus its bound, which is shaded."""
+    ends = np.column_stack([-bound, bound])
+    band(axes, x, ends, colour="#e3eef6")
+    edges(axes, x, ends, BOUND, "2-sigma bounds")
+    curve(axes, x, error, SHOWN, label)
+
+
+# --- trajectory -------------------------------------------------------------------------------------
+
+
+def _trajectory(record: Evidence) -> Picture | None:
+    found = None if has_one_step(record) else trajectory_panel(record)
+    if found is None:
+        return None
+    caption, paint = found
+    return Picture("Trajectory", caption, (paint,), height=2.6)
+
+
+# --- NEES -------------------------------------------------------------------------------------------
+
+
+def _nees(record: Evidence, verdict: Verdict) -> Picture | None:
+    """NEES of one run, or its average over runs, with the bands of a right estimator."""
+    if record.parts:  # of the whole no distribution is known
+        return None
+    if record.independent or has_one_step(record):
+        return _single_nees(record)
+    scale, location = verdict.scale, verdict.location
+    if scale is None or len(scale.anees) != len(record.t):
+        return None
+    clock = clock_of(record.t)
+    name = "NEES" if verdict.runs == 1 else f"NEES, average of {verdict.runs} runs"
+    simultaneous = None
+    if location is not None and np.isfinite(location.simultaneous).any():
+        simultaneous = location.simultaneous
+
+    def paint(axes: Axes) -> None:
+        band(axes, clock.values, scale.band, "95 % band of one step")
+        drawn = [scale.anees, scale.band]
+        if simultaneous is not None:
+            edges(axes, clock.values, simultaneous, LIMIT, "band of all steps at once")
+            drawn.append(simultaneous)
+        axes.axhline(float(scale.dof), **stroke(EXPECTED), label="expected")
+        curve(axes, clock.values, scale.anees, SHOWN, record.name)
+        axes.set_ylabel("NEES")
+        clock.name(axes)
+        if wide(drawn):
+            log_axis(axes, "y")
+
+    caption = (
+        f"{name}; {scale.dof} is expected (line). Above is overconfident, below conservative. Shaded: where one step "
+        f"of a right estimator lies with 95 %, which is not judged.{clock.note}"
+    )
+    return Picture("NEES", caption, (paint,), height=1.9)
+
+
+def _single_nees(record: Evidence) -> Picture | None:
+    """NEES of each run of one step, or of each window, independent of the others."""
+    nees = record.nees
+    if nees is None or not np.isfinite(nees).any():
+        return None
+    what, each, note = "each run", "one run", ""
+    if record.independent:
+        note = clock_of(record.t).note
+        what, each = f"the motion over each window of {record.window or 'a step'}", "one window"
+
+    def paint(axes: Axes) -> None:
+        x, rows = record.run_numbers.astype(float), nees[:, :1].T
+        if record.independent:
+            x, rows = clock_of(record.t).values, nees
+        ends = [float(distributions.chi2.ppf(q, record.dof)) for q in (0.025, 0.975)]
+        axes.axhspan(*ends, color=BAND, linewidth=0, zorder=0.5, label=f"95 % band of {each}")
+        axes.axhline(float(record.dof), **stroke(EXPECTED), label="expected")
+        label = f"NEES of {each.replace('one', 'a')}"
+        for values in rows:
+            points(axes, x, values, EACH, label)
+            label = ""
+        axes.set_ylabel("NEES")
+        if record.independent:
+            clock_of(record.t).name(axes)
+        else:
+            _span_runs(axes, record)
+        if wide([nees]):
+            log_axis(axes, "y")
+
+    plural_of = "windows" if record.independent else "runs"
+    caption = (
+        f"NEES of {what}; {record.dof} is expected in the mean (line). Above is overconfident, below conservative. "
+        f"Shaded: where 95 % of the {plural_of} of a right estimator lie, which is not judged.{note}"
+    )
+    return Picture("NEES", caption, (paint,), height=1.9)
+
+
+# --- coverage ---------------------------------------------------------------------------------------
+
+
+def observed_coverage(record: Evidence, p: Array) -> dict[str, Array]:
+    """Share of errors inside the interval that should hold them with probability ``p`` (N,), by component and jointly.
+
+    Of all steps of all runs; -> (N,) each.
+    """
+    found: dict[str, Array] = {}
+    if record.error is not None and record.covariance is not None:
+        sigma = np.sqrt(np.diagonal(record.covariance, axis1=-2, axis2=-1))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            z = np.abs(record.error) / sigma
+        for i, name in enumerate(record.axes[:MOST_PANELS]):
+            found[name] = _shares(z[..., i], np.sqrt(2.0) * special.erfinv(p))
+    if record.nees is not None and record.dof and not record.parts:
+        found["all together"] = _shares(record.nees, distributions.chi2.ppf(p, record.dof))
+    return {name: shares for name, shares in found.items() if np.isfinite(shares).any()}
+
+
+def _shares(values: Array, limits: Array) -> Array:
+    known = np.sort(values[np.isfinite(values)])
+    if not len(known):
+        return np.full(len(limits), np.nan)
+    return np.searchsorted(known, limits, side="right") / len(known)
+
+
+def _coverage(record: Evidence) -> Picture | None:
+    """Share of errors within an interval against the probability that it should hold them with."""
+    p = np.linspace(0.0, 0.999, 200)
+    found = observed_coverage(record, p)
+    if not found:
+        return None
+
+    def paint(axes: Axes) -> None:
+        axes.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED), label="expected")
+        for number, (name, shares) in enumerate(found.items()):
+            look = JOINT if name == "all together" else replace(style(number), width=1.1)
+            curve(axes, p, shares, look, name)
+        axes.set(xlabel="stated probability", ylabel="share of errors inside", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
+
+    caption = (
+        "Coverage: share of errors inside the interval that should hold them with the stated probability, over all "
+        "steps of all runs. On the diagonal the covariance is right; below it is overconfident, above conservative."
+    )
+    return Picture("Coverage", caption, (paint,), height=2.1)
+
+
+# --- innovations ------------------------------------------------------------------------------------
+
+
+def _innovations(record: Evidence, verdict: Verdict) -> Picture | None:
+    """NIS over its degrees of freedom, averaged over runs."""
+    if record.nis is None or record.nis_dof is None:
+        return None
+    clock = clock_of(record.t)
+    known = np.isfinite(record.nis) & (record.nis_dof > 0)
+    dof = np.where(known, record.nis_dof, 0.0).sum(axis=0)
+    least = np.maximum(dof, 1.0)
+    ratio = np.where(dof > 0, np.where(known, record.nis, 0.0).sum(axis=0) / least, np.nan)
+    ends = np.column_stack([distributions.chi2.ppf(q, least) / least for q in (0.025, 0.975)])
+
+    def paint(axes: Axes) -> None:
+        band(axes, clock.values, np.where(dof[:, None] > 0, ends, np.nan), "95 % band of one step")
+        axes.axhline(1.0, **stroke(EXPECTED), label="expected")
+        points(axes, clock.values, ratio, EACH)
+        axes.set_ylabel("NIS / dof")
+        clock.name(axes)
+        if wide([ratio]):
+            log_axis(axes, "y")
+
+    judged = verdict.innovations is not None and verdict.innovations.judged
+    caption = (
+        "NIS over its degrees of freedom; 1 is expected (line). Shaded: where one step of white innovations lies with "
+        f"95 %.{'' if judged else ' Reported, not judged: no optimal gain is declared.'}{clock.note}"
+    )
+    return Picture("Innovations", caption, (paint,), height=1.6)

@@ -1,0 +1,107 @@
+"""What a file of estimates is, by its name and its first lines."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.named_columns import (
+    beginning,
+    begins_with_numbers,
+    clock_of,
+    head_of,
+    places_of,
+    roles_of,
+)
+
+TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
+ARCHIVES = (".npz", ".mat")
+TRAJECTORIES = (".txt", ".tum")
+BAGS = (".bag", ".mcap", ".db3")
+SPEEDS = ("v", "speed", "velocity", "forward_velocity", "linear_velocity", "linear_x", "vx", "v_x")
+TURNS = ("omega", "w", "yaw_rate", "yawrate", "turn_rate", "angular_velocity", "angular_z", "wz", "w_z")
+HEADINGS = ("heading", "theta", "yaw", "orientation", "psi")
+PLACES = (("x", "tx", "px"), ("y", "ty", "py"), HEADINGS)
+
+
+def is_bag(path: Path) -> bool:
+    """A file of ROS 1 or 2, a folder of ROS 2, or a folder that holds such."""
+    return is_one_bag(path) or (path.is_dir() and any(is_one_bag(part) for part in path.iterdir()))
+
+
+def is_one_bag(path: Path) -> bool:
+    """A file of ROS 1 or 2, or a folder of ROS 2."""
+    return (path.suffix in BAGS and path.is_file()) or (path.is_dir() and (path / "metadata.yaml").is_file())
+
+
+def is_drive(path: Path) -> bool:
+    """Whether a folder is a drive of the KITTI raw data: it holds oxts/data."""
+    return (path / "oxts" / "data").is_dir()
+
+
+def is_solution(path: Path) -> bool:
+    """Whether a file is a solution of RTKLIB, by its suffix."""
+    return path.suffix.lower() == ".pos" and path.is_file()
+
+
+def is_spatial(path: Path) -> bool:
+    """Whether a table is of poses in space."""
+    return path.suffix.lower() == ".csv" and path.is_file() and is_poses(path)
+
+
+def is_poses(path: Path) -> bool:
+    """Whether a text file is of poses in space: by the names of its columns, or without names."""
+    head = head_of(path)
+    if head is None:
+        return begins_with_numbers(path)
+    roles = roles_of(head.names, path)
+    return "heading" not in head.names and roles is not None and bool(roles.quaternion)
+
+
+def is_plane(path: Path) -> bool:
+    """Whether a file has columns of planar poses, or of speeds and turn rates, under names of their own."""
+    head = head_of(path)
+    if head is None or clock_of(head.names) is None or is_poses(path):
+        return False
+    return any(places_of(head.names, each) is not None for each in (PLACES, (SPEEDS, TURNS)))
+
+
+def trajectory_files(folder: Path) -> list[Path]:
+    """Files of a folder that may be trajectories, by name."""
+    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    named = [p for p in files if p.suffix.lower() in TRAJECTORIES]
+    return named or [p for p in files if is_spatial(p) or is_solution(p)]
+
+
+SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
+ARRAYS = "errors=truth - estimates, covariances=P"
+WAYS_IN = {
+    **dict.fromkeys((".ulg", ".bin"), "flight logs are for 'consistency monitor'"),
+    **dict.fromkeys((".gz", ".zip", ".7z", ".xz", ".bz2", ".zst"), "unpack it"),
+    **dict.fromkeys((".dat", ".log", ".out", ""), "rename text to .csv, or to .txt if its columns have no names"),
+    ".json": "a file with an object a line is .jsonl",
+    **dict.fromkeys((".h5", ".hdf5"), "h5py.File(name)[key][()] is an array of it"),
+    **dict.fromkeys((".npy", ".pkl", ".pickle"), "load it"),
+    **dict.fromkeys((".xls", ".xlsx", ".ods"), "save the sheet as .csv"),
+}  # for files of unknown kinds, by suffix
+FOREIGN = (
+    (rb"(?m)^CCSDS_OEM_VERS", "an orbit of CCSDS, whose covariances are of the axes COV_REF_FRAME, in km"),
+    (rb"(?m)^(# )?(Raw|Fix),", "a log of Android, whose accuracies are radii of 68 %; RTKLIB solves its raw data"),
+    (rb"(?m)^\$G[A-Z]{4},", "a log of NMEA, which has deviations in its GST sentences alone"),
+)  # fmt: skip
+
+
+def is_foreign(path: Path) -> str:
+    """What a text file of another format is, and how it gets here; "" of all else."""
+    begin = beginning(path) if path.suffix.lower() not in (*ARCHIVES, *BAGS) else b""
+    return next((hint for pattern, hint in FOREIGN if re.search(pattern, begin)), "")
+
+
+def unknown_kind(path: Path, known: Sequence[str] = SUFFIXES, arrays: str = ARRAYS) -> InputError:
+    """Refusal of a file of an unknown kind, with the way to one that is known."""
+    hint = is_foreign(path) or WAYS_IN.get(path.suffix.lower(), "")
+    line = f"in Python, numpy.savez('{path.stem}.npz', {arrays}) makes an archive of arrays (runs, steps, ...)"
+    kinds = f"{path}: unknown kind of file; known are {', '.join(known)} (.txt and .tum are TUM trajectories)"
+    return InputError("; ".join(filter(None, (kinds, line, hint))))

@@ -1,0 +1,233 @@
+"""Files of other estimators, read as errors and covariances; docs/files.md describes the formats.
+
+Filters, scenarios and results folders of this package do not belong here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+from consistency.referee.diagnostics import Record
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
+from consistency.referee.parsing import require_name
+from consistency.referee.readers.formats.file_kinds import (
+    ARCHIVES,
+    TRAJECTORIES,
+    is_bag,
+    is_drive,
+    is_foreign,
+    trajectory_files,
+    unknown_kind,
+)
+from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.pipeline.kinds import OF_BAGS, OF_TRAJECTORIES, Found, kind_of
+from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
+from consistency.referee.readers.truth_matching import Estimator
+
+CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
+ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
+GUESS = "guess"  # judge every convention
+NO_GUESS = {
+    "truth_covariance": ", whose covariance is of a declared error too",
+    "relative": ", which judges motions in one error; name the conventions one by one",
+}
+OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
+
+
+def is_recording(path: Path, reading: Reading) -> bool:
+    """Whether a path is something :func:`read_recordings` reads, and not a folder of ``consistency run``.
+
+    Raises
+    ------
+    InputError
+        The path is a results folder, with an option for other files; or a folder of neither kind.
+    """
+    given = reading.given()
+    if path.is_dir() and not (path / "manifest.json").exists():
+        recording = bool(trajectory_files(path)) or is_bag(path) or bool(given)
+        if not recording:
+            known = f"trajectories ({', '.join(TRAJECTORIES)}) or ROS bags"
+            raise InputError(f"{path}: holds no results of 'consistency run', and no {known}")
+    else:
+        recording = not path.is_dir() and (path.exists() or path.suffix != "")
+    if not recording and path.exists() and given:
+        raise InputError(f"{flag_of(given[0])}: does not go with {path}, a folder of 'consistency run'")
+    return recording
+
+
+def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
+    """Tables in memory, with columns by name: one record for each estimator.
+
+    Parameters
+    ----------
+    estimates : a DataFrame, or anything with ``columns`` that gives a column by its name
+    truth : of the same kind, or a path; None without truth
+
+    Raises
+    ------
+    InputError
+        As :func:`read_recordings`; the tables are called "estimates" and "truth".
+    """
+    from consistency.referee.readers.formats.sheet import frame_rows
+    from consistency.referee.readers.formats.table import read_tables
+
+    def rows(table: Any, name: str) -> Any:
+        if hasattr(table, "columns"):
+            return frame_rows(table, name)
+        return None if table is None else Path(table)
+
+    sheet, true = rows(estimates, "estimates"), rows(truth, "truth")
+    r = _checked(replace(reading, truth=cast(Any, true)))
+    _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
+    return _read("tables", r, lambda options: _records(read_tables(sheet, options), options))
+
+
+def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Record]:
+    """Read CSV, Parquet, TUM or NumPy files, or ROS bags: one record for each estimator.
+
+    Parameters
+    ----------
+    estimates : .csv, .parquet, .npz, .bag, or a TUM trajectory, or a folder of these with one for each run
+
+    Raises
+    ------
+    InputError
+        Something cannot be used: names file, line, column or option, and what is allowed.
+    """
+    return _read(str(estimates), _checked(reading or Reading()), lambda r: _by_kind(estimates, r))
+
+
+def _read(name: str, r: Reading, read: Callable[[Reading], list[Record]]) -> list[Record]:
+    """Records under the declared convention, or under each, with what else is declared of them."""
+
+    def under(convention: str | None) -> list[Record]:
+        return _declared(read(replace(r, error=convention)), r)
+
+    return _guessed(name, r, under) if r.error == GUESS else under(r.error)
+
+
+def _guessed(name: str, r: Reading, read: Callable[[str | None], list[Record]]) -> list[Record]:
+    """Records with the same runs under each convention that such poses have, the default of the files first.
+
+    Parameters
+    ----------
+    read : records under a convention, or under the default
+    """
+    r.refuse(f"--error {GUESS}", NO_GUESS)
+    first = read(None)
+    default = first[0].convention
+    if default not in (*PLANAR, *SPATIAL) or default == "vector":
+        raise InputError(f"--error {GUESS}: is for poses; the errors of {name} are plain differences")
+    kinds = [kind for kind in (SPATIAL if default in SPATIAL else PLANAR) if kind not in (default, "vector")]
+    others = {kind: {one.name: one for one in read(kind)} for kind in kinds}
+    return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
+
+
+def _declared(records: list[Record], r: Reading) -> list[Record]:
+    """Records with what is declared of their truth, in pieces where that is asked."""
+    if r.given(OF_TRUTH) or any(record.truth_covariance is not None for record in records):
+        from consistency.referee.readers.truth_covariance import declared
+
+        records = declared(records, r)
+    pieces = pieces_asked(r)
+    if pieces is None:
+        return records
+    from consistency.referee.diagnostics.planning.single_log import in_pieces
+
+    return [in_pieces(record, pieces or None) for record in records]
+
+
+def _records(found: Found, r: Reading) -> list[Record]:
+    """Records of what a reader gives."""
+    records: list[Record] = []
+    for one in found:
+        if isinstance(one, Estimator):
+            records.extend(records_of(one, r))
+        else:
+            records.append(one)
+    return records
+
+
+def _by_kind(estimates: Path, r: Reading) -> list[Record]:
+    if not estimates.exists():
+        raise InputError(f"{estimates}: no such file")
+    require_name(estimates.name, "file")
+    if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
+        raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
+    kind = kind_of(estimates, r)
+    _refuse(estimates, r, *(OF_BAGS if kind is None else kind.refused))
+    if kind is None:
+        raise unknown_kind(estimates)
+    if r.truth is not None and is_foreign(r.truth):
+        raise unknown_kind(r.truth)
+    records = _records(kind.read(estimates, r, False), r)
+    if r.truth is None or not is_drive(r.truth):
+        return records
+    of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
+    return [replace(records[0], notes=(f"{r.truth}: {of}", *records[0].notes)), *records[1:]]
+
+
+def pieces_asked(r: Reading) -> int | None:
+    """Number of pieces of ``--split``, 0 for the advised one; None without the option.
+
+    Raises
+    ------
+    InputError
+        It is no number of pieces, or another option makes runs of the log.
+    """
+    if r.split is None:
+        return None
+    r.refuse("--split", dict.fromkeys(OF_WINDOWS, ", which cuts the log into windows"))
+    if r.align not in (None, "none"):
+        raise InputError(f"--split: does not go with --align {r.align}: all pieces would share the error of one frame")
+    if r.split == "auto":
+        return 0
+    if not str(r.split).isdecimal() or int(r.split) < 1:
+        raise InputError(f"--split {r.split}: must be a number of pieces, or 'auto'")
+    return int(r.split)
+
+
+def _checked(r: Reading) -> Reading:
+    """Options that go together, whatever the file; numbers are floats, and no alignment is None."""
+    windows_asked(r)
+    if r.error not in (None, GUESS, *CONVENTIONS):
+        raise InputError(f"--error {r.error}: must be one of {', '.join((*CONVENTIONS, GUESS))}")
+    if r.max_dt is not None and not (math.isfinite(r.max_dt) and r.max_dt >= 0):
+        raise InputError(f"--max-dt {r.max_dt:g}: must be 0 or more, in s")
+    if r.lever_arm is not None and not (len(r.lever_arm) == 3 and all(map(math.isfinite, r.lever_arm))):
+        raise InputError("--lever-arm: must be three numbers x,y,z, in m")
+    offset = r.time_offset
+    if isinstance(offset, int):
+        offset = float(offset)
+    if offset not in (None, "estimate") and not (isinstance(offset, float) and math.isfinite(offset)):
+        raise InputError(f"--time-offset {offset}: must be a number of seconds, or 'estimate'")
+    if offset is not None and r.truth is None and r.truth_topic is None:
+        raise InputError("--time-offset needs --truth: without truth there are no clocks to compare")
+    if r.relative is not None and offset == "estimate":
+        raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
+    if r.given(OF_TRUTH):
+        from consistency.referee.readers.truth_covariance import require_truth_options
+
+        require_truth_options(r)
+    if r.align not in (None, *ALIGNMENTS):
+        raise InputError(f"--align {r.align}: must be one of {', '.join(ALIGNMENTS)}")
+    align = None if r.align == "none" else r.align
+    if align is not None and (r.truth or r.truth_topic) is None:
+        raise InputError(f"--align {align} needs --truth, with which the estimates are aligned")
+    if r.relative is not None and align is not None:
+        raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
+    pieces_asked(r)  # refused before anything is read
+    return replace(r, time_offset=offset, align=align)
+
+
+def _refuse(path: Path, r: Reading, *names: str) -> None:
+    if given := r.given(names):
+        keys = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}
+        kept = path.suffix.lower() in ARCHIVES and given[0] in keys
+        instead = f", an archive; it has a key '{keys[given[0]]}' in its place" if kept else ""
+        raise InputError(f"{flag_of(given[0])}: does not go with {path}{instead}")

@@ -323,7 +323,8 @@ def _innovations(e: Estimator) -> Record:
 
 def _windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:
     """The record of motions over windows."""
-    from consistency.referee.readers.relative_motions import Stretch, causes_of_motions, relative_recording
+    from consistency.referee.readers.mix_ups.motion_causes import causes_of_motions
+    from consistency.referee.readers.relative_motions import Stretch, relative_recording
 
     if e.stated != WHOLE:
         raise InputError(f"{e.path}: --relative needs covariances of whole poses; here parts are stated apart")

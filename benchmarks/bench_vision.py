@@ -12,8 +12,8 @@ import numpy as np
 from bench_trials import SEED, Work, interleaved
 
 from consistency.bench.runs.findings import sibling
-from consistency.bench.shipped import data_folder
 from consistency.referee.errors import InputError
+from consistency.referee.system.shipped import data_folder
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.registration import rigid_motions
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence

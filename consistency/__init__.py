@@ -23,7 +23,7 @@ _MODULES = {
     "Study": "bench.runs.findings",
     "Trial": "bench.types",
     "Tuning": "bench.tuning.result",
-    "Verdict": "referee.diagnostics.verdict.parts",
+    "Verdict": "referee.diagnostics.verdict.verdict",
     "analyse": "bench.runs.analyse_results",
     "anees": "referee.diagnostics",
     "anees_interval": "referee.diagnostics",

@@ -13,7 +13,7 @@ def list_command(as_json: AsJson = False) -> None:
     """Scenarios, filters, experiments and sweeps."""
     from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
     from consistency.bench.filters.guard.plain_rules import KINDS
-    from consistency.bench.shipped import summaries
+    from consistency.referee.system.shipped import summaries
 
     shipped, filters = summaries(), filter_summaries()
     if missing("bench"):

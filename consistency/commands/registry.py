@@ -87,7 +87,7 @@ ROWS = (
 COMMANDS = {row.name: row for row in ROWS}
 
 
-class Command(TyperCommand):
+class MarkedCommand(TyperCommand):
     """A command that says in the list of commands which of its extras are not installed."""
 
     lacks: tuple[str, ...] = ()
@@ -106,7 +106,7 @@ class Loaded(Mapping[str, Any]):
         epilog = "\b\nExamples:\n" + "\n".join(f"  consistency {line}" for line in row.examples)
         info = CommandInfo(
             name,
-            cls=Command,
+            cls=MarkedCommand,
             callback=row.function(),
             epilog=epilog if row.examples else None,
         )

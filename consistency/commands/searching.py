@@ -106,12 +106,12 @@ def tune_command(
     """Fit the process and measurement noise of a filter, and judge it before and after on data the fit has not seen."""
     from consistency.bench.scenario import load_scenario
     from consistency.bench.store.log import read_log
-    from consistency.bench.tuning.result import KIND, as_data, lines, verdicts, write
+    from consistency.bench.tuning.result import KIND, tuning_data, tuning_lines, tuning_verdicts, write
     from consistency.bench.tuning.tune import tune as tune_filter
     from consistency.referee.document.verdict import document
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free
-    from consistency.referee.verdicts.options import settings_of
+    from consistency.referee.verdicts.command_settings import settings_of
 
     require_word("--fail-on", fail_on, "inconsistent")
     if (scenario is None) == (log is None):
@@ -129,10 +129,10 @@ def tune_command(
     if out is not None:
         write(tuning, out, overwrite)
     if as_json:
-        print(json.dumps(as_data(tuning, out), indent=2, allow_nan=False))
+        print(json.dumps(tuning_data(tuning, out), indent=2, allow_nan=False))
     else:
-        terminal.show(*document(verdicts(tuning), reasons=False).opening)
-        print("\n" + "\n".join(lines(tuning, out)))
+        terminal.show(*document(tuning_verdicts(tuning), reasons=False).opening)
+        print("\n" + "\n".join(tuning_lines(tuning, out)))
     if fail_on and not tuning.consistent:
         raise typer.Exit(1)
 
@@ -176,7 +176,12 @@ def challenge_command(
     """Look for the world in which a filter is most overconfident, and confirm it on fresh runs."""
     from consistency.bench.challenging.challenge import Plan
     from consistency.bench.challenging.challenge import challenge as challenge_filter
-    from consistency.bench.challenging.challenge_text import as_data, lines, require_writable, write_scenario
+    from consistency.bench.challenging.challenge_text import (
+        challenge_data,
+        challenge_lines,
+        require_writable,
+        write_scenario,
+    )
 
     require_word("--fail-on", fail_on, "found")
     if minutes is None and trials is None:
@@ -188,8 +193,8 @@ def challenge_command(
     if outcome.found:
         write_scenario(outcome, out)
     if as_json:
-        print(json.dumps(as_data(outcome, out), indent=2))
+        print(json.dumps(challenge_data(outcome, out), indent=2))
     else:
-        print("\n".join(lines(outcome, out)))
+        print("\n".join(challenge_lines(outcome, out)))
     if fail_on and outcome.found:
         raise typer.Exit(1)

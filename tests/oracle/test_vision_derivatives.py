@@ -17,7 +17,7 @@ from consistency.stereo.visual_odometry.covariance_propagation import (
 )
 from consistency.stereo.visual_odometry.maximum_likelihood import _profile, loss
 from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches, PointMatches, TwoFrames
-from consistency.stereo.visual_odometry.two_frame_cost import derivatives as two_frame_derivatives
+from consistency.stereo.visual_odometry.two_frame_cost import cost_derivatives as two_frame_derivatives
 from consistency.vision import RelativePose, StereoRig, register_svd, triangulate
 
 Array = np.ndarray[Any, Any]

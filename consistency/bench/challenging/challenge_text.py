@@ -16,7 +16,7 @@ from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
 
 
-def lines(outcome: Challenge, out: Path) -> list[str]:
+def challenge_lines(outcome: Challenge, out: Path) -> list[str]:
     """What to print; ``out`` is the file that was written, if the filter was found overconfident."""
     plan, verdict = outcome.plan, outcome.verdict
     name = outcome.filter
@@ -50,7 +50,7 @@ def command(outcome: Challenge, out: Path) -> str:
     return f"consistency run {out} --filter {outcome.filter} --runs {outcome.plan.runs} --seed {seed} --out results"
 
 
-def as_data(outcome: Challenge, out: Path) -> dict[str, Any]:
+def challenge_data(outcome: Challenge, out: Path) -> dict[str, Any]:
     plan, verdict, space = outcome.plan, outcome.verdict, outcome.space
     search_seed, confirm_seed = plan.seeds
     return {

@@ -19,7 +19,7 @@ from consistency.bench.pages.sections.provenance import provenance
 from consistency.bench.pages.sections.stereo_noise import stereo_noise
 from consistency.bench.pages.sections.study_sections import SECTIONS
 from consistency.bench.runs.findings import read_findings
-from consistency.bench.runs.results_to_records import design_of, record_of, steps_of
+from consistency.bench.runs.results_to_records import design_of, longest_run, record_of
 from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
 from consistency.bench.types import outcome
@@ -76,7 +76,7 @@ def build_report(folder: Path, advance: Advance = lambda _: None) -> Report:
 def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
     """One folder of results; ``styles`` are the numbers of filters that other studies have."""
     results = open_results(folder)
-    scenario, design, steps = results.scenario, design_of(results), steps_of(results)
+    scenario, design, steps = results.scenario, design_of(results), longest_run(results)
     runs = np.unique(np.concatenate([results.runs_of(name) for name in results.filters]))
     shown_run = int(runs[0]) if len(runs) else 0
 

@@ -80,7 +80,7 @@ def first_trials(worlds: Iterable[tuple[Filter, Scenario]]) -> Iterator[Wanted]:
 def _compile(missing: Sequence[Need], jobs: int) -> None:
     shared = [need for need in missing if need.outlook.is_shared]
     workers = min(jobs, len(shared))
-    if disk_cache.refusal():
+    if disk_cache.folder_fault():
         workers = 1
     with progress.foreseen(_label(missing), _wall([need.outlook.seconds for need in missing], max(workers, 1))):
         if workers > 1:
@@ -119,7 +119,7 @@ def _compile_side_by_side(needs: Sequence[Need], workers: int) -> None:
     initargs = link_to_parent(context)
     pool = ProcessPoolExecutor(workers, context=context, initializer=_begin_compiler, initargs=initargs)
     try:
-        with contextlib.suppress(OSError):  # no more processes
+        with contextlib.suppress(Exception):  # no more processes, or a filter that cannot be sent
             wait([pool.submit(_compile_one, _pickled(need)) for need in longest_first])
     finally:
         pool.shutdown(kill_workers=True)

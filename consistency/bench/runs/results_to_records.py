@@ -32,7 +32,7 @@ POINT = ("x", "y", "z")
 
 def records_of(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
     """A record for every filter of the results, or for those named, each read when it is asked for."""
-    steps = steps_of(results)
+    steps = longest_run(results)
     return (record_of(results, name, steps) for name in filters or results.filters)
 
 
@@ -48,7 +48,7 @@ def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Re
         raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
     broken = results.failures[results.failures["filter"] == filter_name]
     convention, runs = results.error_of(filter_name), results.runs_of(filter_name)
-    steps = steps_of(results) if steps is None else steps
+    steps = longest_run(results) if steps is None else steps
     shape = len(runs), steps
     pose, covariance = np.full((*shape, 3), np.nan), np.full((*shape, 3, 3), np.nan)
     own = None if convention == ADDITIVE else covariance.copy()
@@ -270,7 +270,7 @@ def _places(results: Tables, labels: Indices) -> Array:
     return places
 
 
-def steps_of(results: Tables) -> int:
+def longest_run(results: Tables) -> int:
     """Steps of the longest run, failed steps counted."""
     last = int(results.failures["step"].max()) if len(results.failures) else 0
     for table in ("estimates", "truth"):
@@ -297,7 +297,7 @@ def results_source(results: Tables | str | Path) -> Source:
         The folder is damaged; the records raise as :func:`record_of`.
     """
     tables = results if isinstance(results, Tables) else open_results(results)
-    m, steps = tables.manifest, cache(partial(steps_of, tables))
+    m, steps = tables.manifest, cache(partial(longest_run, tables))
     unfinished = "" if m.get("complete", True) else f"only {m['finished_runs']} of {m['runs']} runs are there"
     return Source(
         tables.filters, lambda name: record_of(tables, name, steps()), partial(design_of, tables), tables.has_truth,

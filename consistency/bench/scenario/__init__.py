@@ -39,7 +39,7 @@ from consistency.bench.scenario.truth_and_belief import (
     scenario_text,
     toml_text,
 )
-from consistency.bench.shipped import data_folder
+from consistency.referee.system.shipped import data_folder
 
 __all__ = [
     "PLANAR_SENSORS",

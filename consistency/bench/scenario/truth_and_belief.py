@@ -17,9 +17,9 @@ from consistency.bench.scenario.effects import LocalBias
 from consistency.bench.scenario.sensor import BelievedSensor
 from consistency.bench.scenario.tables.toml_tables import UNITS, Count, Finite, NonNegative, Positive, Table, read_table
 from consistency.bench.scenario.truth import Truth
-from consistency.bench.shipped import data_folder
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_folder, one_line
+from consistency.referee.system.shipped import data_folder
 
 Share = Annotated[float, Field(gt=0, lt=1, strict=True)]
 # keys of both halves; of the second kind one half may have what the other leaves out

@@ -47,7 +47,7 @@ class Regime:
 
     def trusted(self, cell: Cell) -> list[tuple[str, CellResult]]:
         """Filters that are consistent in a cell, the most accurate first."""
-        return ranked({name: result for name, result in self.at(cell).items() if result.status == "consistent"})
+        return ranked_by_cost({name: result for name, result in self.at(cell).items() if result.status == "consistent"})
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -64,7 +64,7 @@ def _table_value(value: Any) -> Any:
     return value if isinstance(value, int | float | str) else json.dumps(value)
 
 
-def ranked(results: Mapping[str, CellResult]) -> list[tuple[str, CellResult]]:
+def ranked_by_cost(results: Mapping[str, CellResult]) -> list[tuple[str, CellResult]]:
     """Filters by RMSE of position; of those that differ by 2 % or less the cheaper one first."""
 
     def key(pair: tuple[str, CellResult]) -> tuple[float, float]:

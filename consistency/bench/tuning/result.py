@@ -85,10 +85,10 @@ class Tuning:
         return self.chosen.belief
 
     def __str__(self) -> str:
-        return "\n".join(lines(self))
+        return "\n".join(tuning_lines(self))
 
 
-def lines(tuning: Tuning, out: Path | None = None) -> list[str]:
+def tuning_lines(tuning: Tuning, out: Path | None = None) -> list[str]:
     """What to print beside the table of verdicts; ``out`` is the folder that was written."""
     parts, chosen = tuning.parts, tuning.chosen
     text = [
@@ -178,14 +178,14 @@ def _next(tuning: Tuning, out: Path) -> str:
     return f"; judged again by: {run} {out / name} --filter {tuning.filter} {tuning.parts.again} --out results"
 
 
-def verdicts(tuning: Tuning) -> dict[str, Verdict]:
+def tuning_verdicts(tuning: Tuning) -> dict[str, Verdict]:
     """Rows of the table of verdicts, by name."""
     return {f"{tuning.filter}, as believed": tuning.before, f"{tuning.filter}, tuned": tuning.verdict}
 
 
 def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
     """Write the files of a fit, with its outcome, as a folder that appears whole."""
-    outcome = json.dumps(as_data(tuning, out), indent=2, allow_nan=False) + "\n"
+    outcome = json.dumps(tuning_data(tuning, out), indent=2, allow_nan=False) + "\n"
     texts = files(tuning) | {"tuning.json": outcome}
 
     def contents(at: Path) -> None:
@@ -193,14 +193,14 @@ def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
             (at / name).write_text(text, encoding="utf-8")
 
     world = tuning.parts.world
-    origin = {"scenario": world.name}
+    origin: dict[str, Any] = {"scenario": world.name}
     if isinstance(world, Log):
         origin = {"log": world.name, "log_sha256": world.sha256}
     manifest = manifest_of(KIND, wall=tuning.seconds, filters=[tuning.filter], **origin)
     write_tables(out, {}, manifest, contents, overwrite)
 
 
-def as_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:
+def tuning_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:
     """The outcome for programs; numbers that are not finite become null. An open interval has low 0 or high null."""
     data = {
         "filter": tuning.filter,

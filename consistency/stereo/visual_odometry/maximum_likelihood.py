@@ -27,7 +27,7 @@ from consistency.stereo.visual_odometry.two_frame_cost import (
     PixelMatches,
     PointMatches,
     TwoFrames,
-    derivatives,
+    cost_derivatives,
 )
 
 Robust = Literal["huber", "cauchy"]
@@ -173,7 +173,7 @@ def _refined(frames: TwoFrames, S1: Array, S2: Array, pose: RelativePose, q: Arr
     pose, q = _minimum(frames, pose, q, robust, c)
     s = frames.squared(pose, q)
     _, weight, bend = loss(robust, s, c)
-    C_dd, C_dz = _profile(derivatives(frames, pose, q, exact=True), weight, bend)
+    C_dd, C_dz = _profile(cost_derivatives(frames, pose, q, exact=True), weight, bend)
     S = implicit_covariance(C_dd, C_dz, np.concatenate([S1, S2]))
     return Refined(pose, S, weight, pose.apply(q), s, free * len(q) - 6)
 
@@ -200,11 +200,11 @@ def _minimum(
     damping, newton = 0.0, False
     cost, weight, bend = _cost(frames, pose, q, robust, c)
     for _ in range(STEPS):
-        f = derivatives(frames, pose, q, exact=newton)
+        f = cost_derivatives(frames, pose, q, exact=newton)
         while True:
             step, step_q, decrement = _step(f, weight, bend if newton else 0.0 * bend, damping)
             if newton and not decrement >= 0.0:
-                newton, f = False, derivatives(frames, pose, q, exact=False)
+                newton, f = False, cost_derivatives(frames, pose, q, exact=False)
                 continue
             there, q_there = RelativePose.from_vector(pose.vector + step), q + step_q
             if decrement < DECREMENT and damping < 1.0:

@@ -56,7 +56,7 @@ class Derivatives:
     qz2: Array  # (N, 3, k)
 
 
-def derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) -> Derivatives:
+def cost_derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) -> Derivatives:
     """First and second derivatives of f in closed form at ``q`` (N, 3), the points in frame 2.
 
     Without ``exact`` they are Gauss-Newton's, which leave out second derivatives of the measurement. With a = R q + t

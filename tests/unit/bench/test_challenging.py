@@ -19,7 +19,7 @@ import pytest
 import consistency as cs
 from consistency.bench.challenging import world_scores as scoring
 from consistency.bench.challenging.challenge import BASES, ChallengePhases, Plan, base_of, challenge, is_overconfident
-from consistency.bench.challenging.challenge_text import as_data, lines, write_scenario
+from consistency.bench.challenging.challenge_text import challenge_data, challenge_lines, write_scenario
 from consistency.bench.challenging.search import (
     BATCH,
     RUNGS,
@@ -383,7 +383,7 @@ def test_a_wrong_filter_is_found(far: Any) -> None:
     assert far.verdict.runs == 61
     assert 0.8 * 150 <= far.trials <= 0.8 * 150 + 2 * BATCH  # what has begun is finished
     assert far.ratio > 2.0
-    assert lines(far, Path("a.toml"))[0].startswith("ekf-uvd is overconfident in ")
+    assert challenge_lines(far, Path("a.toml"))[0].startswith("ekf-uvd is overconfident in ")
 
 
 def test_the_file_repeats_the_confirmation(far: Any, tmp_path: Path) -> None:
@@ -399,8 +399,8 @@ def test_the_file_repeats_the_confirmation(far: Any, tmp_path: Path) -> None:
 
 def test_trials_in_place_of_time_give_the_same_result_on_any_number_of_workers(far: Any) -> None:
     again = challenge("ekf-uvd", STEREO, replace(far.plan, jobs=2), [*SMALL, "range=6:9", "baseline=0.05:0.09"])
-    left = {key: value for key, value in as_data(again, Path("a.toml")).items() if key != "seconds"}
-    assert left == {key: value for key, value in as_data(far, Path("a.toml")).items() if key != "seconds"}
+    left = {key: value for key, value in challenge_data(again, Path("a.toml")).items() if key != "seconds"}
+    assert left == {key: value for key, value in challenge_data(far, Path("a.toml")).items() if key != "seconds"}
 
 
 def test_what_is_not_found_is_not_called_consistent() -> None:
@@ -408,10 +408,10 @@ def test_what_is_not_found_is_not_called_consistent() -> None:
     outcome = challenge("kf", None, Plan(minutes=None, trials=60, jobs=1, false_alarm=0.01), SMALL)
     assert not outcome.found
     assert outcome.verdict.settings.false_alarm == 0.01
-    text = "\n".join(lines(outcome, Path("out.toml")))
+    text = "\n".join(challenge_lines(outcome, Path("out.toml")))
     assert "no world found within 60 trials" in text
     assert "no proof" in text
-    assert as_data(outcome, Path("out.toml"))["file"] is None
+    assert challenge_data(outcome, Path("out.toml"))["file"] is None
 
 
 class Breaking:
@@ -439,7 +439,7 @@ def test_a_filter_that_breaks_down_is_the_worst() -> None:
     assert outcome.found
     assert outcome.verdict.failures
     assert outcome.ratio == pytest.approx(np.exp(WORST))
-    assert "broke down" in "\n".join(lines(outcome, Path("out.toml")))
+    assert "broke down" in "\n".join(challenge_lines(outcome, Path("out.toml")))
 
 
 class Constant:

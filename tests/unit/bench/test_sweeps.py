@@ -23,7 +23,7 @@ from consistency.bench.sweeps import sweep_folder as folders
 from consistency.bench.sweeps.axes import QUANTITIES
 from consistency.bench.sweeps.cell import CellResult, cost_of, run_cell
 from consistency.bench.sweeps.plan import Sweep, load_sweep, number_of_points, sweep_names
-from consistency.bench.sweeps.regime import Regime, ranked, read_regime, regime_of, write_regime
+from consistency.bench.sweeps.regime import Regime, ranked_by_cost, read_regime, regime_of, write_regime
 from consistency.bench.sweeps.running import run_sweep
 from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder, describe, sweep_from
 from consistency.referee.errors import InputError
@@ -407,7 +407,7 @@ def test_a_map_is_the_same_from_its_files(at: Path) -> None:
 
 def test_filters_are_ranked_by_rmse_and_then_cost() -> None:
     found = {"slow": result(rmse=0.1000, cost=3.0), "fast": result(rmse=0.1005), "worse": result(rmse=0.2, cost=0.5)}
-    assert [name for name, _ in ranked(found)] == ["fast", "slow", "worse"]
+    assert [name for name, _ in ranked_by_cost(found)] == ["fast", "slow", "worse"]
 
 
 def test_only_consistent_filters_are_trusted() -> None:

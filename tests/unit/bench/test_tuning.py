@@ -21,7 +21,7 @@ from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.stepping import run_filter, step_through
 from consistency.bench.store.log import Log
 from consistency.bench.tuning.noise_groups import groups_of, rounded, scaled, sigma_by_channel
-from consistency.bench.tuning.result import Tuning, as_data, factor_text, lines
+from consistency.bench.tuning.result import Tuning, factor_text, tuning_data, tuning_lines
 from consistency.bench.tuning.scores import BeliefScorer, score_of
 from consistency.bench.tuning.split import part_of, parts_of
 from consistency.bench.tuning.tune import MOST_TOLERATED, tolerant
@@ -251,13 +251,13 @@ def test_a_filter_that_is_not_compiled_hears_the_factors(small: Small) -> None:
 
 def test_the_words_say_what_came_of_it(tuned: Tuning) -> None:
     text = str(tuned)
-    assert text == "\n".join(lines(tuned))
+    assert text == "\n".join(tuning_lines(tuned))
     assert "kf on off: fitted by the likelihood of the innovations on 8 runs" in text
     assert f"  Q {factor_text(tuned.factors[0])} (sigma: Q.v 0.025 -> {tuned.belief.motion.sigma_v:.4g}" in text
     assert f"sigma_v = {tuned.belief.motion.sigma_v}" in text
     assert "[belief.motion]" in text
     assert "would be found with power 0.95" in text
-    data = json.loads(json.dumps(as_data(tuned), allow_nan=False))
+    data = json.loads(json.dumps(tuning_data(tuned), allow_nan=False))
     assert data["chosen"]["factors"][0]["factor"] == tuned.factors[0].value
     assert data["chosen"]["sigma"]["R.x"] == tuned.belief.sensor.sigma[0]
 
@@ -295,7 +295,7 @@ def test_an_open_interval_is_said_and_exported(tuned: Tuning, low: float, high: 
     text = said if edge else f"x{short(changed.factors[0].value)}{said}"
     assert factor_text(changed.factors[0]) == text
     assert f"  Q {text} (sigma: Q.v" in str(changed)
-    exported = json.loads(json.dumps(as_data(changed), allow_nan=False))["chosen"]["factors"][0]
+    exported = json.loads(json.dumps(tuning_data(changed), allow_nan=False))["chosen"]["factors"][0]
     assert exported["low"] == low
     assert exported["high"] == (high if np.isfinite(high) else None)
     assert exported["edge"] == edge

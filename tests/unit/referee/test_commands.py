@@ -18,7 +18,6 @@ from documents import parsed
 
 import consistency as cs
 from consistency.bench import filters
-from consistency.bench.shipped import summaries
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.commands.app import app
 from consistency.commands.registry import COMMANDS
@@ -32,6 +31,7 @@ from consistency.referee.extras import (
     require,
     requirements,
 )
+from consistency.referee.system.shipped import summaries
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -232,6 +232,23 @@ print(cs.anees.__name__, "run_trials" in dir(cs))
     sentence, other, here = done.stdout.splitlines()
     assert sentence.startswith("consistency.run_trials needs numba, pandas: pip install ")
     assert (other, here) == ("ImportError", "anees True")
+
+
+def test_a_failed_import_is_explained_by_the_extra_that_has_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not by one that collects others."""
+    monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
+    for module, package, extra in (("joblib", "joblib", "bench"), ("yaml", "pyyaml", "vision")):
+        without(monkeypatch, module)
+        error = explained(ModuleNotFoundError(name=f"{module}.part"), "this")
+        assert str(error) == f"this needs {package}: pip install 'here[{extra}]'"
+        monkeypatch.undo()
+        monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
+
+
+def test_who_needs_no_extra_does_not_wait_for_the_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "requires", lambda _: pytest.fail("the metadata were read"))
+    require("this")
+    assert requirements() == []
 
 
 def test_another_module_that_is_missing_is_not_explained() -> None:

@@ -522,6 +522,15 @@ def test_the_likeliest_cause_is_named_whatever_its_size() -> None:
     assert str(readers_hints._cause([(other, worse), (one, better)], declared)).startswith("one")
 
 
+@pytest.mark.parametrize("size", [30.0, 100.0, 300.0])
+def test_a_truth_is_not_shrunk_into_errors_of_any_size(size: float, rng: np.random.Generator) -> None:
+    """A path of some 10 m beside deviations of as many: the truth in mm would leave errors like the path."""
+    sigma = np.array([size, 0.7 * size, 1.4 * size, 0.01, 0.02, 0.015])
+    runs = world.log(rng, "spatial", 5, 100, 0.0, sigma=sigma, correlated=False)
+    (said,) = hints("est", SIX, [world.deviations(p) for p in runs])
+    assert "its diagonal holds standard deviations" in said
+
+
 def test_a_bias_of_few_standard_deviations_explains_a_large_nees(rng: np.random.Generator) -> None:
     """3 sigma of one axis, growing with sigma, beside a covariance in which a sum is known 1,000 times better."""
     R = np.array([[1.0, 1.0 - 1e-6], [1.0 - 1e-6, 1.0]])

@@ -71,7 +71,7 @@ def kept_observations(kind: str, y: Array, S: Array, s: int, limits: Limits) -> 
     numpy.linalg.LinAlgError
         The covariance of some observations is not positive definite.
     """
-    own = np.array([distance(y, S, rows_of([i], s)) for i in range(len(y) // s)])
+    own = np.array([distance(y, S, component_rows([i], s)) for i in range(len(y) // s)])
     passed = own <= limits.own
     if kind == "gate":
         return passed
@@ -81,7 +81,7 @@ def kept_observations(kind: str, y: Array, S: Array, s: int, limits: Limits) -> 
     return keep
 
 
-def rows_of(which: list[int] | Indices, s: int) -> Indices:
+def component_rows(which: list[int] | Indices, s: int) -> Indices:
     """Rows (s k,) of k observations in an innovation."""
     return (s * np.asarray(which, np.int64)[:, None] + np.arange(s)).ravel()
 
@@ -120,7 +120,7 @@ def largest_compatible(y: Array, S: Array, s: int, own: Array, candidates: Indic
             nodes += 1
             if nodes > MOST_NODES:
                 return
-            far = distance(y, S, rows_of(branch, s)) if branch is more else total
+            far = distance(y, S, component_rows(branch, s)) if branch is more else total
             most = len(branch) + len(order) - level - 1
             if (most, -far) > (best[0], -best[1]) and far <= limits.joint[most]:
                 follow(branch, far, level + 1)
@@ -136,7 +136,7 @@ def best_supported(y: Array, S: Array, s: int, own: Array, candidates: Indices, 
         support = [
             int(j)
             for j in candidates
-            if j == i or conditional_distance(y, S, rows_of([j], s), rows_of([i], s)) <= limits.support
+            if j == i or conditional_distance(y, S, component_rows([j], s), component_rows([i], s)) <= limits.support
         ]
         if (len(support), -own[i]) > (best[0], -best[1]):
             best = (len(support), own[i], support)
@@ -144,6 +144,6 @@ def best_supported(y: Array, S: Array, s: int, own: Array, candidates: Indices, 
     rescued = [
         int(j)
         for j in candidates
-        if j not in low and conditional_distance(y, S, rows_of([j], s), rows_of(low, s)) <= limits.own
+        if j not in low and conditional_distance(y, S, component_rows([j], s), component_rows(low, s)) <= limits.own
     ]
     return np.array(low + rescued, np.int64)

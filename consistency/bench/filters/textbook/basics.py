@@ -181,7 +181,7 @@ def pose_of(state: SlamState) -> Gaussian:
     return Gaussian(state.x[:3], state.P[:3, :3])
 
 
-def world_map(state: SlamState) -> dict[int, Gaussian]:
+def map_of_state(state: SlamState) -> dict[int, Gaussian]:
     """Landmarks (3,) by label, m, with covariance (3, 3), of a state of world points whose error is additive."""
     w = state.width
     blocks = {label: slice(state.at(label), state.at(label) + w) for label in state.landmarks}
@@ -210,7 +210,7 @@ class WrappedFilter:
         return pose_of(state.slam)
 
     def map(self, state: Any) -> dict[int, Gaussian]:
-        return world_map(state.slam)
+        return map_of_state(state.slam)
 
     def joint(self, state: Any) -> Gaussian:
         return joint_of(state.slam)

@@ -48,7 +48,7 @@ class ExtendedKalman:
         return basics.pose_of(state)
 
     def map(self, state: SlamState) -> dict[int, Gaussian]:
-        return basics.world_map(state)
+        return basics.map_of_state(state)
 
     def joint(self, state: SlamState) -> Gaussian:
         return basics.joint_of(state)

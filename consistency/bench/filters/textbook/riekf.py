@@ -55,7 +55,7 @@ class RightInvariantKalman(ExtendedKalman):
         return state.P[:3, :3]
 
     def map(self, state: SlamState) -> dict[int, Gaussian]:
-        return basics.world_map(_additive(state))
+        return basics.map_of_state(_additive(state))
 
     def joint(self, state: SlamState) -> Gaussian:
         return basics.joint_of(_additive(state))

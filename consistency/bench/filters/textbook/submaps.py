@@ -73,7 +73,7 @@ class SubmapKalman:
         return basics.pose_of(in_world(state))
 
     def map(self, state: Maps) -> dict[int, Gaussian]:
-        return basics.world_map(joined_map(state))
+        return basics.map_of_state(joined_map(state))
 
     def _begun(self, large: SlamState) -> Maps:
         return Maps(large, self.small.init(replace(large.problem, start=np.zeros(3))))

@@ -1,1 +1,1 @@
-"""The sections of a report; ``consistency/bench/pages/contents.py`` has their order."""
+"""The sections of a report; ``study_sections`` has their order."""

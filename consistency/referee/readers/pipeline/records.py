@@ -332,6 +332,7 @@ def _innovations(e: Estimator) -> Record:
 
 def _windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:
     """The record of motions over windows."""
+    from consistency.referee.readers.pipeline.motion_causes import causes_of_motions
     from consistency.referee.readers.pipeline.relative_motions import Stretch, relative_recording
 
     if e.stated != WHOLE:
@@ -354,5 +355,10 @@ def _windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative
             )
         )  # fmt: skip
     of = str(e.covariances or e.path)
-    record = relative_recording(e.name, of, stretches, e.axes[: len(AXES)], judged, relative)
-    return replace(record, notes=(*e.notes, *_left_out(e, runs, known), *record.notes))
+    axes = AXES
+    if stretches[0].d == 2:  # archives do not name them
+        axes = ("x", "y", "heading")
+    record = relative_recording(e.name, of, stretches, axes, judged, relative)
+    causes = causes_of_motions(e.said, stretches, axes, judged, relative)
+    notes = (*e.notes, *_left_out(e, runs, known), *record.notes, *causes)
+    return replace(record, notes=notes, causes=tuple(causes))

@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.bench.pages import exhibits
-from consistency.bench.pages.report_input import Report, Study, Track
-from consistency.bench.pages.sections import images, overview, sensor_issues
+from consistency.bench.pages.sections import exhibits, images, overview, sensor_issues
 from consistency.bench.pages.sections.calibration_rates import calibration_rates
 from consistency.bench.pages.sections.filters_table import filters_table
 from consistency.bench.pages.sections.front_end import front_end
-from consistency.bench.pages.sections.provenance import provenance
+from consistency.bench.pages.sections.report_input import Report, Study, Track
 from consistency.bench.pages.sections.stereo_noise import stereo_noise
+from consistency.bench.pages.sections.study_origin import provenance
 from consistency.bench.pages.sections.study_sections import SECTIONS
 from consistency.bench.runs.findings import read_findings
 from consistency.bench.runs.results_to_records import design_of, longest_run, record_of

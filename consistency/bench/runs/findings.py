@@ -18,7 +18,7 @@ from joblib.externals.loky.backend import get_context
 
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.backends.local import worker_count
+from consistency.bench.runs.backends.threads import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import record_of

@@ -1,4 +1,4 @@
-"""The score of a map in rows and columns, as :mod:`consistency.referee.document.verdict` has those of a pose."""
+"""The score of a map in rows and columns, as :mod:`consistency.referee.document.judged_filters` has those of a pose."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from consistency.referee.document.blocks import Chapter, Document, Facts, Text
 from consistency.referee.pages import questions, verdicts
 from consistency.referee.pages.by_axis import by_axis
 from consistency.referee.pages.judged import Estimator, Judged, clock_of
-from consistency.referee.pages.provenance import facts
+from consistency.referee.pages.origin import facts
 from consistency.referee.pages.record_figures import record_figures
 
 

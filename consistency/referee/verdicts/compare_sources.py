@@ -11,7 +11,7 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import Comparison, compare
 from consistency.referee.diagnostics.comparison import FailedRuns
 from consistency.referee.document.blocks import Block, Document, Text
-from consistency.referee.document.comparison import comparison_table
+from consistency.referee.document.compared_filters import comparison_table
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.baselines import Baseline
 

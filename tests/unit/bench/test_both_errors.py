@@ -22,8 +22,8 @@ from consistency.referee.column_names import OWN_COVARIANCE
 from consistency.referee.diagnostics import Interval, Settings, judge, map_score, sequential_design
 from consistency.referee.diagnostics.questions.scale import ratio_interval
 from consistency.referee.diagnostics.verdict.verdict import MapScore
+from consistency.referee.document.judged_filters import document
 from consistency.referee.document.map import map_text
-from consistency.referee.document.verdict import document
 from consistency.referee.gating.checked_arrays import record_of_filter
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Failure

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.pages.report_input import Study, Track
+from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.verdict.answers import STEP
 from consistency.referee.document.blocks import Figure

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.pages.report_input import Study, Track
+from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import SIGMAS, ZERO, solid
 from consistency.referee.show.painting import canvas, curve, edges, say, stroke

@@ -176,7 +176,8 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(pose_errors.pose_error, study.tracks), paths_and_landmarks.read(study).paths, strict=True,
+        anees.read(study).curves, map(pose_errors.pose_error, study.tracks), paths_and_landmarks.read(study).paths,
+        strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
         verdict = by_filter[track.name]

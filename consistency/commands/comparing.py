@@ -50,8 +50,8 @@ def compare_command(
 ) -> None:
     """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
     from consistency.referee.verdicts.baselines import is_baseline
+    from consistency.referee.verdicts.command_settings import skip_asked
     from consistency.referee.verdicts.compare_sources import compare_filters, compare_with, document
-    from consistency.referee.verdicts.judging_options import skip_asked
 
     require_word("--fail-on", fail_on, "worse")
     if not 0.0 < false_alarm < 1.0:

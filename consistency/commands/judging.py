@@ -78,7 +78,7 @@ def analyse_command(
     """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
-    from consistency.referee.verdicts.judging_options import settings_of, skip_asked
+    from consistency.referee.verdicts.command_settings import settings_of, skip_asked
     from consistency.referee.verdicts.sources import analyse as judge
 
     require_word("--fail-on", fail_on, "inconsistent")
@@ -201,7 +201,7 @@ def plan_command(
 ) -> None:
     """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
     from consistency.referee.document.needed_runs import plan_lines
-    from consistency.referee.verdicts.judging_options import plan as plan_runs
+    from consistency.referee.verdicts.command_settings import plan as plan_runs
 
     if scenario is not None and like is not None:
         raise InputError("give either a SCENARIO for a pilot or --like RESULTS")

@@ -24,7 +24,7 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.diagnostics import Settings, Verdict, gate_runs
 from consistency.referee.diagnostics.verdict.answers import JOINT, SCALE
 from consistency.referee.errors import InputError
-from consistency.referee.verdicts.judging_options import refused
+from consistency.referee.verdicts.command_settings import refused
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
 SIZE_QUESTIONS = (*SCALE, JOINT, "outliers")  # what a confirmation needs a fault in: errors that are too large

@@ -25,7 +25,7 @@ from consistency.referee.diagnostics.questions.scale import FEW
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
 from consistency.referee.types import Array
-from consistency.referee.verdicts.judging_options import refused
+from consistency.referee.verdicts.command_settings import refused
 
 
 def run_until_decided(
@@ -170,7 +170,7 @@ def pilots_in_world(scenario: str, filters: Sequence[str], runs: int, seed: int)
 
 
 def pilots_of(results: Tables, filters: Sequence[str] | None = None) -> dict[str, tuple[Array, int]]:
-    """Pilots of :func:`consistency.referee.verdicts.judging_options.plan`, of every filter or of those named."""
+    """Pilots of :func:`consistency.referee.verdicts.command_settings.plan`, of every filter or of those named."""
     return {of.name: (_pilot_means(of), of.t.size) for of in records_of(results, filters)}
 
 

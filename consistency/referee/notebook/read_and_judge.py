@@ -16,7 +16,7 @@ from consistency.referee.readers.formats.numpy_archive import record_of_arrays
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.read_files import read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
-from consistency.referee.verdicts.judging_options import settings_of, skip_asked
+from consistency.referee.verdicts.command_settings import settings_of, skip_asked
 
 
 def read(

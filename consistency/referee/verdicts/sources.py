@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.records.skipping import Skip
 from consistency.referee.errors import InputError
-from consistency.referee.verdicts.judging_options import settings_of, skip_asked
+from consistency.referee.verdicts.command_settings import settings_of, skip_asked
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics import Design

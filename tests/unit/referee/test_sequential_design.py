@@ -26,7 +26,7 @@ from consistency.referee.diagnostics import (
     look,
     sequential_design,
 )
-from consistency.referee.diagnostics.judging.test_results import Inspection, findings_of
+from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
 from consistency.referee.diagnostics.statistics import e_process as betting
 from consistency.referee.types import Array, Failure

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from consistency.referee.diagnostics.judging.record_findings import findings_of
 from consistency.referee.diagnostics.judging.status import few_lost
-from consistency.referee.diagnostics.judging.test_results import findings_of
 from consistency.referee.diagnostics.questions.equivalence import worst
 from consistency.referee.diagnostics.questions.lost_runs import lost_of
 from consistency.referee.diagnostics.questions.sample import names_of

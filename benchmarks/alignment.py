@@ -25,9 +25,10 @@ from script_options import options_of
 
 from consistency.referee.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.geometry import wrap
+from consistency.referee.readers.alignment.residuals import clocks_and_frames
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
-from consistency.referee.readers.clock_offset import clocks_and_frames
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.clock_offset import clock_shift
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 
@@ -189,11 +190,10 @@ def displaced(rng: np.random.Generator, runs: Sequence[Poses], mode: str) -> lis
 
 
 def verdict(runs: Sequence[Poses], mode: str) -> Verdict:
-    if mode == "offset":
-        shift, _, found = clocks_and_frames("bench", runs, "estimate", None, range(3))
-    else:
-        # a number keeps the clocks out of it
-        shift, _, found = clocks_and_frames("bench", runs, 0.0, None if mode == "none" else mode, range(3))
+    if mode in ("offset", "none"):
+        shift, _ = clock_shift("bench", runs, "estimate" if mode == "offset" else 0.0)
+        return judge(evidence(Aligned(runs), shift), Settings(FALSE_ALARM))
+    shift, _, found = clocks_and_frames("bench", runs, 0.0, mode, range(3))  # a number keeps the clocks out of it
     return judge(evidence(found, shift), Settings(FALSE_ALARM))
 
 

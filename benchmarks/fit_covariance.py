@@ -15,6 +15,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -31,10 +32,9 @@ from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.mean_by_motion import mean_by_motion
 from consistency.referee.fit_covariance.motion_windows import PLANE, SPACE, DriveWindows, cut_windows, span_of
 from consistency.referee.fit_covariance.noise_model import decided
-from consistency.referee.fit_covariance.persistence import doubts, persistent
+from consistency.referee.fit_covariance.persistence import doubts, persistent_errors
 from consistency.referee.fit_covariance.refusals import require_sound, rotation_growth
-from consistency.referee.fit_covariance.slip import BY_TURN
-from consistency.referee.fit_covariance.white_noise import fit_noise, terms_of, variance_intervals
+from consistency.referee.fit_covariance.white_noise import fit_noise, intervals, terms_of
 from consistency.referee.geometry.groups import composed, matrices, vectors
 from consistency.referee.types import Array
 
@@ -173,7 +173,7 @@ def recovery(rng: np.random.Generator, world: World, number: int, draws: int) ->
         own = np.diagonal(F.mean(axis=0), axis1=1, axis2=2)  # (2 n, n)
         main += theta * own[np.arange(2 * n), np.arange(2 * n) % n] / np.tile(theta @ own, 2) / draws
         best += within_at_best(theta, F) / draws
-        found = [each for part in variance_intervals(fit_noise(windows), windows) for each in part]
+        found = intervals(fit_noise(windows), windows)
         fitted = np.array([each.value for each in found])
         ratios[k], whole[k] = fitted / theta, fitted @ own / (theta @ own)
         covered[k] = [each.holds(true) for each, true in zip(found, theta, strict=True)]
@@ -241,7 +241,7 @@ class Case:
     judged: int = 0
     times: float = 1.0  # variance of the judged drives over that of the fitted ones
     length: float = SHORT  # m
-    correct: bool | str = True
+    by_turn: bool = False
 
     @property
     def later(self) -> World:
@@ -263,7 +263,7 @@ CASES = (
     Case("right, 10 drives of 250 m", World(), 10, length=250.0),
     Case("right in space, 10 drives of 250 m", ROADS[2][1], 10, length=250.0),
     Case("way by turn, -0.4 m a rad", World(slip=-0.4)),
-    Case("way by turn, corrected", World(slip=-0.4), correct=BY_TURN),
+    Case("way by turn, corrected", World(slip=-0.4), by_turn=True),
     Case("one drive, halves", World(), 1),
     Case("loops closed", World(closed=True)),
     Case("one camera, x2.2", World(metric=2.2)),
@@ -281,16 +281,15 @@ def told(rng: np.random.Generator, case: Case, fresh: DriveWindows) -> tuple[str
     names, every = ",".join(each.name for each in judged) or None, [*made, *judged]
     try:
         windows = cut_windows(every, span_of(SPAN))
-        require_sound(every, windows, False, True)
-        noise, folds = folds_of(every, windows, names, case.correct)
+        require_sound(windows, True)
+        noise, folds = folds_of(windows, names, partial(fit_noise, by_turn=case.by_turn))
     except InputError as error:
         return "refused", np.nan, str(error)
-    lasting = persistent(noise, windows)
+    lasting = persistent_errors(noise, windows)
     depends = mean_by_motion(noise, windows).is_found
-    status = decided(
-        judged_by(folds, windows, len(every), case.fitted > 1).status, any(each.decides for each in lasting), depends
-    )
-    growth = rotation_growth(every, windows, False, noise.mean)
+    judged_status = judged_by(folds, windows, case.fitted > 1).status
+    status = decided(judged_status, any(each.decides for each in lasting), depends)
+    growth = rotation_growth(windows, noise.mean)
     warnings = doubts(noise, windows, growth, lasting)
     nees = noise.nees(fresh)[0]
     means = [nees[fresh.drive == i].mean() for i in range(FRESH)]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from script_options import options_of
 
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of, windows_at
+from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of
 from consistency.referee.fit_covariance.systematic_errors import MeanFit
 from consistency.referee.fit_covariance.white_noise import fit_noise, jitter_of
 from consistency.referee.geometry.groups import composed, matrices
@@ -109,8 +109,8 @@ def fitted(rng: np.random.Generator, side: Side) -> tuple[MeanFit, float]:
     """The mean, and the ratio of true to stated covariance at 20 spans of other drives."""
     made, others = drives(rng, side), drives(rng, side)
     windows = cut_windows(made, span_of("1m"))
-    noise = fit_noise(windows, jitter=jitter_of(fit_noise(windows), made, windows, False))
-    judged = windows_at(others, windows, float(LONG), False)
+    noise = fit_noise(windows, jitter=jitter_of(fit_noise(windows), windows))
+    judged = replace(windows, drives=tuple(others)).over(float(LONG))
     assert judged is not None
     assert noise.mean_fit is not None
     nees = noise.nees(judged)[0]

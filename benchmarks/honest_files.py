@@ -26,7 +26,7 @@ from consistency.referee.diagnostics import Verdict, judge
 from consistency.referee.geometry.groups import composed, vectors
 from consistency.referee.readers.formats.geodetic import axes_at, centred, geodetic
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.read_files import read_recordings
+from consistency.referee.readers.pipeline.read_files import read_recordings
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch
 

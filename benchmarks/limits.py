@@ -24,7 +24,7 @@ from scipy import stats
 from script_options import options_of
 
 from consistency.referee.diagnostics import Evidence, Verdict, compare, e_process, judge
-from consistency.referee.readers.formats.numpy_archive import record_of_arrays
+from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array
 
 Rng = np.random.Generator

@@ -78,11 +78,20 @@ def words_of(is_own: bool, jobs: int, runs: int) -> list[str]:
     return [sys.executable, *(["script.py"] if is_own else ["-m", "consistency"]), *options]
 
 
-def stopped(words: list[str], at: Path, number: int, moment: float) -> tuple[float, bool, list[str]]:
+def stopped(words: list[str], at: Path, number: int, moment: float, is_cold: bool) -> tuple[float, bool, list[str]]:
     """Begin the command and send the signal; seconds until all is gone, whether it was done before, faults."""
+    environment = dict(os.environ)
+    if is_cold:
+        environment["NUMBA_CACHE_DIR"] = str(at / "cache")
     with (at / "said").open("w+") as said:
         process = subprocess.Popen(
-            words, cwd=at, stdout=said, stderr=said, start_new_session=True, preexec_fn=as_in_a_terminal
+            words,
+            cwd=at,
+            env=environment,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
+            preexec_fn=as_in_a_terminal,
         )
         time.sleep(moment)
         was_done = process.poll() is not None
@@ -144,10 +153,9 @@ def main() -> int:
             which, is_own, is_cold = case(count)
             number = signal.SIGKILL if which == 0 else STOPS[count // 2 % len(STOPS)]
             whole, length = wholes[is_own]
-            os.environ["NUMBA_CACHE_DIR"] = str(top / "cache" / (str(count) if is_cold else "warm"))
             words = words_of(is_own, 1 + count // 4 % 2, arguments.runs)
             at, moment = prepared(top / str(count)), rng.uniform(0.0, length)
-            took, was_done, faults = stopped(words, at, number, moment)
+            took, was_done, faults = stopped(words, at, number, moment, is_cold)
             if not was_done:
                 seconds.append(took)
                 counts[signal.Signals(number).name] += 1

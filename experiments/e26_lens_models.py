@@ -12,6 +12,7 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,7 +21,7 @@ from scipy.stats import ttest_rel
 import consistency as cs
 from consistency.bench.runs.findings import OURS, script
 from consistency.bench.runs.run_scores import run_means
-from consistency.bench.scenario import PicturedSensor
+from consistency.bench.scenario import PicturedSensor, UvdSensor
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
@@ -91,13 +92,22 @@ def with_camera(world: cs.Scenario, camera: PicturedSensor) -> cs.Scenario:
     baseline.
     """
     before = world.truth.sensor
+    assert isinstance(before, UvdSensor)
+    assert camera.f is not None
+    assert camera.B is not None
     f, B = before.rig
     image, disparity = camera.image, camera.disparity
-    if image is None:
-        image = tuple(round(pixels * camera.f / f) for pixels in before.image)
+    if image is None and before.image is not None:
+        width, height = (round(pixels * camera.f / f) for pixels in before.image)
+        image = (width, height)
     if disparity is None:
         disparity = before.disparity[0], before.disparity[1] * camera.f * camera.B / (f * B)
-    own = {"f": camera.f, "B": camera.B, "sigma": camera.sigma, "principal_point": camera.principal_point}
+    own: dict[str, Any] = {
+        "f": camera.f,
+        "B": camera.B,
+        "sigma": camera.sigma,
+        "principal_point": camera.principal_point,
+    }
     own |= {"image": image, "disparity": disparity, "mount": camera.mount.model_dump()}
     bias = [] if camera.bias is None else [{"kind": "local-bias", **camera.bias.model_dump()}]
     changes = {f"truth__sensor__{key}": value for key, value in own.items()}

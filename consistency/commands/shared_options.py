@@ -87,13 +87,13 @@ def print_document(document: Document, as_json: bool, written: Sequence[Path] = 
 
 def are_files(path: Path, files: Reading) -> bool:
     """Whether a path is files of another estimator, and no folder of ``consistency run``."""
-    from consistency.referee.readers.read_files import is_recording
+    from consistency.referee.readers.pipeline.read_files import is_recording
 
     return is_recording(path, files)
 
 
 def read_files(path: Path, files: Reading) -> list[Evidence]:
-    from consistency.referee.readers.read_files import read_recordings
+    from consistency.referee.readers.pipeline.read_files import read_recordings
 
     return read_recordings(path, files)
 

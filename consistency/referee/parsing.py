@@ -23,7 +23,7 @@ WHOLE = 2**53  # beyond it a floating-point number counts no more
 DEEPEST = 64  # parts of a dotted key
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""  # its possessive quantifiers need Python 3.11
 UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # categories of Unicode: control, surrogate, ends of lines and paragraphs
-PROGRAMMING = (NameError,)  # those of other kinds also come of what a file holds
+PROGRAMMING = (NameError, TypeError, AttributeError, IndexError)  # of others what a file holds may be the cause
 PACKAGE = Path(__file__).parents[1]
 _SHOWN = 160  # characters of a parser's own words
 

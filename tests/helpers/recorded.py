@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.readers import read_files
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.pipeline import read_files
 
 
 def read_recordings(

@@ -18,7 +18,7 @@ from consistency.referee.geometry.groups import se3_log, spatial_error
 from consistency.referee.readers.formats.sheet import read_sheet
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.read_files import read_recordings
+from consistency.referee.readers.pipeline.read_files import read_recordings
 from consistency.referee.readers.truth_matching import BRIDGED, truth_at
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import _known

@@ -127,10 +127,12 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
 
 def test_the_kind_of_files_of_the_document_is_read(copy: Path) -> None:
     """One file and a row; what is refused of it is refused, and what is broken is said."""
-    module, row = code("Add a kind of files")
+    module, load, row = code("Add a kind of files")
     (copy / "consistency/referee/readers/formats/run_lines.py").write_text(module, encoding="utf-8")
-    last = ")  # fmt: skip\nSUFFIXES"
-    changed(copy / "consistency/referee/readers/file_kinds.py", last, f"    {row.strip()},\n{last}")
+    kinds = copy / "consistency/referee/readers/pipeline/kinds.py"
+    changed(kinds, "KINDS = (", f"{load}\n\nKINDS = (")
+    last = ")\n\n\ndef kind_of"
+    changed(kinds, last, f"    {row.strip()},\n{last}")
     lines = [f'{{"errors": [[{run}], [{run}]], "covariances": [[[1]], [[1]]]}}' for run in (3, 7)]
     (copy / "est.runs").write_text("\n".join(lines), encoding="utf-8")
     (copy / "bad.runs").write_text("\n".join([*lines, "{}"]), encoding="utf-8")

@@ -454,7 +454,7 @@ def test_html_escapes_what_others_named(rng: np.random.Generator) -> None:
         assert bad not in html
     assert escape(hostile) in html
     assert "&lt;b&gt;x" in html
-    assert html.count("<tr>") == html.count("</tr>") >= 5
+    assert html.count("<dt>") == html.count("</dt>") >= 5
 
 
 KEYS = {

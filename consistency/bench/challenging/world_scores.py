@@ -62,10 +62,11 @@ class ChallengeScorer:
         No trial begins after ``until``, a time of ``time.monotonic``.
         """
         with one_blas_thread():
-            return list(self._pool.map(lambda job: _score(self.filter, *job, seed, until), jobs))
+            return list(self._pool.map(lambda job: _score(self.filter, job, seed, until), jobs))
 
 
-def _score(filter_: Filter, scenario: Scenario, runs: Sequence[int], seed: int, until: float) -> Done | None:
+def _score(filter_: Filter, job: Job, seed: int, until: float) -> Done | None:
+    scenario, runs = job
     if time.monotonic() >= until:
         return Done((), 0.0)
     try:

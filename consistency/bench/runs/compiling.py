@@ -119,7 +119,7 @@ def _compile_side_by_side(needs: Sequence[Need], workers: int) -> None:
     initargs = link_to_parent(context)
     pool = ProcessPoolExecutor(workers, context=context, initializer=_begin_compiler, initargs=initargs)
     try:
-        with contextlib.suppress(OSError):  # no more processes
+        with contextlib.suppress(Exception):  # no more processes, or a filter that cannot be sent
             wait([pool.submit(_compile_one, _pickled(need)) for need in longest_first])
     finally:
         pool.shutdown(kill_workers=True)

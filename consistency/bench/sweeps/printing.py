@@ -39,7 +39,7 @@ def regime_blocks(regime: Regime) -> tuple[Block, ...]:
     statuses, rows = by_verdict(regime)
     heads = [Column("filter")]
     heads += [Column(head, number=True) for head in (*statuses, "cost")]
-    blocks: list[Block] = [table(heads, rows, "Cells by verdict")]
+    blocks: list[Block] = [table(tuple(heads), rows, "Cells by verdict")]
     cells = regime.sweep.cells
     if len(cells) <= MOST_CELLS:
         blocks += [Text(""), _cells_table(regime), Text("verdict, and ratio of true to stated covariance")]
@@ -65,7 +65,7 @@ def _cells_table(regime: Regime) -> Table:
         found = regime.at(cell)
         verdicts = [_verdict(found.get(name)) for name in sweep.filters]
         rows.append((*values_of(sweep, axes, cell), *verdicts))
-    return table(columns, rows, "Cells")
+    return table(tuple(columns), rows, "Cells")
 
 
 def _verdict(result: CellResult | None) -> Cell:

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from consistency.bench.runs.backends.threads import worker_count
-from consistency.bench.store.journal import Busy, unfinished_of
+from consistency.bench.store.journal import Busy
 from consistency.bench.sweeps.cell import CellResult, run_cell
 from consistency.bench.sweeps.plan import Sweep
 from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
 from consistency.referee.errors import InputError
+from consistency.referee.system.folders import unfinished_of
 from consistency.referee.system.progress import say
 
 PAUSE = 1.0  # s, between looks at whether another process has done what is left

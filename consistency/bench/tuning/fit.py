@@ -43,18 +43,18 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> FactorFit | None:
     if start is None:
         return None
     size = scores(start).size
-    found: Any = minimize(
-        lambda x: -scores.total(x) / size,
-        start,
-        method="COBYQA",
-        bounds=[(-LIMIT, LIMIT)] * len(start),
-        options={
-            "initial_tr_radius": FIRST_RADIUS,
-            "final_tr_radius": LAST_RADIUS,
-            "maxfev": MOST_SETTINGS,
-            "scale": False,
-        },
-    )
+    how: dict[str, Any] = {"method": "COBYQA", "bounds": [(-LIMIT, LIMIT)] * len(start)}
+    how["options"] = {
+        "initial_tr_radius": FIRST_RADIUS,
+        "final_tr_radius": LAST_RADIUS,
+        "maxfev": MOST_SETTINGS,
+        "scale": False,
+    }
+
+    def loss(x: Array) -> float:
+        return -scores.total(x) / size
+
+    found: Any = minimize(loss, start, **how)
     best = np.clip(found.x, -LIMIT, LIMIT)
     edge = np.where(np.abs(best) > LIMIT - AT_LIMIT, np.sign(best), 0.0).astype(int)
     free = np.flatnonzero(edge == 0)

@@ -64,22 +64,21 @@ def profile_intervals(score: Callable[[Array], Array], best: Array, curvature: A
     return intervals
 
 
-def _farthest(i: int, side: float, depth: Callable[[Array], float], guess: Array, low: Array, high: Array) -> float:
+def _farthest(i: int, side: float, depth: Callable[[Any], Any], guess: Array, low: Array, high: Array) -> float:
     """Return the largest (``side`` 1) or smallest (-1) coordinate ``i`` of the points at a depth of 1 at most."""
-    options = {
+    how: dict[str, Any] = {"method": "COBYQA", "bounds": list(zip(low, high, strict=True))}
+    how["constraints"] = NonlinearConstraint(depth, -np.inf, 1.0)
+    how["options"] = {
         "initial_tr_radius": FIRST_RADIUS,
         "final_tr_radius": LAST_RADIUS,
         "maxfev": MOST_SETTINGS,
         "scale": False,
     }
-    found: Any = minimize(
-        lambda u: -side * u[i],
-        guess,
-        method="COBYQA",
-        bounds=list(zip(low, high, strict=True)),
-        constraints=NonlinearConstraint(depth, -np.inf, 1.0),
-        options=options,
-    )
+
+    def nearness(u: Array) -> float:
+        return float(-side * u[i])
+
+    found: Any = minimize(nearness, guess, **how)
     return float(found.x[i])
 
 

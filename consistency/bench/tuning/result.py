@@ -193,7 +193,7 @@ def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
             (at / name).write_text(text, encoding="utf-8")
 
     world = tuning.parts.world
-    origin = {"scenario": world.name}
+    origin: dict[str, Any] = {"scenario": world.name}
     if isinstance(world, Log):
         origin = {"log": world.name, "log_sha256": world.sha256}
     manifest = manifest_of(KIND, wall=tuning.seconds, filters=[tuning.filter], **origin)

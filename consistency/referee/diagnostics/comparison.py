@@ -91,7 +91,9 @@ class Comparison:
         least = abs(float(np.log(detect)))
         sizes = (self.standard_error, least), (self.sum_error, least + 2.0 * self.reference)
         needed = max(_planned(error, self.runs, size, self.false_alarm, power) for error, size in sizes)
-        return min(needed, self.runs) if self.at_most < least else needed
+        if self.at_most < least:
+            return min(needed, self.runs)
+        return needed
 
 
 def summary(
@@ -107,7 +109,9 @@ def summary(
     if error is not None and covariance is not None:
         both = by_runs(_squared_and_covered, np.asarray(nees), np.asarray(error), np.asarray(covariance))
         squared, covered = both[:, 0], both[:, 1]
-    return RunSummary(np.arange(len(nees)) if runs is None else runs, dof, means / dof, squared, covered)
+    if runs is None:
+        runs = np.arange(len(nees))
+    return RunSummary(runs, dof, means / dof, squared, covered)
 
 
 def _squared_and_covered(nees: Array, error: Array, covariance: Array) -> Array:
@@ -161,14 +165,22 @@ def compare(
     if a.dof != b.dof:
         raise ValueError(f"the errors have {a.dof} and {b.dof} dimensions; compare filters of the same state")
     common = np.intersect1d(a.runs[np.isfinite(a.nees)], b.runs[np.isfinite(b.nees)])
-    paired = len(common) >= FEWEST if paired is None else paired
-    a, b = (_rows(x, np.isin(x.runs, common) if paired else np.isfinite(x.nees)) for x in (a, b))
+    if paired is None:
+        paired = len(common) >= FEWEST
+    which = ""
+    if paired:
+        which = " in common"
+        a, b = _rows(a, np.isin(a.runs, common)), _rows(b, np.isin(b.runs, common))
+    else:
+        a, b = _rows(a, np.isfinite(a.nees)), _rows(b, np.isfinite(b.nees))
     fewest = min(len(a.runs), len(b.runs))
     if fewest < FEWEST:
-        raise ValueError(f"a comparison needs at least {FEWEST} runs{' in common' if paired else ''}, got {fewest}")
+        raise ValueError(f"a comparison needs at least {FEWEST} runs{which}, got {fewest}")
     differences = [_ratio("ANEES", a.nees * a.dof, b.nees * b.dof, 1.0, paired, confidence)]
     n = min(a.squared.shape[1], b.squared.shape[1])
-    names = axes if axes is not None and len(axes) == n else numbered_axes(n)
+    names = numbered_axes(n)
+    if axes is not None and len(axes) == n:
+        names = axes
     for i, axis in enumerate(names):
         differences.append(_ratio(f"RMSE {axis}", a.squared[:, i], b.squared[:, i], 0.5, paired, confidence))
     for i, axis in enumerate(names):

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.judging.status import deciding_axis
+from consistency.referee.diagnostics.questions.innovation_causes import innovation_causes
+from consistency.referee.diagnostics.questions.innovations import nis_and_dof
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
@@ -82,7 +84,7 @@ def judge(
     if evidence.parts:
         from consistency.referee.diagnostics.judging.separate_components import findings_of_parts
 
-        found = findings_of_parts(evidence, settings, in_words)
+        found = findings_of_parts(evidence, settings, verdict_of)
     else:
         found = findings_of(evidence, settings, truth=truth)
     first = ""
@@ -91,7 +93,7 @@ def judge(
         first = unshown_sentence(found, unshown)
     world = None
     if record.world is not None:
-        world = in_words(findings_of(record.in_world, settings))
+        world = verdict_of(findings_of(record.in_world, settings))
     beside = Beside(world, _map_of(record, settings), _rejections_of(record, None), record if keep_record else None)
     return _whole(record, found, first, beside)
 
@@ -105,7 +107,7 @@ class Beside(NamedTuple):
     record: Record | None = None
 
 
-def in_words(found: Findings, first: str = "") -> Verdict:
+def verdict_of(found: Findings, first: str = "") -> Verdict:
     """The verdict on errors and innovations alone; ``first`` stands in the place of the first sentence."""
     return Verdict(**vars(found), reasons=tuple(reasons(found, first)), axis=deciding_axis(found))
 
@@ -126,15 +128,20 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
     left_out = set(found.left_out_steps)
     if record.align:
         left_out.update(record.left_out_steps)
+    causes, nees_ratio = list(record.causes), float("nan")
+    if found.scale is not None:
+        nees_ratio = found.scale.mean_anees / found.scale.dof
+    if (innovations := nis_and_dof(record)) is not None:
+        causes += innovation_causes(*innovations, nees_ratio)
     fields = vars(found) | {"left_out_steps": tuple(sorted(left_out))}
     return Verdict(
         **fields,
-        reasons=(sentence, *figures, *record.causes, *other_ways(found.status, record)),
+        reasons=(sentence, *figures, *causes, *other_ways(found.status, record)),
         axis=deciding_axis(found),
         convention=convention,
         align=align,
         notes=tuple(record.notes),
-        causes=tuple(record.causes),
+        causes=tuple(causes),
         **beside._asdict(),
     )
 
@@ -153,7 +160,7 @@ def _map_of(record: Record, settings: Settings | None) -> MapScore | None:
         return map_score(landmarks.run, landmarks.nees, landmarks.dof)
     verdict, of_map = None, landmarks.record(last_nees(record))
     if of_map is not None:
-        verdict = in_words(findings_of(of_map, settings))
+        verdict = verdict_of(findings_of(of_map, settings))
     return map_score(landmarks.run, landmarks.nees, landmarks.dof, verdict)
 
 

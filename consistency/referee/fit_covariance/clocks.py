@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -21,6 +22,30 @@ STEPS = np.geomspace(0.004, REACH, 12)
 GRID = np.concatenate([-STEPS[::-1], [0.0], STEPS])
 
 
+class Part(NamedTuple):
+    """Some motions of a drive, K of them."""
+
+    poses: Poses
+    starts: Array  # (K,), s
+    ends: Array  # (K,), s
+    motions: Array  # (K, d + 1, d + 1), estimated
+
+    def squares(self, shift: float) -> Array:
+        """Squared errors (k, 2) of positions and rotations, with the truth ``shift`` s later, where it is known."""
+        p = self.poses
+        true = np.full((2, *self.motions.shape), np.nan)
+        for T, times in zip(true, (self.starts, self.ends), strict=True):
+            known = truth_at(times + shift, p.true_t, p.truth, p.manifold, p.max_dt)
+            T[known.rows] = matrices(known.truth)
+        start, end = true
+        is_known = np.isfinite(true).all(axis=(0, 2, 3))
+        error = log(inverse(self.motions[is_known]) @ inverse(start[is_known]) @ end[is_known])
+        d = self.motions.shape[-1] - 1
+        positions = (error[:, :d] ** 2).sum(axis=1)
+        rotations = (error[:, d:] ** 2).sum(axis=1)
+        return np.column_stack([positions, rotations])
+
+
 def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     """Time to add to the timestamps of the estimates, s, one for all drives.
 
@@ -36,49 +61,42 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     InputError
         The motions do not tell it.
     """
-    parts = []
+    parts: list[Part] = []
     for poses, T in drives:
         last = np.searchsorted(poses.t, poses.t + LONG)
         first = np.flatnonzero(last < len(poses.t))
         some = first[:: max(len(first) * len(drives) // MOST, 1)]
         for rows in np.array_split(some, -(-PARTS // len(drives))):
-            parts.append((poses, poses.t[[rows, last[rows]]], inverse(T[rows]) @ T[last[rows]]))
-    values = [_best([part]) for part in parts if len(part[2])]
-    value = _best(parts) if len(values) > 1 else np.nan
-    if not np.isfinite(value) or not np.std(values, ddof=1) < UNSURE * np.sqrt(len(values)):
-        raise InputError(
-            "--time-offset estimate: the motions do not tell it, because nothing moves unevenly, or the offset is more "
-            f"than {REACH:g} s; give seconds"
-        )
-    return value
+            if len(rows):
+                ends = last[rows]
+                motions = inverse(T[rows]) @ T[ends]
+                parts.append(Part(poses, poses.t[rows], poses.t[ends], motions))
+    if len(parts) > 1:
+        offset = _best(parts)
+        spread = float(np.std([_best([part]) for part in parts], ddof=1))
+        if np.isfinite(offset) and spread < UNSURE * np.sqrt(len(parts)):
+            return offset
+    raise InputError(
+        "--time-offset estimate: the motions do not tell it, because nothing moves unevenly, or the offset is more "
+        f"than {REACH:g} s; give seconds"
+    )
 
 
-def _best(parts: Sequence[tuple[Poses, Array, Array]]) -> float:
+def _best(parts: Sequence[Part]) -> float:
     """The offset with the smallest errors; NaN where that is at an end of ``GRID``, or no offset is better."""
 
     def size(shift: float) -> float:
-        squares = np.sort(np.concatenate([_squares(*part, shift) for part in parts]), axis=0)
-        return float(np.log(squares[: max(int(KEPT * len(squares)), 1)].mean(axis=0) + 1e-300).sum())
+        squares = np.sort(np.concatenate([part.squares(shift) for part in parts]), axis=0)
+        kept = squares[: max(int(KEPT * len(squares)), 1)]
+        return float(np.log(kept.mean(axis=0) + 1e-300).sum())
 
     sizes = np.array([size(shift) for shift in GRID])
-    best = int(np.nanargmin(np.append(sizes, np.inf)))
-    if best in (0, len(GRID) - 1, len(GRID)) or not np.nanmax(sizes) - sizes[best] > 1e-6:
+    if np.isnan(sizes).all():
         return float("nan")
-    found = optimize.minimize_scalar(
-        size, bounds=(GRID[best - 1], GRID[best + 1]), method="bounded", options={"xatol": 1e-4}
-    )
+    best = int(np.nanargmin(sizes))
+    is_told = np.nanmax(sizes) - sizes[best] > 1e-6
+    if best in (0, len(GRID) - 1) or not is_told:
+        return float("nan")
+    bounds = GRID[best - 1], GRID[best + 1]
+    found = optimize.minimize_scalar(size, bounds=bounds, method="bounded", options={"xatol": 1e-4})
     return float(found.x if found.fun < sizes[best] else GRID[best])
-
-
-def _squares(p: Poses, t: Array, motions: Array, shift: float) -> Array:
-    """Squared errors (k, 2) of positions and rotations, with the truth ``shift`` s later, where it is known.
-
-    The motions (K, d + 1, d + 1) are between times (2, K).
-    """
-    ends = np.full((2, *motions.shape), np.nan)
-    for T, times in zip(ends, t + shift, strict=True):
-        known = truth_at(times, p.true_t, p.truth, p.manifold, p.max_dt)
-        T[known.rows] = matrices(known.truth)
-    fine, d = np.isfinite(ends).all(axis=(0, 2, 3)), motions.shape[-1] - 1
-    error = log(inverse(motions[fine]) @ inverse(ends[0, fine]) @ ends[1, fine])
-    return np.column_stack([(error[:, :d] ** 2).sum(axis=1), (error[:, d:] ** 2).sum(axis=1)])

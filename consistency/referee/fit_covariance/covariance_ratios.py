@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,14 +10,14 @@ from scipy import special, stats
 
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.motion_windows import BLOCKS, ENOUGH, DriveWindows
-from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise
-from consistency.referee.readers.runs_to_record import listed
+from consistency.referee.fit_covariance.white_noise import WhiteNoise
+from consistency.referee.readers.places import listed
 from consistency.referee.types import Array, Indices
 
 DECIDE = 50  # windows that decide where drives are fewer than ENOUGH
 HALF = "half"
+IN_TURN = "in turn"
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class Fold:
 
     def judges(self, windows: DriveWindows) -> Array:
         """Which windows chose nothing of this fit, (W,)."""
-        return np.asarray(np.isin(windows.drive, self.judged) & (windows.first >= self.since[windows.drive]))
+        is_late = windows.first >= self.since[windows.drive]
+        return np.asarray(np.isin(windows.drive, self.judged) & is_late)
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,15 @@ class Ratio:
             return "undecided"
         if self.low >= 1.0 / DETECT and self.high <= DETECT:
             return "consistent" if self.general and self.drives > 1 else "undecided"
-        return "overconfident" if self.low > 1.0 else "conservative" if self.high < 1.0 else "undecided"
+        if self.low > 1.0:
+            return "overconfident"
+        return "conservative" if self.high < 1.0 else "undecided"
 
     @property
     def reach(self) -> tuple[float, float]:
         """Ratio of a new drive: two standard deviations between drives about the mean."""
-        return self.value * float(np.exp(-2 * self.spread)), self.value * float(np.exp(2 * self.spread))
+        factor = float(np.exp(2 * self.spread))
+        return self.value / factor, self.value * factor
 
 
 @dataclass(frozen=True)
@@ -80,12 +84,15 @@ class JudgedSpan:
         return "undecided" if "undecided" in found else "consistent"
 
 
+def are_halves(windows: DriveWindows, held_out: str | None) -> bool:
+    """Whether second halves of drives are judged by a fit to the first ones."""
+    return held_out == HALF or (held_out is None and len(windows.drives) == 1)
+
+
 def folds_of(
-    drives: Sequence[Drive],
     windows: DriveWindows,
     held_out: str | None,
-    correct: bool | str,
-    jitter: Array | float = 0.0,
+    fit: Callable[[DriveWindows], WhiteNoise],
 ) -> tuple[WhiteNoise, list[Fold]]:
     """The fit that is handed out, and those that are judged.
 
@@ -99,47 +106,66 @@ def folds_of(
     InputError
         A name is no drive, or nothing is left to fit or to judge.
     """
-    none = np.zeros(len(drives), np.int64)
-    every = np.arange(len(drives))
-    if held_out == HALF or (held_out is None and len(drives) == 1):
-        ends = [windows.last[windows.drive == i] for i in every]
-        middle = np.array([int(each[(len(each) - 1) // 2]) if len(each) else 0 for each in ends])  # rows at half time
+    every = np.arange(len(windows.drives))
+    begin = np.zeros(len(every), np.int64)
+    if are_halves(windows, held_out):
+        middle = np.array([_middle(windows.last[windows.drive == i]) for i in every])
         early = windows.of(windows.last <= middle[windows.drive])
-        return fit_noise(windows, correct, jitter), [Fold(fit_noise(early, correct, jitter), every, middle)]
+        return fit(windows), [Fold(fit(early), every, middle)]
     if held_out is None:
-        fits = [fit_noise(windows.of(windows.drive != i), correct, jitter) for i in np.unique(windows.drive)]
-        return fit_noise(windows, correct, jitter), [
-            Fold(fit, np.array([i]), none) for i, fit in zip(np.unique(windows.drive), fits, strict=True)
-        ]
+        judged = np.unique(windows.drive)[:, None]
+        folds = [Fold(fit(windows.of(windows.drive != i)), i, begin) for i in judged]
+        return fit(windows), folds
+    judged = _named(windows, held_out)
+    is_judged = np.isin(windows.drive, judged)
+    if is_judged.all() or not is_judged.any():
+        raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if is_judged.all() else 'judge'}")
+    noise = fit(windows.of(~is_judged))
+    return noise, [Fold(noise, judged, begin)]
+
+
+def _middle(ends: Indices) -> int:
+    """Row at half time of a drive whose windows end at these rows."""
+    return int(ends[(len(ends) - 1) // 2]) if len(ends) else 0
+
+
+def _named(windows: DriveWindows, held_out: str) -> Indices:
     names = [name.strip() for name in held_out.split(",")]
-    known = [drive.name for drive in drives]
-    if unknown := [name for name in names if name not in known]:
-        raise InputError(f"--held-out {held_out}: no drive '{unknown[0]}'; there are {listed(known)}, or 'half'")
-    judged = np.array([known.index(name) for name in names])
-    rest = ~np.isin(windows.drive, judged)
-    if not rest.any() or rest.all():
-        raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if not rest.any() else 'judge'}")
-    noise = fit_noise(windows.of(rest), correct, jitter)
-    return noise, [Fold(noise, judged, none)]
+    known = [drive.name for drive in windows.drives]
+    for name in names:
+        if name not in known:
+            raise InputError(f"--held-out {held_out}: no drive '{name}'; there are {listed(known)}, or 'half'")
+    return np.array([known.index(name) for name in names])
 
 
-def judged_by(folds: Sequence[Fold], windows: DriveWindows, drives: int, general: bool) -> JudgedSpan:
+def judged_by(folds: Sequence[Fold], windows: DriveWindows, general: bool) -> JudgedSpan:
     """Ratios of the windows of a span, each by the fit that it did not choose; of the whole and of each axis."""
-    parts = []
+    drives, parts = [], []
     for fold in folds:
         some = windows.of(fold.judges(windows))
-        whole, axes = fold.noise.nees(some)
-        parts.append((some.drive, np.column_stack([whole, axes])))
-    drive, values = (np.concatenate(each) for each in zip(*parts, strict=True))
-    by_drive, counts = np.full((drives, values.shape[1]), np.nan), np.bincount(drive, minlength=drives)
+        drives.append(some.drive)
+        parts.append(np.column_stack(fold.noise.nees(some)))
+    drive = np.concatenate(drives)
+    values = np.concatenate(parts)
+    by_drive = np.full((len(windows.drives), values.shape[1]), np.nan)
     for i in np.unique(drive):
         by_drive[i] = values[drive == i].mean(axis=0)
-    n = values.shape[1] - 1
-    ratios = [ratio_of(by_drive[:, k], values[:, k], general, counts * (1 if k else n)) for k in range(values.shape[1])]
-    return JudgedSpan(windows.span.option, ratios[0], tuple(ratios[1:]), by_drive)
+    dof = np.bincount(drive, minlength=len(by_drive))
+    axes = zip(by_drive.T[1:], values.T[1:], strict=True)
+    return JudgedSpan(
+        span=windows.span.option,
+        whole=ratio_of(by_drive[:, 0], values[:, 0], general, len(windows.axes) * dof),
+        axes=tuple(ratio_of(*axis, general, dof) for axis in axes),
+        by_drive=by_drive,
+    )
 
 
-def ratio_of(by_drive: Array, values: Array, general: bool = True, dof: Array | None = None) -> Ratio:
+def ratio_of(
+    by_drive: Array,
+    values: Array,
+    general: bool = True,
+    dof: Array | None = None,
+) -> Ratio:
     """Geometric mean of the ratios of drives, (drives,), with Student's interval of its logarithm.
 
     The logarithm of a mean square with few degrees of freedom, ``dof`` (drives,), is too small on average, by what a
@@ -147,21 +173,30 @@ def ratio_of(by_drive: Array, values: Array, general: bool = True, dof: Array | 
     transformation", J. R. Statist. Soc. Suppl. 8).
     A single drive has an interval from the means of consecutive windows, of ``values`` (W,), which holds for it alone.
     """
-    there = np.isfinite(by_drive) & (by_drive > 0)
-    known = by_drive[there]
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    if len(known) > 1:
-        logs = np.log(known)
+    known = np.isfinite(by_drive) & (by_drive > 0)
+    drives = int(known.sum())
+    center = reach = spread = float("nan")
+    if drives > 1:
+        logs = np.log(by_drive[known])
         if dof is not None:
-            logs += np.log(0.5 * dof[there]) - special.digamma(0.5 * dof[there])
-        spread = float(logs.std(ddof=1))
-        reach = float(stats.t.isf(tail, len(logs) - 1)) * spread / np.sqrt(len(logs))
+            half = 0.5 * dof[known]
+            logs += np.log(half) - special.digamma(half)
         center = float(logs.mean())
-    elif len(known) == 1:
-        blocks = np.array([part.mean() for part in np.array_split(values, min(BLOCKS, len(values)))])
-        k, center, spread = len(blocks), float(np.log(values.mean())), float("nan")
-        reach = float(stats.t.isf(tail, k - 1) * blocks.std(ddof=1) / np.sqrt(k) / blocks.mean()) if k > 1 else np.inf
-    else:
-        return Ratio(*(float("nan"),) * 4, drives=0, windows=len(values), general=general)
-    low, high = float(np.exp(center - reach)), float(np.exp(min(center + reach, 700.0)))
-    return Ratio(float(np.exp(center)), low, high, spread, len(known), len(values), general)
+        spread = float(logs.std(ddof=1))
+        reach = _student(drives) * spread / np.sqrt(drives)
+    elif drives == 1:
+        center = float(np.log(values.mean()))
+        parts = np.array_split(values, min(BLOCKS, len(values)))
+        reach = np.inf
+        if len(parts) > 1:
+            means = np.array([part.mean() for part in parts])
+            error = means.std(ddof=1) / np.sqrt(len(means))
+            reach = _student(len(means)) * error / means.mean()
+    low = float(np.exp(center - reach))
+    high = float(np.exp(np.minimum(center + reach, 700.0)))
+    return Ratio(float(np.exp(center)), low, high, spread, drives, len(values), general)
+
+
+def _student(k: int) -> float:
+    """Reach of an interval of the mean of k values, in standard errors."""
+    return float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1))

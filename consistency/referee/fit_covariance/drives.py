@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.extras import function_at
 from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.geometry.groups import composed, matrices
-from consistency.referee.readers.file_kinds import (
+from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
     TRAJECTORIES,
@@ -20,14 +18,15 @@ from consistency.referee.readers.file_kinds import (
     is_drive,
     is_plane,
     is_solution,
-    kind_of,
     trajectory_files,
     unknown_kind,
 )
-from consistency.referee.readers.formats.sheet import refuse
-from consistency.referee.readers.formats.table import table_poses
+from consistency.referee.readers.formats.table import read_tables
+from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.truth_matching import NamedPoses, truth_at
+from consistency.referee.readers.pipeline.kinds import Found, kind_of
+from consistency.referee.readers.places import refuse
+from consistency.referee.readers.truth_matching import Estimator, Poses, truth_at
 from consistency.referee.types import Array, Indices
 
 
@@ -72,10 +71,12 @@ def read_drives(
         raise InputError(f"{path}: no such file")
     if r.time_offset not in (None, "estimate") and not isinstance(r.time_offset, (int, float)):
         raise InputError(f"--time-offset {r.time_offset}: must be a number of seconds, or 'estimate'")
-    found = [(each, _matrices(each, r)) for each in _poses(path, r)]
+    poses = _poses(path, r)
+    require_radians(str(path), poses)
+    found = [(each, _matrices(each, r)) for each in poses]
     if r.time_offset != "estimate":
         return [_drive(each, T, float(r.time_offset or 0.0)) for each, T in found]
-    shift = clock_offset([(each.poses, T) for each, T in found])
+    shift = clock_offset(found)
     return [replace(_drive(each, T, shift), shift=shift) for each, T in found]
 
 
@@ -101,53 +102,72 @@ def drive_of(
     if not (np.isfinite(estimate).all() and np.isfinite(truth).all()):
         raise InputError(f"{name}: a pose is not finite; leave such rows out")
     T = matrices(estimate)
-    rows = np.arange(len(T)) if row is None else row
-    return Drive(
-        name, np.full(len(T), np.nan) if t is None else np.asarray(t, float), rows,
-        composed(T) if motions else T, matrices(truth),
-    )  # fmt: skip
+    if t is None:
+        t = np.full(len(T), np.nan)
+    if row is None:
+        row = np.arange(len(T))
+    return Drive(name, np.asarray(t, float), row, composed(T) if motions else T, matrices(truth))
 
 
-def _poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
-    kind = kind_of(path, r)
+def _poses(path: Path, r: Reading) -> list[Poses]:
+    """The poses of each drive, without covariances."""
     if not is_bag(path) and path.is_dir() and not trajectory_files(path):
-        yield from _of_folder(path, r)
-    elif kind is None or not kind.poses or is_solution(path):
-        raise unknown_kind(path, (*TABLES, *ARCHIVES, ".bag", *TRAJECTORIES), "estimates=poses, truth=true_poses")
-    else:
-        yield from function_at(kind.poses)(path, r)
+        return _of_folder(path, r)
+    kind = kind_of(path, r)
+    if kind is None or is_solution(path):
+        raise _no_poses(path)
+    return _of_one(path, kind.read(path, r, True))
 
 
-def _of_folder(folder: Path, r: Reading) -> Iterator[NamedPoses]:
+def _no_poses(path: Path) -> InputError:
+    return unknown_kind(path, (*TABLES, *ARCHIVES, ".bag", *TRAJECTORIES), "estimates=poses, truth=true_poses")
+
+
+def _of_one(path: Path, found: Found) -> list[Poses]:
+    """The runs of the one estimator of a file."""
+    if len(found) > 1:
+        raise InputError(f"{path}: holds several estimators in its column 'filter'; keep the rows of one")
+    (one,) = found
+    if not isinstance(one, Estimator):
+        raise _no_poses(path)
+    if one.innovations_alone:
+        raise InputError(f"{path}: needs --truth FILE, poses in any world")
+    return list(one.runs)
+
+
+def _of_folder(folder: Path, r: Reading) -> list[Poses]:
     """Tables of a folder, one for each drive, with truths of the same names in another."""
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in TABLES or is_plane(path))
     if not files:
         raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
+    found = []
     for path in files:
-        truth = r.truth / path.name if r.truth is not None and r.truth.is_dir() and not is_drive(r.truth) else r.truth
+        truth = r.truth
+        if truth is not None and truth.is_dir() and not is_drive(truth):
+            truth = truth / path.name
         if truth is not None and not truth.exists():
             raise InputError(f"--truth {r.truth}: holds no file '{path.name}' for {path}")
-        for name, poses, clock in table_poses(path, replace(r, truth=truth)):
-            stem = path.name.split(".")[0]
-            yield NamedPoses(stem if name == path.stem else f"{stem}, {name}", poses, clock)
+        stem = path.name.split(".")[0]
+        for poses in _of_one(path, read_tables(path, replace(r, truth=truth), poses_alone=True)):
+            found.append(replace(poses, name=stem if poses.name == path.stem else f"{stem}, {poses.name}"))
+    return found
 
 
-def _matrices(read: NamedPoses, r: Reading) -> Array:
+def _matrices(poses: Poses, r: Reading) -> Array:
     """Estimated poses, (N, d + 1, d + 1)."""
-    finite = np.isfinite(read.poses.estimate).all(axis=1)
+    finite = np.isfinite(poses.estimate).all(axis=1)
     what = "the pose is not finite; end the drive before it, or leave the row out"
-    refuse(~finite, read.poses.place.__getitem__, what)
-    T = matrices(read.poses.estimate)
+    refuse(~finite, poses.place.__getitem__, what)
+    T = matrices(poses.estimate)
     return composed(T) if r.motions else T
 
 
-def _drive(read: NamedPoses, T: Array, shift: float) -> Drive:
-    name, poses, clock = read
+def _drive(poses: Poses, T: Array, shift: float) -> Drive:
     t = poses.t + shift
     known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
     if len(known.rows) < 2:
         raise InputError(
-            f"{name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t is "
-            f"{t[0]:.15g} to {t[-1]:.15g}, but {poses.true_t[0]:.15g} to {poses.true_t[-1]:.15g} in the truth"
+            f"{poses.name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t "
+            f"is {t[0]:.15g} to {t[-1]:.15g}, but {poses.true_t[0]:.15g} to {poses.true_t[-1]:.15g} in the truth"
         )
-    return Drive(name, clock[known.rows] + shift, known.rows, T[known.rows], matrices(known.truth))
+    return Drive(poses.name, poses.seconds[known.rows] + shift, known.rows, T[known.rows], matrices(known.truth))

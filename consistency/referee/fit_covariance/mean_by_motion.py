@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
-from consistency.referee.fit_covariance.motion_windows import DriveWindows, blocks_of, rotation_vectors, ways
-from consistency.referee.fit_covariance.slip import held_out_gain
-from consistency.referee.fit_covariance.systematic_errors import error_derivatives
+from consistency.referee.fit_covariance.motion_windows import DriveWindows, angles, blocks_of, mean_square, ways
+from consistency.referee.fit_covariance.systematic_errors import fit_mean, fit_slip, jacobian_of_mean, left_by
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.types import Array, Indices
 
@@ -23,7 +24,7 @@ SCALES = ("the scale of the way", "the scale of turns")
 
 
 @dataclass(frozen=True)
-class ByMotion:
+class MotionDependence:
     """A scale that depends on the turn of a window, or on its way."""
 
     scale: str  # of SCALES
@@ -41,81 +42,154 @@ class ByMotion:
         return self.p_value <= SURE and self.share >= LEAST
 
 
-def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> ByMotion:
-    """The dependence with the smallest p-value, which is times the number of questions.
+class Question(NamedTuple):
+    """Whether a scale differs between bins of the windows."""
 
-    Windows are divided once by the estimated and once by the true motion, and both must show it: the noise of a motion
-    is itself a mean error in windows that are chosen by it.
-    """
-    now = noise.mean.applied(windows)
-    both, found = (now.pieces, windows.true_pieces), []
-    for by in ("turn", "way"):
-        sizes = [_size(pieces, by) for pieces in both]
-        bins = [np.searchsorted(np.quantile(size, np.arange(1, BINS) / BINS), size, side="right") for size in sizes]
-        least, most = (np.quantile(sizes[1], at) for at in (0.5 / BINS, 1.0 - 0.5 / BINS))
-        if by == "turn" or most >= VARIES * least:
-            for scale in range(len(SCALES)):
-                p = max(dependence_p_value(now, pieces, of, scale) for pieces, of in zip(both, bins, strict=True))
-                found.append((p, by, scale, sizes[0], bins[0]))
-    p, by, scale, size, of = min(found, key=lambda each: each[0])
-    values, error = _by_bin(now, of, scale)
-    shares = (error**2).mean(axis=0) / np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0)
-    axis, there = int(np.argmax(shares)), np.unique(of)
-    dependence = ByMotion(
-        SCALES[scale], by, tuple((noise.mean.values[scale] * (1.0 + values[there])).tolist()),
-        tuple(float(size[of == k].min()) for k in there[1:]), now.axes[axis], float(shares[axis]),
-        max(float(np.abs(error[of == k, axis]).mean()) for k in there), min(len(found) * p, 1.0),
-    )  # fmt: skip
-    if dependence.is_found and (by, scale) == ("turn", 0):
+    p_value: float
+    by: str  # turn | way
+    scale: int  # of SCALES
+    sizes: Array  # (W,), rad or m
+    bins: Indices  # (W,)
+
+
+def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> MotionDependence:
+    """Find the dependence with the smallest p-value, which is times the number of questions."""
+    corrected = noise.mean.applied(windows)
+    questions = _questions(corrected)
+    found = min(questions, key=lambda each: each.p_value)
+    values, error = values_by_bin(corrected, found.bins, found.scale)
+    shares = mean_square(error) / noise.variances(corrected.pieces).mean(axis=0)
+    axis = int(np.argmax(shares))
+    starts, reaches = [], []
+    there = np.unique(found.bins)
+    for k in there:
+        is_in = found.bins == k
+        starts.append(float(found.sizes[is_in].min()))
+        reaches.append(float(np.abs(error[is_in, axis]).mean()))
+    scales = noise.mean.values[found.scale] * (1.0 + values[there])
+    dependence = MotionDependence(
+        scale=SCALES[found.scale],
+        by=found.by,
+        values=tuple(scales.tolist()),
+        edges=tuple(starts[1:]),
+        axis=corrected.axes[axis],
+        share=float(shares[axis]),
+        reach=max(reaches),
+        p_value=min(len(questions) * found.p_value, 1.0),
+    )
+    is_of_slip = (found.by, found.scale) == ("turn", 0)
+    if dependence.is_found and is_of_slip:
         return replace(dependence, gain=held_out_gain(windows, blocks_of(windows.drive)))
     return dependence
 
 
-def dependence_p_value(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) -> float:
+def _questions(corrected: DriveWindows) -> list[Question]:
+    """All questions that are asked.
+
+    Windows are divided once by the estimated and once by the true motion, and both must show it: the noise of a motion
+    is itself a mean error in windows that are chosen by it.
+    """
+    found = []
+    for by, size_of in (("turn", angles), ("way", ways)):
+        sizes = size_of(corrected.pieces).sum(axis=1)
+        true_sizes = size_of(corrected.true_pieces).sum(axis=1)
+        least, most = np.quantile(true_sizes, [0.5 / BINS, 1.0 - 0.5 / BINS])
+        if by == "way" and most < VARIES * least:
+            continue
+        bins = bins_of(sizes)
+        true_bins = bins_of(true_sizes)
+        for scale in range(len(SCALES)):
+            by_estimate = p_value_of(corrected, corrected.pieces, bins, scale)
+            by_truth = p_value_of(corrected, corrected.true_pieces, true_bins, scale)
+            found.append(Question(max(by_estimate, by_truth), by, scale, sizes, bins))
+    return found
+
+
+def bins_of(sizes: Array) -> Indices:
+    """Bin of each window, (W,), of which each has as many."""
+    edges = np.quantile(sizes, np.arange(1, BINS) / BINS)
+    return np.searchsorted(edges, sizes, side="right")
+
+
+def p_value_of(
+    windows: DriveWindows,
+    pieces: Array,
+    bins: Indices,
+    scale: int,
+) -> float:
     """p-value of one scale in all bins, by a score test; errors are of ``windows``, and motions ``pieces``.
 
     Each drive has constants of its own. The scores of blocks of windows, in all bins but the first, are compared with
     their scatter (Hotelling 1931).
     """
-    X, names = error_derivatives(pieces), np.unique(windows.drive)
-    y, own, Z = _weighted(windows, X, X[:, :, [scale]] * (bins[:, None] == np.arange(1, BINS))[:, None, :])
-    scores = []
+    X = jacobian_of_mean(pieces)
+    in_bin = bins[:, None] == np.arange(1, BINS)
+    size = _size_of_errors(windows)
+    own = X / size
+    scores = X[:, :, [scale]] * in_bin[:, None, :] / size
+    both = np.concatenate([scores, windows.errors[..., None] / size], axis=-1)
+    names = np.unique(windows.drive)
+    sums = []
     for name in names:
         rows = np.flatnonzero(windows.drive == name)
-        both, mean = np.concatenate([Z[rows], y[rows]], axis=-1).reshape(-1, BINS), own[rows].reshape(-1, X.shape[-1])
-        both = both - mean @ np.linalg.lstsq(mean, both, rcond=None)[0]
-        products = (both[:, :-1] * both[:, -1:]).reshape(len(rows), -1, BINS - 1).sum(axis=1)
-        parts = min(max(round(BLOCKS / len(names)), 1), len(rows))
-        scores += [part.sum(axis=0) for part in np.array_split(products, parts)]
-    S, lost = np.array(scores), X.shape[-1] * len(names)
-    G, q = S.shape
-    scatter = np.atleast_2d(np.cov(S.T)) * y.size / max(y.size - lost, 1)
+        mean = own[rows].reshape(-1, own.shape[-1])
+        left = left_by(mean, both[rows].reshape(-1, BINS))
+        products = left[:, :-1] * left[:, -1:]
+        by_window = products.reshape(len(rows), -1, BINS - 1).sum(axis=1)
+        blocks = min(max(round(BLOCKS / len(names)), 1), len(rows))
+        sums += [block.sum(axis=0) for block in np.array_split(by_window, blocks)]
+    numbers = windows.errors.size
+    spent = X.shape[-1] * len(names)
+    return _hotelling(np.array(sums), numbers / max(numbers - spent, 1))
+
+
+def _hotelling(sums: Array, inflation: float) -> float:
+    """p-value of G vectors (G, q) whose mean is 0, and whose scatter is ``inflation`` times that seen."""
+    G, q = sums.shape
+    scatter = np.atleast_2d(np.cov(sums.T)) * inflation
     size = np.sqrt(np.diag(scatter))
     if q >= G or not (size > 0).all():
         return 1.0
-    t = S.mean(axis=0) / size
-    T2 = G * float(t @ np.linalg.pinv(scatter / np.outer(size, size), rcond=1e-9) @ t)
-    return float(stats.f.sf(T2 * (G - q) / (q * (G - 1)), q, G - q))
+    t = sums.mean(axis=0) / size
+    correlation = scatter / np.outer(size, size)
+    squared = G * float(t @ np.linalg.pinv(correlation, rcond=1e-9) @ t)
+    ratio = squared * (G - q) / (q * (G - 1))
+    return float(stats.f.sf(ratio, q, G - q))
 
 
-def _by_bin(windows: DriveWindows, bins: Indices, scale: int) -> tuple[Array, Array]:
+def values_by_bin(windows: DriveWindows, bins: Indices, scale: int) -> tuple[Array, Array]:
     """What a scale is more in each bin, (BINS,), and mean errors (W, n) by its differences; 0 where nothing tells."""
-    X = error_derivatives(windows.pieces)
-    Z = X[:, :, [scale]] * (bins[:, None] == np.arange(BINS))[:, None, :]
+    X = jacobian_of_mean(windows.pieces)
+    in_bin = bins[:, None] == np.arange(BINS)
+    Z = X[:, :, [scale]] * in_bin[:, None, :]
     squares = (Z**2).sum(axis=(0, 1))
     Z = Z * (squares > UNTOLD * squares.sum())
-    y, design = _weighted(windows, np.concatenate([Z, np.delete(X, scale, axis=-1)], axis=-1))
-    values = np.linalg.lstsq(design.reshape(y.size, -1), y.ravel(), rcond=None)[0][:BINS]
+    size = _size_of_errors(windows)
+    design = np.concatenate([Z, np.delete(X, scale, axis=-1)], axis=-1) / size
+    y = (windows.errors[..., None] / size).ravel()
+    values = np.linalg.lstsq(design.reshape(len(y), -1), y, rcond=None)[0]
+    values = values[:BINS]
     return values, Z @ (values - squares @ values / squares.sum())
 
 
-def _weighted(windows: DriveWindows, *designs: Array) -> list[Array]:
-    """Errors (W, n, 1) and their derivatives (W, n, p), in units of the root mean square of each axis."""
-    error = windows.errors[..., None]
-    return [each / np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-150) for each in (error, *designs)]
+def _size_of_errors(windows: DriveWindows) -> Array:
+    """Root mean square of each axis, (n, 1)."""
+    return np.maximum(np.sqrt(mean_square(windows.errors)), 1e-150)[:, None]
 
 
-def _size(pieces: Array, by: str) -> Array:
-    """Sum of the angles of the pieces of each window, rad, or of their ways, m: (W,)."""
-    each = np.linalg.norm(rotation_vectors(pieces), axis=-1) if by == "turn" else ways(pieces)
-    return np.asarray(each.sum(axis=1))
+def held_out_gain(windows: DriveWindows, blocks: Sequence[Indices]) -> float:
+    """Share of the squared error of positions that a slip takes out of the blocks that chose nothing of it."""
+    before = after = 0.0
+    for block in blocks:
+        judged = windows.of(block)
+        rest = windows.of(np.setdiff1d(np.arange(len(windows.drive)), block))
+        before += _squares_left(rest, judged, 0.0)
+        after += _squares_left(rest, judged, fit_slip(rest))
+    return 1.0 - after / before if before > 0 else 0.0
+
+
+def _squares_left(fitted: DriveWindows, judged: DriveWindows, slip: float) -> float:
+    """Sum of squared errors of positions, with a slip and the mean that is fitted to others beside it."""
+    mean = fit_mean(fitted.lengthened(slip))
+    error = mean.applied(judged.lengthened(slip)).errors
+    return float((error[:, : judged.d] ** 2).sum())

@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.geometry.groups import inverse, log
+from consistency.referee.geometry.groups import inverse, log, matrices
 from consistency.referee.readers.windows import Relative, relative_of, windows
 from consistency.referee.types import Array, Indices
 
 PIECES = 20  # of a window: sums over them are independent of the rate of the file, and as good as integrals
 STILL = 0.1  # of the span: a window with less motion says nothing about the span
-JUMP = (12.0, 3.0)  # medians of the errors of its drive's pieces, and windows, that a piece exceeds in a jump
+JUMP_OF_PIECES = 12.0  # medians of the errors of its drive's pieces that a piece exceeds in a jump
+JUMP_OF_WINDOWS = 3.0  # medians of the errors of its drive's windows that it exceeds, too
+ROUNDED = 1e-4  # rad, of rotation errors that neither jump nor grow: a file with four digits has them
 BLOCKS = 20  # of windows, where drives are too few for the jackknife
 ENOUGH = 5  # drives for which they are the blocks
-ROUNDED = 1e-4  # rad, of rotation errors that neither jump nor grow: a file with four digits has them
 PLANE, SPACE = ("x", "y", "yaw"), ("x", "y", "z", "roll", "pitch", "yaw")
+ROWS = ("drive", "first", "last", "pieces", "true", "true_pieces")  # what there is of each window
 
 
 @dataclass(frozen=True)
 class DriveWindows:
     """W windows of some drives, in P pieces of estimated motion each; a piece that is the identity is none."""
 
+    drives: tuple[Drive, ...] = field(repr=False)
     span: Relative
+    is_planar: bool  # x, y and yaw alone, also of motions in space
     drive: Indices  # (W,), index of the drive
     first: Indices  # (W,), rows of the drive
     last: Indices  # (W,)
@@ -58,12 +63,34 @@ class DriveWindows:
         return log(inverse(self.motions) @ self.true)
 
     @property
-    def cut(self) -> float:
-        return self.jumps / max(len(self.drive) + self.jumps, 1)
+    def counts(self) -> dict[str, int]:
+        """Windows, and those left out."""
+        return {"windows": len(self.drive), "long": self.long, "still": self.still, "jumps": self.jumps}
+
+    @property
+    def follows(self) -> Array:
+        """Whether each window but the first begins where the one before ends, (W - 1,)."""
+        same_drive = self.drive[1:] == self.drive[:-1]
+        return same_drive & (self.first[1:] == self.last[:-1])
 
     def of(self, keep: Indices | Array) -> DriveWindows:
-        names = ("drive", "first", "last", "pieces", "true", "true_pieces")
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+        """Some of the windows, by index or mask."""
+        return replace(self, **{name: getattr(self, name)[keep] for name in ROWS})
+
+    def lengthened(self, slip: float) -> DriveWindows:
+        """The same windows with a longer estimated way in each piece that turns."""
+        return replace(self, pieces=lengthened(self.pieces, slip))
+
+    def over(self, size: float) -> DriveWindows | None:
+        """Windows of all drives over a span of another size, in pieces of the same size; None where none fits.
+
+        Turns of another size would hold another share of the noise.
+        """
+        pieces = max(round(PIECES * size / self.span.size), 1)
+        try:
+            return cut_windows(self.drives, replace(self.span, size=size), self.is_planar, pieces)
+        except InputError:
+            return None
 
 
 def span_of(text: str | float) -> Relative:
@@ -83,8 +110,13 @@ def span_of(text: str | float) -> Relative:
     return replace(span, flag="--span")
 
 
-def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> DriveWindows:
-    """The windows of all drives; drives in which none fits have none.
+def cut_windows(
+    drives: Sequence[Drive],
+    span: Relative,
+    planar: bool = False,
+    pieces: int = PIECES,
+) -> DriveWindows:
+    """Cut all drives into windows; drives in which none fits have none.
 
     Parameters
     ----------
@@ -96,67 +128,107 @@ def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, p
     InputError
         No window fits in any drive.
     """
-    parts, long, refused = [], 0, None
-    for number, drive in enumerate(drives):
+    parts: list[DriveWindows] = []
+    refused: InputError | None = None
+    for number in range(len(drives)):
         try:
-            position = drive.truth[:, : drive.d, drive.d]
-            rows = drive.row if span.unit == "step" else np.arange(len(position))
-            first, last, skipped = windows(drive.t, position, rows, span, drive.name)
+            parts.append(_cut_drive(tuple(drives), number, span, planar, pieces))
         except InputError as error:
             refused = error
-            continue
-        long += skipped
-        first, last = np.searchsorted(rows, first), np.searchsorted(rows, last)
-        parts.append(_pieces(number, drive, first, last, planar, pieces))
     if not parts:
         assert refused is not None
         raise refused
-    index, first, last, motions, true, true_pieces, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
-    found = DriveWindows(span, index, first, last, motions, true, true_pieces, long)
-    moved, jumped = _moves(found), _jumps(errors, found)
-    found = replace(found, still=int((~moved).sum()), jumps=int((moved & jumped).sum()))
-    if not (moved & ~jumped).any():
+    rows: dict[str, Any] = {}
+    for name in ROWS:
+        rows[name] = np.concatenate([getattr(part, name) for part in parts])
+    found = replace(parts[0], **rows, long=sum(part.long for part in parts))
+    moves = _moves(found)
+    jumps = _jumps(found)
+    sound = moves & ~jumps
+    if not sound.any():
         raise InputError(f"--span {span.option}: no window of {drives[0].name} has motion without a jump; take another")
-    return found.of(moved & ~jumped)
+    still = int((~moves).sum())
+    return replace(found, still=still, jumps=int((moves & jumps).sum())).of(sound)
 
 
-def windows_at(drives: Sequence[Drive], windows: DriveWindows, size: float, planar: bool) -> DriveWindows | None:
-    """The windows of all drives over a span of another size, in pieces of the same size; None where none fits.
-
-    Turns of another size would hold another share of the noise.
-    """
-    pieces = max(round(PIECES * size / windows.span.size), 1)
-    try:
-        return cut_windows(drives, replace(windows.span, size=size), planar, pieces)
-    except InputError:
-        return None
-
-
-def _pieces(
-    number: int, drive: Drive, first: Indices, last: Indices, planar: bool, pieces: int
-) -> tuple[Indices, Indices, Indices, Array, Array, Array, Array]:
-    """Windows of one drive: index, rows, pieces (W, P, ...), true motions and pieces, errors of pieces (W, P, n)."""
-    share = np.linspace(0.0, 1.0, pieces + 1)
-    ends = np.rint(first[:, None] + share * (last - first)[:, None]).astype(np.int64)
-    T, true = drive.estimate, drive.truth
-    D, M = (inverse(each[ends[:, :-1]]) @ each[ends[:, 1:]] for each in (T, true))
-    whole = inverse(true[first]) @ true[last]
+def _cut_drive(
+    drives: tuple[Drive, ...],
+    number: int,
+    span: Relative,
+    planar: bool,
+    pieces: int,
+) -> DriveWindows:
+    drive = drives[number]
+    position = drive.truth[:, :-1, -1]
+    rows = drive.row if span.unit == "step" else np.arange(len(position))
+    first, last, left_out = windows(drive.t, position, rows, span, drive.name)
+    first = np.searchsorted(rows, first)
+    last = np.searchsorted(rows, last)
+    ends = _ends(first, last, pieces)
+    estimated = motions_between(drive.estimate, ends[:, :-1], ends[:, 1:])
+    true_pieces = motions_between(drive.truth, ends[:, :-1], ends[:, 1:])
+    true = motions_between(drive.truth, first, last)
     if planar and drive.d == 3:
-        D, M, whole = (in_plane(each) for each in (D, M, whole))
-    error = log((inverse(D) @ M).reshape(-1, *D.shape[-2:])).reshape(*D.shape[:2], -1)
-    error[ends[:, 1:] == ends[:, :-1]] = np.nan
-    return np.full(len(first), number), first, last, D, whole, M, error
+        estimated = in_plane(estimated)
+        true_pieces = in_plane(true_pieces)
+        true = in_plane(true)
+    index = np.full(len(first), number)
+    return DriveWindows(drives, span, planar, index, first, last, estimated, true, true_pieces, left_out)
+
+
+def _ends(first: Indices, last: Indices, pieces: int) -> Indices:
+    """Rows at which the pieces of windows begin and end, (W, pieces + 1)."""
+    shares = np.linspace(0.0, 1.0, pieces + 1)
+    return np.rint(first[:, None] + shares * (last - first)[:, None]).astype(np.int64)
+
+
+def _moves(of: DriveWindows) -> Array:
+    """Which windows have motion, (W,): on the way, for a span in m; in way or turn, compared with others, otherwise."""
+    way = ways(of.pieces).sum(axis=1)
+    if of.span.unit == "m":
+        return np.asarray(way >= STILL * of.span.size)
+    angle = angles(of.pieces).sum(axis=1)
+    return np.asarray((way > STILL * np.median(way)) | (angle > STILL * np.median(angle)))
+
+
+def _jumps(of: DriveWindows) -> Array:
+    """Which windows have a piece whose error, of position or rotation, is a jump in its drive, (W,)."""
+    W, P = of.pieces.shape[:2]
+    gaps = inverse(of.pieces) @ of.true_pieces
+    flat = gaps.reshape(W * P, of.d + 1, of.d + 1)
+    errors = log(flat).reshape(W, P, -1)
+    ends = _ends(of.first, of.last, P)
+    errors[ends[:, 1:] == ends[:, :-1]] = np.nan  # a piece without a row
+    positions = slice(0, of.d), 0.0
+    rotations = slice(of.d, None), ROUNDED
+    found = np.zeros(W, bool)
+    for part, least in (positions, rotations):
+        of_pieces = norms(errors[..., part])
+        of_windows = norms(of.errors[:, part])
+        for drive in np.unique(of.drive):
+            rows = of.drive == drive
+            by_pieces = JUMP_OF_PIECES * float(np.nanmedian(of_pieces[rows]))
+            by_windows = JUMP_OF_WINDOWS * float(np.median(of_windows[rows]))
+            limit = max(by_pieces, by_windows, least)
+            exceeds = np.nan_to_num(of_pieces[rows]) > limit
+            found[rows] |= exceeds.any(axis=1) & (limit > 0)
+    return found
+
+
+# --- motions in pieces ------------------------------------------------------------------------------------------------
+
+
+def motions_between(T: Array, first: Indices, last: Indices) -> Array:
+    """Motions between rows of poses (N, d + 1, d + 1), in the frame of the first."""
+    return inverse(T[first]) @ T[last]
 
 
 def in_plane(T: Array) -> Array:
     """Motions in space (..., 4, 4) as x, y and yaw, (..., 3, 3); yaw is the direction of the x axis."""
-    out = np.zeros((*T.shape[:-2], 3, 3))
     yaw = np.arctan2(T[..., 1, 0], T[..., 0, 0])
-    out[..., 0, 0] = out[..., 1, 1] = np.cos(yaw)
-    out[..., 1, 0] = np.sin(yaw)
-    out[..., 0, 1] = -out[..., 1, 0]
-    out[..., :2, 2], out[..., 2, 2] = T[..., :2, 3], 1.0
-    return out
+    poses = np.concatenate([T[..., :2, 3], yaw[..., None]], axis=-1)
+    flat = matrices(poses.reshape(-1, 3))
+    return flat.reshape(*yaw.shape, 3, 3)
 
 
 def rests(pieces: Array) -> Array:
@@ -171,47 +243,63 @@ def rests(pieces: Array) -> Array:
 
 def ways(pieces: Array) -> Array:
     """Length of each piece, (W, P), m."""
-    d = pieces.shape[-1] - 1
-    return np.asarray(np.linalg.norm(pieces[..., :d, d], axis=-1))
+    return norms(pieces[..., :-1, -1])
 
 
 def rotation_vectors(pieces: Array) -> Array:
     """Rotation vectors (W, P, 3), or (W, P, 1) in the plane, rad."""
     if pieces.shape[-1] == 3:
         return np.arctan2(pieces[..., 1, 0], pieces[..., 0, 0])[..., None]
-    flat = pieces[..., :3, :3].reshape(-1, 3, 3)
-    vectors = Rotation.from_matrix(flat).as_rotvec() if len(flat) else np.empty((0, 3))
-    return np.asarray(vectors.reshape(*pieces.shape[:2], 3))
+    shape = (*pieces.shape[:2], 3)
+    if pieces.size == 0:
+        return np.empty(shape)
+    turns = Rotation.from_matrix(pieces[..., :3, :3].reshape(-1, 3, 3))
+    return np.asarray(turns.as_rotvec().reshape(shape))
+
+
+def angles(pieces: Array) -> Array:
+    """Angle by which each piece turns, (W, P), rad, at least 0."""
+    return norms(rotation_vectors(pieces))
+
+
+def rotated(pieces: Array, vectors: Array) -> Array:
+    """Pieces with other rotations, of rotation vectors (W, P, 3) or (W, P, 1)."""
+    out = np.array(pieces)
+    if pieces.shape[-1] == 3:
+        out[..., 0, 0] = out[..., 1, 1] = np.cos(vectors[..., 0])
+        out[..., 1, 0] = np.sin(vectors[..., 0])
+        out[..., 0, 1] = -out[..., 1, 0]
+    elif pieces.size:
+        turns = Rotation.from_rotvec(vectors.reshape(-1, 3))
+        out[..., :3, :3] = turns.as_matrix().reshape(*pieces.shape[:2], 3, 3)
+    return out
+
+
+def turn_per_way(pieces: Array) -> Array:
+    """Angle over length of each piece, (W, P), rad/m; 0 where a piece turns without a way."""
+    way = ways(pieces)
+    return angles(pieces) / np.where(way > 0, way, np.inf)
 
 
 def lengthened(pieces: Array, slip: float) -> Array:
     """Motions whose way is longer by ``slip`` for each radian of their turn; none goes backwards by this."""
-    out, d, way = np.array(pieces), pieces.shape[-1] - 1, ways(pieces)
-    turn = np.linalg.norm(rotation_vectors(pieces), axis=-1)
-    out[..., :d, d] *= np.maximum(1.0 + slip * turn / np.where(way > 0, way, np.inf), 0.0)[..., None]
+    out = np.array(pieces)
+    factor = np.maximum(1.0 + slip * turn_per_way(pieces), 0.0)
+    out[..., :-1, -1] *= factor[..., None]
     return out
 
 
-def _moves(of: DriveWindows) -> Array:
-    """Which windows have motion, (W,): on the way, for a span in m; in way or turn, compared with others, otherwise."""
-    way = ways(of.pieces).sum(axis=1)
-    if of.span.unit == "m":
-        return np.asarray(way >= STILL * of.span.size)
-    turn = np.linalg.norm(rotation_vectors(of.pieces), axis=-1).sum(axis=1)
-    return np.asarray((way > STILL * np.median(way)) | (turn > STILL * np.median(turn)))
+# --- numbers of windows -----------------------------------------------------------------------------------------------
 
 
-def _jumps(errors: Array, of: DriveWindows) -> Array:
-    """Which windows have a piece whose error (W, P, n), of position or rotation, is a jump in its drive, (W,)."""
-    out, whole = np.zeros(len(errors), bool), of.errors
-    for part, least in ((slice(0, of.d), 0.0), (slice(of.d, None), ROUNDED)):
-        pieces, windows = (np.linalg.norm(each[..., part], axis=-1) for each in (errors, whole))
-        for drive in np.unique(of.drive):
-            rows = of.drive == drive
-            medians = float(np.nanmedian(pieces[rows])), float(np.median(windows[rows]))
-            limit = max(JUMP[0] * medians[0], JUMP[1] * medians[1], least)
-            out[rows] |= (np.nan_to_num(pieces[rows]) > limit).any(axis=1) & (limit > 0)
-    return out
+def norms(vectors: Array) -> Array:
+    """Lengths of vectors (..., n)."""
+    return np.asarray(np.linalg.norm(vectors, axis=-1))
+
+
+def mean_square(errors: Array) -> Array:
+    """Mean square of each axis, (W, ...) -> (...)."""
+    return np.asarray((errors**2).mean(axis=0))
 
 
 def blocks_of(drive: Indices, enough: int = ENOUGH) -> list[Indices]:
@@ -219,4 +307,4 @@ def blocks_of(drive: Indices, enough: int = ENOUGH) -> list[Indices]:
     names = np.unique(drive)
     if len(names) >= enough:
         return [np.flatnonzero(drive == name) for name in names]
-    return [part for part in np.array_split(np.arange(len(drive)), min(BLOCKS, len(drive))) if len(part)]
+    return np.array_split(np.arange(len(drive)), min(BLOCKS, len(drive)))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import linalg, stats
 
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.verdict.parts import Interval
@@ -17,28 +18,28 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import (
     DECIDE,
     HALF,
+    IN_TURN,
     Fold,
     JudgedSpan,
     Ratio,
+    are_halves,
     folds_of,
     judged_by,
 )
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.mean_by_motion import ByMotion, mean_by_motion
-from consistency.referee.fit_covariance.motion_windows import (
-    ENOUGH,
-    PIECES,
-    DriveWindows,
-    cut_windows,
-    span_of,
-    windows_at,
-)
+from consistency.referee.fit_covariance.mean_by_motion import MotionDependence, mean_by_motion
+from consistency.referee.fit_covariance.motion_windows import ENOUGH, PIECES, DriveWindows, cut_windows, span_of
 from consistency.referee.fit_covariance.motions import record_of_motions, stretches_of
-from consistency.referee.fit_covariance.persistence import Lasting, Second, doubts, errors_of_second, persistent
+from consistency.referee.fit_covariance.persistence import (
+    PersistentError,
+    SecondErrors,
+    doubts,
+    errors_of_second,
+    persistent_errors,
+)
 from consistency.referee.fit_covariance.refusals import RotationGrowth, require_poses, require_sound, rotation_growth
-from consistency.referee.fit_covariance.slip import BY_TURN
-from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, jitter_of, variance_intervals
-from consistency.referee.geometry.groups import matrices
+from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, intervals, jitter_of
+from consistency.referee.geometry.groups import log, matrices
 from consistency.referee.readers.relative_motions import Stretch
 from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import analyse
@@ -62,16 +63,22 @@ class NoiseModel:
     fitted_drives: tuple[str, ...]
     judged_drives: tuple[str, ...]
     held_out: str  # "in turn", "half" or names
-    counts: Mapping[str, int]  # windows, and those left out: long, still, jumps
     growth: RotationGrowth  # of the squared rotation error over the span
     warnings: tuple[str, ...]
-    lasting: tuple[Lasting, ...]  # errors that differ between drives
-    by_motion: ByMotion | None  # whether the mean depends on the motion; None where it is left in
-    second: Second | None  # errors of the second estimator
-    drives: tuple[Drive, ...] = field(repr=False)
+    lasting: tuple[PersistentError, ...]  # errors that differ between drives
+    by_motion: MotionDependence | None  # whether the mean depends on the motion; None where it is left in
+    second: SecondErrors | None  # errors of the second estimator
     windows: DriveWindows = field(repr=False)
     folds: tuple[Fold, ...] = field(repr=False)
-    is_planar: bool
+
+    @property
+    def drives(self) -> tuple[Drive, ...]:
+        return self.windows.drives
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Windows, and those left out: long, still, jumps."""
+        return self.windows.counts
 
     @property
     def ratio(self) -> Ratio:
@@ -86,9 +93,9 @@ class NoiseModel:
         return decided(self.spans[0].status, doubted, self.by_motion is not None and self.by_motion.is_found)
 
     @property
-    def stretches(self) -> list[tuple[str, Stretch]]:
+    def stretches(self) -> list[Stretch]:
         """Judged motions as files have them."""
-        return stretches_of(self.drives, self.windows, self.folds)
+        return stretches_of(self.windows, self.folds)
 
     def correct(self, motions: ArrayLike) -> Array:
         """Estimated motions (K, 3) or (K, 7) with the mean error taken out, as matrices (K, d + 1, d + 1)."""
@@ -118,12 +125,12 @@ class NoiseModel:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        from consistency.referee.fit_covariance.page import plot_noise
+        from consistency.referee.fit_covariance.page import plot_noise  # draws
 
         return plot_noise(self, path)
 
     def __repr__(self) -> str:
-        from consistency.referee.fit_covariance.model_text import sentence
+        from consistency.referee.fit_covariance.model_text import sentence  # of this class
 
         return f"<NoiseModel {self.name}: {sentence(self)}>"
 
@@ -173,43 +180,53 @@ def fit_covariance(
     InputError
         An option is out of its range, or the errors are none that white noise describes: says which, and what to do.
     """
-    drives, over = list(records), span_of(span)
+    drives = list(records)
     planar = _is_planar(drives, axes)
     if cautious is not None and not 0.5 < cautious < 1.0:
         raise InputError(f"--cautious {cautious:g}: must be a probability between 0.5 and 1, such as 0.9")
     if by_turn and not correct:
         raise InputError("--by-turn is a correction; leave --no-correct out")
+    length = span_of(span)
     require_poses(drives)
-    windows = cut_windows(drives, over, planar)
-    require_sound(drives, windows, planar, correct)
-    correction = BY_TURN if by_turn else correct
-    jitter = jitter_of(fit_noise(windows, correction), drives, windows, planar)
-    noise, folds = folds_of(drives, windows, held_out, correction, jitter)
-    growth, lasting = rotation_growth(drives, windows, planar, noise.mean), persistent(noise, windows)
-    is_half = held_out == HALF or (held_out is None and len(drives) == 1)
+    windows = cut_windows(drives, length, planar)
+    require_sound(windows, correct)
+    jitter = jitter_of(fit_noise(windows, correct, by_turn), windows)
+    fit = partial(fit_noise, correct=correct, by_turn=by_turn, jitter=jitter)
+    noise, folds = folds_of(windows, held_out, fit)
+    growth = rotation_growth(windows, noise.mean)
+    lasting = persistent_errors(noise, windows)
+    by_halves = are_halves(windows, held_out)
     if cautious is not None:
-        factor = caution(judged_by(folds, windows, len(drives), not is_half).whole, cautious)
+        factor = caution(judged_by(folds, windows, not by_halves).whole, cautious)
         noise = replace(noise, factor=factor)
         folds = [replace(fold, noise=replace(fold.noise, factor=factor)) for fold in folds]
-    spans = _spans(folds, drives, windows, planar, not is_half)
-    record = record_of_motions(stretches_of(drives, windows, folds), windows.axes)
-    fitted = windows.of(~np.isin(windows.drive, folds[0].judged)) if held_out not in (None, HALF) else windows
-    per_m, per_rad = variance_intervals(noise, fitted)
-    judged = sorted({int(i) for fold in folds for i in fold.judged})
+    spans = _judge_spans(folds, windows, not by_halves)
+    record = record_of_motions(stretches_of(windows, folds), windows.axes)
+    judged = np.unique(np.concatenate([fold.judged for fold in folds]))
+    is_by_name = not (by_halves or held_out is None)
+    fitted = windows.of(~np.isin(windows.drive, judged)) if is_by_name else windows
+    n = len(windows.axes)
+    variances = intervals(noise, fitted)
     return NoiseModel(
-        name=name, span=over.option, noise=noise, per_m=per_m, per_rad=per_rad, spans=spans, record=record,
+        name=name,
+        span=length.option,
+        noise=noise,
+        per_m=variances[:n],
+        per_rad=variances[n:],
+        spans=spans,
+        record=record,
         verdict=replace(analyse([record])[record.name], record=record),
         fitted_drives=tuple(drives[i].name for i in np.unique(fitted.drive)),
         judged_drives=tuple(drives[i].name for i in judged),
-        held_out=HALF if is_half else held_out or "in turn",
-        counts={
-            "windows": len(windows.drive), "long": windows.long, "still": windows.still, "jumps": windows.jumps,
-        },
-        growth=growth, warnings=tuple(doubts(noise, windows, growth, lasting)), lasting=lasting,
+        held_out=HALF if by_halves else held_out or IN_TURN,
+        growth=growth,
+        warnings=tuple(doubts(noise, windows, growth, lasting)),
+        lasting=lasting,
         by_motion=mean_by_motion(noise, windows) if correct else None,
-        second=None if second is None else errors_of_second(noise, windows, drives, second),
-        drives=tuple(drives), windows=windows, folds=tuple(folds), is_planar=planar,
-    )  # fmt: skip
+        second=errors_of_second(noise, windows, second) if second is not None else None,
+        windows=windows,
+        folds=tuple(folds),
+    )
 
 
 def caution(ratio: Ratio, probability: float) -> float:
@@ -226,30 +243,21 @@ def caution(ratio: Ratio, probability: float) -> float:
         raise InputError(
             f"--cautious: {ratio.drives} judged drives do not tell how drives differ; it takes {ENOUGH} or more"
         )
-    reach = float(stats.t.ppf(probability, ratio.drives - 1)) * ratio.spread * np.sqrt(1.0 + 1.0 / ratio.drives)
+    error = ratio.spread * np.sqrt(1.0 + 1.0 / ratio.drives)  # of a new drive
+    reach = float(stats.t.ppf(probability, ratio.drives - 1)) * error
     return float(max(1.0, ratio.value * np.exp(reach)))
 
 
 def evenly(motion: Array, pieces: int) -> Array:
-    """A motion (d + 1, d + 1) as equal pieces of one screw, (pieces, d + 1, d + 1)."""
-    root = np.array(motion)[None]
+    """Divide a motion (d + 1, d + 1) into equal pieces of one screw, (pieces, d + 1, d + 1)."""
+    twist = log(motion[None])[0] / pieces
     d = motion.shape[-1] - 1
-    if d == 2:
-        angle = np.arctan2(motion[1, 0], motion[0, 0]) / pieces
-        root = matrices(np.array([[0.0, 0.0, angle]]))
-    else:
-        from scipy.spatial.transform import Rotation
-
-        vector = Rotation.from_matrix(motion[:3, :3]).as_rotvec() / pieces
-        root[0] = np.eye(4)
-        root[0, :3, :3] = Rotation.from_rotvec(vector).as_matrix()
-    # T = r^p with translation sum r^k t: solve for t
-    total, power = np.zeros((d, d)), np.eye(d)
-    for _ in range(pieces):
-        total += power
-        power = power @ root[0, :d, :d]
-    root[0, :d, d] = np.linalg.solve(total, motion[:d, d])
-    return np.repeat(root, pieces, axis=0)
+    x, y, z = twist[d:] if d == 3 else (0.0, 0.0, twist[d])
+    rotation = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    generator = np.zeros((d + 1, d + 1))
+    generator[:d, :d] = rotation[:d, :d]
+    generator[:d, d] = twist[:d]
+    return np.repeat(linalg.expm(generator)[None], pieces, axis=0)
 
 
 def _matrices(motion: ArrayLike, noise: WhiteNoise) -> Array:
@@ -273,15 +281,18 @@ def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
     return spaces == {2} or axes == 3
 
 
-def _spans(
-    folds: Sequence[Fold], drives: Sequence[Drive], windows: DriveWindows, planar: bool, general: bool
+def _judge_spans(
+    folds: Sequence[Fold],
+    windows: DriveWindows,
+    general: bool,
 ) -> tuple[JudgedSpan, ...]:
+    """Judge the fit at its span and at longer ones, as long as there are windows."""
     found = []
     for times in SPANS:
-        some = windows if times == 1 else windows_at(drives, windows, windows.span.size * times, planar)
+        some = windows if times == 1 else windows.over(windows.span.size * times)
         if some is None or sum(int(fold.judges(some).sum()) for fold in folds) < FEWEST:
             break
-        found.append(judged_by(folds, some, len(drives), general))
+        found.append(judged_by(folds, some, general))
     if not found:
         raise InputError(
             f"--span {windows.span.option}: fewer than {FEWEST} windows are left to judge; take a shorter span or "
@@ -291,6 +302,7 @@ def _spans(
 
 
 def error_windows(model: NoiseModel, judged: JudgedSpan) -> DriveWindows:
-    found = windows_at(model.drives, model.windows, span_of(judged.span).size, model.is_planar)
+    """The windows of a span, corrected."""
+    found = model.windows.over(span_of(judged.span).size)
     assert found is not None
     return model.noise.mean.applied(found)

@@ -11,26 +11,33 @@ from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.motion_windows import ENOUGH, DriveWindows, in_plane
+from consistency.referee.fit_covariance.motion_windows import (
+    ENOUGH,
+    DriveWindows,
+    in_plane,
+    mean_square,
+    motions_between,
+)
 from consistency.referee.fit_covariance.refusals import RotationGrowth
-from consistency.referee.fit_covariance.systematic_errors import error_derivatives
+from consistency.referee.fit_covariance.systematic_errors import FORWARD, jacobian_of_mean, normal_equations
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.readers.relative_motions import BENT
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 
 SURE = 0.01  # chance to name a term where there is none, all terms together
 MOST = 0.5  # share of an axis' variance over the span
 SHARED = 0.7  # correlation of two estimators' errors from which the truth's own are behind both
+FEWEST = 8  # windows that both estimators have
 TERMS = ("the scale of the way", "the scale of turns", "the drift of the heading with the way")
-UNITS = dict(zip(TERMS, ("", "", " rad/m"), strict=True))
+UNITS = {TERMS[0]: "", TERMS[1]: "", TERMS[2]: " rad/m"}
 
 
 @dataclass(frozen=True)
-class Lasting:
+class PersistentError:
     """An error that lasts for a whole drive, and differs between drives."""
 
-    term: str
+    term: str  # of TERMS
     sigma: float  # between drives
     share: float  # of the stated variance of an axis over the span, the largest
 
@@ -44,73 +51,91 @@ class Lasting:
         return self.term in TERMS[:2] or self.share >= MOST
 
 
-def doubts(noise: WhiteNoise, windows: DriveWindows, growth: RotationGrowth, lasting: Sequence[Lasting]) -> list[str]:
-    """Sentences on errors that outlast a window or (:func:`persistent`) a drive, and on angles beyond first order."""
+def doubts(
+    noise: WhiteNoise,
+    windows: DriveWindows,
+    growth: RotationGrowth,
+    persistent: Sequence[PersistentError],
+) -> list[str]:
+    """Sentences on errors that outlast a window or a drive, and on angles beyond first order."""
     found = []
     if growth.persists:
         found.append(
             f"the squared rotation error grows with the span to the power of {growth.power:.2g}, where white noise has "
             "1: errors last longer than a window, so that longer spans have more than this model says"
         )
-    now = noise.mean.applied(windows)
-    angles = np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2)[:, now.d :].max(axis=1)
-    if (sigma := float(np.sqrt(np.median(angles)))) > BENT:
+    variances = noise.variances(noise.mean.corrected(windows.pieces))
+    sigma = float(np.sqrt(np.median(variances[:, windows.d :].max(axis=1))))
+    if sigma > BENT:
         found.append(
             f"the sigma of a rotation over the span is {sigma:.2g} rad: beyond {BENT:g} a covariance to first order is "
             "doubtful, so take a shorter span"
         )
-    return found + [
-        f"{each.term} differs between drives (sigma {each.sigma:.2g}{UNITS[each.term]}): add a state for it to the "
-        "filter; it is not in the exported covariance"
-        for each in lasting
-    ]
+    for each in persistent:
+        found.append(
+            f"{each.term} differs between drives (sigma {each.sigma:.2g}{UNITS[each.term]}): add a state for it to the "
+            "filter; it is not in the exported covariance"
+        )
+    return found
 
 
-def persistent(noise: WhiteNoise, windows: DriveWindows) -> tuple[Lasting, ...]:
+def persistent_errors(noise: WhiteNoise, windows: DriveWindows) -> tuple[PersistentError, ...]:
     """Terms that differ between drives by more than white noise, from ``ENOUGH`` drives on.
 
-    Each drive has means of its own, by generalised least squares; their differences are compared with their errors by
-    Cochran's (1954) chi-square. Of several axes of the drift the first that differs is named.
+    Each drive has means of its own, by generalised least squares on the estimated motion; their differences are
+    compared with their errors by Cochran's (1954) chi-square. Where turns are measured with noise these means are too
+    small, by the same factor in drives that turn alike. Of several axes of the drift the first that differs is named.
     """
-    names = np.unique(windows.drive)
-    if len(names) < ENOUGH:
+    drives = np.unique(windows.drive)
+    if len(drives) < ENOUGH:
         return ()
-    found: dict[str, Lasting] = {}
-    now = noise.mean.applied(windows)
-    effect = (error_derivatives(now.pieces) ** 2).mean(axis=0)  # (n, p), of a term of 1 on the mean square of an axis
-    stated = np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0)
-    own = [_means(noise, now.of(windows.drive == name)) for name in names]
-    for term in range(own[0][0].shape[0]):
-        value, variance = (np.array([each[k][term] for each in own]) for k in (0, 1))
-        weight = np.where(np.isfinite(variance) & (variance > 0), 1.0 / np.where(variance > 0, variance, 1.0), 0.0)
-        if (weight > 0).sum() < ENOUGH:
-            continue
-        center = (weight * value).sum() / weight.sum()
-        statistic, dof = float((weight * (value - center) ** 2).sum()), int((weight > 0).sum()) - 1
-        if stats.chi2.sf(statistic, dof) > SURE / own[0][0].shape[0]:
-            continue
-        # DerSimonian & Laird (1986): variance between drives beyond that of the estimates
-        between = (statistic - dof) / (weight.sum() - (weight**2).sum() / weight.sum())
-        kind = TERMS[min(term, len(TERMS) - 1)]
-        found.setdefault(
-            kind, Lasting(kind, float(np.sqrt(between)), float((between * effect[:, term] / stated).max()))
-        )
+    corrected = noise.mean.applied(windows)
+    effects = mean_square(jacobian_of_mean(corrected.pieces))  # (n, p), of a term of 1 on squares of an axis
+    stated = noise.variances(corrected.pieces).mean(axis=0)
+    own = [_own_mean(noise, windows.of(windows.drive == drive)) for drive in drives]
+    values, variances = (np.array(each) for each in zip(*own, strict=True))  # (drives, p)
+    terms = values.shape[1]
+    found: dict[str, PersistentError] = {}
+    for term in range(terms):
+        variance = _between(values[:, term], variances[:, term], SURE / terms)
+        if variance > 0:
+            name = TERMS[min(term, len(TERMS) - 1)]
+            share = float((variance * effects[:, term] / stated).max())
+            found.setdefault(name, PersistentError(name, float(np.sqrt(variance)), share))
     return tuple(found.values())
 
 
-def _means(noise: WhiteNoise, windows: DriveWindows) -> tuple[Array, Array]:
+def _between(values: Array, variances: Array, chance: float) -> float:
+    """Variance between drives, beyond that of their values, (drives,); 0 where none is shown."""
+    known = np.isfinite(variances) & (variances > 0)
+    if known.sum() < ENOUGH:
+        return 0.0
+    value = values[known]
+    weight = 1.0 / variances[known]
+    center = (weight * value).sum() / weight.sum()
+    statistic = float((weight * (value - center) ** 2).sum())
+    dof = len(value) - 1
+    if stats.chi2.sf(statistic, dof) > chance:
+        return 0.0
+    # DerSimonian & Laird (1986)
+    return float((statistic - dof) / (weight.sum() - (weight**2).sum() / weight.sum()))
+
+
+def _own_mean(noise: WhiteNoise, windows: DriveWindows) -> tuple[Array, Array]:
     """Scale, turn and drift (p,) that a drive has beyond the mean of all, and their variances; infinite if unknown."""
-    C, X, e = noise.covariance(windows.pieces), error_derivatives(windows.pieces), windows.errors
-    solved = np.linalg.solve(C, np.concatenate([X, e[..., None]], axis=-1))
-    H = (np.swapaxes(X, 1, 2) @ solved[..., :-1]).sum(axis=0)
-    g = (np.swapaxes(X, 1, 2) @ solved[..., -1:]).sum(axis=0)[:, 0]
+    C = noise.covariance(noise.mean.corrected(windows.pieces))
+    equations = normal_equations(windows, noise.mean, C, [FORWARD])[FORWARD]
+    H, g = equations.A.sum(axis=0), equations.b.sum(axis=0)
     size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    scaled = np.linalg.pinv(H / np.outer(size, size), rcond=1e-6)
-    known = np.diag(H) > 1e-200
-    return scaled @ (g / size) / size, np.where(known, np.diag(scaled) / size**2, np.inf)
+    inverted = np.linalg.pinv(H / np.outer(size, size), rcond=1e-6)
+    variance = np.where(np.diag(H) > 1e-200, np.diag(inverted) / size**2, np.inf)
+    return inverted @ (g / size) / size, variance
 
 
-class Second(NamedTuple):
+# --- a second estimator -----------------------------------------------------------------------------------------------
+
+
+class SecondErrors(NamedTuple):
     """Errors of a second estimator over the same windows, for each of n axes."""
 
     correlation: Array  # (n,), with those of the first
@@ -127,47 +152,63 @@ class Second(NamedTuple):
         return np.asarray(self.size > 1.0 / SHARED)
 
 
-def errors_of_second(
-    noise: WhiteNoise, windows: DriveWindows, drives: Sequence[Drive], second: Sequence[Drive]
-) -> Second:
-    """Errors of another estimator beside the corrected ones.
+def errors_of_second(noise: WhiteNoise, windows: DriveWindows, second: Sequence[Drive]) -> SecondErrors:
+    """Compare the errors of another estimator with the corrected ones.
 
     Raises
     ------
     InputError
         The second one has other drives, or no window in common.
     """
-    named = {drive.name: drive for drive in second}
-    own, other = [], []
     corrected = noise.mean.applied(windows).errors
+    first, other = [], []
     for i in np.unique(windows.drive):
-        drive, rows = drives[i], np.flatnonzero(windows.drive == i)
-        twin = named.get(drive.name) or (second[0] if len(second) == len(drives) == 1 else None)
-        if twin is None:
-            raise InputError(f"--second: has no drive '{drive.name}'; it needs the same drives")
-        place = [_at(twin, drive, ends[rows]) for ends in (windows.first, windows.last)]
-        both = (place[0] >= 0) & (place[1] >= 0)
-        T = twin.estimate
-        D = inverse(T[place[0][both]]) @ T[place[1][both]]
-        true = windows.true[rows][both]
-        D = in_plane(D) if windows.d == 2 and twin.d == 3 else D
-        if D.shape[1:] != true.shape[1:]:
+        drive = windows.drives[i]
+        twin = _same_drive(drive, second, len(windows.drives))
+        rows = np.flatnonzero(windows.drive == i)
+        start = _rows_at(twin, drive, windows.first[rows])
+        end = _rows_at(twin, drive, windows.last[rows])
+        both = (start >= 0) & (end >= 0)
+        estimated = motions_between(twin.estimate, start[both], end[both])
+        if windows.d == 2 and twin.d == 3:
+            estimated = in_plane(estimated)
+        true = windows.true[rows[both]]
+        if estimated.shape[1:] != true.shape[1:]:
             raise InputError("--second: needs poses of the same kind, in the plane or in space")
-        error = log(inverse(D) @ true)
-        own.append(corrected[rows][both])
-        other.append(error - error.mean(axis=0) if len(error) else error)
-    a, b = np.concatenate(own), np.concatenate(other)
-    if len(a) < 8:
+        first.append(corrected[rows[both]])
+        other.append(_centered(log(inverse(estimated) @ true)))
+    a = np.concatenate(first)
+    b = np.concatenate(other)
+    if len(a) < FEWEST:
         raise InputError(f"--second: has {len(a)} windows in common; its times must be those of the estimates")
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    own_size, size = (np.maximum(np.sqrt((each**2).mean(axis=0)), 1e-300) for each in (a, b))
-    return Second((a * b).mean(axis=0) / (own_size * size), size / own_size)
+    a = _centered(a)
+    b = _centered(b)
+    size = np.maximum(np.sqrt(mean_square(a)), 1e-300)
+    size_of_second = np.maximum(np.sqrt(mean_square(b)), 1e-300)
+    correlation = (a * b).mean(axis=0) / (size * size_of_second)
+    return SecondErrors(correlation, size_of_second / size)
 
 
-def _at(twin: Drive, drive: Drive, rows: Array) -> Array:
+def _centered(error: Array) -> Array:
+    """Errors (W, n) less their mean."""
+    return error - error.mean(axis=0) if len(error) else error
+
+
+def _same_drive(drive: Drive, second: Sequence[Drive], drives: int) -> Drive:
+    """The second estimator's drive of this name; a single one needs no name."""
+    if len(second) == drives == 1:
+        return second[0]
+    for each in second:
+        if each.name == drive.name:
+            return each
+    raise InputError(f"--second: has no drive '{drive.name}'; it needs the same drives")
+
+
+def _rows_at(twin: Drive, drive: Drive, rows: Indices) -> Indices:
     """Rows of another drive at the times of some rows; -1 where it has none within half its own period."""
-    clock = np.isfinite(drive.t).all() and np.isfinite(twin.t).all()
-    own, other = (drive.t, twin.t) if clock else (drive.row.astype(float), twin.row.astype(float))
+    own, other = drive.t, twin.t
+    if not (np.isfinite(own).all() and np.isfinite(other).all()):
+        own, other = drive.row.astype(float), twin.row.astype(float)
     at = own[rows]
     near = np.clip(np.searchsorted(other, at), 1, len(other) - 1)
     near = near - (at - other[near - 1] < other[near] - at)

@@ -1,13 +1,13 @@
-"""The mean error of a window: a scale of the way, a scale of the turn, and a heading that drifts with the way."""
+"""The mean error of a window: scales of way and turn, a heading that drifts with the way, and a way that turns add."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
-from scipy.spatial.transform import Rotation
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.fit_covariance.motion_windows import (
@@ -15,8 +15,11 @@ from consistency.referee.fit_covariance.motion_windows import (
     DriveWindows,
     blocks_of,
     lengthened,
+    mean_square,
     rests,
+    rotated,
     rotation_vectors,
+    turn_per_way,
     ways,
 )
 from consistency.referee.geometry.groups import adjoint, inverse
@@ -30,6 +33,8 @@ GAP = 2  # pieces of a neighbouring window that are left out
 STRONG = 10.0  # first-stage F from which instruments are not weak (Staiger & Stock 1997, Econometrica 65)
 OPEN = 0.02  # between scales of turns that are fitted in both directions, from which it is said that they differ
 SURE = 3.0  # standard errors from which errors of neighbouring windows correlate: 0.3 % of right drives
+SLIP_ROUNDS = 4  # of slip and mean in turn
+APART = 1e-3  # of the squared effect of a slip that a mean must leave, so that both are told from each other
 
 
 @dataclass(frozen=True)
@@ -43,20 +48,15 @@ class Mean:
 
     @property
     def values(self) -> Array:
-        """Scale of the way, that of turns, and the drift, (p,)."""
+        """Coefficients: scale of the way, that of turns, and the drift, (p,)."""
         return np.array([self.way, self.turn, *self.drift])
 
     def corrected(self, pieces: Array) -> Array:
         """Motions (W, P, d + 1, d + 1) with this mean taken out."""
-        d, pieces = pieces.shape[-1] - 1, lengthened(pieces, self.slip)
-        way, out = ways(pieces), np.array(pieces)
-        angle = self.turn * rotation_vectors(pieces) + way[..., None] * np.asarray(self.drift)
-        out[..., :d, d] *= self.way
-        if d == 2:
-            c, s = np.cos(angle[..., 0]), np.sin(angle[..., 0])
-            out[..., :2, :2] = np.moveaxis(np.array([[c, -s], [s, c]]), (0, 1), (-2, -1))
-        else:
-            out[..., :3, :3] = Rotation.from_rotvec(angle.reshape(-1, 3)).as_matrix().reshape(*out.shape[:2], 3, 3)
+        pieces = lengthened(pieces, self.slip)
+        drifts = ways(pieces)[..., None] * np.asarray(self.drift)
+        out = rotated(pieces, self.turn * rotation_vectors(pieces) + drifts)
+        out[..., :-1, -1] *= self.way
         return out
 
     def applied(self, windows: DriveWindows) -> DriveWindows:
@@ -65,7 +65,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class MeanFit:
-    """A mean with its evidence: coefficients are the scale of the way, that of turns, and the drift, (p,)."""
+    """A mean with its evidence; p coefficients are the scale of the way, that of turns, and the drift."""
 
     mean: Mean  # of the coefficients whose interval does not hold none
     whole: Mean  # of all coefficients
@@ -83,52 +83,7 @@ class MeanFit:
         return self.instruments == FORWARD and bool(abs(self.turns[1] - self.turns[0]) > OPEN)
 
 
-def fit_mean(windows: DriveWindows, covariance: Array | None = None, start: Mean | None = None) -> Mean:
-    """Mean by generalised least squares.
-
-    Parameters
-    ----------
-    covariance : (W, n, n) of the errors; None weighs by their mean square
-    start : a mean that is nearly right
-    """
-    mean = none_of(windows) if start is None else start
-    for _ in range(ROUNDS if start is None else 1):
-        mean = _estimate(windows, mean, moments_of(windows, mean, covariance, FORWARD)[0])[0]
-    return mean
-
-
-def choose_mean(windows: DriveWindows, covariance: Array | None = None, start: Mean | None = None) -> MeanFit:
-    """The mean that holds whether the odometry's noise is in the estimated motion or in the true one.
-
-    Errors in variables (Fuller 1987, "Measurement Error Models"): least squares on the estimated motion is right where
-    that is what the vehicle was told to do, and too small where it was measured with noise; with the true motion as
-    instruments it is the other way round. The coefficient is between both (Frisch 1934). The motion of neighbouring
-    windows as instruments (Reiersol 1941) holds for either, if it predicts the motion, and errors of different windows
-    are independent; it is used where its intervals are the narrower ones.
-    """
-    near = fit_mean(windows, covariance) if start is None else start
-    kinds = (FORWARD, BACKWARD, NEIGHBOURS)
-    moments = dict(zip(kinds, moments_of(windows, near, covariance, *kinds), strict=True))
-    none = none_of(windows).values
-    free = np.ones(len(none), bool)
-    found = {each: _estimate(windows, near, moments[each], free) for each in kinds}
-    lows, highs = (np.array([found[each][k] for each in kinds]) for k in (1, 2))
-    strength, lasts = _strength(moments[NEIGHBOURS]), _lasts(found[NEIGHBOURS][0].applied(windows))
-    gain = np.log((highs[:2].max(axis=0) - lows[:2].min(axis=0)) / (highs[2] - lows[2]))[:SCALES].sum()
-    used = kinds[2:] if strength >= STRONG and not lasts and gain > 0 else kinds[:2]
-    whole, turns = found[used[0]][0], (found[FORWARD][0].turn, found[BACKWARD][0].turn)
-    low, high = none, none
-    while True:
-        means, least, most = zip(*(_estimate(windows, near, moments[each], free) for each in used), strict=True)
-        low, high = np.where(free, np.min(least, axis=0), low), np.where(free, np.max(most, axis=0), high)
-        inside = np.where(free, np.minimum(high - none, none - low), -1.0) / (high - low)
-        if not inside.max() >= 0:
-            break
-        free[np.argmax(inside)] = False  # one at a time, as the others change with it
-    return MeanFit(means[0], whole, low, high, free, used[0], turns, strength, lasts)
-
-
-class InstrumentMoments(NamedTuple):
+class NormalEquations(NamedTuple):
     """Z' C^-1 X (W, p, p) and Z' C^-1 e (W, p) of instruments, derivatives and errors; Z and X (W, n, p) whitened."""
 
     A: Array
@@ -137,122 +92,255 @@ class InstrumentMoments(NamedTuple):
     X: Array
 
 
-def moments_of(
-    windows: DriveWindows, mean: Mean, covariance: Array | None, *instruments: str
-) -> list[InstrumentMoments]:
-    """Moments with each kind of instruments, at a mean."""
-    now = mean.applied(windows)
-    error, design = now.errors, error_derivatives(now.pieces)
-    square = (error**2).mean(axis=0)
-    P = np.diag(np.maximum(square, 1e-12 * square.max() + 1e-100))[None] if covariance is None else covariance
-    whiten = np.linalg.inv(np.linalg.cholesky(P))
-    X, y, found = whiten @ design, whiten @ error[..., None], []
-    for each in instruments:
+class Estimate(NamedTuple):
+    """A mean with intervals (p,) of its coefficients."""
+
+    mean: Mean
+    low: Array
+    high: Array
+
+
+def no_mean(windows: DriveWindows) -> Mean:
+    """The mean that corrects nothing."""
+    return Mean(drift=(0.0,) * (len(windows.axes) - windows.d))
+
+
+def fit_mean(windows: DriveWindows, covariance: Array | None = None) -> Mean:
+    """Fit a mean by generalised least squares on the estimated motion.
+
+    Parameters
+    ----------
+    covariance : (W, n, n) of the errors; None weighs by their mean square
+    """
+    mean = no_mean(windows)
+    for _ in range(ROUNDS):
+        equations = normal_equations(windows, mean, covariance, [FORWARD])
+        mean = estimate(windows, mean, equations[FORWARD]).mean
+    return mean
+
+
+def choose_mean(
+    windows: DriveWindows,
+    covariance: Array | None = None,
+    start: Mean | None = None,
+) -> MeanFit:
+    """Fit the mean that holds whether the odometry's noise is in the estimated motion or in the true one.
+
+    Errors in variables (Fuller 1987, "Measurement Error Models"): least squares on the estimated motion is right where
+    that is what the vehicle was told to do, and too small where it was measured with noise; with the true motion as
+    instruments it is the other way round. The coefficient is between both (Frisch 1934). The motion of neighbouring
+    windows as instruments (Reiersol 1941) holds for either, if it predicts the motion, and errors of different windows
+    are independent; it is used where its intervals are the narrower ones.
+
+    Parameters
+    ----------
+    start : a mean that is nearly right
+    """
+    near = start or fit_mean(windows, covariance)
+    equations = normal_equations(windows, near, covariance, [FORWARD, BACKWARD, NEIGHBOURS])
+    forward, backward, neighbours = (estimate(windows, near, each) for each in equations.values())
+    strength = _strength(equations[NEIGHBOURS])
+    lasts = _lasts(neighbours.mean.applied(windows))
+    range_of_both = np.maximum(forward.high, backward.high) - np.minimum(forward.low, backward.low)
+    gain = np.log(range_of_both / (neighbours.high - neighbours.low))[:SCALES].sum()
+    are_instruments = strength >= STRONG and not lasts and gain > 0
+    used = [NEIGHBOURS] if are_instruments else [FORWARD, BACKWARD]
+    mean, low, high, free = _select(windows, near, [equations[each] for each in used])
+    whole = neighbours.mean if are_instruments else forward.mean
+    turns = forward.mean.turn, backward.mean.turn
+    return MeanFit(mean, whole, low, high, free, used[0], turns, strength, lasts)
+
+
+def _select(
+    windows: DriveWindows, near: Mean, equations: Sequence[NormalEquations]
+) -> tuple[Mean, Array, Array, Array]:
+    """Mean of the coefficients whose range, over all equations, excludes none; ranges, and which coefficients, (p,)."""
+    none = no_mean(windows).values
+    free = np.ones(len(none), bool)
+    low = high = none
+    while True:
+        found = [estimate(windows, near, each, free) for each in equations]
+        low = np.where(free, np.min([each.low for each in found], axis=0), low)
+        high = np.where(free, np.max([each.high for each in found], axis=0), high)
+        depth = np.minimum(high - none, none - low) / (high - low)  # of none in its range
+        depth[~free] = -1.0
+        if not depth.max() >= 0:
+            return found[0].mean, low, high, free
+        free = free & (np.arange(len(free)) != np.argmax(depth))  # one at a time, as the others change with it
+
+
+def normal_equations(
+    windows: DriveWindows,
+    mean: Mean,
+    covariance: Array | None,
+    instruments: Sequence[str],
+) -> dict[str, NormalEquations]:
+    """Equations of each kind of instruments, at a mean."""
+    corrected = mean.applied(windows)
+    error = corrected.errors
+    if covariance is None:
+        square = mean_square(error)
+        covariance = np.diag(np.maximum(square, 1e-12 * square.max() + 1e-100))[None]
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    X = whiten @ jacobian_of_mean(corrected.pieces)
+    y = whiten @ error[..., None]
+    found = {}
+    for kind in instruments:
         Z = X
-        if each == BACKWARD:
-            Z = whiten @ error_derivatives(windows.true_pieces)
-        elif each == NEIGHBOURS:
-            Z = whiten @ _of_neighbours(now)
+        if kind == BACKWARD:
+            Z = whiten @ jacobian_of_mean(windows.true_pieces)
+        elif kind == NEIGHBOURS:
+            Z = whiten @ _of_neighbours(corrected)
         back = np.swapaxes(Z, -1, -2)
-        found.append(InstrumentMoments(back @ X, (back @ y)[..., 0], Z, X))
+        found[kind] = NormalEquations(back @ X, (back @ y)[..., 0], Z, X)
     return found
 
 
-def _estimate(
-    windows: DriveWindows, near: Mean, moments: InstrumentMoments, free: Array | None = None
-) -> tuple[Mean, Array, Array]:
-    """The mean after a step of Gauss and Newton, and intervals (p,) from the scatter between blocks of what it leaves.
+def estimate(
+    windows: DriveWindows,
+    near: Mean,
+    equations: NormalEquations,
+    free: Array | None = None,
+) -> Estimate:
+    """The mean after a step of Gauss and Newton, with intervals from the scatter between blocks of what it leaves.
 
     Parameters
     ----------
     free : (p,) bool, coefficients that are fitted; the others are those of no mean
     """
-    free = np.ones(moments.b.shape[1], bool) if free is None else free
-    none, start, blocks = none_of(windows).values, near.values, blocks_of(windows.drive, BLOCKS)
+    none = no_mean(windows).values
+    start = near.values
+    if free is None:
+        free = np.ones(len(none), bool)
+    # a step is relative for scales, and of a drift in the corrected way; here those that lead to no mean
     step = np.append(none[:SCALES] / start[:SCALES] - 1.0, -start[SCALES:] / near.way)
     step[free] = 0.0
-    A, left = moments.A[:, free][:, :, free], moments.b[:, free] - moments.A[:, free] @ step
-    step[free] = _solved(A.sum(axis=0), left.sum(axis=0))
+    A = equations.A[:, free][:, :, free]
+    left = equations.b[:, free] - equations.A[:, free] @ step
+    step[free] = _solve(A.sum(axis=0), left.sum(axis=0))
     left = left - A @ step[free]
-    scatter = np.zeros((len(step), len(blocks)))
-    scatter[free] = _solved(A.sum(axis=0), np.stack([left[block].sum(axis=0) for block in blocks], axis=1))
+    blocks = blocks_of(windows.drive, BLOCKS)
     k = max(len(blocks), 2)
-    error = np.sqrt((scatter**2).sum(axis=1) * k / (k - 1))
-    reach = np.maximum(float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1)) * error, 1e-12)
+    sums = np.stack([left[block].sum(axis=0) for block in blocks], axis=1)
+    squares = np.zeros(len(step))
+    squares[free] = (_solve(A.sum(axis=0), sums) ** 2).sum(axis=1)
+    quantile = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1))
+    reach = np.maximum(quantile * np.sqrt(squares * k / (k - 1)), 1e-12)
+    scales = start[:SCALES] * (1 + step[:SCALES])
     drift = start[SCALES:] * (1 + step[1]) + step[SCALES:] * near.way
-    value = np.where(free, np.append(start[:SCALES] * (1 + step[:SCALES]), drift), none)
-    mean = Mean(float(value[0]), float(value[1]), tuple(value[SCALES:].tolist()))
-    return mean, value - reach, value + reach
+    value = np.where(free, np.append(scales, drift), none)
+    way, turn, *drifts = value.tolist()
+    mean = Mean(way, turn, tuple(drifts))
+    return Estimate(mean, value - reach, value + reach)
+
+
+def _solve(A: Array, b: Array) -> Array:
+    """x of A x = b, (p, p) and (p,) or (p, k); 0 in directions that are not determined."""
+    size = np.sqrt(np.maximum(np.abs(np.diag(A)), 1e-300))
+    scaled = A / np.outer(size, size)
+    x = np.linalg.lstsq(scaled, (b.T / size).T, rcond=WEAK**2)[0]
+    return np.asarray((x.T / size).T)
 
 
 def _of_neighbours(windows: DriveWindows) -> Array:
     """Derivatives of the windows before and after, (W, n, p), less what is next to this one: its ends may be shared."""
-    early, late = np.array(windows.pieces), np.array(windows.pieces)
+    early = np.array(windows.pieces)
+    late = np.array(windows.pieces)
     early[:, -GAP:] = late[:, :GAP] = np.eye(windows.d + 1)
-    return sum_of_neighbours(windows, error_derivatives(early), error_derivatives(late))
+    return sum_of_neighbours(windows, jacobian_of_mean(early), jacobian_of_mean(late))
 
 
 def sum_of_neighbours(windows: DriveWindows, before: Array, after: Array) -> Array:
     """Sum of a value of the window before and another of the one after, each (W, ...); 0 where there is none."""
-    second = np.flatnonzero((windows.first[1:] == windows.last[:-1]) & (np.diff(windows.drive) == 0)) + 1
+    second = np.flatnonzero(windows.follows) + 1
     out = np.zeros_like(before)
     out[second] += before[second - 1]
     out[second - 1] += after[second]
     return out
 
 
-def _solved(A: Array, b: Array) -> Array:
-    """x of A x = b, (p, p) and (p,) or (p, k); 0 in directions that are not determined."""
-    size: Array = np.sqrt(np.maximum(np.abs(np.diag(A)), 1e-300))
-    return np.asarray((np.linalg.lstsq(A / np.outer(size, size), (b.T / size).T, rcond=WEAK**2)[0].T / size).T)
-
-
-def _strength(moments: InstrumentMoments) -> float:
+def _strength(equations: NormalEquations) -> float:
     """First-stage F, the smallest of all coefficients: how well an instrument, beside the others, predicts the motion.
 
     Robust to unequal variances of windows (White 1980).
     """
-    found, (_, _, Z, X) = [], moments
-    for j in range(X.shape[-1]):
-        others = np.delete(Z, j, axis=-1).reshape(-1, Z.shape[-1] - 1)
-        x, z = (each[..., j].ravel() for each in (X, Z))
-        x, z = (each - others @ np.linalg.lstsq(others, each, rcond=WEAK)[0] for each in (x, z))
+    W, _, p = equations.X.shape
+    smallest = 1e100
+    for j in range(p):
+        others = np.delete(equations.Z, j, axis=-1).reshape(-1, p - 1)
+        x = left_by(others, equations.X[..., j].ravel(), WEAK)
+        z = left_by(others, equations.Z[..., j].ravel(), WEAK)
         slope = float(z @ x) / max(float(z @ z), 1e-300)
-        scatter = (z * (x - slope * z)).reshape(len(X), -1).sum(axis=1)
-        found.append(abs(z @ x) / max(np.sqrt((scatter**2).sum()), 1e-300))
-    return float(min(min(found), 1e100) ** 2)
+        scores = (z * (x - slope * z)).reshape(W, -1).sum(axis=1)
+        spread = max(float(np.linalg.norm(scores)), 1e-300)
+        smallest = min(smallest, abs(float(z @ x)) / spread)
+    return smallest**2
+
+
+def left_by(X: Array, y: Array, weak: float | None = None) -> Array:
+    """What least squares on X (N, p) leaves of y, (N,) or (N, k)."""
+    return np.asarray(y - X @ np.linalg.lstsq(X, y, rcond=weak)[0])
 
 
 def _lasts(corrected: DriveWindows) -> bool:
     """Whether rotation errors of windows one or two apart correlate positively; jitter of their ends does not."""
     error = corrected.errors[:, corrected.d :]
-    error = error / np.maximum(np.sqrt((error**2).mean(axis=0)), 1e-300)
-    found = []
+    error = error / np.maximum(np.sqrt(mean_square(error)), 1e-300)
     for lag in (1, 2):
-        pairs = corrected.drive[lag:] == corrected.drive[:-lag]
-        product = (error[lag:] * error[:-lag]).sum(axis=1)[pairs]
-        found.append(product.sum() > SURE * np.sqrt((product**2).sum()))
-    return any(found)
+        same_drive = corrected.drive[lag:] == corrected.drive[:-lag]
+        products = (error[lag:] * error[:-lag]).sum(axis=1)[same_drive]
+        if products.sum() > SURE * np.linalg.norm(products):
+            return True
+    return False
 
 
-def none_of(windows: DriveWindows) -> Mean:
-    """The mean that corrects nothing."""
-    return Mean(drift=(0.0,) * (1 if windows.d == 2 else 3))
+# --- a way by turn, where wheels slip ---------------------------------------------------------------------------------
 
 
-def error_derivatives(pieces: Array) -> Array:
-    """Derivative (W, n, 2 + 1) or (W, n, 2 + 3) of the errors by scale of the way, scale of the turn, and drift."""
-    W, P, m, _ = pieces.shape
-    d, n = m - 1, 3 if m == 3 else 6
-    A = carriers(pieces)[:, 1:]
-    way, turn = ways(pieces), rotation_vectors(pieces)
-    local = np.zeros((W, P, n, n - d + 2))
-    # at the end of its piece, a longer way is an error along R' t
-    R = pieces[..., :d, :d]
-    local[..., :d, 0] = (np.swapaxes(R, -1, -2) @ pieces[..., :d, d, None])[..., 0]
-    local[..., d:, 1] = turn
-    local[..., d:, 2:] = way[..., None, None] * np.eye(n - d)
-    return np.asarray(np.moveaxis(A, 1, 2).reshape(W, n, -1) @ local.reshape(W, P * n, -1))
+def fit_slip(windows: DriveWindows) -> float:
+    """Fit the way that a turn adds, m a rad, by least squares beside the mean.
+
+    It is 0 where it cannot be told from a scale of the way, or of turns.
+    """
+    slip = 0.0
+    for _ in range(SLIP_ROUNDS):
+        longer = windows.lengthened(slip)
+        mean = fit_mean(longer)
+        corrected = mean.applied(longer)
+        error = corrected.errors
+        size = np.maximum(np.sqrt(mean_square(error)), 1e-150)
+        derivatives = (jacobian(corrected.pieces) / size[:, None]).reshape(error.size, -1)
+        X, effect = derivatives[:, :-1], derivatives[:, -1]
+        y = (error / size).ravel()
+        left = left_by(X, effect)
+        if not left @ left > APART * effect @ effect:
+            return 0.0
+        slip += float(left @ left_by(X, y) / (left @ left)) / mean.way
+    return slip
+
+
+# --- derivatives of errors --------------------------------------------------------------------------------------------
+
+
+def jacobian(pieces: Array) -> Array:
+    """Derivative (W, n, p + 1) of the errors by the p coefficients of a mean, and by a slip."""
+    d = pieces.shape[-1] - 1
+    turns = rotation_vectors(pieces)
+    axes = turns.shape[-1]
+    local = np.zeros((*turns.shape[:2], d + axes, SCALES + axes + 1))
+    along = -inverse(pieces)[..., :-1, -1]  # R' t: at the end of its piece a longer way is an error along it
+    local[..., :d, 0] = along
+    local[..., d:, 1] = turns
+    local[..., d:, SCALES:-1] = ways(pieces)[..., None, None] * np.eye(axes)
+    local[..., :d, -1] = along * turn_per_way(pieces)[..., None]
+    W, P, n, p = local.shape
+    A = np.moveaxis(carriers(pieces)[:, 1:], 1, 2)
+    return np.asarray(A.reshape(W, n, P * n) @ local.reshape(W, P * n, p))
+
+
+def jacobian_of_mean(pieces: Array) -> Array:
+    """Derivative (W, n, p) of the errors by scale of the way, scale of turns, and drift."""
+    return jacobian(pieces)[..., :-1]
 
 
 def carriers(pieces: Array) -> Array:

@@ -14,31 +14,25 @@ from scipy import optimize, stats
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.motion_windows import (
-    DriveWindows,
-    blocks_of,
-    lengthened,
-    rotation_vectors,
-    ways,
-    windows_at,
-)
-from consistency.referee.fit_covariance.slip import BY_TURN, fit_slip
+from consistency.referee.fit_covariance.motion_windows import DriveWindows, angles, blocks_of, mean_square, norms, ways
 from consistency.referee.fit_covariance.systematic_errors import (
     NEIGHBOURS,
     Mean,
     MeanFit,
     carriers,
     choose_mean,
-    none_of,
+    fit_slip,
+    no_mean,
     sum_of_neighbours,
 )
 from consistency.referee.types import Array, Indices
 
 LEAST = 1e-4  # of the largest variance of positions, or of rotations, that every axis has: a hundredth of its sigma
-ROUNDS = 3  # of mean and noise in turn
+ROUNDS = 2  # of mean and noise in turn, before the mean is told from none
 SHOWN = 3.0  # standard errors from which there is jitter
 SHORTER = (8.0, 4.0, 2.0, 1.0)  # parts of the span, whose errors tell jitter of both ends from noise of the way
+LENGTHS = 3  # that tell it
+STEPS, CLOSE = 100, 1e-7  # of scoring; gain of the log likelihood of a window at which it ends
 
 
 @dataclass(frozen=True)
@@ -53,23 +47,40 @@ class WhiteNoise:
     factor: float = 1.0  # on all covariances, where caution asks for more than the fit
     mean_fit: MeanFit | None = None  # None where nothing is corrected
 
+    @property
+    def theta(self) -> Array:
+        """Variances a metre and a radian, (2 n,)."""
+        return np.concatenate([self.per_m, self.per_rad])
+
     def covariance(self, pieces: Array) -> Array:
         """Covariances (W, n, n) of Log(D^-1 M), of corrected motions in pieces (W, P, d + 1, d + 1)."""
-        theta = np.concatenate([self.per_m, self.per_rad])
-        return np.asarray(self.factor * (np.tensordot(theta, terms_of(pieces), (0, 1)) + np.diag(self.floor)))
+        return self.factor * sum_of_terms(self.theta, terms_of(pieces), self.floor)
+
+    def variances(self, pieces: Array) -> Array:
+        """Diagonals of the covariances, (W, n)."""
+        return np.diagonal(self.covariance(pieces), axis1=1, axis2=2)
 
     def nees(self, windows: DriveWindows) -> tuple[Array, Array]:
         """NEES over dof (W,), and of each axis alone (W, n), of windows whose motions are not corrected yet."""
         corrected = self.mean.applied(windows)
-        error, C = corrected.errors, self.covariance(corrected.pieces)
-        return nees_of(error, C) / error.shape[1], error**2 / np.diagonal(C, axis1=1, axis2=2)
+        error = corrected.errors
+        C = self.covariance(corrected.pieces)
+        own = np.diagonal(C, axis1=1, axis2=2)
+        return nees_of(error, C) / error.shape[1], error**2 / own
 
 
-def fit_noise(windows: DriveWindows, correct: bool | str = True, jitter: Array | float = 0.0) -> WhiteNoise:
-    """Mean and noise of windows, each given the other in turn; the mean is of BY_TURN, too, if this is ``correct``.
+def fit_noise(
+    windows: DriveWindows,
+    correct: bool = True,
+    by_turn: bool = False,
+    jitter: Array | float = 0.0,
+) -> WhiteNoise:
+    """Fit mean and noise of windows, each given the other in turn.
 
     Parameters
     ----------
+    correct : take the mean out first
+    by_turn : take out a way that each turn adds, too
     jitter : (n,), variance that both ends of a motion add, of :func:`jitter_of`
 
     Raises
@@ -77,45 +88,60 @@ def fit_noise(windows: DriveWindows, correct: bool | str = True, jitter: Array |
     InputError
         Estimate and truth are the same, or there are fewer windows than parameters.
     """
-    least = 2 * len(windows.axes)
-    if len(windows.drive) < least:
+    n = len(windows.axes)
+    if len(windows.drive) < 2 * n:
         raise InputError(
-            f"--span {windows.span.option}: {len(windows.drive)} windows are too few to fit {least} variances; take a "
+            f"--span {windows.span.option}: {len(windows.drive)} windows are too few to fit {2 * n} variances; take a "
             "shorter span or longer drives: 50 windows in 5 drives make a verdict possible"
         )
-    if correct == BY_TURN:
+    if by_turn:
         slip = fit_slip(windows)
-        noise = fit_noise(replace(windows, pieces=lengthened(windows.pieces, slip)), True, jitter)
+        noise = fit_noise(windows.lengthened(slip), jitter=jitter)
         return replace(noise, mean=replace(noise.mean, slip=slip))
-    found, theta = choose_mean(windows) if correct else None, None
-    mean = none_of(windows) if found is None else found.whole
-    for left in reversed(range(ROUNDS if correct else 1)):
-        now = mean.applied(windows)
-        error, F = now.errors, fitted_terms(now, found)
-        floor = np.maximum(least_of(error), jitter)
-        theta = fit_terms(error, F, floor, theta)
-        if left and found:
-            C = np.diag(floor) + np.tensordot(theta, F, (0, 1))
-            found = choose_mean(windows, C, mean)
-            mean = found.whole if left > 1 else found.mean
-    assert theta is not None
-    n = len(windows.axes)
-    return WhiteNoise(windows.axes, mean, theta[:n], theta[n:], floor, mean_fit=found)
+    fit, mean, theta = None, no_mean(windows), None
+    if correct:
+        fit = choose_mean(windows)
+        for _ in range(ROUNDS):
+            theta, floor, C = _fit_about(windows, fit.whole, fit, jitter, theta)
+            fit = choose_mean(windows, C, fit.whole)
+        mean = fit.mean
+    theta, floor, _ = _fit_about(windows, mean, fit, jitter, theta)
+    return WhiteNoise(windows.axes, mean, theta[:n], theta[n:], floor, mean_fit=fit)
 
 
-def fitted_terms(windows: DriveWindows, mean: MeanFit | None) -> Array:
+def _fit_about(
+    windows: DriveWindows,
+    mean: Mean,
+    fit: MeanFit | None,
+    jitter: Array | float,
+    start: Array | None,
+) -> tuple[Array, Array, Array]:
+    """Variances (2 n,), floor (n,) and covariances (W, n, n) of the errors about a mean."""
+    corrected = mean.applied(windows)
+    error = corrected.errors
+    F = fitted_terms(corrected, fit)
+    floor = np.maximum(least_of(error), jitter)
+    theta = fit_terms(error, F, floor, start)
+    return theta, floor, sum_of_terms(theta, F, floor)
+
+
+def fitted_terms(windows: DriveWindows, fit: MeanFit | None) -> Array:
     """Terms (W, 2 n, n, n) that variances are fitted to, of windows whose motions are corrected.
 
     Where turns are measured with noise, an error is large where its own noise makes |turn| large, so that the turns of
     neighbouring windows stand for them.
     """
-    F, n = terms_of(windows.pieces), len(windows.axes)
-    if mean is None or mean.instruments != NEIGHBOURS:
+    F = terms_of(windows.pieces)
+    n = len(windows.axes)
+    if fit is None or fit.instruments != NEIGHBOURS:
         return F
-    number = sum_of_neighbours(windows, *2 * [np.ones(len(F))])
-    other = sum_of_neighbours(windows, F[:, n:], F[:, n:])[number > 0] / number[number > 0, None, None, None]
-    F[:, n:] = other.mean(axis=0)
-    F[number > 0, n:] = other
+    one = np.ones(len(F))
+    number = sum_of_neighbours(windows, one, one)
+    known = number > 0
+    others = sum_of_neighbours(windows, F[:, n:], F[:, n:])[known]
+    others = others / number[known, None, None, None]
+    F[:, n:] = others.mean(axis=0)
+    F[known, n:] = others
     return F
 
 
@@ -127,73 +153,80 @@ def least_of(error: Array) -> Array:
     InputError
         All errors of one kind are nothing but rounding.
     """
-    d, square = (2 if error.shape[1] == 3 else 3), (error**2).mean(axis=0)
-    kinds = ((slice(0, d), "positions"), (slice(d, None), "rotations"))
-    out = np.empty(error.shape[1])
-    for part, what in kinds:
-        if not square[part].max() > 1e-20:
+    square = mean_square(error)
+    d = 2 if len(square) == 3 else 3
+    least = np.empty(len(square))
+    for what, part in (("positions", slice(d)), ("rotations", slice(d, None))):
+        largest = square[part].max()
+        if not largest > 1e-20:
             raise InputError(
                 f"estimate and truth have the same {what}; there is no error to fit: give those that the odometry "
                 "estimates itself"
             )
-        out[part] = LEAST * square[part].max()
-    return out
+        least[part] = LEAST * largest
+    return least
 
 
-def jitter_of(noise: WhiteNoise, drives: Sequence[Drive], windows: DriveWindows, planar: bool) -> Array:
+def jitter_of(noise: WhiteNoise, windows: DriveWindows) -> Array:
     """Variance that both ends of a motion add to its error, (n,), where shorter windows show it; 0 otherwise.
 
     The mean square error of windows of several lengths is what the noise says, times a factor, and a constant.
     """
-    squares, stated, counts = [], [], []
-    for part in SHORTER:
-        size = windows.span.size / part
-        if windows.span.unit == "step":
-            size = round(size) if size >= 1 else 0
-        some = windows_at(drives, windows, size, planar) if size else None
-        if some is None:
-            continue
-        now = noise.mean.applied(some)
-        squares.append((now.errors**2).mean(axis=0))
-        stated.append(np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0))
-        counts.append(len(some.drive))
-    if len(squares) < 3:
+    sizes = windows.span.size / np.array(SHORTER)
+    if windows.span.unit == "step":
+        sizes = np.round(sizes[sizes >= 1])
+    cut = [windows.over(size) for size in sizes.tolist()]
+    corrected = [noise.mean.applied(each) for each in cut if each is not None]
+    if len(corrected) < LENGTHS:
         return np.zeros(len(noise.axes))
-    return _constants(np.array(squares), np.array(stated), np.array(counts))
+    squares = np.array([mean_square(each.errors) for each in corrected])
+    stated = np.array([noise.variances(each.pieces).mean(axis=0) for each in corrected])
+    counts = np.array([len(each.drive) for each in corrected])
+    axes = zip(squares.T, stated.T, strict=True)
+    return np.array([constant_of(*axis, counts) for axis in axes])
 
 
-def _constants(squares: Array, stated: Array, counts: Array) -> Array:
-    """J >= 0 (n,) of squares (k, n) = factor stated + J, by weighted least squares; 0 where none is shown.
+def constant_of(squares: Array, stated: Array, counts: Array) -> float:
+    """J >= 0 of squares (k,) = factor * stated + J, by weighted least squares; 0 where none is shown.
 
     A mean square of W windows has a relative variance of 2 / W.
     """
-    out = np.zeros(squares.shape[1])
-    for axis, (q, c) in enumerate(zip(squares.T, stated.T, strict=True)):
-        weight = np.sqrt(counts / 2.0)
-        X = np.column_stack([c, np.ones(len(c))]) * (weight / np.maximum(q, 1e-100))[:, None]
-        size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
-        slope, constant = np.linalg.lstsq(X / size, weight, rcond=None)[0] / size
-        error = np.sqrt(np.linalg.pinv((X / size).T @ (X / size))[1, 1]) / size[1]
-        out[axis] = constant if slope > 0 and constant > SHOWN * error else 0.0
-    return out
+    weight = np.sqrt(counts / 2.0)
+    relative = weight / np.maximum(squares, 1e-100)
+    X = np.column_stack([stated * relative, relative])
+    size = np.maximum(norms(X.T), 1e-300)
+    X = X / size
+    slope, constant = np.linalg.lstsq(X, weight, rcond=None)[0] / size
+    error = np.sqrt(np.linalg.pinv(X.T @ X)[1, 1]) / size[1]
+    is_shown = slope > 0 and constant > SHOWN * error
+    return float(constant) if is_shown else 0.0
 
 
-def variance_intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
-    """Intervals of the variances a metre and a radian, from the jackknife over drives or blocks of windows."""
-    now = noise.mean.applied(windows)
-    error, F, floor = now.errors, fitted_terms(now, noise.mean_fit), noise.floor
-    theta = np.concatenate([noise.per_m, noise.per_rad])
+def intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[Interval, ...]:
+    """Intervals of the variances a metre and a radian, (2 n,), from the jackknife over drives or blocks of windows."""
+    corrected = noise.mean.applied(windows)
+    error = corrected.errors
+    F = fitted_terms(corrected, noise.mean_fit)
     whole: Indices = np.arange(len(error))
-    left = []
-    for block in blocks_of(windows.drive):
-        rest = np.setdiff1d(whole, block)
-        left.append(fit_terms(error[rest], F[rest], floor, theta))
-    values = [interval_of(float(value), column) for value, column in zip(theta, np.array(left).T, strict=True)]
-    n = len(noise.axes)
-    return tuple(values[:n]), tuple(values[n:])
+    rests = [np.setdiff1d(whole, block) for block in blocks_of(windows.drive)]
+    left = [fit_terms(error[rest], F[rest], noise.floor, noise.theta) for rest in rests]
+    terms = zip(noise.theta.tolist(), np.transpose(left), strict=True)
+    return tuple(interval_of(*term) for term in terms)
 
 
-STEPS, CLOSE = 100, 1e-7  # of scoring; gain of the log likelihood of a window at which it ends
+def interval_of(value: float, left_out: Sequence[float] | Array) -> Interval:
+    """Interval of a variance from its values with each block left out, in cube roots (Wilson & Hilferty 1931)."""
+    roots = np.cbrt(np.asarray(left_out))
+    k = len(roots)
+    error = float(np.sqrt(k - 1) * roots.std())
+    if not error > 0:  # 0 with any block left out: its upper end is not known
+        return Interval(value, 0.0, float("nan"))
+    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1)) * error
+    root = float(np.cbrt(value))
+    return Interval(value, max(root - reach, 0.0) ** 3, (root + reach) ** 3)
+
+
+# --- maximum likelihood -----------------------------------------------------------------------------------------------
 
 
 def terms_of(pieces: Array) -> Array:
@@ -202,7 +235,7 @@ def terms_of(pieces: Array) -> Array:
     The noise of a piece stands half at each of its ends (trapezoidal rule), and is carried to the end of the window.
     """
     A = carriers(pieces)
-    sizes = np.stack([ways(pieces), np.linalg.norm(rotation_vectors(pieces), axis=-1)], axis=1)  # (W, 2, P)
+    sizes = np.stack([ways(pieces), angles(pieces)], axis=1)  # (W, 2, P)
     share = np.zeros((*sizes.shape[:2], sizes.shape[2] + 1))
     share[..., :-1] += 0.5 * sizes
     share[..., 1:] += 0.5 * sizes
@@ -210,8 +243,18 @@ def terms_of(pieces: Array) -> Array:
     return np.asarray(F.reshape(len(F), -1, *F.shape[-2:]))
 
 
-def fit_terms(error: Array, F: Array, floor: Array, start: Array | None = None) -> Array:
-    """Variances theta >= 0 (p,) with Cov e_w = diag(floor) + sum theta_p F_wp, by maximum likelihood.
+def sum_of_terms(theta: Array, F: Array, floor: Array) -> Array:
+    """Covariances (W, n, n) of terms F (W, p, n, n) with variances theta (p,), and the floor (n,)."""
+    return np.asarray(np.diag(floor) + np.tensordot(theta, F, (0, 1)))
+
+
+def fit_terms(
+    error: Array,
+    F: Array,
+    floor: Array,
+    start: Array | None = None,
+) -> Array:
+    """Fit variances theta >= 0 (p,) with Cov e_w = diag(floor) + sum theta_p F_wp, by maximum likelihood.
 
     Scoring for covariances that are linear in their parameters (Anderson 1973, "Asymptotically efficient estimation of
     covariance matrices with linear structure", Ann. Statist. 1): each step is a least squares fit of e e', weighted by
@@ -224,39 +267,42 @@ def fit_terms(error: Array, F: Array, floor: Array, start: Array | None = None) 
     F : (W, p, n, n)
     floor : (n,), variances that are there in any case
     """
-    base = np.diag(floor)
     theta = _start(error, F) if start is None else np.maximum(start, 1e-12 * start.max())
-    value = _likelihood(error, base + np.tensordot(theta, F, (0, 1)))
+    value = _likelihood(error, sum_of_terms(theta, F, floor))
     for _ in range(STEPS):
-        C = base + np.tensordot(theta, F, (0, 1))
-        inverse = np.linalg.inv(C)
-        G = inverse[:, None] @ F  # (W, p, n, n)
-        flat = G.reshape(*G.shape[:2], -1)
-        turned = np.swapaxes(G, -1, -2).reshape(flat.shape)
-        H = np.tensordot(flat, turned, ((0, 2), (0, 2)))
-        u = inverse @ error[..., None]
-        g = np.einsum("wi,wpij,wj->p", u[..., 0], F, u[..., 0], optimize=True)
-        g = g - np.einsum("wpij,wji->p", G, inverse * floor[:, None], optimize=True)
-        target, step = _nonnegative(H, g), 1.0
-        while True:
+        target = _target(error, F, floor, theta)
+        step, gain = 1.0, -np.inf
+        while gain < 0 and step >= 5e-4:
             trial = theta + step * (target - theta)
-            better = _likelihood(error, base + np.tensordot(trial, F, (0, 1)))
-            if better >= value or step < 1e-3:
-                break
+            gain = _likelihood(error, sum_of_terms(trial, F, floor)) - value
             step *= 0.5
-        gain = better - value
         if gain > 0:
-            theta, value = trial, better
+            theta = trial
+            value += gain
         if gain < CLOSE * len(error):
             break
-    return np.asarray(theta)
+    return theta
+
+
+def _target(error: Array, F: Array, floor: Array, theta: Array) -> Array:
+    """Where a step of scoring leads to from theta, (p,)."""
+    inverse = np.linalg.inv(sum_of_terms(theta, F, floor))
+    G = inverse[:, None] @ F  # (W, p, n, n)
+    flat = G.reshape(*G.shape[:2], -1)
+    turned = np.swapaxes(G, -1, -2).reshape(flat.shape)
+    H = np.tensordot(flat, turned, ((0, 2), (0, 2)))
+    u = (inverse @ error[..., None])[..., 0]
+    of_errors = np.einsum("wi,wpij,wj->p", u, F, u, optimize=True)
+    of_floor = np.einsum("wpij,wji->p", G, inverse * floor, optimize=True)
+    return _nonnegative(H, of_errors - of_floor)
 
 
 def _start(error: Array, F: Array) -> Array:
     """The mean square of each axis, divided evenly among its terms."""
-    n = error.shape[1]
-    own = np.stack([np.diagonal(F, axis1=2, axis2=3)[:, p, p % n].mean() for p in range(F.shape[1])])
-    return np.asarray((error**2).mean(axis=0)[np.arange(F.shape[1]) % n] / (2 * np.where(own > 0, own, np.inf)) + 1e-30)
+    axis = np.arange(F.shape[1]) % error.shape[1]
+    own = F.mean(axis=0)[np.arange(F.shape[1]), axis, axis]
+    square = mean_square(error)[axis]
+    return np.asarray(square / (2 * np.where(own > 0, own, np.inf)) + 1e-30)
 
 
 def _likelihood(error: Array, C: Array) -> float:
@@ -269,24 +315,15 @@ def _likelihood(error: Array, C: Array) -> float:
 
 def nees_of(error: Array, C: Array) -> Array:
     """e' C^-1 e, (W,)."""
-    return np.asarray((error * np.linalg.solve(C, error[..., None])[..., 0]).sum(axis=1))
+    solved = np.linalg.solve(C, error[..., None])[..., 0]
+    return np.asarray((error * solved).sum(axis=1))
 
 
 def _nonnegative(H: Array, g: Array) -> Array:
     """The minimum of x'Hx / 2 - g'x with x >= 0."""
     scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    scaled = H / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(scaled)
+    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     root = np.sqrt(np.maximum(values, 1e-9))
-    return np.asarray(optimize.nnls(root[:, None] * vectors.T, (vectors.T @ (g / scale)) / root)[0] / scale)
-
-
-def interval_of(value: float, left_out: Sequence[float]) -> Interval:
-    """Interval of a variance from its values with each block left out, in cube roots (Wilson & Hilferty 1931)."""
-    roots, k = np.cbrt(np.asarray(left_out)), len(left_out)
-    error = float(np.sqrt((k - 1) / k * ((roots - roots.mean()) ** 2).sum()))
-    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1)) * error if k > 1 else np.inf
-    if not error > 0:  # 0 with any block left out: its upper end is not known
-        return Interval(value, 0.0, float("nan"))
-    low, high = float(np.cbrt(value)) - reach, float(np.cbrt(value)) + reach
-    return Interval(value, max(low, 0.0) ** 3, high**3)
+    target = (vectors.T @ (g / scale)) / root
+    least, _ = optimize.nnls(root[:, None] * vectors.T, target)
+    return np.asarray(least / scale)

@@ -47,18 +47,20 @@ PLACES = {3: (0, 1, 5), 6: (0, 1, 2, 3, 4, 5)}  # of the axes in messages of ROS
 
 def toml(model: NoiseModel) -> str:
     """noise.toml: the model, its span, and the figures of the verdict."""
-    numbers = {key: value for key, value in data(model).items() if key not in ("referee", "spans")}
-    tables = {key: numbers.pop(key) for key in ("mean", "noise", "counts")}
+    known = data(model)
+    del known["referee"]
+    spans = known.pop("spans")
+    tables = {key: known.pop(key) for key in ("mean", "noise", "counts")}
     lines = [
         "# Cov Log(D^-1 M) = factor * (sum over steps of A diag(variance_per_m |way| + variance_per_rad |turn|) A'",
         "# + diag(floor)); D is the estimated motion after the correction of [mean], M the true one, and A",
         "# carries a step's error to the end of the motion. Shown for motions over the span, and for no others.",
-        *_pairs(numbers),
+        *_pairs(known),
     ]
     for key, values in tables.items():
         lines += ["", f"[{key}]", *_pairs(values)]
-    for each in data(model)["spans"]:
-        lines += ["", "[[spans]]", *_pairs(each)]
+    for span in spans:
+        lines += ["", "[[spans]]", *_pairs(span)]
     return "\n".join(lines) + "\n"
 
 
@@ -68,69 +70,76 @@ def _pairs(values: dict[str, Any]) -> list[str]:
 
 
 def _toml(value: Any) -> str:
+    if value is None:
+        return "nan"
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ") + '"'
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
+        return f'"{escaped}"'
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join("nan" if each is None else _toml(each) for each in value) + "]"
+        return f"[{', '.join(map(_toml, value))}]"
     if isinstance(value, dict):
-        return "{ " + ", ".join(_pairs(value)) + " }"
+        return f"{{ {', '.join(_pairs(value))} }}"
     if isinstance(value, bool):
         return str(value).lower()
-    return repr(value) if isinstance(value, (int, float)) else str(value)
+    return repr(value)
 
 
 def robot_localization(model: NoiseModel) -> str:
     """A function of the covariance of a twist message, whose integration has the covariance of the model."""
-    n, places = model.noise, PLACES[len(model.noise.axes)]
-    per_m, per_rad = n.factor * n.per_m, n.factor * n.per_rad
-    rest = n.factor * n.floor / seconds(model)
-    rows = [
-        f"    covariance[{7 * place}] = ({per_m[i]:.17g} * abs(v) + {per_rad[i]:.17g} * abs(w) + {rest[i]:.17g}) / dt"
-        f"  # {axis}"
-        for i, (axis, place) in enumerate(zip(n.axes, places, strict=True))
-    ]
-    return "\n".join([
-        f'"""robot_localization: fuse the twist of the odometry, not its pose. {_origin(model)}',
-        "",
-        "In differential mode two poses are turned into a twist with the sum of their covariances, which is not that",
-        "of a motion; a twist is integrated as it is. Set odom0_config to the velocities alone.",
-        '"""',
-        "",
-        "",
-        "def twist_covariance(v: float, w: float, dt: float) -> list[float]:",
-        '    """36 numbers of a TwistWithCovariance: v in m/s, w in rad/s, dt in s since the message before."""',
-        "    covariance = [0.0] * 36",
-        *rows,
-        *([] if len(places) == 6 else ["    # z, roll, pitch: set two_d_mode"]),
-        "    return covariance",
-        "",
-    ])  # fmt: skip
+    noise = model.noise
+    places = PLACES[len(noise.axes)]
+    at_rest = noise.floor / seconds(model)
+    numbers = noise.factor * np.column_stack([noise.per_m, noise.per_rad, at_rest])
+    rows = []
+    for axis, place, (per_m, per_rad, rest) in zip(noise.axes, places, numbers.tolist(), strict=True):
+        variance = f"{per_m:.17g} * abs(v) + {per_rad:.17g} * abs(w) + {rest:.17g}"
+        rows.append(f"    covariance[{7 * place}] = ({variance}) / dt  # {axis}")
+    if len(places) < 6:
+        rows.append("    # z, roll, pitch: set two_d_mode")
+    assignments = "\n".join(rows)
+    return f'''"""robot_localization: fuse the twist of the odometry, not its pose. {_origin(model)}
+
+In differential mode two poses are turned into a twist with the sum of their covariances, which is not that
+of a motion; a twist is integrated as it is. Set odom0_config to the velocities alone.
+"""
+
+
+def twist_covariance(v: float, w: float, dt: float) -> list[float]:
+    """36 numbers of a TwistWithCovariance: v in m/s, w in rad/s, dt in s since the message before."""
+    covariance = [0.0] * 36
+{assignments}
+    return covariance
+'''
 
 
 def seconds(model: NoiseModel) -> float:
     """Median time that a motion over the span takes, s, over which the floor is spread; 1 without a clock."""
-    w = model.windows
-    took = [model.drives[i].t[b] - model.drives[i].t[a] for i, a, b in zip(w.drive, w.first, w.last, strict=True)]
-    median = float(np.median(took)) if took else float("nan")
+    windows = model.windows
+    took = []
+    for i, first, last in zip(windows.drive, windows.first, windows.last, strict=True):
+        t = windows.drives[i].t
+        took.append(t[last] - t[first])
+    median = float(np.median(took))
     return median if np.isfinite(median) and median > 0 else 1.0
 
 
 def gtsam(model: NoiseModel) -> str:
     """A function of the noise model of a BetweenFactor."""
-    n = model.noise
-    plane = len(n.axes) == 3
+    noise = model.noise
+    n = len(noise.axes)
     # Pose3 has the rotation first, Pose2 the position
-    order = [0, 1, 2] if plane else [3, 4, 5, 0, 1, 2]
-    turn, kind = ("[2:]", "Pose2") if plane else ("[:3]", "Pose3")
+    order, turn, kind = [0, 1, 2], "[2:]", "Pose2"
+    if n == 6:
+        order, turn, kind = [3, 4, 5, 0, 1, 2], "[:3]", "Pose3"
     return f'''"""GTSAM: noise of a BetweenFactor{kind}. {_origin(model)}"""
 
 import gtsam
 import numpy as np
 
-# {", ".join(n.axes[i] for i in order)}: the order of gtsam.{kind}
-PER_M = np.array({_list(n.factor * n.per_m[order])})
-PER_RAD = np.array({_list(n.factor * n.per_rad[order])})
-FLOOR = np.array({_list(n.factor * n.floor[order])})
+# {", ".join(noise.axes[i] for i in order)}: the order of gtsam.{kind}
+PER_M = np.array([{_numbers(noise.factor * noise.per_m[order])}])
+PER_RAD = np.array([{_numbers(noise.factor * noise.per_rad[order])}])
+FLOOR = np.array([{_numbers(noise.factor * noise.floor[order])}])
 PIECES = {PIECES}
 
 
@@ -138,7 +147,7 @@ def covariance(delta: gtsam.{kind}) -> np.ndarray:
     """Of the error Log(delta^-1 true) of a corrected motion over the span, taken as even."""
     xi = gtsam.{kind}.Logmap(delta) / PIECES
     way, turn = np.linalg.norm(np.asarray(gtsam.{kind}.Expmap(xi).translation())), np.linalg.norm(xi{turn})
-    Q, S = np.diag(PER_M * way + PER_RAD * turn), np.zeros(({len(n.axes)}, {len(n.axes)}))
+    Q, S = np.diag(PER_M * way + PER_RAD * turn), np.zeros(({n}, {n}))
     for k in range(PIECES + 1):
         A = gtsam.{kind}.Expmap(-k * xi).AdjointMap()
         S += (0.5 if k in (0, PIECES) else 1.0) * A @ Q @ A.T
@@ -153,42 +162,42 @@ def noise(delta: gtsam.{kind}) -> gtsam.noiseModel.Gaussian:
 
 def ceres(model: NoiseModel) -> str:
     """A header with the square root of the information of a straight motion over the span."""
-    S = straight(model)
-    n = len(S)
-    L = np.linalg.cholesky(np.linalg.inv(S)).T
-    rows = ",\n".join("    " + ", ".join(f"{value:.17g}" for value in row) for row in L)
+    root = np.linalg.cholesky(np.linalg.inv(straight(model))).T
+    rows = ",\n".join(f"    {_numbers(row)}" for row in root)
     return f"""// Ceres: residual = kSqrtInformation * Log(D^-1 M), with {", ".join(model.noise.axes)} in this order.
 // {_origin(model)}
 // Of a straight motion over the span; for others take the inverse square root of the covariance in motions.csv.
 #pragma once
 
-constexpr int kErrorSize = {n};
-constexpr double kSqrtInformation[{n * n}] = {{
+constexpr int kErrorSize = {len(root)};
+constexpr double kSqrtInformation[{root.size}] = {{
 {rows}}};
 """
 
 
 def straight(model: NoiseModel) -> Array:
     """Covariance (n, n) of a straight motion as long as the median one of the windows."""
-    d = model.windows.d
-    way = float(np.median(ways(model.noise.mean.applied(model.windows).pieces).sum(axis=1)))
-    motion = np.zeros(3 if d == 2 else 7)
-    motion[0], motion[-1] = way, float(d == 3)
-    return model.covariance(motion)
+    corrected = model.noise.mean.corrected(model.windows.pieces)
+    way = float(np.median(ways(corrected).sum(axis=1)))
+    if model.windows.d == 2:
+        return model.covariance([way, 0.0, 0.0])
+    return model.covariance([way, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
 def _origin(model: NoiseModel) -> str:
     """Span and correction, for the head of a file."""
-    of = correction(model)
-    return f"Shown for motions over {model.span} alone; {of or 'nothing is corrected'}."
+    return f"Shown for motions over {model.span} alone; {correction(model) or 'nothing is corrected'}."
 
 
-def _list(values: Array) -> str:
-    return "[" + ", ".join(f"{value:.17g}" for value in values) + "]"
+def _numbers(values: Array) -> str:
+    return ", ".join(f"{value:.17g}" for value in values)
 
 
 def snippets(model: NoiseModel) -> dict[str, str]:
+    """Files of the model for other programs, by name."""
     return {
-        "noise.toml": toml(model), "robot_localization_noise.py": robot_localization(model),
-        "gtsam_noise.py": gtsam(model), "ceres_noise.h": ceres(model),
-    }  # fmt: skip
+        "noise.toml": toml(model),
+        "robot_localization_noise.py": robot_localization(model),
+        "gtsam_noise.py": gtsam(model),
+        "ceres_noise.h": ceres(model),
+    }

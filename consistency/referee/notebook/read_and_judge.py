@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics import judge as judge_record
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.numpy_archive import record_of_arrays
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.read_files import read_frames, read_recordings
+from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
+from consistency.referee.readers.pipeline.read_files import read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
 from consistency.referee.verdicts.command_settings import settings_of, skip_asked
 
@@ -42,9 +42,6 @@ def read(
     truth_covariance: str | Path | None = None,
     truth_errors: str | None = None,
     truth_shared: bool = False,
-    shared: str | None = None,
-    shared_from: str | Path | None = None,
-    shared_truth: str | Path | None = None,
     filter: str | None = None,
 ) -> Record:
     """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
@@ -75,10 +72,6 @@ def read(
     truth_errors : how errors of the truth depend on each other: "independent", "per-run", or "common" to all runs; with
         None only what holds under any dependence is said
     truth_shared : the estimator has fused the truth
-    shared : take off errors that all estimates share: a vector ("by-vector"), one that grows by the second ("by-time"),
-        or by the metre of the true path ("by-distance")
-    shared_from, shared_truth : drives that these are fitted to, and their truth, ``truth`` by default; without them the
-        first half, and halves of one log are at most undecided
     filter : which estimator, where the files hold several
 
     Raises
@@ -93,7 +86,7 @@ def read(
     reading = Reading(
         true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
         motions or None, windows, align, lever_arm, split, of_truth, truth_errors,
-        truth_shared or None, shared, *(None if each is None else Path(each) for each in (shared_from, shared_truth)),
+        truth_shared or None,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates

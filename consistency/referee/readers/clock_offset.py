@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize
@@ -11,7 +11,7 @@ from scipy import optimize
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.errors import InputError
-from consistency.referee.readers.truth_matching import Aligned, Poses
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 REACH = 1.0  # s, the largest offset that is looked for
@@ -42,37 +42,6 @@ class Offset:
 
     def __str__(self) -> str:
         return f"{self.value:.4g} s [{self.low:.4g}, {self.high:.4g}]"
-
-
-def clocks_and_frames(
-    name: str, runs: Sequence[Poses], time_offset: float | str | None, align: str | None, judged: Sequence[int]
-) -> tuple[float, list[str], Aligned]:
-    """Time to add to the timestamps, s, notes on it, and the runs in the world of the truth.
-
-    Parameters
-    ----------
-    align : one of ``ALIGNMENTS``, or None
-    judged : components of the error that are judged, and by which frames are fitted
-
-    Raises
-    ------
-    InputError
-        The offset cannot be estimated, or nothing can be aligned.
-    """
-    if align is None:
-        return *clock_shift(name, runs, time_offset), Aligned(runs)
-    from consistency.referee.readers.alignment.residuals import aligned, frames_of
-    from consistency.referee.readers.alignment.world_frames import moved
-
-    shift = time_offset if isinstance(time_offset, float) else 0.0
-    for _ in range(ROUNDS):
-        before, frames = shift, frames_of(name, [p.later(shift) for p in runs], align, judged)
-        there = [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
-        shift, notes = clock_shift(name, there, time_offset)
-        if abs(shift - before) <= SETTLED:
-            break
-    found = aligned(name, [p.later(shift) for p in runs], align, judged, frames if shift == before else None)
-    return shift, notes, replace(found, runs=[replace(p, t=own.t) for p, own in zip(found.runs, runs, strict=True)])
 
 
 def clock_shift(name: str, runs: Sequence[Poses], wanted: float | str | None) -> tuple[float, list[str]]:

@@ -86,12 +86,6 @@ class Reading:
         "How errors of the truth depend on each other: independent, per-run or common to all runs."
     )
     truth_shared: bool | None = _option("The estimator has fused the truth.", flag="--truth-shared/")
-    shared: str | None = _option(
-        "Take off errors that all estimates share: a vector, one that grows by the second, or by the metre.",
-        "by-vector|by-time|by-distance",
-    )
-    shared_from: Path | None = _option("Drives that --shared is fitted to [the first half of the estimates].", "DRIVES")
-    shared_truth: Path | None = _option("Truth of these drives [that of --truth].", "TRUTH")
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

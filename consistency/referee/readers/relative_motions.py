@@ -7,6 +7,7 @@ A change of either world frame changes neither. Log(M D^-1) is the adjoint of it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +18,10 @@ from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.words.numbers import p_text, plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.mix_ups.hints import Change, Pairs, hints
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble
-from consistency.referee.readers.truth_matching import common_times
+from consistency.referee.readers.truth_matching import Poses, common_times
 from consistency.referee.readers.windows import Relative, windows
 from consistency.referee.types import Array, Indices
 
@@ -28,6 +30,7 @@ MARGINAL = (
     "covariances of two poses do not tell that of the motion between them; give their cross-covariances, or motions "
     "with --motions (docs/files.md, Relative poses)"
 )
+SEARCHED = 20_000  # rows with truth, of all runs, in which mix-ups are looked for
 BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
 
 
@@ -159,13 +162,45 @@ def relative_recording(
     notes = _notes(name, found, axes, stretches[0].convention, relative)
     of = independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
     notes += _doubt(name, of, relative) if relative.independent else []
+    causes = _causes(name, stretches, axes, judged, relative)
+    notes += causes
     names = tuple(axes[i] for i in part)
     record = assemble(name, tracks, t, names, file, KIND, notes, may_end=relative.independent)
+    record = replace(record, causes=tuple(causes))
     if not relative.independent:
         return replace(record, window=relative.text)
     caption = f"the {_whose(relative)} do not seem to be independent, on which this rests" if of.doubtful else ""
     unshown = _too_few(of, relative)
     return replace(record, window=relative.text, independent=True, caption=caption, unshown=unshown)
+
+
+def _causes(
+    name: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
+) -> list[str]:
+    """Mix-ups of motions, or of poses with cross-covariances, without which the errors of the windows fit."""
+    most = SEARCHED // len(stretches)
+    stretches = [replace(s, rows=s.rows[:most], truth=s.truth[:most]) for s in stretches]
+    planar = len(axes) == 3
+    runs = [
+        Poses(
+            s.place, s.t, s.estimate, s.covariance, np.ones(len(s.t), bool), s.t[s.rows], s.truth,
+            "planar" if planar else "spatial", s.convention, 0.0,
+        )
+        for s in stretches
+    ]  # fmt: skip
+
+    def errors_without(change: Change) -> Pairs:
+        found = []
+        for s, p in zip(stretches, runs, strict=True):
+            with np.errstate(invalid="ignore"), suppress(InputError):  # infinite covariances; no window fits
+                q = change(p)
+                cross = None if s.cross is None else change(replace(p, covariance=s.cross)).covariance
+                s = replace(s, estimate=q.estimate, covariance=q.covariance, cross=cross, convention=q.convention)
+                one = windows_of(replace(s, truth=q.truth), relative)
+                found.append((one.error, one.covariance))
+        return found
+
+    return hints(name, axes, runs, judged=judged, errors_without=errors_without)
 
 
 def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention: str, relative: Relative) -> list[str]:

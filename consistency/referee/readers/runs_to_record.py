@@ -15,7 +15,7 @@ from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, 
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.sheet import Places, refuse
+from consistency.referee.readers.places import Places, listed, refuse
 from consistency.referee.types import Array, Failure, Indices
 
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
@@ -129,11 +129,13 @@ def _require_different(file: str, tracks: Sequence[Track]) -> None:
 
 
 def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
-    """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so already."""
+    """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so, nor one triangle alone."""
     out = np.empty(covariance.shape)
     with np.errstate(invalid="ignore"):  # of infinite ones
         for piece in of_runs(out):
             P = covariance[piece]
+            if np.triu(P, 1).any() != np.tril(P, -1).any():
+                P = np.where(P == 0, np.swapaxes(P, -1, -2), P)
             rows = Places(place, np.arange(piece.start, piece.stop))
             what = "the covariance is not symmetric; write P = (P + P') / 2"
             refuse(asymmetric(P, ROUNDED), rows.__getitem__, what)
@@ -220,7 +222,9 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     still = ~(np.abs(np.concatenate([t.error for t in tracks if t.error is not None])) > NO_ERROR).any(axis=0)
     if none.all():
         return f"{file}: the covariance is zero in every step; nothing to judge"
-    of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})" * bool(none.any())
+    of = ""
+    if none.any():
+        of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})"
     missing, idle = none & ~still, ~none & still
     if missing.any() and idle.any():
         with_errors, without = (", ".join(np.array(axes)[which]) for which in (missing, idle))
@@ -232,7 +236,3 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     if not none.any():
         advice = "write only the states that the filter estimates by themselves"
     return f"{file}: the covariance is singular in every step{of}; {advice}"
-
-
-def listed(numbers: Sequence[object]) -> str:
-    return ", ".join(map(str, numbers[:5])) + ", …" * (len(numbers) > 5)

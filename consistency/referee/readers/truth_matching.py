@@ -1,27 +1,34 @@
 """Matching of estimates to the truth, which is interpolated on its manifold, and to the steps of other runs.
 
-:class:`Poses` is a run before any error is taken.
+:class:`Poses` is a run before any error is taken, and :class:`Estimator` is what every reader gives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics import Record
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.readers.formats.named_columns import UNIT_NAMES, unit_of
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.types import Array, Indices
 
+AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
+REST = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # velocity, biases of gyroscope and accelerometer
+STATE = (*AXES, *REST)
 Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more
 BRIDGED = 0.1  # s between two samples of the truth that are always interpolated: a period of 10 Hz
 ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
+
+
+def manifold_of(convention: str) -> Manifold:
+    """What errors of a convention live on, of states and of poses in the plane."""
+    return "vector" if convention == "vector" else "planar"
 
 
 def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
@@ -75,6 +82,10 @@ class Known(NamedTuple):
     apart: Array  # (k,), s to the nearest sample
     bend: Array  # (k,), what the interpolation may be off by in the first three components, or two in the plane
 
+    def of(self, kept: Array) -> Known:
+        """Some of them, by truth values or indices."""
+        return Known(*(values[kept] for values in self))
+
 
 def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, max_dt: float) -> Known:
     """The truth at ``times`` (N,), s, from samples at ``reference`` (M,), increasing, with ``values`` (M, m).
@@ -90,7 +101,8 @@ def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, 
     inside = (times >= reference[before]) & (times <= reference[after]) & (gap > 0)
     apart = np.minimum(np.abs(times - reference[before]), np.abs(reference[after] - times))
     rows = np.flatnonzero((apart <= max_dt + ROUNDING) | (inside & (gap <= BRIDGED + ROUNDING)))
-    before, after, gap, inside, apart = before[rows], after[rows], gap[rows], inside[rows], apart[rows]
+    before, after, gap = before[rows], after[rows], gap[rows]
+    inside, apart = inside[rows], apart[rows]
     share = np.where(inside, (times[rows] - reference[before]) / np.where(gap > 0, gap, 1.0), 0.0)
     later = ~inside & (np.abs(times[rows] - reference[after]) < np.abs(times[rows] - reference[before]))
     truth = _between(values[np.where(later, after, before)], values[after], share, manifold)
@@ -102,20 +114,6 @@ def nearest(times: Array, reference: Array, before: Indices) -> Indices:
     """The nearest sample to each of ``times`` (k,), from the one at or before it."""
     after = np.minimum(before + 1, len(reference) - 1)
     return np.where(np.abs(times - reference[after]) < np.abs(times - reference[before]), after, before)
-
-
-def unit_apart(t: Array, other_t: Array, names: Sequence[Path | str]) -> str:
-    """Which of two files seems to have times in another unit than seconds, as the end of a sentence; "" of neither."""
-    units = unit_of(t), unit_of(other_t)
-    for unit in sorted(UNIT_NAMES, reverse=True):  # the smallest that makes them overlap, 1 where they do
-        units = (unit, 1) if _overlap(t / unit, other_t) else (1, unit) if _overlap(t, other_t / unit) else units
-    if units[0] == units[1]:
-        return ""
-    return f"; {names[units[0] < units[1]]} seems to be in {UNIT_NAMES[max(units)]}, and has to be in seconds"
-
-
-def _overlap(t: Array, other_t: Array) -> bool:
-    return bool(t[0] <= other_t[-1] and t[-1] >= other_t[0])
 
 
 def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Array:
@@ -155,20 +153,32 @@ class Poses:
     """
 
     place: Places  # (N,), "est.csv, line 7"
-    t: Array  # (N,), s, increasing
+    t: Array  # (N,), s, or numbers of steps, increasing
     estimate: Array  # (N, m)
     covariance: Array  # (N, n, n)
     stated: Array  # (N,) of bool: there is a covariance
-    true_t: Array  # (M,), s, increasing
+    true_t: Array  # (M,), s or numbers of steps, increasing
     truth: Array  # (M, m)
     manifold: Manifold
     convention: str
     max_dt: float  # s
-    cross: Array | None = None  # (N, n, n), E e_before e' with the row before; dropped where rows are chosen
+    cross: Array | None = None  # (N, n, n), E e_before e' with the row before
     true_covariance: Array | None = None  # (M, n, n), of the truth's own error in the convention; NaN where it has none
+    run: int = 0
+    name: str = ""  # of a drive
+    files: tuple[Path | str, Path | str] = ("the estimates", "the truth")
+    numbered: bool = False  # t are numbers of steps
+    clock: Array | None = None  # (N,), s, where t are numbers of steps
+    true_clock: Array | None = None  # (M,), s
+    nis: Array | None = None  # (N,)
+    nis_dof: Array | None = None  # (N,)
+    open_end: str = ""  # the last row stands in a line without an end: what to note if it is cut short
 
     def known(self, shift: float = 0.0) -> Known:
         """The truth at the timestamps, ``shift`` s later."""
+        if self.true_t is self.t and not shift:  # beside the estimates
+            none = np.zeros(len(self.t))
+            return Known(np.arange(len(self.t)), self.truth, np.arange(len(self.t)), none, none)
         return truth_at(self.t + shift, self.true_t, self.truth, self.manifold, self.max_dt)
 
     def truth_covariances(self, known: Known, shift: float = 0.0) -> Array | None:
@@ -195,19 +205,26 @@ class Poses:
         out[finite] = error(truth[finite], estimate[finite], self.convention)
         return out
 
+    @property
+    def seconds(self) -> Array:
+        """Time of each estimate, (N,), s; NaN where steps have none."""
+        if not self.numbered:
+            return self.t
+        return np.full(len(self.t), np.nan) if self.clock is None else self.clock
+
     def later(self, shift: float) -> Poses:
         return replace(self, t=self.t + shift) if shift else self
 
     def sound(self) -> Poses:
-        return self._of(
-            np.flatnonzero(np.isfinite(self.estimate).all(axis=1) & np.isfinite(self.covariance).all((1, 2)))
-        )
+        """Estimates that are finite, with a finite covariance."""
+        finite = np.isfinite(self.estimate).all(axis=1) & np.isfinite(self.covariance).all((1, 2))
+        return self.of_rows(np.flatnonzero(finite))
 
     def some(self, most: int) -> Poses:
         """At most ``most`` estimates, evenly chosen."""
         if len(self.t) <= most:
             return self
-        return self._of(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
+        return self.of_rows(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
 
     def alone(self) -> Poses:
         """Without velocities and biases behind the poses in space."""
@@ -217,20 +234,34 @@ class Poses:
             self, estimate=self.estimate[:, :7], covariance=self.covariance[:, :6, :6], truth=self.truth[:, :7]
         )
 
-    @classmethod
-    def bare(
-        cls, place: Places, t: Array, estimate: Array, true_t: Array, truth: Array, manifold: Manifold, max_dt: float
-    ) -> Poses:
-        """Poses without covariances, which are NaN."""
-        n = 6 if manifold == "spatial" else truth.shape[1]
-        P = np.broadcast_to(np.nan, (len(t), n, n))
-        return cls(place, t, estimate, P, np.zeros(len(t), bool), true_t, truth, manifold, "left", max_dt)
-
-    def _of(self, rows: Indices) -> Poses:
+    def of_rows(self, rows: Indices) -> Poses:
+        """Some of the estimates beside all of the truth."""
+        if len(rows) == len(self.t):
+            return self
         return replace(
             self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
-            covariance=self.covariance[rows], stated=self.stated[rows], cross=None,
+            covariance=self.covariance[rows], stated=self.stated[rows], cross=at(self.cross, rows),
+            clock=at(self.clock, rows), nis=at(self.nis, rows), nis_dof=at(self.nis_dof, rows),
         )  # fmt: skip
+
+    def beside(self, samples: Indices) -> Poses:
+        """The estimates beside some samples of the truth."""
+        return replace(
+            self, true_t=self.true_t[samples], truth=self.truth[samples], true_clock=at(self.true_clock, samples),
+            true_covariance=at(self.true_covariance, samples),
+        )  # fmt: skip
+
+
+def at(values: Array | None, rows: Any) -> Array | None:
+    """Some rows of values, if there are any."""
+    if values is None:
+        return None
+    return np.asarray(values[rows])
+
+
+def unstated(rows: int, n: int) -> tuple[Array, Array]:
+    """Covariances (rows, n, n) that are NaN, and that none is stated, (rows,): where a file states none."""
+    return np.broadcast_to(np.nan, (rows, n, n)), np.zeros(rows, bool)
 
 
 @dataclass(frozen=True)
@@ -245,13 +276,49 @@ class Aligned:
     unavailable: tuple[str, ...] = ()  # questions that have no answer
     unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
 
-    def on(self, recording: Evidence) -> Evidence:
-        return replace(recording, **{key: value for key, value in vars(self).items() if key not in ("runs", "notes")})
+    def on(self, record: Record) -> Record:
+        return replace(record, **{key: value for key, value in vars(self).items() if key not in ("runs", "notes")})
 
 
-class NamedPoses(NamedTuple):
-    """A run of a file without its covariances, by name."""
+@dataclass(frozen=True)
+class Stated:
+    """Which covariances a file states: components have cross terms with those of their own group only."""
+
+    groups: Mapping[str, slice] = field(default_factory=lambda: {"": slice(None)})  # by the end of a record's name
+    alone: bool = False  # standard deviations: each component of a group is judged by itself
+
+
+WHOLE = Stated()
+ALONE = Stated(alone=True)
+POINTS = Stated({"": slice(3)})  # positions without orientations
+BLOCKS = Stated({" position": slice(3), " rotation": slice(3, 6)})
+SINGLE = Stated(
+    {f" {axis}": slice(i, i + 1) for i, axis in enumerate(AXES)} | {" velocity and biases": slice(6, None)}, alone=True
+)
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """The runs of one estimator, with what its record is called and what a reader must know of it."""
 
     name: str
-    poses: Poses
-    clock: Array  # (N,), s, of the estimates; NaN where they are numbered by steps alone
+    path: Path  # of the estimates, for messages
+    runs: Sequence[Poses]
+    axes: Sequence[str]  # names of the components of the error
+    convention: str = ""  # of the error; "" where the file holds errors
+    definition: str = ""  # of the convention, in words
+    stated: Stated = WHOLE
+    label: str = ""  # of the estimator in notes; its name if there is none
+    covariances: Path | None = None  # file of the covariances; that of the estimates if there is none
+    notes: Sequence[str] = ()  # what the files were read as
+    causes: Sequence[str] = ()  # mix-ups that are found while reading
+    judged: Sequence[int] | None = None  # components that are estimated; None if the errors tell
+    in_space: bool = False  # poses in space, or positions beside such a truth
+    position: int = 0  # leading components of an estimate that are a position in m, to be drawn
+    t: Array | None = None  # (steps,), s, of an archive, whose poses are numbered by its steps from 0 on
+    innovations_alone: bool = False  # there is no truth
+
+    @property
+    def said(self) -> str:
+        """Its name in notes."""
+        return self.label or self.name

@@ -30,7 +30,8 @@ class Relative:
     @property
     def text(self) -> str:
         """100 steps, 10 s, 50 m."""
-        return f"{self.size:g} {self.unit}{'s' * (self.unit == 'step' and self.size != 1)}"
+        unit = "steps" if self.unit == "step" and self.size != 1 else self.unit
+        return f"{self.size:g} {unit}"
 
     @property
     def option(self) -> str:
@@ -86,7 +87,8 @@ def windows(t: Array, position: Array, rows: Indices, relative: Relative, file: 
         No window fits, or seconds are asked for and rows have no time.
     """
     place = _along(t, position, rows, relative, file)
-    first, last, skipped, i = [], [], 0, 0
+    first, last = [], []
+    skipped = i = 0
     while (j := int(np.searchsorted(place, place[i] + relative.size - ROUNDING))) < len(place):
         if place[j] - place[i] > (1.0 + OVERSHOOT) * relative.size:
             skipped += 1

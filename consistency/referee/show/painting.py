@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.legend import Legend
 
 LIMIT = 300  # points of a line
 WIDTH = 5.0  # inches, the widest figure
@@ -233,54 +234,54 @@ def wrapped(label: str, width: int = 26) -> str:
 
 def add_legend(figure: Figure, beside: bool = False) -> Figure:
     """A legend of all that has a label, above the axes or to their right; the figure is made larger for it."""
-    found = dict(_labelled(figure.axes))
+    found = labelled(figure.axes)
     if not found:
         return figure
     labels = [wrapped(label) for label in found]
-    columns = 1
+    options: dict[str, Any] = {"loc": "outside right center"}
     if not beside:
         longest = max(len(line) for label in labels for line in label.split("\n"))
         columns = max(1, min(len(labels), int(17.5 * figure.get_figwidth() / (longest + 7))))
-    rows = -(-len(labels) // columns)
-    place: Any = "outside upper left"
-    if beside:
-        place = "outside right center"
-    else:
-        lines = rows * max(label.count("\n") + 1 for label in labels)
+        lines = -(-len(labels) // columns) * max(label.count("\n") + 1 for label in labels)
         figure.set_figheight(figure.get_figheight() + 0.13 * lines)
-    legend = figure.legend(
-        [_handle(artist) for artist in found.values()], [str(number) for number in range(len(labels))],
-        loc=place, ncols=columns, alignment="left",
-    )  # fmt: skip
-    for text, handle, label, artist in zip(
-        legend.get_texts(), legend.legend_handles, labels, found.values(), strict=True
-    ):
-        text.set_text(label)  # also one that begins with an underscore, which legend() leaves out
-        text.set_gid(artist.get_gid())
-        if handle is not None:
-            handle.set_gid(artist.get_gid())
+        options = {"loc": "outside upper left", "ncols": columns, "alignment": "left"}
+    _write_labels(figure.legend(*_entries(found), **options), found, labels)
     return figure
 
 
 def panel_legend(axes: Axes) -> None:
     """A legend inside one panel, where there is room."""
-    found = dict(_labelled([axes]))
+    found = labelled([axes])
     if found:
-        legend = axes.legend(
-            [_handle(artist) for artist in found.values()], [str(number) for number in range(len(found))],
-            fontsize=5.5, handlelength=1.8, labelspacing=0.25, borderpad=0.2,
-        )  # fmt: skip
-        for text, label in zip(legend.get_texts(), found, strict=True):
-            text.set_text(wrapped(label, 30))
+        options: dict[str, Any] = {"fontsize": 5.5, "handlelength": 1.8, "labelspacing": 0.25, "borderpad": 0.2}
+        _write_labels(axes.legend(*_entries(found), **options), found, [wrapped(label, 30) for label in found])
 
 
-def _labelled(panels: Sequence[Axes]) -> Iterator[tuple[str, Artist]]:
-    """Labels and what has them, the last first, so that a dictionary keeps the first."""
+def labelled(panels: Sequence[Axes]) -> dict[str, Artist]:
+    """What has a label, each label once."""
+    found: dict[str, Artist] = {}
     for axes in panels:
         for artist in (*axes.collections, *axes.patches, *axes.lines):
             label = str(artist.get_label())
             if not UNNAMED.fullmatch(label):
-                yield label, artist
+                found.setdefault(label, artist)
+    return found
+
+
+def _entries(found: Mapping[str, Artist]) -> tuple[list[Artist], list[str]]:
+    """Handles and labels of a legend; it leaves out labels that begin with an underscore, so it gets numbers first."""
+    return [_handle(artist) for artist in found.values()], [str(number) for number in range(len(found))]
+
+
+def _write_labels(legend: Legend, found: Mapping[str, Artist], labels: Sequence[str]) -> None:
+    """The labels in place of the numbers; an entry is hidden with what it stands for."""
+    for text, handle, label, artist in zip(
+        legend.get_texts(), legend.legend_handles, labels, found.values(), strict=True
+    ):
+        text.set_text(label)
+        for part in (text, handle):
+            if part is not None:
+                part.set_gid(artist.get_gid())
 
 
 def _handle(artist: Any) -> Artist:

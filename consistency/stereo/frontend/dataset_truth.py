@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading
-from consistency.referee.readers.file_kinds import is_drive
+from consistency.referee.readers.formats.file_kinds import is_drive
 from consistency.referee.readers.formats.kitti_files import BODIES, NANO, drive_poses, place_of, read_times
 from consistency.referee.readers.formats.tum import UNIT, read_trajectory
 from consistency.referee.readers.truth_matching import associate

@@ -42,6 +42,8 @@ def total(values):
 class Sum(Compiled):
     def __init__(self, name, values):
         self.name, self.values, self.kernel = name, values, Kernel(total)
+    def __reduce__(self):
+        return Sum, (self.name, self.values)
     def outlook(self, *_):
         return self.kernel.outlook(self.values)
     def compile(self, *_):

@@ -806,14 +806,16 @@ def test_findings_and_distributions(reproduced):
     # first order: sigma_x = x^2 sigma_d / (f B)
     np.testing.assert_allclose(np.sqrt(narrow.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.09))
     np.testing.assert_allclose(np.sqrt(wide.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.5))
-    np.testing.assert_allclose(np.sum(wide.density * np.diff(wide.edges)), 1.0, atol=0.02)
     cloud, histogram = panels(stereo_noise.stereo_noise(report)[0])
     linear, fitted = lines(cloud)
-    np.testing.assert_array_equal(linear.get_xydata(), narrow.linear_ellipse)
-    np.testing.assert_array_equal(fitted.get_xydata(), narrow.fitted_ellipse)
-    np.testing.assert_array_equal(places(cloud)[0], narrow.points)
-    densities = [line.get_ydata() for line in lines(histogram)]
-    np.testing.assert_array_equal(densities, [narrow.linear_density, narrow.fitted_density])
+    np.testing.assert_array_equal(linear.get_xydata(), stereo_noise.ellipse(narrow.linear))
+    np.testing.assert_array_equal(fitted.get_xydata(), stereo_noise.ellipse(narrow.fitted))
+    np.testing.assert_array_equal(places(cloud)[0], narrow.drawn)
+    height, edges, _ = histogram.patches[0].get_data()
+    np.testing.assert_allclose(np.sum(height * np.diff(edges)), 1.0, atol=0.02)
+    for line, gaussian in zip(lines(histogram), (narrow.linear, narrow.fitted), strict=True):
+        x, sd = line.get_xdata(), np.sqrt(gaussian.covariance[0, 0])
+        np.testing.assert_allclose(line.get_ydata(), stats.norm.pdf(x, gaussian.mean[0], sd))
     source = shown(report)
     assert "unacceptably large &lt;ANEES&gt;" in source
     assert printed(report).startswith(b"%PDF")

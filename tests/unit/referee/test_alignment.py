@@ -35,13 +35,11 @@ from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers import clock_offset
 from consistency.referee.readers.alignment import residuals
 from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned
+from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned, clocks_and_frames
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
-from consistency.referee.readers.clock_offset import clocks_and_frames
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 
@@ -560,7 +558,7 @@ def test_clock_and_frame_are_found_in_turn_until_the_clock_settles(
     """To 0.1 ms, or five times."""
     then = iter(shifts)
     monkeypatch.setattr(residuals, "frames_of", lambda *_: [])
-    monkeypatch.setattr(clock_offset, "clock_shift", lambda *_: (next(then), []))
+    monkeypatch.setattr(residuals, "clock_shift", lambda *_: (next(then), []))
     monkeypatch.setattr(residuals, "aligned", lambda *_: Aligned([]))
     assert clocks_and_frames("est", [], "estimate", "posyaw", range(3))[0] == said
 

@@ -72,6 +72,28 @@ def test_a_folder_of_bags_has_a_run_in_each(tmp_path: Path) -> None:
     assert cs.read(tmp_path / "bags", truth_topic="/vicon", axes=["x", "yaw"]).axes == ("x", "yaw")
 
 
+@pytest.mark.parametrize(
+    ("variances", "unstated"), [((0.2, 1e-3, 1e-3), ""), ((0.0, 1e-3, 1e-3), "z"), ((2e9, 0.1, 0.1), "z")]
+)
+def test_a_robot_in_the_plane_is_judged_in_the_plane(
+    tmp_path: Path, variances: tuple[float, float, float], unstated: str
+) -> None:
+    """By the rule of all other files, also where some variances are not stated."""
+    drive = Drive()
+    drive.true[:, 2], drive.own[:, 2] = 0.0, 0.0
+    heading = np.deg2rad(30.0) + drive.error[:, 5]
+    turn = Rotation.from_quat(drive.true[: 5 * STEPS : 5, 3:]) * Rotation.from_rotvec(
+        np.outer(heading, [0.0, 0.0, 1.0])
+    )
+    drive.own[:, 3:] = turn.as_quat()
+    drive.P = np.diag([0.01, 0.04, *variances, 9e-4])
+    [r] = read_recordings(write(tmp_path / "drive.bag", 1, "pose", drive), truth_topic="/vicon")
+    assert r.axes == ("x", "y", "yaw")
+    left = "roll, pitch" if unstated else "z, roll, pitch"
+    assert any(f"{left} are not estimated and left out" in note for note in r.notes)
+    assert any(f"the variances of {unstated} are 0, -1" in note for note in r.notes) == bool(unstated)
+
+
 def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path: Path) -> None:
     drive = Drive()
     drive.t = drive.t.copy()

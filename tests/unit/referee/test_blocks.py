@@ -103,6 +103,6 @@ def test_a_verdict_needs_less_memory_than_its_arrays_hold(
 @pytest.mark.parametrize(("count", "each"), [(0, 5), (1, 5), (10, 0), (10, 3), (10, 10**9)])
 def test_slices_cover_everything_once(monkeypatch: pytest.MonkeyPatch, count: int, each: int) -> None:
     monkeypatch.setattr(large_arrays, "ROWS", 7)
-    slices = list(large_arrays.blocks(count, each))
+    slices = list(large_arrays.block_slices(count, each))
     assert slices
     assert [k for here in slices for k in range(count)[here]] == list(range(count))

@@ -23,14 +23,15 @@ from consistency.referee.fit_covariance.systematic_errors import (
     Mean,
     MeanFit,
     choose_mean,
-    error_derivatives,
-    moments_of,
-    none_of,
+    estimate,
+    jacobian_of_mean,
+    no_mean,
+    normal_equations,
     sum_of_neighbours,
 )
 from consistency.referee.fit_covariance.white_noise import (
     WhiteNoise,
-    _constants,
+    constant_of,
     fit_noise,
     fitted_terms,
     jitter_of,
@@ -75,14 +76,14 @@ def test_neighbours_are_those_of_the_same_drive_without_a_gap() -> None:
 @pytest.mark.parametrize("in_space", [False, True])
 def test_instruments_are_of_neighbouring_motion_apart_from_shared_ends(in_space: bool) -> None:
     w = cut(Side(3, in_space=in_space), 2).of(np.arange(3))
-    Z = moments_of(w, none_of(w), np.tile(np.eye(len(w.axes)), (3, 1, 1)), NEIGHBOURS)[0].Z
+    Z = normal_equations(w, no_mean(w), np.tile(np.eye(len(w.axes)), (3, 1, 1)), [NEIGHBOURS])[NEIGHBOURS].Z
     P, one = w.pieces.shape[1], np.eye(w.d + 1)
     early, late = np.array(w.pieces[:1]), np.array(w.pieces[2:])
     early[:, P - GAP :], late[:, :GAP] = one, one
-    np.testing.assert_allclose(Z[1], (error_derivatives(early) + error_derivatives(late))[0], atol=1e-12)
+    np.testing.assert_allclose(Z[1], (jacobian_of_mean(early) + jacobian_of_mean(late))[0], atol=1e-12)
     # another motion of a window, or next to it, does not change its instruments
     w.pieces[1], w.pieces[0, P - GAP :], w.pieces[2, :GAP] = one, one, one
-    again = moments_of(w, none_of(w), np.tile(np.eye(len(w.axes)), (3, 1, 1)), NEIGHBOURS)[0].Z
+    again = normal_equations(w, no_mean(w), np.tile(np.eye(len(w.axes)), (3, 1, 1)), [NEIGHBOURS])[NEIGHBOURS].Z
     np.testing.assert_allclose(again[1], Z[1], atol=1e-12)
 
 
@@ -90,8 +91,8 @@ def test_moments_are_weighted_by_the_covariance() -> None:
     w = cut(Side(3), 3).of(np.arange(4))
     root = np.random.default_rng(0).normal(size=(4, 3, 3))
     C = root @ np.swapaxes(root, 1, 2) + np.eye(3)
-    forward, backward = moments_of(w, none_of(w), C, FORWARD, BACKWARD)
-    X, Z = error_derivatives(w.pieces), error_derivatives(w.true_pieces)
+    forward, backward = normal_equations(w, no_mean(w), C, [FORWARD, BACKWARD]).values()
+    X, Z = jacobian_of_mean(w.pieces), jacobian_of_mean(w.true_pieces)
     for k in range(4):
         for found, left in ((forward, X[k]), (backward, Z[k])):
             np.testing.assert_allclose(found.A[k], left.T @ np.linalg.solve(C[k], X[k]), rtol=1e-9, atol=1e-12)
@@ -102,8 +103,8 @@ def test_an_interval_is_of_the_scatter_between_blocks() -> None:
     """Student's, of sums over 20 blocks that the solution leaves; a coefficient that is not fitted is that of none."""
     w = cut(Side(3, scale=0.9), 5)
     near = Mean(1.02, 0.9, (0.01,))
-    (m,) = moments_of(w, near, None, FORWARD)
-    mean, low, high = errors_._estimate(w, near, m)
+    m = normal_equations(w, near, None, [FORWARD])[FORWARD]
+    mean, low, high = estimate(w, near, m)
     A = m.A.sum(axis=0)
     step = np.linalg.solve(A, m.b.sum(axis=0))
     left = m.b - m.A @ step
@@ -113,7 +114,7 @@ def test_an_interval_is_of_the_scatter_between_blocks() -> None:
         mean.values, [1.02 * (1 + step[0]), 0.9 * (1 + step[1]), 0.01 * (1 + step[1]) + 1.02 * step[2]]
     )
     np.testing.assert_allclose(high - low, 2 * reach, rtol=1e-6)
-    alone, _, _ = errors_._estimate(w, near, m, np.array([True, False, False]))
+    alone, _, _ = estimate(w, near, m, np.array([True, False, False]))
     assert alone.turn == 1.0
     assert alone.drift == (0.0,)
     fixed = np.array([0.0, 1 / 0.9 - 1, -0.01 / 1.02])
@@ -182,7 +183,7 @@ def test_strength_is_the_first_stage_f() -> None:
     rng = np.random.default_rng(0)
     Z = rng.normal(size=(400, 2, 2))
     X = Z * [3.0, 0.2] + rng.normal(size=Z.shape)
-    f = errors_._strength(errors_.InstrumentMoments(Z, Z[:, 0], Z, X))
+    f = errors_._strength(errors_.NormalEquations(Z, Z[:, 0], Z, X))
     z, other, x = Z[..., 1].ravel(), Z[..., 0].ravel(), X[..., 1].ravel()
     z, x = (each - other * (other @ each) / (other @ other) for each in (z, x))
     slope = z @ x / (z @ z)
@@ -224,17 +225,17 @@ def test_a_turn_of_its_own_does_not_stand_for_a_noisy_one() -> None:
 
 
 def test_jitter_is_the_constant_of_mean_squares() -> None:
-    stated, counts = np.array([[1.0, 2.0], [2.0, 4.0], [4.0, 8.0], [8.0, 16.0]]), np.array([800, 400, 200, 100])
-    squares = stated * [2.0, 1.0] + [3.0, 0.0]
-    np.testing.assert_allclose(_constants(squares, stated, counts), [3.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(_constants(squares, stated, counts / 100), [0.0, 0.0])  # not shown by 3 standard errors
-    assert _constants(20.0 - stated, stated, 1000 * counts).tolist() == [0.0, 0.0]  # errors do not grow
+    stated, counts = np.array([1.0, 2.0, 4.0, 8.0]), np.array([800, 400, 200, 100])
+    assert constant_of(2.0 * stated + 3.0, stated, counts) == pytest.approx(3.0)
+    assert constant_of(stated, stated, counts) == 0.0
+    assert constant_of(2.0 * stated + 3.0, stated, counts / 100) == 0.0  # not shown by 3 standard errors
+    assert constant_of(20.0 - stated, stated, 1000 * counts) == 0.0  # errors do not grow
 
 
 def test_the_floor_is_added() -> None:
     w = cut(Side(3), 9).of(np.arange(4))
     theta, floor = np.arange(1.0, 7.0), np.array([0.1, 0.2, 0.3])
-    noise = WhiteNoise(w.axes, none_of(w), theta[:3], theta[3:], floor, 2.0)
+    noise = WhiteNoise(w.axes, no_mean(w), theta[:3], theta[3:], floor, 2.0)
     F = terms_of(w.pieces)
     np.testing.assert_allclose(noise.covariance(w.pieces), 2.0 * (np.tensordot(theta, F, (0, 1)) + np.diag(floor)))
 
@@ -248,7 +249,7 @@ def test_jitter_of_the_truth_is_not_noise_of_the_way() -> None:
 def test_every_fit_that_is_judged_has_the_jitter(rng: np.random.Generator) -> None:
     made = drives(rng, 3, World(offset=0.1), 300.0)
     model = cs.fit_covariance(made, "10m")
-    jitter = jitter_of(fit_noise(model.windows), made, model.windows, False)
+    jitter = jitter_of(fit_noise(model.windows), model.windows)
     assert jitter[0] > 0.005  # of 0.02
     for noise in (model.noise, *(fold.noise for fold in model.folds)):
         assert (noise.floor >= jitter).all()
@@ -291,7 +292,7 @@ def test_sentences_of_the_mean(model: cs.NoiseModel) -> None:
     slip = "correct first: -0.1 m of way a rad of turn"
     assert said(model, mean=Mean(1.0, 0.95, (0.0,), -0.1)).startswith(f"{slip}, then turn x0.95\n")
     assert said(model, mean=Mean(slip=-0.1), free=np.array([False] * 3)).startswith(f"{slip}\n")
-    none = said(model, free=np.array([False] * 3), mean=none_of(model.windows))
+    none = said(model, free=np.array([False] * 3), mean=no_mean(model.windows))
     assert none.startswith("\n")
 
 

@@ -15,7 +15,13 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan, Ratio, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
-from consistency.referee.fit_covariance.mean_by_motion import SCALES, _by_bin, dependence_p_value, mean_by_motion
+from consistency.referee.fit_covariance.mean_by_motion import (
+    SCALES,
+    held_out_gain,
+    mean_by_motion,
+    p_value_of,
+    values_by_bin,
+)
 from consistency.referee.fit_covariance.model_text import correction, noise_lines, sentence
 from consistency.referee.fit_covariance.motion_windows import (
     ROUNDED,
@@ -28,13 +34,13 @@ from consistency.referee.fit_covariance.motion_windows import (
 )
 from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.refusals import require_poses
-from consistency.referee.fit_covariance.slip import BY_TURN, effect_of, fit_slip, held_out_gain
-from consistency.referee.fit_covariance.systematic_errors import Mean, error_derivatives
+from consistency.referee.fit_covariance.systematic_errors import Mean, fit_slip, jacobian, jacobian_of_mean
 from consistency.referee.fit_covariance.white_noise import fit_noise
 from consistency.referee.fit_covariance.writing import toml
 from consistency.referee.geometry.groups import composed, inverse, vectors
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.places import Places
+from consistency.referee.readers.truth_matching import Manifold, Poses, unstated
 from consistency.referee.types import Array
 
 SPAN = "10m"
@@ -64,7 +70,7 @@ def test_effect_of_a_slip_is_its_derivative(world: World, rng: np.random.Generat
     w = cut_windows(drives(rng, 1, world, 300.0), span_of(SPAN))
     w = replace(w, true=w.motions)
     less, more = (replace(w, pieces=lengthened(w.pieces, slip)).errors for slip in (-1e-6, 1e-6))
-    np.testing.assert_allclose((less - more) / 2e-6, effect_of(w.pieces), atol=1e-6)
+    np.testing.assert_allclose((less - more) / 2e-6, jacobian(w.pieces)[..., -1], atol=1e-6)
     longer = lengthened(w.pieces, 0.1)
     np.testing.assert_allclose(ways(longer), ways(w.pieces) + 0.1 * np.linalg.norm(rotation_vectors(w.pieces), axis=-1))
     np.testing.assert_allclose(rotation_vectors(longer), rotation_vectors(w.pieces))
@@ -76,7 +82,7 @@ def test_a_known_slip_is_recovered_and_corrected(rng: np.random.Generator) -> No
     quiet = World((1e-10, 1e-10, 1e-12), (1e-12,) * 3, slip=-0.1)
     w = cut_windows(drives(rng, 2, quiet, 400.0), span_of(SPAN))
     assert fit_slip(w) == pytest.approx(-0.1, rel=1e-3)
-    noise = fit_noise(w, BY_TURN)
+    noise = fit_noise(w, by_turn=True)
     assert noise.mean.slip == pytest.approx(-0.1, rel=1e-3)
     assert noise.mean.way == pytest.approx(1.0, abs=1e-3)
     assert np.abs(noise.mean.applied(w).errors).max() < 1e-3
@@ -90,9 +96,9 @@ def test_a_known_slip_is_recovered_and_corrected(rng: np.random.Generator) -> No
 
 def test_a_slip_keeps_the_floor_and_the_evidence(rng: np.random.Generator) -> None:
     w = cut_windows(drives(rng, 2, World(slip=-0.2), 300.0), span_of(SPAN))
-    noise = fit_noise(w, BY_TURN, np.array([1.0, 2.0, 3.0]))
+    noise = fit_noise(w, by_turn=True, jitter=np.array([1.0, 2.0, 3.0]))
     assert noise.floor.tolist() == [1.0, 2.0, 3.0]
-    alone = fit_noise(replace(w, pieces=lengthened(w.pieces, noise.mean.slip)), True, noise.floor)
+    alone = fit_noise(w.lengthened(noise.mean.slip), jitter=noise.floor)
     assert noise.mean_fit is not None
     assert alone.mean_fit is not None
     np.testing.assert_array_equal(noise.mean_fit.low, alone.mean_fit.low)
@@ -157,7 +163,7 @@ def test_a_scale_that_depends_on_the_turn_has_its_values(scale: int, rng: np.ran
     w = cut_windows(made, span_of(SPAN))
     size = np.linalg.norm(rotation_vectors(w.pieces), axis=-1).sum(axis=1)
     thirds = np.searchsorted(np.quantile(size, [1 / 3, 2 / 3]), size, side="right")
-    e = w.errors + 0.1 * thirds[:, None] * error_derivatives(w.pieces)[:, :, scale]
+    e = w.errors + 0.1 * thirds[:, None] * jacobian_of_mean(w.pieces)[:, :, scale]
     noise = replace(fit_noise(w), mean=Mean())
     found = mean_by_motion(noise, replace(w, true=w.motions @ spatial.exp(e)))
     assert (found.scale, found.by) == (SCALES[scale], "turn")
@@ -170,8 +176,8 @@ def test_a_scale_of_all_windows_that_is_not_corrected_is_no_spread(rng: np.rando
     """A tenth of the way is 15 sigma, which would be a share of 200; noise alone makes 0.02 of it on average."""
     w = cut_windows(drives(rng, 5, World(), 400.0), span_of(SPAN))
     noise, thirds = replace(fit_noise(w), mean=Mean()), np.arange(len(w.drive)) % 3
-    w = replace(w, true=w.motions @ spatial.exp(w.errors + 0.1 * error_derivatives(w.pieces)[:, :, 0]))
-    values, error = _by_bin(w, thirds, 0)
+    w = replace(w, true=w.motions @ spatial.exp(w.errors + 0.1 * jacobian_of_mean(w.pieces)[:, :, 0]))
+    values, error = values_by_bin(w, thirds, 0)
     np.testing.assert_allclose(values, 0.1, atol=0.01)  # 10 standard errors
     assert np.abs(error).max() < 0.1
     found = mean_by_motion(noise, w)
@@ -184,7 +190,7 @@ def test_a_scale_that_depends_on_the_way(rng: np.random.Generator) -> None:
     made = paced(rng, 0.01)
     w = cut_windows(made, span_of("20s"))
     fast = ways(w.pieces).sum(axis=1) > 15.0
-    e = w.errors + 0.1 * fast[:, None] * error_derivatives(w.pieces)[:, :, 0]
+    e = w.errors + 0.1 * fast[:, None] * jacobian_of_mean(w.pieces)[:, :, 0]
     found = mean_by_motion(replace(fit_noise(w), mean=Mean()), replace(w, true=w.motions @ spatial.exp(e)))
     assert (found.is_found, found.scale, found.by, found.gain) == (True, SCALES[0], "way", 0.0)
     assert found.values[0] == pytest.approx(1.0, abs=0.02)
@@ -199,7 +205,7 @@ def test_noise_of_the_way_by_which_windows_are_divided_is_not_a_dependence(rng: 
     now = noise.mean.applied(w)
     size = ways(now.pieces).sum(axis=1)
     thirds = np.searchsorted(np.quantile(size, [1 / 3, 2 / 3]), size, side="right")
-    assert dependence_p_value(now, now.pieces, thirds, 0) < 1e-3
+    assert p_value_of(now, now.pieces, thirds, 0) < 1e-3
     assert mean_by_motion(noise, w).p_value > 0.01  # fails in 1 %
 
 
@@ -260,6 +266,12 @@ def test_the_mean_of_logarithms_of_few_degrees_of_freedom(rng: np.random.Generat
 # --- clocks ---------------------------------------------------------------------------------------------
 
 
+def bare(t: Array, estimate: Array, true_t: Array, truth: Array, manifold: Manifold, max_dt: float) -> Poses:
+    """Poses without covariances."""
+    place, P = Places("row {}".format, np.arange(len(t))), unstated(len(t), 3 if manifold == "planar" else 6)
+    return Poses(place, t, estimate, *P, true_t, truth, manifold, "left", max_dt)
+
+
 def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> list[tuple[Poses, Array]]:
     """Poses whose timestamps are ``late`` s early, in a world of their own, of a vehicle that does not move evenly."""
     found = []
@@ -267,7 +279,7 @@ def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> 
         t = np.cumsum(0.4 + 0.3 * np.sin(0.3 * np.arange(len(drive.t))))
         place = matrices_of(np.full((1, 3 if drive.d == 2 else 6), 0.7))
         E, M = vectors(place @ drive.estimate), vectors(drive.truth)
-        poses = Poses.bare(None, t - late, E, t, M, "planar" if drive.d == 2 else "spatial", 0.02)  # type: ignore[arg-type]
+        poses = bare(t - late, E, t, M, "planar" if drive.d == 2 else "spatial", 0.02)
         found.append((poses, place @ drive.estimate))
     return found
 
@@ -284,7 +296,7 @@ def test_an_offset_of_clocks_is_found_from_motions(
 
 def test_an_offset_that_nothing_tells_is_refused() -> None:
     M = np.column_stack([np.arange(300.0), np.zeros((300, 2))])
-    poses = Poses.bare(None, np.arange(300.0), M, np.arange(300.0), M, "planar", 0.5)  # type: ignore[arg-type]
+    poses = bare(np.arange(300.0), M, np.arange(300.0), M, "planar", 0.5)
     with pytest.raises(InputError, match="--time-offset estimate: the motions do not tell it"):
         clock_offset([(poses, matrices_of(M))])
 
@@ -305,7 +317,7 @@ def test_the_command_reads_an_offset_that_is_estimated(tmp_path: Path, rng: np.r
     assert fixed[0].shift == 0.0
     model = cs.fit_covariance(found, SPAN)
     assert f"clocks: {found[0].shift:.3g} s are added to the timestamps" in "\n".join(noise_lines(model))
-    assert "clocks" not in "\n".join(noise_lines(replace(model, drives=tuple(fixed))))
+    assert "clocks" not in "\n".join(noise_lines(replace(model, windows=replace(model.windows, drives=tuple(fixed)))))
     with pytest.raises(InputError, match="--time-offset fast: must be a number of seconds, or 'estimate'"):
         cs.read_drives(tmp_path / "est", reading=replace(given, time_offset="fast"))
     whole = [cs.read_drives(tmp_path / "est", reading=replace(given, time_offset=one))[0].t[0] for one in (1, 1.0)]
@@ -359,6 +371,33 @@ def test_what_moves_without_turning_is_no_placeholder(rng: np.random.Generator) 
 def test_a_scale_that_is_not_metric_is_not_taken_for_increments(rng: np.random.Generator) -> None:
     with pytest.raises(InputError, match="not metric"):
         cs.fit_covariance(drives(rng, 2, World(metric=2.2)), SPAN)
+
+
+@pytest.mark.parametrize("side", ["estimates", "truth"])
+@pytest.mark.parametrize("kind", ["npz", "csv", "folder"])
+def test_headings_in_degrees_are_refused(kind: str, side: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    """Those of unwrapped radians are read, though they are beyond a turn."""
+    drive = drives(rng, 1, length=300.0)[0]
+    rows = {"estimates": vectors(drive.estimate), "truth": vectors(drive.truth)}
+
+    def read() -> list[Drive]:
+        if kind == "npz":
+            np.savez(tmp_path / "a.npz", t=drive.t, **rows)
+            return cs.read_drives(tmp_path / "a.npz")
+        paths = {each: tmp_path / each / "a.csv" for each in rows}
+        for each, path in paths.items():
+            path.parent.mkdir(exist_ok=True)
+            table = np.column_stack([drive.t, rows[each]])
+            np.savetxt(path, table, delimiter=",", header="t,x,y,heading", comments="", fmt="%.12g")
+        if kind == "csv":
+            return cs.read_drives(paths["estimates"], paths["truth"])
+        return cs.read_drives(tmp_path / "estimates", tmp_path / "truth")
+
+    rows[side][:, 2] += 6.0 * np.pi
+    assert len(read()) == 1
+    rows[side][:, 2] = np.rad2deg(rows[side][:, 2] - 6.0 * np.pi)
+    with pytest.raises(InputError, match=rf"headings of the {side} .* seem to be in degrees; write headings in rad"):
+        read()
 
 
 @pytest.mark.parametrize("size", [1e-12, 1e-9, 1e-5])

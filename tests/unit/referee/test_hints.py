@@ -14,10 +14,12 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from consistency.referee.diagnostics import Record
+from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.geometry.groups import spatial_error
-from consistency.referee.notebook.read_and_judge import judge
+from consistency.referee.geometry.groups import composed, matrices, spatial_error, vectors
+from consistency.referee.notebook.read_and_judge import judge, read
 from consistency.referee.readers.alignment.world_frames import (
     BodyTransform,
     WorldTransform,
@@ -27,12 +29,16 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     on_body,
 )
-from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.mix_ups import hints as readers_hints
-from consistency.referee.readers.mix_ups.hints import FACTOR, ReadingFit, fit_of, hints, turns
-from consistency.referee.readers.mix_ups.known import _ned
-from consistency.referee.readers.runs_to_record import Track, _singular
+from consistency.referee.readers.mix_ups import reading_fit
+from consistency.referee.readers.mix_ups.hints import hints, turns
+from consistency.referee.readers.mix_ups.known import Guess, _ned
+from consistency.referee.readers.mix_ups.reading_fit import FACTOR, ReadingFit, fit_of
+from consistency.referee.readers.places import Places
+from consistency.referee.readers.relative_motions import Stretch, relative_recording
+from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
 from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 from consistency.testing import assert_consistent
 
@@ -479,6 +485,203 @@ def test_causes_are_shown_by_print_and_gate(rng: np.random.Generator) -> None:
 
 
 # --- frames -----------------------------------------------------------------------------------------
+
+
+def test_one_error_that_is_constant_over_a_log_is_no_reason_against_a_cause(rng: np.random.Generator) -> None:
+    """One effective estimate, whose components differ by chance; with as many runs they would not."""
+    sigma, w = np.repeat([1.0, 1e-3], 3), np.array([1.0, 0.05, 2.0, -0.1, 0.5, 1.5])
+    right = world.run_of(rng, "spatial", "so3", np.tile(w * sigma, (60, 1)), np.tile(np.diag(sigma**2), (60, 1, 1)))
+    swapped = replace(right, covariance=right.covariance[:, SWAP][:, :, SWAP])
+    (said,) = hints("est", SIX, [swapped])
+    assert "other order (--covariance-order)" in said
+    assert not fit(*[np.tile(w, (60, 1)) * sign for sign in rng.choice([-1.0, 1.0], 60)]).right(True)
+
+
+def test_runs_are_independent_however_their_nees_spreads(rng: np.random.Generator) -> None:
+    """Five constant errors whose P is of the body: each run alone says too little, and one of them nearly all."""
+    runs, sigma = [], np.array([0.3, 0.03, 0.01])
+    for size in (0.3, 0.3, 0.4, 0.4, 1.8):
+        e = np.tile(size * sigma * [1.0, -1.0, 1.0], (90, 1))
+        runs.append(world.run_of(rng, "planar", "left", e, np.tile(np.diag(sigma**2), (90, 1, 1))))
+    turned = [replace(p, convention="so2") for p in runs]
+    (said,) = hints("est", THREE, turned)
+    assert "the error is 'left'" in said
+    assert hints("est", THREE, turned[:1]) == []
+
+
+def test_the_likeliest_cause_is_named_whatever_its_size() -> None:
+    """Of two that are both right, the one of the larger likelihood, though its NEES spreads more."""
+    rng = np.random.default_rng(12)
+    w = rng.normal(size=(400, 3))
+    better, worse = fit(w * np.exp(rng.normal(size=(400, 1)))), fit(w, P=9.0 * np.eye(3))
+    assert better.size < worse.size
+    assert better.near() > worse.near()
+    one, other = (Guess(text, lambda p: p) for text in ("one", "other"))
+    declared = fit(30.0 * w * [1.0, 10.0, 0.1])
+    assert str(readers_hints._cause([(other, worse), (one, better)], declared)).startswith("one")
+
+
+def test_a_bias_of_few_standard_deviations_explains_a_large_nees(rng: np.random.Generator) -> None:
+    """3 sigma of one axis, growing with sigma, beside a covariance in which a sum is known 1,000 times better."""
+    R = np.array([[1.0, 1.0 - 1e-6], [1.0 - 1e-6, 1.0]])
+    grown = np.exp(0.5 * np.sin(np.linspace(0.0, 6.0, 400)))[:, None]
+    e = (rng.normal(size=(400, 2)) @ np.linalg.cholesky(R).T + [3.0, 0.0]) * grown
+    P = R * np.square(grown)[:, :, None]
+    run = replace(poses(np.arange(400.0), np.zeros_like(e), R, e, "vector", "vector"), covariance=P)
+    assert decades([run])[0] > 5.0
+    assert hints("est", ("a", "b"), [run]) == []
+
+
+def test_one_number_for_all_variances_is_no_covariance_of_an_estimator(rng: np.random.Generator) -> None:
+    sigma = np.repeat([0.3, 0.3 * np.pi / 180.0], 3)
+    right = world.log(rng, "spatial", 20, 50, 0.0, sigma=sigma, correlated=False)
+    runs = [weighed(p, slice(3, 6), DEGREES) for p in right]
+    dummy = [replace(p, covariance=np.broadcast_to(0.09 * np.eye(6), p.covariance.shape)) for p in runs]
+    assert hints("est", SIX, dummy) == []
+    sigma[0] *= 3.0
+    right = world.log(rng, "spatial", 20, 50, 0.0, sigma=sigma, correlated=False)
+    (said,) = hints("est", SIX, [weighed(p, slice(3, 6), DEGREES) for p in right])
+    assert "its angles are in degrees" in said
+
+
+def test_many_components_are_fitted_like_few(rng: np.random.Generator) -> None:
+    """Each matrix by itself where they are large; one without a factor is left out, and the others stay."""
+    n = reading_fit.SMALL + 5
+    A = rng.normal(size=(4, n, n))
+    P, e = A @ np.swapaxes(A, 1, 2), rng.normal(size=(4, n))
+    P[1, 0, 1] = P[1, 1, 0] = 2.0 * np.sqrt(P[1, 0, 0] * P[1, 1, 1])
+    found = fit_of([(e[:2], P[:2]), (e[2:], P[2:])])
+    assert found is not None
+    assert [len(w) for w in found.whitened] == [1, 2]
+    nees = [float(e[k] @ np.linalg.solve(P[k], e[k])) for k in (0, 2, 3)]
+    np.testing.assert_allclose(np.square(found.w).sum(axis=1), nees, rtol=1e-6)
+    log_det = np.mean([np.linalg.slogdet(P[k])[1] for k in (0, 2, 3)])
+    assert found.likelihood == pytest.approx(-0.5 * (np.mean(nees) + log_det), rel=1e-9)
+    many = [poses(np.arange(1.0), np.zeros((1, 400)), np.eye(400), np.ones((1, 400)), "vector", "vector")] * 40
+    assert len(readers_hints._thinned(many, 0.0)) == 20
+
+
+def assert_named(causes: Sequence[str], said: str | None) -> None:
+    """One cause in these words, or none."""
+    assert len(causes) == (said is not None)
+    assert all(str(said) in cause for cause in causes)
+
+
+# --- motions ----------------------------------------------------------------------------------------
+
+
+def wheels(rng: np.random.Generator, steps: int = 2000) -> dict[str, Array]:
+    """An archive of planar motions of two robots, with the true poses."""
+    sigma = np.array([0.01, 0.004, 0.003])
+    told = np.tile([0.15, 0.0, 0.02], (2, steps, 1)) + rng.normal(size=(2, steps, 3)) * [0.02, 0.001, 0.02]
+    true = told + sigma * rng.normal(size=told.shape)
+    start = np.zeros((2, 1, 3))
+    poses = [vectors(composed(matrices(np.concatenate([start[0], one])))) for one in true]
+    P = np.broadcast_to(np.diag(sigma**2), (2, steps + 1, 3, 3))
+    return {"estimates": np.concatenate([start, told], axis=1), "truth": np.array(poses), "covariances": P}
+
+
+@pytest.mark.parametrize(
+    ("key", "mess", "said"),
+    [
+        ("covariances", lambda P: P, None),
+        ("covariances", lambda P: P * np.outer(ANGLES, ANGLES), "its angles are in degrees"),
+        ("covariances", lambda P: P[..., [1, 0, 2], :][..., [1, 0, 2]], "in the order y, x, heading"),
+        ("estimates", lambda motions: motions * [1e3, 1e3, 1.0], "positions of the estimates are in millimetres"),
+    ],
+)
+def test_mix_ups_of_motions_are_named(
+    key: str, mess: Mess, said: str | None, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    arrays = wheels(rng)
+    np.savez(tmp_path / "wheels.npz", **arrays | {key: mess(arrays[key])})  # type: ignore[arg-type]
+    record = read(tmp_path / "wheels.npz", relative=20, motions=True)
+    assert_named(record.causes, said)
+    assert set(record.causes) <= set(record.notes)
+
+
+def test_mix_ups_of_poses_with_cross_covariances_are_named(rng: np.random.Generator) -> None:
+    """A walk whose steps are independent: E e_before e' is the covariance before; both have their rows in one order."""
+    sigma = np.array([0.02, 0.05, 0.001])
+    pose = np.column_stack([np.arange(400) * 0.4, np.zeros(400), np.zeros(400)])
+    e = np.cumsum(rng.normal(size=(400, 3)) * sigma, axis=0)
+    P = np.arange(1, 401)[:, None, None] * np.diag(sigma**2)
+    before = np.concatenate([np.zeros((1, 3, 3)), P[:-1]])
+    order = [2, 0, 1]
+
+    def causes(some: list[int]) -> list[str]:
+        P_, C = (M[:, some][:, :, some] for M in (P, before))
+        track = Stretch(
+            0, "est", Places("line {}".format, np.arange(400)), np.arange(400.0), pose, P_, C, np.arange(400),
+            pose + e, "so2",
+        )  # fmt: skip
+        return list(relative_recording("est", "est", [track], THREE, range(3), Relative(1.0, "step")).causes)
+
+    assert causes([0, 1, 2]) == []
+    (said,) = causes(order)
+    assert "in the order heading, x, y" in said
+
+
+# --- roots, innovations ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("root", "said"),
+    [
+        (lambda P: np.linalg.cholesky(P), "it holds the lower root L of the covariance; write L L'"),
+        (lambda P: np.linalg.cholesky(np.linalg.inv(P)), "it holds the upper root U of an information matrix U'U"),
+        (lambda P: np.swapaxes(np.linalg.cholesky(np.linalg.inv(P)), 1, 2), "the upper root U of an information"),
+        (lambda P: np.triu(P), None),
+    ],
+)
+def test_one_triangle_of_36_numbers_is_read(
+    root: Callable[[Array], Array], said: str | None, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """The upper or lower triangle of a covariance, or of a root, whose mirrored matrix may be no covariance at all."""
+    (p,) = world.log(rng, "spatial", 1, 400, 0.0, sigma=np.repeat([0.1, 0.01], 3))
+    M = root(p.covariance).reshape(400, 36)
+    np.savetxt(tmp_path / "est.txt", np.column_stack([p.t, p.estimate, M]), fmt="%.15g")
+    np.savetxt(tmp_path / "truth.txt", np.column_stack([p.t, p.truth]), fmt="%.15g")
+    record = read(tmp_path / "est.txt", tmp_path / "truth.txt")
+    assert_named(record.causes, said)
+
+
+def test_a_matrix_with_two_triangles_that_differ_is_still_refused() -> None:
+    both, upper = np.array([[[1.0, 0.2], [0.4, 1.0]]]), np.array([[[1.0, 0.4], [0.0, np.inf]]])
+    with pytest.raises(InputError, match="line 3: the covariance is not symmetric"):
+        symmetric(both, lambda row: f"line {row + 3}")
+    np.testing.assert_array_equal(symmetric(upper, str), [[[1.0, 0.4], [0.4, np.inf]]])
+
+
+def gated(nis: Array) -> Array:
+    """Without the largest 5 % of two components."""
+    return np.where(nis > 5.99, np.nan, nis)
+
+
+@pytest.mark.parametrize("optimal", [True, False])
+@pytest.mark.parametrize(
+    ("nis_of", "said"),
+    [
+        (lambda v: np.square(v[..., :2]).sum(axis=-1), None),
+        (lambda v: np.square(v).sum(axis=-1), "like chi-square with 3 degrees of freedom, not 2 as stated"),
+        (lambda v: np.square(v[..., 0]), "like chi-square with 1 degrees of freedom, not 2 as stated"),
+        (lambda v: 0.25 * np.square(v[..., :2]).sum(axis=-1), "are the innovations residuals after the update"),
+        (lambda v: 1.5 * np.square(v[..., :2]).sum(axis=-1), None),  # a wrong R
+        (lambda v: gated(np.square(v[..., :2]).sum(axis=-1)), None),
+    ],
+)
+def test_causes_of_innovations(
+    nis_of: Callable[[Array], Array], said: str | None, optimal: bool, rng: np.random.Generator
+) -> None:
+    """A filter of right errors in 2,400 steps; neither a wrong R nor a gate that rejects 5 % is named."""
+    e, v = rng.normal(size=(40, 60, 2)), rng.normal(size=(40, 60, 3))
+    P, dof = np.broadcast_to(np.eye(2), (40, 60, 2, 2)), np.full((40, 60), 2.0)
+    record = Record("est", error=e, covariance=P, nis=nis_of(v), nis_dof=dof, optimal_gain=optimal)
+    verdict = judge(record)
+    assert_named(verdict.causes, said)
+    assert set(verdict.causes) <= set(verdict.reasons)
+    wrong = replace(record, error=3.0 * e)
+    assert not any("after the update" in cause for cause in judge(wrong).causes)
 
 
 @pytest.mark.parametrize("angle", [-2.0, 0.3])

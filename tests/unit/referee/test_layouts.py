@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -14,9 +15,9 @@ from command import consistency, refused
 from recorded import read_recordings
 
 import consistency as cs
+from consistency.referee.readers.clock_units import unit_apart
 from consistency.referee.readers.formats.named_columns import fields_of, require_units
 from consistency.referee.readers.formats.sheet import TableRows
-from consistency.referee.readers.truth_matching import unit_apart
 from consistency.referee.types import Array
 
 DATA = Path(os.environ.get("CONSISTENCY_DATA", Path(__file__).parents[4] / "shared" / "data"))
@@ -535,6 +536,40 @@ def test_a_last_line_that_is_cut_short_is_left_out(
     assert not record.failures
     np.testing.assert_allclose(record.nees[0, : STEPS - 1], reference(d.own, d.true, d.P)[:-1], rtol=1e-9)
     assert "has no end and is left out" in consistency(capsys, "analyse", "est.tum", "--truth", truth)[1]
+
+
+CUT = {
+    "a field less": ("est.csv", lambda text: text[: text.rindex(",")]),
+    "a number that ends in e": ("est.csv", lambda text: text[: text.rindex(",") + 2] + "e"),
+    "a variance of 0": ("est.csv", lambda text: text[: text.rindex(",") + 2]),
+    "an object without an end": ("est.jsonl", lambda text: text.rstrip()[:-1]),
+    "a truth with a field less": ("truth.csv", lambda text: text[: text.rindex(",")]),
+}
+
+
+@pytest.mark.parametrize("case", CUT)
+def test_a_last_row_of_a_table_that_is_cut_short_is_left_out(case: str, inside: Path) -> None:
+    rows, (file, cut) = [float(k) for k in range(STEPS)], CUT[case]
+    names = ("t", "a", "P_a_a")
+    table = [dict(zip(names, (t, 0.1 * t, 0.01), strict=True)) for t in rows]
+    texts = {
+        "est.csv": "\n".join([",".join(names), *(",".join(map(repr, row.values())) for row in table)]),
+        "est.jsonl": "\n".join(map(json.dumps, table)),
+        "truth.csv": "\n".join(["t,a", *(f"{t},0.0" for t in rows)]),
+    }
+    for name, text in texts.items():
+        Path(name).write_text(cut(text) if name == file else text, encoding="utf-8")
+    est = "est.jsonl" if file == "est.jsonl" else "est.csv"
+    record = cs.read(est, truth="truth.csv", state=["a"], max_dt=0.5)
+    assert record.notes[0] == (
+        f"{file}: the last line, {STEPS + (file != 'est.jsonl')}, has no end and is left out; it seems to be cut short"
+    )
+    assert record.nees.shape == (1, STEPS - 1)
+    assert not record.failures
+    if file == est and "0" not in case.split():  # a line with an end is not cut short, but broken
+        Path(est).write_text(cut(texts[est]) + "\n", encoding="utf-8")
+        with pytest.raises(cs.InputError, match=rf"line {STEPS + (file != 'est.jsonl')}"):
+            cs.read(est, truth="truth.csv", state=["a"], max_dt=0.5)
 
 
 def test_whole_files_without_a_final_newline_are_read_whole(inside: Path) -> None:

@@ -18,11 +18,10 @@ from consistency.referee.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.questions.innovations import outliers_of
 from consistency.referee.gating.checked_arrays import record_of_checked
 from consistency.referee.readers.formats.position_truth import placeholder
-from consistency.referee.readers.formats.sheet import Places
 from consistency.referee.readers.heading_units import require_radians
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import not_estimated
-from consistency.referee.readers.space_trajectories import AXES, REST
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import AXES, REST, Poses
 from consistency.referee.types import Array
 from consistency.testing import assert_consistent
 

@@ -15,7 +15,7 @@ import consistency as cs
 from consistency.referee.geometry import wrap
 from consistency.referee.readers import clock_offset
 from consistency.referee.readers.clock_offset import Offset, clock_shift, offset_of, steps_of
-from consistency.referee.readers.formats.sheet import Places
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
@@ -222,3 +222,15 @@ def test_what_has_truth_is_judged_at_every_offset(rng: np.random.Generator, monk
 def test_an_offset_that_makes_next_to_nothing_is_not_named(explained: float, alone: bool, found: bool) -> None:
     """However sure: x and y exchanged looked like clocks that differ by 0.01 s, which made 0 % of the NEES."""
     assert Offset(-0.01, -0.014, -0.006, 1e-9, explained, alone).found == found
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.05])
+def test_a_truth_beside_the_estimates_is_that_of_other_times_if_the_clocks_differ(
+    rng: np.random.Generator, shift: float
+) -> None:
+    p = run_of(rng, 0.0)
+    own = p.known(0.0).truth
+    beside, apart = (replace(p, true_t=t, truth=own, max_dt=0.2).known(shift) for t in (p.t, p.t.copy()))
+    np.testing.assert_allclose(beside.truth, apart.truth)
+    np.testing.assert_array_equal(beside.rows, apart.rows)
+    assert np.array_equal(beside.truth, own) == (shift == 0.0)

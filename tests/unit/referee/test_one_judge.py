@@ -115,6 +115,9 @@ def test_a_look_has_what_stands_beside_the_errors_of_its_runs() -> None:
     assert verdict.map.verdict is None, "a look has the scores of the maps alone"
     assert verdict.world.convention is None
     assert verdict.world.notes == ()
+    errors = replace(given.in_world, map=None, rejections=None)
+    assert verdict.world.answers == follow(Design(3), errors.first_runs, 12)[0].answers
+    assert verdict.world.answers != judge(errors.first_runs(12)).answers, "a look costs a part of the rate"
 
 
 def test_a_design_judges_by_the_look_that_decides() -> None:

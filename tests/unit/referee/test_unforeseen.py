@@ -60,7 +60,7 @@ def test_debug_stands_before_any_command(capsys: pytest.CaptureFixture[str]) -> 
     assert "runs" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", [NameError, UnboundLocalError])
+@pytest.mark.parametrize("kind", [NameError, UnboundLocalError, TypeError, AttributeError, IndexError])
 def test_a_programming_error_of_ours_is_not_reworded(kind: type[Exception]) -> None:
     code = compile(
         "def parse():\n    raise KIND('ours')", str(Path(cs.__file__).parent / "referee" / "some.py"), "exec"

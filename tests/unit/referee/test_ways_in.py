@@ -235,6 +235,50 @@ def test_truth_and_estimate_in_one_table(true: str, own: str, inside: Path) -> N
     assert "est.csv: the truth stands in columns beside the estimates" in record.notes
 
 
+def in_space(data: Data, stated: dict[str, Array], true: str, own: str = "{}") -> pd.DataFrame:
+    """A table of poses without turns, their truth beside them."""
+    names = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    still = pd.DataFrame({f"q{axis}": np.full(STEPS, float(axis == "w")) for axis in "xyzw"})
+    sides = [pd.DataFrame(values[:, :3], columns=names[:3]).join(still)
+             for values in (data.truth - data.error, data.truth)]  # fmt: skip
+    return pd.concat([side.rename(columns=spelling.format) for side, spelling in zip(sides, (own, true), strict=True)]
+                     + [pd.DataFrame(stated)], axis=1)  # fmt: skip
+
+
+@pytest.mark.parametrize("true", ["true_{}", "{}_gt"])
+@pytest.mark.parametrize("own", ["{}", "{}_est"])
+@pytest.mark.parametrize("folder", [False, True])
+def test_truth_beside_poses_in_space(true: str, own: str, folder: bool, inside: Path) -> None:
+    data = Data(("x", "y", "z", "1", "2", "3"))
+    table = in_space(data, data.stated("P{}{}", tuple("123456")), true, own).assign(t=data.t)
+    table.loc[2, true.format("y")] = np.nan
+    Path("est").mkdir()
+    est = write("est/one.csv", table)
+    record = cs.read("est" if folder else est)
+    np.testing.assert_allclose(record.error[0, :, :3], np.delete(data.error[:, :3], 2, axis=0), atol=1e-9)  # type: ignore[index]
+    assert any("1 of 7 estimates have no truth" in note for note in record.notes)
+    assert any(note.endswith("the truth stands in columns beside the estimates") for note in record.notes)
+    other = write("truth.csv", data.true().iloc[:, :3], t=data.t, qx=0.0, qy=0.0, qz=0.0, qw=1.0)
+    np.testing.assert_allclose(cs.read(est, truth=other).error[0, :, :3], data.error[:, :3], atol=1e-9)  # type: ignore[index]
+
+
+@pytest.mark.parametrize("spelling", ["var_{}", "{}_var", "sd_{}", "{}_sd"])
+def test_variances_and_deviations_of_poses_in_space(spelling: str, inside: Path) -> None:
+    data, words = Data(("x", "y", "z", "1", "2", "3")), ("x", "y", "z", "roll", "pitch", "yaw")
+    stated = {spelling.format(word): np.full(STEPS, 4.0) for word in words}
+    record = cs.read(write("est.csv", in_space(data, stated, "true_{}"), t=data.t), axes=words)
+    variance = 4.0 if "var" in spelling else 16.0
+    np.testing.assert_allclose(np.asarray(record.covariance)[0, 3], variance * np.eye(6))
+    assert record.parts == tuple((i,) for i in range(6))
+    other = {f"var_{word}": np.full(STEPS, 9.0) for word in words} | {
+        f"sd_{word}": np.full(STEPS, 2.0) for word in words
+    }
+    both = cs.read(
+        write("est.csv", in_space(data, other, "true_{}"), t=data.t), axes=words
+    )  # deviations count, as in the plane
+    np.testing.assert_allclose(np.asarray(both.covariance)[0, 3], 4.0 * np.eye(6))
+
+
 def test_rows_without_a_truth_beside_them_do_not_count(inside: Path) -> None:
     data, step = Data(("a", "b")), np.arange(1, STEPS + 1)
     table = data.table(data.stated("P_{}_{}", data.axes)).join(data.true("true_{}")).assign(step=step)
@@ -425,7 +469,7 @@ def test_times_in_messages_have_all_their_digits(inside: Path) -> None:
     with pytest.raises(cs.InputError, match=r"t 1326030980\.5312 is there twice"):
         cs.read(write("est.csv", table), truth=truth, state=["a"])
     table["t"] = ["1326030980.53", "1326030981.5312"]
-    with pytest.raises(cs.InputError, match=r"\(1326030980\.53 to 1326030981\.5312\)"):
+    with pytest.raises(cs.InputError, match=r"t is 1326030980\.53 to 1326030981\.5312, but 1 to 2 in truth\.csv"):
         cs.read(write("est.csv", table), truth=truth, state=["a"])
 
 

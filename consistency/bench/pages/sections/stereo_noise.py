@@ -36,19 +36,25 @@ class Distribution:
     """Eq. 21 applied to Gaussian (u, d) for one baseline, as Herath et al. (2007) fig. 12."""
 
     baseline: float  # m
-    samples: int
-    points: Array  # (n, 2), m, the samples drawn
-    window: tuple[tuple[float, float], tuple[float, float]]  # drawn range of x and y, m
-    outside: float  # share of samples beyond the drawn range
-    edges: Array  # (b + 1,), m
-    density: Array  # (b,), 1/m
-    grid: Array  # (g,), m
+    samples: Array  # (n, 2), m
     linear: Gaussian  # J diag(sigma^2) J' at the true point
     fitted: Gaussian  # moments of the samples
-    linear_ellipse: Array  # (m, 2), 2 sigma
-    fitted_ellipse: Array
-    linear_density: Array  # (g,), 1/m
-    fitted_density: Array
+
+    @property
+    def window(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Drawn range of x and y, m."""
+        return _range(self.samples[:, 0], self.linear, 0), _range(self.samples[:, 1], self.linear, 1)
+
+    @property
+    def inside(self) -> Array:
+        """Which samples (n,) lie within the drawn range."""
+        low, high = np.transpose(self.window)
+        return np.asarray(((low <= self.samples) & (self.samples <= high)).all(axis=1))
+
+    @property
+    def drawn(self) -> Array:
+        """The first samples, without those beyond the drawn range, (N, 2)."""
+        return np.asarray(self.samples[:DRAWN][self.inside[:DRAWN]])
 
 
 def read(report: Report) -> tuple[Distribution, ...]:
@@ -67,29 +73,9 @@ def read(report: Report) -> tuple[Distribution, ...]:
 
 
 def _distribution(baseline: float, table: pd.DataFrame) -> Distribution:
-    points = table[["x", "y"]].to_numpy(float)
+    samples = table[["x", "y"]].to_numpy(float)
     linear = Gaussian(np.array(POINT), _linear_covariance(baseline))
-    fitted = Gaussian(points.mean(axis=0), np.cov(points.T))
-    window = (_range(points[:, 0], linear, 0), _range(points[:, 1], linear, 1))
-    inside = np.all([(low <= c) & (c <= high) for c, (low, high) in zip(points.T, window, strict=True)], axis=0)
-    edges, grid = np.linspace(*window[0], BINS + 1), np.linspace(*window[0], 201)
-    count, _ = np.histogram(points[:, 0], edges)
-    return Distribution(
-        baseline=baseline,
-        samples=len(points),
-        points=points[:DRAWN][inside[:DRAWN]],
-        window=window,
-        outside=float(1.0 - inside.mean()),
-        edges=edges,
-        density=count / (len(points) * np.diff(edges)),
-        grid=grid,
-        linear=linear,
-        fitted=fitted,
-        linear_ellipse=_ellipse(linear),
-        fitted_ellipse=_ellipse(fitted),
-        linear_density=stats.norm.pdf(grid, linear.mean[0], np.sqrt(linear.covariance[0, 0])),
-        fitted_density=stats.norm.pdf(grid, fitted.mean[0], np.sqrt(fitted.covariance[0, 0])),
-    )
+    return Distribution(baseline, samples, linear, Gaussian(samples.mean(axis=0), np.cov(samples.T)))
 
 
 def _linear_covariance(baseline: float) -> Array:
@@ -110,7 +96,7 @@ def _range(values: Array, linear: Gaussian, axis: int) -> tuple[float, float]:
     )
 
 
-def _ellipse(gaussian: Gaussian) -> Array:
+def ellipse(gaussian: Gaussian) -> Array:
     """Points (73, 2) at two standard deviations."""
     angle = np.linspace(0.0, 2 * np.pi, 73)
     values, vectors = np.linalg.eigh(gaussian.covariance)
@@ -125,25 +111,31 @@ def stereo_noise(report: Report) -> tuple[Figure, ...]:
 
 def _draw(d: Distribution) -> Drawing:
     figure, (cloud, histogram) = canvas(2.0, 2, 2)
-    points(cloud, d.points[:, 0], d.points[:, 1], DOTS, limit=DRAWN)
-    cloud.set(xlabel="x (m)", ylabel="y (m)", xlim=d.window[0], ylim=d.window[1])
-    histogram.stairs(d.density, d.edges, fill=True, color=SAMPLES.colour, label="samples")
-    for look, outline, density, label in (
-        (LINEAR, d.linear_ellipse, d.linear_density, "linearised Gaussian"),
-        (FITTED, d.fitted_ellipse, d.fitted_density, "Gaussian with the samples' moments"),
+    points(cloud, d.drawn[:, 0], d.drawn[:, 1], DOTS, limit=DRAWN)
+    of_x, of_y = d.window
+    cloud.set(xlabel="x (m)", ylabel="y (m)", xlim=of_x, ylim=of_y)
+    count, edges = np.histogram(d.samples[:, 0], BINS, of_x)
+    density = count / (len(d.samples) * np.diff(edges))
+    histogram.stairs(density, edges, fill=True, color=SAMPLES.colour, label="samples")
+    x = np.linspace(*of_x, 201)
+    for gaussian, look, label in (
+        (d.linear, LINEAR, "linearised Gaussian"),
+        (d.fitted, FITTED, "Gaussian with the samples' moments"),
     ):
-        path(cloud, outline, look)
-        histogram.plot(d.grid, density, label=label, **stroke(look))
-    histogram.set(xlabel="x (m)", ylabel="density (1/m)", xlim=d.window[0])
+        path(cloud, ellipse(gaussian), look)
+        sd = np.sqrt(gaussian.covariance[0, 0])
+        histogram.plot(x, stats.norm.pdf(x, gaussian.mean[0], sd), label=label, **stroke(look))
+    histogram.set(xlabel="x (m)", ylabel="density (1/m)", xlim=of_x)
     return add_legend(figure)
 
 
 def caption(d: Distribution) -> str:
     """What one panel pair of fig. 12 shows, with its numbers."""
     linear, fitted = (float(np.sqrt(g.covariance[0, 0])) for g in (d.linear, d.fitted))
-    beyond = f" {100 * d.outside:.1f} % of the samples lie beyond the axes." if d.outside >= 0.0005 else ""
+    outside = 1.0 - d.inside.mean()
+    beyond = f" {100 * outside:.1f} % of the samples lie beyond the axes." if outside >= 0.0005 else ""
     return (
-        f"Baseline {d.baseline:g} m: {d.samples} samples of eq. 21 within the search range, for a point at x = 10 m, "
-        f"y = 1 m ({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the "
-        f"samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
+        f"Baseline {d.baseline:g} m: {len(d.samples)} samples of eq. 21 within the search range, for a point at "
+        f"x = 10 m, y = 1 m ({len(d.drawn)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m "
+        f"from the samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
     )

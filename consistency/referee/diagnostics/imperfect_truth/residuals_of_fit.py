@@ -56,7 +56,9 @@ def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared:
     """
     longest, n = max(map(len, residuals)), residuals[0].shape[1]
     kernels, edges = _kernels(longest, shared), _bins(longest)
-    every = kernels if shared else np.concatenate([kernels, _slower(longest)])
+    every = kernels
+    if not shared:
+        every = np.concatenate([kernels, _slower(longest)])
     seen = np.array([_binned(_products(r), edges) for r in residuals])  # (N, n, bins)
     pairs = np.array([_binned(np.maximum(len(r) - np.arange(longest), 0.0), edges) for r in residuals])  # (N, bins)
     whole = _expected(bases, every, edges, shared)  # (N, n, bins, n, J)
@@ -69,7 +71,9 @@ def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared:
         return Left(left)
     taken = sum(float(np.trace(np.eye(n) - M, axis1=1, axis2=2).sum()) for M in left)
     error = MARGIN * _error(seen, expected, pairs) * (n * sum(map(len, residuals)) - taken)
-    back = min(error / taken, 1.0) if taken > 0 else 0.0
+    back = 0.0
+    if taken > 0:
+        back = min(error / taken, 1.0)
     return Left([M + back * (np.eye(n) - M) for M in left])
 
 

@@ -7,20 +7,15 @@ other data.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize
 
-from consistency.referee.diagnostics.records.record import Record, arrays_of
-from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
 LEAST, MOST = 1e-7, 1.0  # m and rad, standard deviations of the floor that are looked at
-KINDS = ("by-vector", "by-time", "by-distance")
-VAGUE = 100.0  # prior deviation of what is shared, over what explains all of the errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,103 +91,3 @@ def posterior(floor: Array, errors: Array, J: Array, S: Array, prior: Array) -> 
     volume = np.linalg.slogdet(C)[1].sum() + np.linalg.slogdet(H * np.outer(prior, prior))[1]
     slope = 2.0 * floor**2 * (diagonal - weighted**2).sum(axis=0)
     return mean, covariance, float((errors * weighted).sum() + volume), slope
-
-
-# --- records ----------------------------------------------------------------------------------------------
-
-
-def growth(record: Record, kind: str) -> Array:
-    """What the shared vector is multiplied by in each step, (runs, steps): 1, or s or m since the run began.
-
-    Raises
-    ------
-    InputError
-        The record has no errors, no times, or no true path.
-    """
-    if record.error is None or record.covariance is None or record.parts:
-        raise InputError(f"--shared: needs errors with covariances of all components; {record.name} has none")
-    shape = record.error.shape[:2]
-    if kind == "by-vector":
-        return np.ones(shape)
-    if record.window is not None:
-        raise InputError(
-            f"--shared {kind}: windows of {record.window} are alike; take by-vector, a vector for each window"
-        )
-    if kind == "by-time":
-        t = np.broadcast_to(record.t, shape) if record.times is None else record.times
-        if not np.isfinite(t).any():
-            raise InputError(f"--shared by-time: {record.name} has no times")
-        return np.asarray(t - np.nanmin(t, axis=1, keepdims=True))
-    if record.path is None:
-        raise InputError(f"--shared by-distance: {record.name} has no positions")
-    steps = np.linalg.norm(np.diff(record.path[:, :, 0], axis=1), axis=-1)
-    return np.concatenate([np.zeros((shape[0], 1)), np.cumsum(np.nan_to_num(steps), axis=1)], axis=1)
-
-
-def fit_record(record: Record, kind: str) -> SharedError:
-    """What the errors of a record share: one vector, times :func:`growth`.
-
-    Steps of a run depend on each other: its mean is as certain as one of them is, unless they are independent.
-
-    Raises
-    ------
-    InputError
-        As :func:`growth` and :func:`fit_shared`.
-    """
-    e, P, g = _steps(record, kind)
-    n = e.shape[1]
-    prior = VAGUE * np.maximum(np.sqrt((e**2).mean(axis=0)), LEAST) / np.sqrt((g**2).mean())
-    fit = fit_shared(e, g[:, None, None] * np.eye(n), P, prior)
-    together = 1.0 if record.independent else len(e) / max(len(record.run_numbers), 1)
-    return replace(fit, covariance=together * fit.covariance)
-
-
-def without_shared(record: Record, fit: SharedError, kind: str) -> Record:
-    """The record without the errors that another shares with it, and with what they leave uncertain in its covariance.
-
-    What is left of them is in all runs, so that a bias is not asked.
-    """
-    g = growth(record, kind)
-    n = len(fit.floor)
-    error, P = np.asarray(record.error, float), np.asarray(record.covariance, float)
-    if error.shape[-1] != n:
-        raise InputError(f"--shared: {record.name} has {error.shape[-1]} components, what is shared has {n}")
-    added = np.square(g)[..., None, None] * fit.covariance + np.diag(fit.floor**2)
-    return replace(
-        record, error=error - g[..., None] * fit.mean, covariance=P + added, nees=None,
-        unavailable=(*record.unavailable, *BIAS),
-    )  # fmt: skip
-
-
-def halves(record: Record) -> tuple[Record, Record]:
-    """Two records, of the first and the last runs, or steps where there is one run.
-
-    Raises
-    ------
-    InputError
-        The only run failed.
-    """
-    runs = len(record.run_numbers)
-    if runs > 1:
-        return record.of_runs(slice(runs // 2)), record.of_runs(slice(runs // 2, None))
-    if record.failures:
-        raise InputError(f"--shared: {record.name} failed in step {record.failures[0].step}; give --shared-from")
-    assert record.error is not None
-    middle = record.error.shape[1] // 2
-    return _some(record, slice(middle)), _some(record, slice(middle, None))
-
-
-def _some(record: Record, steps: slice) -> Record:
-    """Some steps of the arrays that are judged."""
-    arrays: dict[str, Any] = {name: np.asarray(array)[:, steps] for name, array in arrays_of(record).items()}
-    return replace(record, **arrays, t=record.t[steps] if len(record.t) else record.t)
-
-
-def _steps(record: Record, kind: str) -> tuple[Array, Array, Array]:
-    """Errors (N, n), covariances and growth of the steps that are judged."""
-    g = growth(record, kind)
-    error, P = np.asarray(record.error, float), np.asarray(record.covariance, float)
-    there = np.isfinite(error).all(axis=-1) & np.isfinite(P).all(axis=(-2, -1)) & (g > 0)
-    if not there.any():
-        raise InputError(f"--shared {kind}: {record.name} has no step in which anything has grown")
-    return error[there], P[there], g[there]

@@ -198,12 +198,13 @@ class UncertainTruth:
         error = np.where(counted[..., None], e.error, np.nan)
         P, P_t = self._counted_entries(self.P), self._counted_entries(self.P_t)
         spread = hotelling(mean_of_runs(e.whitened)[runs]).p_value
-        allowed = self._allowed(*(mean_of_runs(M)[runs].mean(axis=0) for M in (error, P, P_t)), np.array(runs.sum()))
+        mean, stated, of_truth = (mean_of_runs(M)[runs].mean(axis=0) for M in (error, P, P_t))
+        allowed = self._allowed(mean, stated, of_truth, np.array(runs.sum()))
         p = {BIAS[0]: max(spread, float(allowed))}
         if len(steps) > 1:
             _, spreads = t_squared(e.whitened[:, steps])
-            means = (mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, P_t))
-            in_steps = self._allowed(*means, counted.sum(axis=0)[steps])
+            mean, stated, of_truth = (mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, P_t))
+            in_steps = self._allowed(mean, stated, of_truth, counted.sum(axis=0)[steps])
             p[BIAS[1]], _ = least_of_steps(np.maximum(spreads, in_steps))
         return p
 

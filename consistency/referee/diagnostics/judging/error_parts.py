@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.questions.bias import hotelling
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
 from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
-from consistency.referee.diagnostics.records.large_arrays import blocks, by_runs
+from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
 from consistency.referee.diagnostics.statistics.accuracy import coverage, coverage_interval, noncredibility, rmse
@@ -242,7 +242,7 @@ def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple
         return None, float("nan"), float("nan")
     n, count = error.shape[-1], int(counted.sum())
     mean, stated, second = np.zeros(n), np.zeros((n, n)), np.zeros((n, n))
-    parts = list(blocks(*counted.shape))
+    parts = list(block_slices(*counted.shape))
     for here in parts:
         mean += standardise(error[here], covariance[here])[counted[here]].sum(axis=0)
     mean /= count

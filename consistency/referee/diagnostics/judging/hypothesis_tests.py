@@ -48,7 +48,7 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     """
     main = scale_test(sample.means(), sample.dof, sample.longest)
     if scale is None:
-        scale = p_value_of(main, settings)
+        scale = sided_p_value(main, settings)
     p = {MAIN: scale}
     axes: dict[str, MeanTest] = {}
     largest = outlier = matrix = bias_step = shape_step = None
@@ -58,7 +58,7 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
         axes = axis_tests(sample)
         p[AXIS] = float("nan")
         if sample.dof > 1:
-            p[AXIS], _ = least_of_steps(np.array([p_value_of(test, settings) for test in axes.values()]))
+            p[AXIS], _ = least_of_steps(np.array([sided_p_value(test, settings) for test in axes.values()]))
         bias_step = _test_bias(whitened, in_steps, p)
         outlier = outliers(whitened, in_steps)
         p["outliers"] = outlier.p_value
@@ -80,7 +80,7 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     return Tests(p, main, band, distribution, axes, largest, outlier, matrix, bias_step, shape_step)
 
 
-def p_value_of(test: MeanTest, settings: Settings) -> float:
+def sided_p_value(test: MeanTest, settings: Settings) -> float:
     """Two-sided, or against a covariance that is too small where nothing else is a fault."""
     if settings.one_sided:
         return test.above

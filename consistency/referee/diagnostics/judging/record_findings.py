@@ -83,7 +83,10 @@ def findings_of(
         p_values |= joint.p_values
     sample, tests = sample_of(record, settings), None
     if sample is not None:
-        tests = run_tests(sample, settings, p_values, None if inspection is None else inspection.scale)
+        scale = None
+        if inspection is not None:
+            scale = inspection.scale
+        tests = run_tests(sample, settings, p_values, scale)
         asked = tests.p_values
         if truth is not None:
             asked = truth.p_values(asked, settings)

@@ -117,10 +117,10 @@ def _nees_over_n(record: Record) -> Array:
     assert record.error is not None
     assert record.covariance is not None
     nees = squared_length(whiten(record.error, record.covariance)) / record.error.shape[-1]
+    counted = np.isfinite(nees)
     if record.nees is not None:
-        nees[~np.isfinite(record.nees)] = np.nan
-    nees[~np.isfinite(nees)] = np.nan
-    return nees
+        counted = np.isfinite(record.nees)
+    return np.where(counted, nees, np.nan)
 
 
 def _scale_of_whole(whole: Scale, scales: Sequence[Scale], record: Record, nees: Array) -> Scale:

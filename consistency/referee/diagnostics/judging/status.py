@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, p_value_of, run_tests
+from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, run_tests, sided_p_value
 from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.questions.scale import scale_test, spreads_more, spreads_more_in_steps
 from consistency.referee.diagnostics.statistics.nees import anees
@@ -222,13 +222,13 @@ def _heavy_steps(sample: Sample, tests: Tests) -> bool:
 def _robust(means: Array, dof: int, steps: int, settings: Settings, questions: int) -> bool:
     """Is the scale found at fault too where the runs differ more than Gaussian errors can?"""
     test = scale_test(means, dof, steps, gaussian=not spreads_more(means, dof))
-    return bool(p_value_of(test, settings) * questions <= SHARES[MAIN] * settings.false_alarm)
+    return bool(sided_p_value(test, settings) * questions <= SHARES[MAIN] * settings.false_alarm)
 
 
 def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
     groups = sample.known_errors.groups
     for key, test in tests.axes.items():
-        found = p_value_of(test, settings) * len(groups) <= settings.false_alarm
+        found = sided_p_value(test, settings) * len(groups) <= settings.false_alarm
         if found and _robust(sample.group_means(groups[key]), len(groups[key]), sample.longest, settings, len(groups)):
             return True
     return False

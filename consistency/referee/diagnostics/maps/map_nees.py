@@ -63,7 +63,9 @@ def joint_nees(error: Array, covariance: Array, dof: int = POINT) -> Array:
         return np.full(count, np.inf)
     squares = np.square(solve_triangular(L, error, lower=True, check_finite=False))
     parts = np.append(squares[:POSE].sum(), squares[POSE:].reshape(-1, dof).sum(axis=1))
-    return parts if np.isfinite(parts).all() else np.full(count, np.inf)
+    if not np.isfinite(parts).all():
+        return np.full(count, np.inf)
+    return parts
 
 
 SURE = 0.04  # false-alarm rate of naming a landmark that does not stand out
@@ -102,8 +104,9 @@ def joint_test(
     p_values = dict.fromkeys((JOINT, JOINT_DISTRIBUTION), float("nan"))
     if len(q):
         above, below = float(distributions.chi2.sf(Q, D)), float(distributions.chi2.cdf(Q, D))
-        p_values[JOINT] = above if settings.one_sided else min(1.0, 2.0 * min(above, below))
+        p_values[JOINT] = above
         if not settings.one_sided:
+            p_values[JOINT] = min(1.0, 2.0 * min(above, below))
             p_values[JOINT_DISTRIBUTION] = kolmogorov(distributions.chi2.cdf(q, d))[1]
     least = int(d.min()) if len(d) else 2 * POSE
     score = JointScore(

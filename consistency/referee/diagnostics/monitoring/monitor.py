@@ -54,9 +54,11 @@ class Alarm:
     rest: float = math.nan  # where the NIS of this step is an outlier: NIS over degrees of freedom of all before
 
     def __str__(self) -> str:
-        size = "larger than a gate lets see" if math.isinf(self.scale) else f"x{self.scale:.3g}"
-        others = f"; the NIS of this step is an outlier, and that of all before x{self.rest:.3g}"
-        others = others if self.rest > 0 else ""
+        size, others = f"x{self.scale:.3g}", ""
+        if math.isinf(self.scale):
+            size = "larger than a gate lets see"
+        if self.rest > 0:
+            others = f"; the NIS of this step is an outlier, and that of all before x{self.rest:.3g}"
         return (
             f"alarm in step {self.step}: {self.direction} since step {self.since}; scale of the NIS since then {size} "
             f"({accepted_scales(self.tolerance)}){others}, e-value {self.evidence:.3g} "
@@ -66,7 +68,9 @@ class Alarm:
 
 def accepted_scales(tolerance: float) -> str:
     """The scales that are no fault, in words."""
-    return "x1 is right" if tolerance == 1.0 else f"x{1 / tolerance:.3g} to x{tolerance:.3g} is accepted"
+    if tolerance == 1.0:
+        return "x1 is right"
+    return f"x{1 / tolerance:.3g} to x{tolerance:.3g} is accepted"
 
 
 class Bet(NamedTuple):
@@ -85,8 +89,10 @@ def alternatives(tolerance: float) -> tuple[tuple[float, float], ...]:
 
 def bet_on(dof: int, tolerance: float = 1.2, gate: float | None = None) -> Bet:
     """Bet for an innovation of ``dof`` degrees of freedom; see :class:`Monitor` for the formula."""
-    limit = math.inf if gate is None else gate_limit(gate, dof)
-    terms = []
+    limit = math.inf
+    terms: list[tuple[float, float]] = []
+    if gate is not None:
+        limit = gate_limit(gate, dof)
     for scale, edge in alternatives(tolerance):
         constant = -0.5 * dof * math.log(scale / edge)
         if gate is not None:
@@ -228,7 +234,9 @@ class Monitor:
             nis, dof = None, 0
         if not (0 <= dof < math.inf and dof == int(dof)):
             raise ValueError(f"dof must be a whole number of 0 or more, got {dof}")
-        value = math.nan if nis is None else float(nis)
+        value = math.nan
+        if nis is not None:
+            value = float(nis)
         if value < 0.0 or value == math.inf:
             raise ValueError(f"nis must be 0 or more and finite, got {nis}; the filter that gave it has failed")
         self.steps += 1
@@ -253,8 +261,11 @@ class Monitor:
             return None
         best = max(range(len(self._R)), key=self._R.__getitem__)
         reset = self._resets[best]
-        direction = "overconfident" if best < len(RATIOS) else "conservative"
-        rest = (self._nis - value) / (self._dof - dof) if value > bet.far and self._dof > dof else math.nan
+        direction, rest = "conservative", math.nan
+        if best < len(RATIOS):
+            direction = "overconfident"
+        if value > bet.far and self._dof > dof:
+            rest = (self._nis - value) / (self._dof - dof)
         self.alarm = Alarm(
             self.steps, reset.step, direction, self.evidence, self._scale_since(reset), self.false_alarm,
             self.tolerance, rest,
@@ -269,12 +280,16 @@ class Monitor:
     @property
     def ratio(self) -> float:
         """Total NIS over total degrees of freedom of the innovations that were judged; NaN before the first."""
-        return self._nis / self._dof if self._dof else math.nan
+        if not self._dof:
+            return math.nan
+        return self._nis / self._dof
 
     @property
     def scale(self) -> float:
         """Scale of the NIS over all that was judged: ``ratio``, corrected for what the gate cuts off."""
-        return self._scale_since(START) if self._dof else math.nan
+        if not self._dof:
+            return math.nan
+        return self._scale_since(START)
 
     def _judge(self, nis: float, dof: int, bet: Bet) -> None:
         self.innovations += 1

@@ -9,7 +9,7 @@ from scipy import optimize, special
 
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.diagnostics.questions.scale import FEW
-from consistency.referee.diagnostics.records.large_arrays import blocks
+from consistency.referee.diagnostics.records.large_arrays import block_slices
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import anees
 from consistency.referee.types import Array
@@ -67,7 +67,7 @@ def simultaneous_band(
     sides = 1 if allow == "conservative" else 2
     slopes = None
     if method == "max" and len(nees) >= FEW:
-        parts = (nees[:, judged[b.start : b.stop + 1]] for b in blocks(len(judged) - 1, len(nees)))
+        parts = (nees[:, judged[b.start : b.stop + 1]] for b in block_slices(len(judged) - 1, len(nees)))
         slopes = np.concatenate([_slopes(part) for part in parts])
 
     def exceedance(c: float) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.records.large_arrays import blocks
+from consistency.referee.diagnostics.records.large_arrays import block_slices
 from consistency.referee.diagnostics.records.whitening import all_finite
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array, Indices
@@ -49,7 +49,9 @@ def t_squared(whitened: Array, known: StepMoments | None = None) -> tuple[Array,
     T^2 (N - n) / (n (N - 1)) is F(n, N - n) distributed (Anderson 2003, Theorem 5.2.2). NaN where fewer
     than n + 1 runs are left. ``known`` are the moments, if already computed.
     """
-    N, mean, S = step_moments(whitened) if known is None else known
+    if known is None:
+        known = step_moments(whitened)
+    N, mean, S = known
     n = whitened.shape[-1]
     statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
     good = n + 1 <= N
@@ -74,7 +76,7 @@ class StepMoments(NamedTuple):
 def step_moments(whitened: Array) -> StepMoments:
     """Moments of whitened errors (runs, steps, n)."""
     runs, steps = whitened.shape[:2]
-    N, mean, S = zip(*(_moments(whitened[:, here]) for here in blocks(steps, runs)), strict=True)
+    N, mean, S = zip(*(_moments(whitened[:, here]) for here in block_slices(steps, runs)), strict=True)
     return StepMoments(np.concatenate(N), np.concatenate(mean), np.concatenate(S))
 
 

@@ -60,13 +60,20 @@ def lost_of(record: Record, nees: Array, dof: int, settings: Settings, any_time:
     if not runs:
         return None
     i = np.arange(1.0, runs + 1.0)
-    rates = settings.false_alarm / (i * (i + 1.0)) if any_time else np.full(runs, settings.false_alarm / runs)
+    rates = np.full(runs, settings.false_alarm / runs)
+    if any_time:
+        rates = settings.false_alarm / (i * (i + 1.0))
     is_lost = failed[there] | (np.nan_to_num(means[there]) > lost_bound(dof, rates))
     lost, level = int(is_lost.sum()), settings.power
-    upper = _limit_at_any_time(is_lost, level) if any_time else share_limit(lost, runs, level)
     needed = None
-    if settings.lost is not None:
-        needed = _next(is_lost, settings.lost, level) if any_time else lost_runs(settings.lost, level, lost)
+    if any_time:
+        upper = _limit_at_any_time(is_lost, level)
+        if settings.lost is not None:
+            needed = _next(is_lost, settings.lost, level)
+    else:
+        upper = share_limit(lost, runs, level)
+        if settings.lost is not None:
+            needed = lost_runs(settings.lost, level, lost)
     return Lost(lost, runs, float(lost_bound(dof, rates[-1])), upper, level, needed)
 
 
@@ -75,7 +82,10 @@ def _limit_at_any_time(is_lost: Array, level: float) -> float:
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if ever(lost_evidence(is_lost, middle)) <= 1.0 - level else (middle, high)
+        if ever(lost_evidence(is_lost, middle)) <= 1.0 - level:
+            high = middle
+        else:
+            low = middle
     return high
 
 
@@ -84,7 +94,9 @@ def _next(is_lost: Array, share: float, level: float) -> int | None:
     further = np.zeros(FURTHEST, bool)
     further[: len(is_lost)] = is_lost[:FURTHEST]
     reached = np.flatnonzero(lost_evidence(further, share) >= 1.0 / (1.0 - level))
-    return int(reached[0]) + 1 if len(reached) else None
+    if not len(reached):
+        return None
+    return int(reached[0]) + 1
 
 
 def early_ends(nees: Array) -> EarlyEnds:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.referee.diagnostics.questions.bias import StepMoments, step_moments
-from consistency.referee.diagnostics.records.large_arrays import blocks
+from consistency.referee.diagnostics.records.large_arrays import block_slices
 from consistency.referee.diagnostics.records.whitening import squared_length
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
@@ -36,7 +36,9 @@ def outliers(whitened: Array, known: StepMoments | None = None) -> Outlier:
     whitened : (runs, steps, n), NaN where a run has no value
     known : moments of ``whitened``, if already computed
     """
-    N, mean, S = step_moments(whitened) if known is None else known
+    if known is None:
+        known = step_moments(whitened)
+    N, mean, S = known
     n = whitened.shape[-1]
     usable = np.flatnonzero(n + 3 <= N)
     usable = usable[np.linalg.det(S[usable]) > 0]
@@ -44,7 +46,7 @@ def outliers(whitened: Array, known: StepMoments | None = None) -> Outlier:
         return Outlier(float("nan"), -1, -1, float("nan"))
     precision = np.linalg.inv(S[usable])
     rows, of_step = np.empty(len(usable), np.int64), np.empty(len(usable))
-    for here in blocks(len(usable), len(whitened)):
+    for here in block_slices(len(usable), len(whitened)):
         d2 = _distances(whitened[:, usable[here]] - mean[usable[here]], precision[here])
         rows[here], of_step[here] = d2.argmax(axis=0), d2.max(axis=0)
     count = N[usable]

@@ -43,7 +43,9 @@ def sphericity(whitened: Array, known: StepMoments | None = None) -> tuple[Array
     second-order expansion of the null distribution (Anderson 2003, sec. 10.7.4). NaN where fewer than 4 n runs are
     left, or n is 1. ``known`` are the moments, if already computed.
     """
-    N, _, S = step_moments(whitened) if known is None else known
+    if known is None:
+        known = step_moments(whitened)
+    N, _, S = known
     n = whitened.shape[-1]
     statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
     good = (4 * n <= N) & (np.trace(S, axis1=-2, axis2=-1) > 0)

@@ -28,7 +28,7 @@ def every_entry(holds: Callable[[Array], Array], matrices: Array) -> Array:
     return out
 
 
-def blocks(count: int, each: int, rows: int | None = None) -> Iterator[slice]:
+def block_slices(count: int, each: int, rows: int | None = None) -> Iterator[slice]:
     """Slices of an axis of ``count`` places with ``each`` rows at a place; at least one slice, which may be empty."""
     if rows is None:
         rows = ROWS
@@ -39,7 +39,7 @@ def blocks(count: int, each: int, rows: int | None = None) -> Iterator[slice]:
 
 def of_runs(array: Array) -> Iterator[slice]:
     """Slices of the runs of an array (runs, steps, ...), or of the rows of one (rows, n)."""
-    return blocks(len(array), math.prod(array.shape[1:2]), FEWER)
+    return block_slices(len(array), math.prod(array.shape[1:2]), FEWER)
 
 
 def by_runs(function: Callable[..., Array], first: Array, *others: Array) -> Array:
@@ -60,6 +60,6 @@ def by_steps(function: Callable[..., Array], *arrays: Array) -> Array:
     """Apply ``function``, which works on each step separately, to arrays (runs, steps, ...) block by block."""
     runs, steps = arrays[0].shape[:2]
     parts = []
-    for here in blocks(steps, runs):
+    for here in block_slices(steps, runs):
         parts.append(function(*(array[:, here] for array in arrays)))
     return np.concatenate(parts)

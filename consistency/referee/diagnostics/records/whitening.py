@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.large_arrays import blocks, by_runs
+from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.types import Array
 
 LARGE = 40  # components from which on LAPACK, matrix by matrix, is faster than all matrices entry by entry
@@ -55,7 +55,7 @@ def _less(value: Array, a: list[Array], b: list[Array]) -> Array:
     total = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=False):
         total = total + x * y
-    return value - total
+    return np.asarray(value - total)
 
 
 def _whiten_matrix_by_matrix(error: Array, covariance: Array) -> Array:
@@ -63,7 +63,7 @@ def _whiten_matrix_by_matrix(error: Array, covariance: Array) -> Array:
     e, P = error.reshape(*batch, n), covariance.reshape(*batch, n, n)
     out = np.full(e.shape, np.nan)
     count = e.size // n
-    for here in blocks(count, n * n, NUMBERS):
+    for here in block_slices(count, n * n, NUMBERS):
         index = np.unravel_index(np.arange(here.start, min(here.stop, count)), batch)
         some, matrices = e[index], P[index]
         known = np.isfinite(some).all(axis=1) & np.isfinite(matrices).all(axis=(1, 2))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.records.large_arrays import blocks, by_runs, of_runs
+from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs, of_runs
 from consistency.referee.diagnostics.records.whitening import all_finite, spread_steps, squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.types import Array
@@ -121,7 +121,7 @@ def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
     (steps,) and (steps,) in dB; NaN where fewer than 2 n runs have a value
     """
     runs, steps = nees.shape
-    index, inclination = zip(*(_of_steps(error[:, s], nees[:, s]) for s in blocks(steps, runs)), strict=True)
+    index, inclination = zip(*(_of_steps(error[:, s], nees[:, s]) for s in block_slices(steps, runs)), strict=True)
     return np.concatenate(index), np.concatenate(inclination)
 
 

@@ -28,7 +28,7 @@ from consistency.referee.diagnostics.verdict.parts import (
 Numbers = dict[str, Any]
 
 
-def of_scale(scale: Scale | None) -> Numbers:
+def scale_numbers(scale: Scale | None) -> Numbers:
     if scale is None:
         return {}
     return {
@@ -46,7 +46,7 @@ def of_scale(scale: Scale | None) -> Numbers:
         "median_run": scale.median_run,
         "worst_run": scale.worst_run,
         "share_inside": scale.share_inside,
-        "equivalence": of_equivalence(scale.equivalence),
+        "equivalence": equivalence_numbers(scale.equivalence),
         "within": _of_within(scale.within),
     }
 
@@ -64,20 +64,20 @@ def _of_within(within: Within | None) -> Numbers | None:
     }
 
 
-def of_equivalence(equivalence: Equivalence | None) -> Numbers | None:
+def equivalence_numbers(equivalence: Equivalence | None) -> Numbers | None:
     if equivalence is None:
         return None
     return vars(equivalence) | {"shown": equivalence.shown}
 
 
-def of_lost(lost: Lost | None, asked: float | None) -> Numbers:
+def lost_numbers(lost: Lost | None, asked: float | None) -> Numbers:
     if lost is None:
         return {}
     numbers = {"asked": asked, "count": lost.count, "runs": lost.runs, "bound": lost.bound, "upper": lost.upper}
     return {"lost": numbers | {"level": lost.level, "needed": lost.needed}}
 
 
-def of_location(location: Location | None) -> Numbers:
+def location_numbers(location: Location | None) -> Numbers:
     if location is None:
         return {}
     until = None
@@ -96,7 +96,7 @@ def of_location(location: Location | None) -> Numbers:
     }
 
 
-def of_axes(axes: Axes) -> Numbers:
+def axes_numbers(axes: Axes) -> Numbers:
     return {
         "axes": axes.names,
         "groups": {key: list(index) for key, index in axes.groups.items()},
@@ -104,7 +104,7 @@ def of_axes(axes: Axes) -> Numbers:
     }
 
 
-def of_bias(bias: Bias | None) -> Numbers:
+def bias_numbers(bias: Bias | None) -> Numbers:
     if bias is None:
         return {}
     by_axis = {axis: tuple(interval) for axis, interval in bias.by_axis.items()}
@@ -116,7 +116,7 @@ def of_bias(bias: Bias | None) -> Numbers:
     return numbers
 
 
-def of_shape(shape: Shape | None) -> Numbers:
+def shape_numbers(shape: Shape | None) -> Numbers:
     if shape is None:
         return {}
     a, b = shape.pair or (None, None)
@@ -128,14 +128,14 @@ def of_shape(shape: Shape | None) -> Numbers:
     }
 
 
-def of_tails(tails: Tails | None) -> Numbers:
+def tails_numbers(tails: Tails | None) -> Numbers:
     if tails is None:
         return {}
     outlier = {"run": tails.run, "step": tails.step, "distance": tails.distance}
     return {"outlier": outlier, "pit": tails.pit, "pit_half_width": tails.half_width}
 
 
-def of_innovations(innovations: Innovations | None) -> Numbers:
+def innovations_numbers(innovations: Innovations | None) -> Numbers:
     if innovations is None:
         return {}
     numbers = {
@@ -145,20 +145,20 @@ def of_innovations(innovations: Innovations | None) -> Numbers:
         "nis_judged": innovations.judged,
         "autocorrelation": innovations.autocorrelation,
         "autocorrelation_bound": innovations.bound,
-        "nis_equivalence": of_equivalence(innovations.equivalence),
+        "nis_equivalence": equivalence_numbers(innovations.equivalence),
     }
     if innovations.outliers is not None:
         numbers["nis_outliers"] = vars(innovations.outliers) | {"rest": innovations.outliers.rest.ratio}
     return numbers
 
 
-def of_accuracy(accuracy: Accuracy | None) -> Numbers:
+def accuracy_numbers(accuracy: Accuracy | None) -> Numbers:
     if accuracy is None:
         return {}
     return dict(vars(accuracy))
 
 
-def of_joint(joint: JointScore | None) -> Numbers:
+def joint_numbers(joint: JointScore | None) -> Numbers:
     if joint is None:
         return {}
     return {
@@ -173,7 +173,7 @@ def of_joint(joint: JointScore | None) -> Numbers:
     }
 
 
-def of_rejection(rejection: RejectionScore | None) -> Numbers:
+def rejection_numbers(rejection: RejectionScore | None) -> Numbers:
     if rejection is None:
         return {}
     return {
@@ -186,19 +186,19 @@ def of_rejection(rejection: RejectionScore | None) -> Numbers:
     }
 
 
-def of_ends(ends: EarlyEnds | None) -> Numbers:
+def ends_numbers(ends: EarlyEnds | None) -> Numbers:
     if ends is None:
         return {}
     return {"early_ends": vars(ends) | {"lost": ends.lost}}
 
 
-def of_skipped(skipped: Skipped | None) -> Numbers:
+def skipped_numbers(skipped: Skipped | None) -> Numbers:
     if skipped is None:
         return {}
     return {"skip": skipped.skip.option, "skipped_steps": skipped.steps, "skipped_runs": skipped.empty}
 
 
-def of_truth(truth: TruthShare | None) -> Numbers:
+def truth_numbers(truth: TruthShare | None) -> Numbers:
     if truth is None:
         return {}
     return {

@@ -237,17 +237,21 @@ class Verdict(Findings):
             "p_value": self.p_value,
             "left_out_steps": list(self.left_out_steps),
         }
-        numbers |= dictionary.of_scale(self.scale) | dictionary.of_lost(self.lost, self.settings.lost)
-        numbers |= dictionary.of_location(self.location) | self._of_axes() | dictionary.of_bias(self.bias)
-        numbers |= dictionary.of_shape(self.shape) | dictionary.of_tails(self.tails)
-        numbers |= dictionary.of_innovations(self.innovations) | dictionary.of_accuracy(self.accuracy) | self._of_map()
+        numbers |= dictionary.scale_numbers(self.scale) | dictionary.lost_numbers(self.lost, self.settings.lost)
+        numbers |= dictionary.location_numbers(self.location) | self._of_axes() | dictionary.bias_numbers(self.bias)
+        numbers |= dictionary.shape_numbers(self.shape) | dictionary.tails_numbers(self.tails)
+        numbers |= (
+            dictionary.innovations_numbers(self.innovations)
+            | dictionary.accuracy_numbers(self.accuracy)
+            | self._of_map()
+        )
         if self.landmarks is not None:
             numbers["landmarks"] = list(self.landmarks)
-        numbers |= dictionary.of_joint(self.joint) | dictionary.of_rejection(self.rejection)
-        numbers |= dictionary.of_ends(self.ends) | dictionary.of_skipped(self.skipped)
+        numbers |= dictionary.joint_numbers(self.joint) | dictionary.rejection_numbers(self.rejection)
+        numbers |= dictionary.ends_numbers(self.ends) | dictionary.skipped_numbers(self.skipped)
         if self.guesses:
             numbers["guesses"] = {kind: guess._asdict() for kind, guess in self.guesses.items()}
-        numbers |= dictionary.of_truth(self.truth)
+        numbers |= dictionary.truth_numbers(self.truth)
         if self.convention is not None or self.notes:
             numbers |= {"convention": self.convention, "align": self.align, "notes": list(self.notes)}
         if self.world is not None:
@@ -261,7 +265,7 @@ class Verdict(Findings):
     def _of_axes(self) -> dict[str, Any]:
         if self.axes is None:
             return {}
-        numbers = dictionary.of_axes(self.axes) | {"impossible": [list(pair) for pair in self.impossible]}
+        numbers = dictionary.axes_numbers(self.axes) | {"impossible": [list(pair) for pair in self.impossible]}
         for key, axis in (("worst_axis", self.worst_axis), ("axis", self.axis)):
             if axis is not None:
                 numbers |= {key: axis[0], f"{key}_ratio": tuple(axis[1])}

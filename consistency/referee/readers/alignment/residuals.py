@@ -14,6 +14,7 @@ from consistency.referee.diagnostics.verdict.answers import BIAS, INNOVATIONS, M
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.frame_fit import Sound, frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
+from consistency.referee.readers.clock_offset import ROUNDS, SETTLED, clock_shift
 from consistency.referee.readers.truth_matching import Aligned, Poses
 from consistency.referee.types import Array
 
@@ -50,6 +51,32 @@ def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]
     if shared:
         return [frame_of_least_nees(name, runs, FREE[base, kind], judged)] * len(runs)
     return [frame_of_least_nees(name, [p], FREE[base, kind], judged) for p in runs]
+
+
+def clocks_and_frames(
+    name: str, runs: Sequence[Poses], time_offset: float | str | None, align: str, judged: Sequence[int]
+) -> tuple[float, list[str], Aligned]:
+    """Time to add to the timestamps, s, notes on it, and the runs in the world of the truth, in turn until both settle.
+
+    Parameters
+    ----------
+    align : one of ``ALIGNMENTS`` but none
+    judged : components of the error that are judged, and by which frames are fitted
+
+    Raises
+    ------
+    InputError
+        The offset cannot be estimated, or nothing can be aligned.
+    """
+    shift = time_offset if isinstance(time_offset, float) else 0.0
+    for _ in range(ROUNDS):
+        before, frames = shift, frames_of(name, [p.later(shift) for p in runs], align, judged)
+        there = [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
+        shift, notes = clock_shift(name, there, time_offset)
+        if abs(shift - before) <= SETTLED:
+            break
+    found = aligned(name, [p.later(shift) for p in runs], align, judged, frames if shift == before else None)
+    return shift, notes, replace(found, runs=[replace(p, t=own.t) for p, own in zip(found.runs, runs, strict=True)])
 
 
 def aligned(

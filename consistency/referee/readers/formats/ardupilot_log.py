@@ -18,7 +18,7 @@ from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.formats.innovation_files import NisLog, choose
 from consistency.referee.readers.formats.px4_log import MICRO, Pairs, nis_of, require_in_order
-from consistency.referee.readers.runs_to_record import listed
+from consistency.referee.readers.places import listed
 from consistency.referee.types import Array
 
 SUFFIX = ".bin"
@@ -112,7 +112,8 @@ def read_stated(path: Path, sensor: str, core: int | None = None) -> NisLog:
         raise InputError(f"{path}: {message} at {t[at]:.10g} s: {low[0][1][at]:.4g} is below 0, beside {low[0][0]}")
     nis, dof, held = nis_of(Pairs(t, own, {part: values**power for part, values in of.items()}, 0), parts)
     note = f"{path}: {sensor}: {int((dof > 0).sum())} innovations in {plural(len(rows), 'message')} {message}"
-    note += f"; {held} repeat the innovation before" * bool(held)
+    if held:
+        note += f"; {held} repeat the innovation before"
     return NisLog(sensor, np.arange(1.0, len(nis) + 1), t, nis, dof, (note,))
 
 

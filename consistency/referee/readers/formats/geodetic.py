@@ -13,6 +13,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.sheet import Lines, increasing
 from consistency.referee.readers.formats.text_blocks import blocks
+from consistency.referee.readers.places import cut_note
 from consistency.referee.types import Array
 
 A, F = 6378137.0, 1.0 / 298.257223563  # m and 1: semi-major axis and flattening of WGS 84 (NIMA TR8350.2, table 3.1)
@@ -86,7 +87,8 @@ def geodetic(point: Array) -> Array:
 def axes_at(place: Array) -> Array:
     """Rows east, north, up (..., 3, 3) of a place, as directions from the centre of the earth."""
     phi, lam = np.deg2rad(np.asarray(place, float)[..., 0]), np.deg2rad(np.asarray(place, float)[..., 1])
-    s, c, sl, cl, zero = np.sin(phi), np.cos(phi), np.sin(lam), np.cos(lam), np.zeros_like(phi)
+    s, c = np.sin(phi), np.cos(phi)
+    sl, cl, zero = np.sin(lam), np.cos(lam), np.zeros_like(phi)
     rows = [[-sl, cl, zero], [-s * cl, -s * sl, c], [c * cl, c * sl, s]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
@@ -129,7 +131,10 @@ def read_solution(path: Path) -> Fixes:
     InputError
         The file has no header that names these columns, a row is broken, or times do not increase.
     """
-    clock, names, rows, numbers = "", list[str](), list[list[str]](), list[int]()
+    names: list[str] = []
+    rows: list[list[str]] = []
+    numbers: list[int] = []
+    clock = cut = ""
     for block in blocks(path):
         for number, line in block.lines():
             if line.startswith("%"):
@@ -138,12 +143,15 @@ def read_solution(path: Path) -> Fixes:
                 continue
             if not names:
                 raise InputError(f"{path}, line {number}: stands under no header '%  GPST  latitude(deg) ...'")
-            rows.append(line.replace(",", " ").split())
-            numbers.append(number)
-            width = len(names) + 2 * (1 + sum(name in SEXAGESIMAL[:2] for name in names))
-            if len(rows[-1]) != width:
-                what = f"has {len(rows[-1])} fields; its header names a time of two and {width - 2} more"
+            row, width = line.replace(",", " ").split(), len(names) + 2 * (1 + sum(n in SEXAGESIMAL[:2] for n in names))
+            if rows and not block.ends and len(row) != width:
+                cut = cut_note(path, number)
+                break
+            if len(row) != width:
+                what = f"has {len(row)} fields; its header names a time of two and {width - 2} more"
                 raise InputError(f"{path}, line {number}: {what}")
+            rows.append(row)
+            numbers.append(number)
     if not rows:
         raise InputError(f"{path}: holds no solution")
     kind = next((each for each in STATED if set(each) <= set(names)), None)
@@ -167,7 +175,7 @@ def read_solution(path: Path) -> Fixes:
         f"{path}: read as a solution of RTKLIB, {len(names) + 2} columns, {_clock_note(clock, t)}; {shares or 'no Q'}"
     )
     values = np.column_stack([t, place, P.reshape(-1, 9)])
-    lines = Fixes(path, values, np.array(numbers), note, geodetic=kind is not BASELINE)
+    lines = Fixes(path, values, np.array(numbers), note, cut=cut, geodetic=kind is not BASELINE)
     increasing(lines)
     return lines
 

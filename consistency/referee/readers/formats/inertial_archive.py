@@ -26,7 +26,7 @@ ROTATION = 1e-3  # largest entry of R R' - I
 
 
 def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | None) -> tuple[dict[str, Array], str]:
-    """The arrays with ``errors`` (runs, steps, 9 or 15) and ``axes`` in place of the states, and a note.
+    """The arrays with ``errors`` (runs, steps, 9 or 15) and ``axes`` in place of the states, and the error in words.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
     axes = [axis for part in order for axis in AXES[part]]
     rest |= {"errors": np.concatenate([errors[part] for part in order], axis=-1), "axes": np.array(axes)}
     of = "with the velocity, of SE2(3)" if convention in ("left", "right") else "and the difference of the velocity"
-    return rest, f"error convention {convention}: {INERTIAL[convention]}, {of}; in the order {', '.join(order)}"
+    return rest, f"{INERTIAL[convention]}, {of}; in the order {', '.join(order)}"
 
 
 def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[str]:

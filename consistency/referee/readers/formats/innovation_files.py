@@ -11,12 +11,12 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, one_line, require_name
-from consistency.referee.readers.file_kinds import ARCHIVES, TABLES, unknown_kind
+from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
 from consistency.referee.readers.formats.numpy_archive import load_arrays, run_lengths, step_times, whole_numbers
 from consistency.referee.readers.formats.other_names import with_clock
-from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet, refuse
+from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet
 from consistency.referee.readers.formats.table_columns import row_order
-from consistency.referee.readers.runs_to_record import listed
+from consistency.referee.readers.places import listed, refuse
 from consistency.referee.types import Array
 
 NEEDED = ("nis", "nis_dof")

@@ -12,18 +12,31 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import keys_once, reading
 from consistency.referee.readers.formats.text_blocks import blocks
+from consistency.referee.readers.places import cut_note
 from consistency.referee.types import Array, Indices
 
 GPSD = "is a report of gpsd, whose epx, epy and epv are of unknown certainty; solve the receiver's raw data with RTKLIB"
 
 
-def read_json_lines(path: Path) -> tuple[dict[str, Array], Indices]:
-    """Columns of a file of JSON lines, with None or NaN where a line lacks a key, and the numbers of its lines."""
-    lines = [each for block in blocks(path) for each in block.lines()]
-    rows = [_row(path, number, line) for number, line in lines]
+def read_json_lines(path: Path) -> tuple[dict[str, Array], Indices, int, str]:
+    """Columns of a file of JSON lines, with None or NaN where a line lacks a key, and the numbers of its lines.
+
+    Also the last line if it has no end, or else 0, and a note if it is cut short and left out.
+    """
+    numbers: list[int] = []
+    rows: list[dict[str, Any]] = []
+    open_line, cut = 0, ""
+    for block in blocks(path):
+        for number, line in block.lines():
+            if rows and not block.ends and not line.rstrip().endswith("}"):
+                cut = cut_note(path, number)
+                break
+            rows.append(_row(path, number, line))
+            numbers.append(number)
+            open_line = 0 if block.ends else number
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: _column([row.get(name) for row in rows]) for name in names}
-    return columns, np.array([number for number, _ in lines])
+    return columns, np.array(numbers), open_line, cut
 
 
 def _row(path: Path, number: int, line: str) -> dict[str, Any]:

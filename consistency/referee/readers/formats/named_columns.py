@@ -12,12 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file
 from consistency.referee.readers.formats.text_blocks import opened
-from consistency.referee.types import Array
 
 PEEKED = 2**16  # bytes of a file that hold its header and its first row
 POSITIONS = ("p_rs_r_{}", "p_{}", "p{}", "t_{}", "t{}", "pos_{}", "position_{}", "translation_{}", "{}")
@@ -31,14 +28,16 @@ INNER = ("position_{}", "translation_{}", "orientation_{}", "rotation_{}")  # wh
 CLOCKS = ("header_stamp", "stamp", "timestamp", "timestamps", "t", "time", "")  # pandas leaves its index without a name
 HALVES = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"))
 UNITS = {"s": 1, "sec": 1, "ms": 10**3, "us": 10**6, "ns": 10**9, "nsec": 10**9}  # in a second
-UNIT_NAMES = {1: "seconds", 10**3: "milliseconds", 10**6: "microseconds", 10**9: "nanoseconds"}
-EPOCHS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3))  # times since 1970 are larger than this in ns, us and ms
 RECORDED = ("field_header_stamp",)  # names whose times are in ns: rostopic echo -p
 LABELS = (("x", "y", "z", "roll", "pitch", "yaw"), ("x", "y", "z", "rx", "ry", "rz"), ("x", "y", "z", "a", "b", "c"))
 MOVING_LABELS = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # behind those of a pose
 PREFIXES = ("p_", "p", "cov_", "cov", "t")  # before two labels
 DEVIATIONS = ("sigma_{}", "std_{}", "s{}", "s_{}", "sd_{}", "sigma{}", "std{}", "stddev_{}", "sd{}",
               "{}_sd", "{}_std", "{}_sigma")  # standard, not squared  # fmt: skip
+VARIANCES = ("var_{}", "var{}", "{}_var", "variance_{}")
+TRUE = ("true_{}", "{}_true", "truth_{}", "{}_truth", "gt_{}", "{}_gt")  # of a truth beside the estimates
+OWN = ("{}", "{}_est", "est_{}", "{}_hat", "{}_estimate", "estimate_{}", "{}_estimated", "estimated_{}")
+OTHER = "other"  # in place of the name of a column that does not count
 APART = {"p": ("x", "y", "z"), "q": ("r", "p", "y")}  # two triangles of cnspy: position, rotation
 _OTHER = r"deg(?:rees?)?|°|mm|cm|km(?:/?h)?|mph|kph|ft|feet|rpm"
 OTHER_UNITS = re.compile(rf"[\[(]\s*((?:{_OTHER})(?![a-z_])[^\])]*)[\])]", re.IGNORECASE)  # than SI and rad
@@ -66,6 +65,7 @@ class Roles:
     covariance: tuple[int, ...] = ()  # n^2, its upper triangle, or 12: rotation, then position; or n deviations
     kind: str = "poses by the names of their columns"
     rest: tuple[int, ...] = ()  # (3,), a velocity, or (9,), biases of gyroscope and accelerometer, too
+    squared: bool = False  # the deviations are variances
 
     @property
     def is_tum(self) -> bool:
@@ -143,11 +143,46 @@ def _is_number(text: str) -> bool:
 def roles_of(names: Sequence[str], where: Path) -> Roles | None:
     """Which columns make up a pose, or a position without a quaternion; None without a position or a time.
 
+    Columns of a truth beside the estimates, as ``true_x`` beside ``x``, are not looked at.
+
     Raises
     ------
     InputError
         Several columns would do.
     """
+    true = [_stem_of(name, TRUE) for name in names]
+    if any(true):
+        own = [OTHER if word else _stem_of(name, OWN[1:]) or name for name, word in zip(names, true, strict=True)]
+        if (roles := _roles(own, where)) is not None:
+            return roles
+    return _roles(names, where)
+
+
+def true_roles_of(names: Sequence[str], where: Path) -> Roles | None:
+    """Which columns make up a true pose, with its quaternion, beside estimates; None where there is none.
+
+    Raises
+    ------
+    InputError
+        Several columns would do.
+    """
+    clock = clock_of(names)
+    times = () if clock is None else clock[0]
+    words = [_stem_of(name, TRUE) or (name if i in times else OTHER) for i, name in enumerate(names)]
+    return _roles(words, where)
+
+
+def _stem_of(name: str, spellings: Sequence[str]) -> str:
+    """What a name has in the place of ``{}`` of a spelling; "" of other names."""
+    plain = plain_name(name)
+    for spelling in spellings:
+        before, _, after = spelling.partition("{}")
+        if plain.startswith(before) and plain.endswith(after) and len(plain) > len(before + after):
+            return plain[len(before) : len(plain) - len(after)]
+    return ""
+
+
+def _roles(names: Sequence[str], where: Path) -> Roles | None:
     plain = [plain_name(name) for name in names]
     quaternion = _family(plain, QUATERNIONS, "xyzw", where)
     position = _family(plain, POSITIONS, "xyz", where)
@@ -158,7 +193,11 @@ def roles_of(names: Sequence[str], where: Path) -> Roles | None:
     kind = "EuRoC truth" if asl else "poses by the names of their columns"
     rest = _rest(plain) if quaternion else ()
     kind = kind if quaternion else kind.replace("poses", "positions")
-    return Roles(*clock, position, quaternion or (), _covariance(plain, len(rest)), kind, rest)
+    covariance, squared = _covariance(plain, len(rest)), False
+    if not covariance:
+        covariance = _deviations(plain, len(rest), VARIANCES)
+        squared = bool(covariance)
+    return Roles(*clock, position, quaternion or (), covariance, kind, rest, squared)
 
 
 def plain_name(name: str) -> str:
@@ -198,9 +237,15 @@ def clock_of(names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
     for clock in CLOCKS:
         for i, name in enumerate(bare):
             if name == clock or (clock == "header_stamp" and name.endswith(clock)):
-                said = re.search(r"[\[(_ ]\s*(s|sec|ms|us|ns|nsec)\s*[\])]?$", names[i].lower())
-                return (i,), UNITS[said[1]] if said else 10**9 if plain[i] in RECORDED else None
+                return (i,), _unit_in(names[i])
     return None
+
+
+def _unit_in(name: str) -> int | None:
+    """How many of the units that the name of a time states are a second; None where it states none."""
+    if stated := re.search(r"[\[(_ ]\s*(s|sec|ms|us|ns|nsec)\s*[\])]?$", name.lower()):
+        return UNITS[stated[1]]
+    return 10**9 if plain_name(name) in RECORDED else None
 
 
 def places_of(names: Sequence[str], spellings: Sequence[Sequence[str]]) -> tuple[int, ...] | None:
@@ -233,21 +278,34 @@ def numbered(name: str) -> bool:
 
 def _covariance(plain: list[str], rest: int) -> tuple[int, ...]:
     """Places of the columns of a covariance of a pose and ``rest`` more, or of the pose alone; none without one."""
-    sizes = sorted({6, 6 + min(rest, 3), 6 + rest}, reverse=True)
-    every = [(*labels, *MOVING_LABELS[: n - 6]) for n in sizes for labels in LABELS]
-    for labels, prefix in itertools.product(every, PREFIXES):
+    for labels, prefix in itertools.product(_labels(rest), PREFIXES):
         if found := _places(plain, _pairs(prefix, labels, len(labels))):
             return found
     blocks = [_places(plain, _pairs(prefix, APART[prefix], 3)) for prefix in ("q", "p")]
     if all(blocks):
         return (*blocks[0], *blocks[1])
-    sizes = [size for n in sizes for size in (n * n, n * (n + 1) // 2)]
-    if found := _numbered(plain, NUMBERED, sizes):
-        return found
-    for labels, spelling in itertools.product(every, DEVIATIONS):
+    sizes = [size for n in _sizes(rest) for size in (n * n, n * (n + 1) // 2)]
+    return (
+        _numbered(plain, NUMBERED, sizes) or _deviations(plain, rest, DEVIATIONS) or _numbered(plain, BY_INDEX, sizes)
+    )
+
+
+def _sizes(rest: int) -> list[int]:
+    """Numbers of components that a covariance of a pose and ``rest`` more may have, the largest first."""
+    return sorted({6, 6 + min(rest, 3), 6 + rest}, reverse=True)
+
+
+def _labels(rest: int) -> list[tuple[str, ...]]:
+    """Words for the components of a pose and ``rest`` more."""
+    return [(*labels, *MOVING_LABELS[: n - 6]) for n in _sizes(rest) for labels in LABELS]
+
+
+def _deviations(plain: list[str], rest: int, spellings: Sequence[str]) -> tuple[int, ...]:
+    """Places of the standard deviations, or variances, of all components; none without them."""
+    for labels, spelling in itertools.product(_labels(rest), spellings):
         if set(names := [spelling.format(label) for label in labels]) <= set(plain):
             return tuple(plain.index(name) for name in names)
-    return _numbered(plain, BY_INDEX, sizes)
+    return ()
 
 
 def _numbered(plain: list[str], pattern: re.Pattern[str], sizes: Sequence[int]) -> tuple[int, ...]:
@@ -281,14 +339,6 @@ def _places(plain: list[str], pairs: Iterator[tuple[str, str]]) -> tuple[int, ..
 
 
 # --- numbers -----------------------------------------------------------------------------------------
-
-
-def unit_of(t: Array, unit: int | None = None) -> int:
-    """How many units of times are a second: what their name says, or what times since 1970 are large enough for."""
-    if unit is not None:
-        return unit
-    middle = float(np.median(np.abs(t))) if len(t) else 0.0
-    return next((each for least, each in EPOCHS if middle > least), 1)
 
 
 def require_units(names: Sequence[str], path: Path) -> None:

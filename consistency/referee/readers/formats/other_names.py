@@ -9,21 +9,20 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.column_names import POSE
-from consistency.referee.readers.file_kinds import HEADINGS, PLACES
+from consistency.referee.readers.formats.file_kinds import HEADINGS, PLACES
 from consistency.referee.readers.formats.named_columns import (
     DEVIATIONS,
+    OWN,
+    TRUE,
+    VARIANCES,
     clock_of,
     plain_name,
     require_units,
-    unit_of,
 )
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.types import Array
 
-OWN = ("{}", "{}_est", "est_{}", "{}_hat", "{}_estimate", "estimate_{}", "{}_estimated", "estimated_{}")
-TRUE = ("true_{}", "{}_true", "truth_{}", "{}_truth", "gt_{}", "{}_gt")
 COVARIANCES = ("p_{}_{}", "p_{}{}", "p{}_{}", "p{}{}", "cov_{}_{}", "cov_{}{}", "cov{}{}")
-VARIANCES = ("var_{}", "var{}", "{}_var", "variance_{}")
 SHORT_HEADINGS = ("h", "th", "t")  # in names of a covariance alone
 KEYS = ("run", "step", "t")
 
@@ -35,7 +34,8 @@ def with_known_names(sheet: TableRows, axes: Sequence[str]) -> tuple[TableRows, 
     require_units([names[place] for place in places.values()], sheet.path)
     taken = ", ".join(f"{names[place]} as {name}" for name, place in places.items())
     data = sheet.data | {name: sheet.data[names[place]] for name, place in places.items()}
-    return replace(sheet, data=data), f"{sheet.path}: read {taken}" * bool(taken)
+    note = f"{sheet.path}: read {taken}" if taken else ""
+    return replace(sheet, data=data), note
 
 
 def with_clock(sheet: TableRows, required: bool = True) -> TableRows:
@@ -47,6 +47,8 @@ def with_clock(sheet: TableRows, required: bool = True) -> TableRows:
     names = [] if clock is None else [list(sheet.data)[place] for place in clock[0]]
     if clock is None or not (required or all(sheet.data[name].dtype.kind == "f" for name in names)):
         return sheet
+    from consistency.referee.readers.clock_units import unit_of
+
     columns = [sheet.numbers(name) for name in names]
     t = columns[0] / unit_of(columns[0], clock[1]) + sum(columns[1:]) * 1e-9
     return replace(sheet, data=sheet.data | {"t": t})

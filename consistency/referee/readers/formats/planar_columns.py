@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,12 @@ import numpy as np
 from consistency.referee.column_names import COVARIANCE, POSE
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.file_kinds import PLACES, SPEEDS, TURNS, is_poses
-from consistency.referee.readers.formats.named_columns import UNIT_NAMES, clock_of, head_of, places_of
-from consistency.referee.readers.formats.other_names import TRUE, covariance_places, state_places
+from consistency.referee.readers.clock_units import UNIT_NAMES
+from consistency.referee.readers.formats.file_kinds import PLACES, SPEEDS, TURNS, is_poses
+from consistency.referee.readers.formats.named_columns import TRUE, clock_of, head_of, places_of
+from consistency.referee.readers.formats.other_names import covariance_places, state_places
 from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
-from consistency.referee.readers.formats.sheet import Lines, TableRows, increasing
+from consistency.referee.readers.formats.sheet import TableRows, increasing
 from consistency.referee.readers.formats.table_columns import LOWER_NAMES
 from consistency.referee.types import Array
 
@@ -55,10 +57,10 @@ def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
         of = f"speed and turn rate, each held until the next, integrated to {'motions' if motions else 'poses'}"
         pose = motions_of(t, pose[:, 0], pose[:, 1])
         pose = pose if motions else poses_of(pose)
-    increasing(Lines(path, t[:, None], lines.line))
+    rows = increasing(replace(lines, values=np.column_stack([t, pose, *columns[first + len(places) :]])))
     note = f"{path}: read as {of}, {len(head.names)} columns, {UNIT_NAMES[unit]}"
-    data = dict(zip(["t", *POSE, *stated], [t, *pose.T, *columns[first + len(places) :]], strict=True))
-    return TableRows(path, data, lines.line, "line"), note
+    data = dict(zip(["t", *POSE, *stated], rows.values.T, strict=True))
+    return TableRows(path, data, rows.line, "line", rows.open_line, rows.cut), note
 
 
 def motions_of(t: Array, v: Array, omega: Array) -> Array:

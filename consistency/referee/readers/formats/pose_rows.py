@@ -14,17 +14,17 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
-from consistency.referee.readers.file_kinds import is_solution
+from consistency.referee.readers.clock_units import UNIT_NAMES, unit_of
+from consistency.referee.readers.formats.file_kinds import is_solution
 from consistency.referee.readers.formats.geodetic import read_solution
 from consistency.referee.readers.formats.named_columns import (  # fmt: skip
-    UNIT_NAMES,
     Head,
     Roles,
     fields_of,
     head_of,
     require_units,
     roles_of,
-    unit_of,
+    true_roles_of,
 )
 from consistency.referee.readers.formats.sheet import (
     Lines,
@@ -33,9 +33,9 @@ from consistency.referee.readers.formats.sheet import (
     read_numbers,
     read_rows,
     read_sheet,
-    refuse,
 )
 from consistency.referee.readers.formats.text_blocks import blocks
+from consistency.referee.readers.places import refuse
 from consistency.referee.types import Array, Indices
 
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
@@ -88,6 +88,18 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     return states
 
 
+def read_beside(path: Path) -> Lines | None:
+    """The truth in columns beside the estimates of a file with names, in rows that have one; None without any."""
+    head = head_of(path)
+    roles = None if head is None else true_roles_of(head.names, path)
+    if head is None or roles is None or not roles.quaternion:
+        return None
+    lines = _named(path, head, roles, true=True)
+    known = np.isfinite(lines.values).all(axis=1)
+    note = f"{path}: the truth stands in columns beside the estimates"
+    return replace(lines, values=lines.values[known], line=lines.line[known], rest=None, note=note)
+
+
 def on_plane(lines: Lines, unit: str) -> TableRows:
     """Columns t, x, y and heading of poses in space, which is that of the x axis.
 
@@ -103,7 +115,7 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
         )
     ahead = Rotation.from_quat(lines.values[:, 4:POSE]).apply([1.0, 0.0, 0.0])
     columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
-    return TableRows(lines.path, columns, lines.line, unit)
+    return TableRows(lines.path, columns, lines.line, unit, lines.open_line, lines.cut)
 
 
 def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
@@ -111,6 +123,9 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     pose = (*roles.time, *roles.position, *roles.quaternion, *roles.covariance)
     lines, columns = read_named(path, head, (*pose, *roles.rest))
     t, unit = times_of(lines, roles.time, columns[: len(roles.time)], roles.unit)
+    if roles.squared:
+        first = len(roles.time) + len(roles.position) + len(roles.quaternion)
+        columns[first : len(pose)] = [np.sign(each) * np.sqrt(np.abs(each)) for each in columns[first : len(pose)]]
     of = roles.kind if true else roles.kind.replace(" truth", " poses")
     clock = UNIT_NAMES[unit] if len(roles.time) == 1 else "seconds and nanoseconds"
     order = "no orientation"
@@ -119,6 +134,7 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if roles.covariance:
         stated = "standard deviations" if len(roles.covariance) in DEVIATIONS else "covariance"
+        stated = "variances" if roles.squared else stated
         note += f", {stated} in {len(roles.covariance)} columns"
     values = np.column_stack([t, *columns[len(roles.time) : len(pose)]])
     rest = np.column_stack(columns[len(pose) :]) if roles.rest else None
@@ -136,7 +152,8 @@ def read_named(path: Path, head: Head, places: Sequence[int]) -> tuple[Lines, li
     names = list(sheet.data)
     if "run" in names or "filter" in names:
         raise InputError(f"{path}: column 'run' or 'filter': write such poses to a file for each run and estimator")
-    return Lines(path, np.empty((len(sheet), 0)), sheet.line), [sheet.numbers(names[i]) for i in places]
+    lines = Lines(path, np.empty((len(sheet), 0)), sheet.line, open_line=sheet.open_line, cut=sheet.cut)
+    return lines, [sheet.numbers(names[i]) for i in places]
 
 
 def _asl(lines: Lines, true: bool) -> Lines:

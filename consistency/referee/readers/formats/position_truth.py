@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,12 +12,11 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
-from consistency.referee.readers.formats.sheet import Lines, Places
+from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.space_trajectories import AXES, TrajectorySource
-from consistency.referee.readers.truth_matching import Poses
-from consistency.referee.readers.windows import Relative
+from consistency.referee.readers.truth_matching import AXES, Poses
 from consistency.referee.types import Array
 
 SAME = 1e-9  # of quaternions
@@ -25,34 +25,32 @@ TURNED, BEYOND = 0.5, 10.0  # rad and sigma: a turn that is no error of a consta
 WINDING, ALIGNED = 0.01, 0.25  # 1 less the mean direction of a path, and the part of it that is left in the body's axes
 
 
-def position_source(
-    source: TrajectorySource, poses: Sequence[Poses], convention: str, r: Reading, relative: Relative | None
-) -> TrajectorySource:
-    """Origin of estimates whose truth is positions alone, with what is judged of them; ``convention`` "" of fixes.
+def require_positions(path: Path, poses: Sequence[Poses], r: Reading) -> None:
+    """Refuse what does not go with a truth of positions alone.
 
     Raises
     ------
     InputError
         Some runs have a truth with orientations, or an option needs one.
     """
-    truth = source.files[0][1]
+    truth = poses[0].files[1]
     if any(one.manifold != "vector" for one in poses):
-        raise InputError(f"{source.path}: the truth of some runs has orientations, of others none; judge them apart")
-    if relative is not None or r.align not in (None, "posyaw", "posyaw-all"):
-        option = "--relative" if relative is not None else f"--align {r.align}"
+        raise InputError(f"{path}: the truth of some runs has orientations, of others none; judge them apart")
+    if r.relative is not None or r.align not in (None, "posyaw", "posyaw-all"):
+        option = "--relative" if r.relative is not None else f"--align {r.align}"
         raise InputError(f"{option}: needs a truth with orientations; {truth} holds positions alone")
     if rotations := [axis for axis in r.axes or () if axis not in AXES[:3]]:
         raise InputError(
             f"--axes {','.join(r.axes or ())}: '{rotations[0]}' has no truth; {truth} holds positions alone"
         )
-    if not convention:
-        return source
+
+
+def position_note(truth: Path | str, lever_arm: Sequence[float] | None) -> str:
+    """A note on the point of the body that is judged."""
     at = "the origin of the body; --lever-arm x,y,z names another point"
-    if r.lever_arm is not None:
-        at = f"the point ({', '.join(f'{each:g}' for each in r.lever_arm)}) m of the body"
-    note = f"{truth}: the truth has no orientation, so that the position alone is judged, of {at}"
-    why = f"; of the position, whose covariance follows from that of the error {convention}"
-    return replace(source, notes=(*source.notes, note), why=why)
+    if lever_arm is not None:
+        at = f"the point ({', '.join(f'{each:g}' for each in lever_arm)}) m of the body"
+    return f"{truth}: the truth has no orientation, so that the position alone is judged, of {at}"
 
 
 def positions(poses: Poses, lever: Sequence[float], blocks: bool) -> Poses:

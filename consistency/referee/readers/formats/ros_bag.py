@@ -11,26 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.geometry.groups import inverse, matrices, vectors
 from consistency.referee.parsing import reading
-from consistency.referee.readers.file_kinds import is_one_bag
+from consistency.referee.readers.formats.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.pose_rows import POSE
 from consistency.referee.readers.formats.sheet import Lines
-from consistency.referee.readers.formats.tum import UNIT, bare_poses, poses_of
+from consistency.referee.readers.formats.tum import UNIT, SpaceRun, poses_of, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.relative_motions import MARGINAL
-from consistency.referee.readers.space_trajectories import (
-    AXES,
-    recordings_of,
-    require_axes,
-)
-from consistency.referee.readers.truth_matching import NamedPoses, Poses, truth_at
-from consistency.referee.readers.windows import Relative
+from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance
@@ -44,46 +37,46 @@ UNKNOWN, DIAGONAL = 0, 2  # types of covariance in sensor_msgs/NavSatFix
 ENDLESS = 1e9  # a variance from which on it is not stated
 
 
-def read_bags(path: Path, r: Reading, relative: Relative | None = None) -> list[Evidence]:
-    """Evidence of one estimator: a bag, or a folder with a bag for each run.
+def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimator]:
+    """One estimator: a bag, or a folder with a bag for each run.
 
     The topic of the estimates is of PoseWithCovarianceStamped, Odometry or NavSatFix, and need not be named where there
     is one; that of the truth is of poses or NavSatFix, or PARENT:CHILD, two frames of /tf that its links join.
+
+    Parameters
+    ----------
+    poses_alone : covariances are not looked at, and the topic of the estimates need not have any
 
     Raises
     ------
     InputError
         A bag cannot be read, or lacks the topic; says which there are.
     """
-    if relative is not None:
+    bags = _bags(path)
+    if poses_alone:
+        return [poses_of(path, [_bare_run(bag, r) for bag in bags], r)]
+    if r.relative is not None:
         raise InputError(f"{path}: --relative: {MARGINAL}")
     if r.error not in (None, *SPATIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    require_axes(r.axes)
-    bags = _bags(path)
     if twice := _parts_of_one(bags):
         raise InputError(
             f"{path}: {twice} and others are parts of one recording; make its metadata by 'ros2 bag reindex'"
         )
-    source, poses, parts = poses_of(
-        path,
-        [(bag, f"{r.truth_topic} of {bag}") for bag in bags],
-        (_run_of(bag, r) for bag in bags),
-        r,
-        why="; as the ROS messages define it; declare yours with --error",
-        mixed=f"{path}: the covariances of some bags have cross terms, of others none; judge them apart",
-    )
-    stated, said = _stated(path, poses)
-    if r.axes is None and said:
-        r, source = replace(r, axes=stated), replace(source, notes=(*source.notes, said))
-    return recordings_of(source, poses, parts, r)
+    why = "; as the ROS messages define it; declare yours with --error"
+    mixed = f"{path}: the covariances of some bags have cross terms, of others none; judge them apart"
+    found = space_estimator(path, (_run_of(bag, r) for bag in bags), r, why, mixed)
+    judged, note = _stated(path, found.runs)
+    if r.axes is not None or not note:
+        return [found]
+    return [replace(found, judged=judged, notes=(*found.notes, note))]
 
 
 def _bags(path: Path) -> list[Path]:
     return [path] if is_one_bag(path) else sorted(part for part in path.iterdir() if is_one_bag(part))
 
 
-def _run_of(bag: Path, r: Reading) -> tuple[Lines, Lines, None, list[str]]:
+def _run_of(bag: Path, r: Reading) -> SpaceRun:
     """Estimates and truth of a bag, whose covariances stand in the lines, and notes on their frames."""
     with _opened(bag) as reader:
         topic, truth = _chosen(bag, reader, r.topic), r.truth_topic
@@ -102,7 +95,7 @@ def _run_of(bag: Path, r: Reading) -> tuple[Lines, Lines, None, list[str]]:
         raise InputError(f"{bag}: --truth-covariance {COLUMNS}: the messages of {r.truth_topic} state none")
     if not np.isfinite(true.values[:, 1:covariance]).all():
         raise InputError(f"{bag}: the truth on {truth} is not finite")
-    return own, true, None, notes
+    return SpaceRun(own, true, (bag, f"{r.truth_topic} of {bag}"), notes=notes)
 
 
 def _parts_of_one(bags: Sequence[Path]) -> str:
@@ -111,7 +104,7 @@ def _parts_of_one(bags: Sequence[Path]) -> str:
     return next((bag.name for bag in bags if (match := PART.fullmatch(bag.stem)) and stems.count(match[1]) > 1), "")
 
 
-def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[str], str]:
+def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
     """Components whose variance is stated in some step, and a note on the others, "" without any.
 
     What a node does not know it writes as 0 in every step, as -1 in the first variance of a block, or as a huge number.
@@ -126,10 +119,10 @@ def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[str], str]:
     none = (variances == 0).all(axis=0) | (variances >= ENDLESS).all(axis=0) | np.isnan(variances).all(axis=0)
     for first in range(0, n, 3):
         none[first : first + 3] |= bool((variances[:, first] == -1).all())
-    left = [axis for axis, missing in zip(AXES, none, strict=False) if not missing]
+    left = np.flatnonzero(~none).tolist()
     if not left:
         raise InputError(f"{path}: states no covariance: its variances are 0, -1 or {ENDLESS:g} in every message")
-    missing = ",".join(axis for axis in AXES[:n] if axis not in left)
+    missing = ",".join(AXES[i] for i in range(n) if i not in left)
     what = f"{path}: the variances of {missing} are 0, -1 or {ENDLESS:g} in every message, so not stated and not judged"
     return left, what if missing else ""
 
@@ -277,8 +270,10 @@ def _fixes(bag: Path, topic: str, messages: Sequence[Any]) -> Fixes:
     values = np.column_stack([np.array(rows, float), P])
     _, first = np.unique(values[:, 0], return_index=True)
     note = f"{bag}: {topic} read as positions by satellite, {len(kept)} of {len(messages)} messages with a fix"
-    note += ", deviations alone" * (kinds <= {DIAGONAL})
-    return Fixes(bag, values[first], first + 1, note, f"message of {topic}", alone=kinds <= {DIAGONAL})
+    alone = kinds <= {DIAGONAL}
+    if alone:
+        note += ", deviations alone"
+    return Fixes(bag, values[first], first + 1, note, f"message of {topic}", alone=alone)
 
 
 def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> Lines:
@@ -312,18 +307,14 @@ def _stamp(header: Any) -> float:
     return float(header.stamp.sec + SECOND * header.stamp.nanosec)
 
 
-# --- poses alone -------------------------------------------------------------------------------------
-
-
-def bag_poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
-    """Poses of each bag, of a topic with or without covariances, which are not looked at."""
-    for bag in _bags(path):
-        with _opened(bag) as reader:
-            topic = r.topic if r.topic in _topics(reader, POSES) else _chosen(bag, reader, r.topic)
-            if r.truth_topic is None:
-                others = [name for name in _topics(reader, POSES) if name != topic]
-                raise InputError(f"{bag}: needs --truth-topic; there are: {_listed(others, reader)}")
-            own, true = (_lines(bag, reader, each) for each in (topic, r.truth_topic))
-        if isinstance(own, Fixes) or isinstance(true, Fixes):
-            raise InputError(f"{bag}: positions by satellite have no orientations, which motions need")
-        yield bare_poses(bag.stem, own, true, r)
+def _bare_run(bag: Path, r: Reading) -> SpaceRun:
+    """Poses of a bag, of a topic with or without covariances."""
+    with _opened(bag) as reader:
+        topic = r.topic if r.topic in _topics(reader, POSES) else _chosen(bag, reader, r.topic)
+        if r.truth_topic is None:
+            others = [name for name in _topics(reader, POSES) if name != topic]
+            raise InputError(f"{bag}: needs --truth-topic; there are: {_listed(others, reader)}")
+        own, true = (_lines(bag, reader, each) for each in (topic, r.truth_topic))
+    if isinstance(own, Fixes) or isinstance(true, Fixes):
+        raise InputError(f"{bag}: positions by satellite have no orientations, which motions need")
+    return SpaceRun(own, true, (bag, f"{r.truth_topic} of {bag}"))

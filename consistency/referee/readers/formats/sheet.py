@@ -6,7 +6,7 @@ import csv
 import itertools
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.referee.readers.formats.text_blocks import Block, blocks
+from consistency.referee.readers.places import cut_note, exact, listed, refuse
 from consistency.referee.types import Array, Indices
 
 Column = Array  # (N,), floats with NaN where a cell is empty; or objects, text for one, with None there
@@ -54,6 +55,8 @@ class TableRows:
     data: dict[str, Column]
     line: Indices  # (N,), line of a text file, row of a Parquet file
     unit: str  # line | row
+    open_line: int = 0  # line of a row without an end, which may be cut short; 0 without one
+    cut: str = ""  # note on a line that is left out, because it is
 
     def __contains__(self, column: str) -> bool:
         return column in self.data
@@ -63,8 +66,7 @@ class TableRows:
 
     @property
     def columns(self) -> str:
-        names = list(self.data)
-        return ", ".join(names[:12]) + ", …" * (len(names) > 12)
+        return listed(list(self.data), 12)
 
     def place(self, row: int) -> str:
         return f"{self.path}, {self.unit} {self.line[row]}"
@@ -92,9 +94,11 @@ class TableRows:
         return values
 
     def rows(self, keep: Array) -> TableRows:
-        return TableRows(
-            self.path, {name: cells[keep] for name, cells in self.data.items()}, self.line[keep], self.unit
-        )
+        return replace(self, data={name: cells[keep] for name, cells in self.data.items()}, line=self.line[keep])
+
+    def open_end(self, row: int) -> str:
+        """What to note of a row if it is cut short; "" where its line has an end."""
+        return cut_note(self.path, self.open_line) if self.line[row] == self.open_line else ""
 
     def texts(self, column: str) -> Array:
         return np.array([str(cell) for cell in self.data[column]], object)
@@ -114,6 +118,8 @@ class Lines:
     note: str = ""  # what they were read as
     unit: str = "line"  # line | message
     rest: Array | None = None  # (N, 3) velocity in the world, m/s, or (N, 9) biases of gyroscope and accelerometer, too
+    open_line: int = 0  # line of the last row if it has no end, and may be cut short; 0 otherwise
+    cut: str = ""  # note on a line that is left out, because it is
 
     @property
     def t(self) -> Array:
@@ -127,35 +133,23 @@ class Lines:
         """Some of the columns, without holding the others in memory."""
         return replace(self, values=self.values[:, columns].copy())
 
+    def without_cut(self, bad: Array) -> Lines:
+        """The lines without the last one if it alone is ``bad``, (N,) of bool, and has no end."""
+        if not self.open_line or len(bad) < 2 or not bad[-1] or bad[:-1].any():
+            return self
+        rest = None if self.rest is None else self.rest[:-1]
+        cut = cut_note(self.path, self.open_line)
+        return replace(self, values=self.values[:-1], line=self.line[:-1], rest=rest, open_line=0, cut=cut)
 
-class Places:
-    """Places of some rows of a file, put into words when asked for."""
-
-    def __init__(self, of: Callable[[int], str], rows: Indices) -> None:
-        self._of, self._rows = of, rows
-
-    def __getitem__(self, which: int) -> str:
-        return self._of(int(self._rows[which]))
-
-    def at(self, rows: Indices | slice) -> Places:
-        return Places(self._of, self._rows[rows])
-
-
-def refuse(bad: Any, place: Callable[[int], str], what: str | Callable[[int], str]) -> None:
-    """Refuse rows, (N,) of bool, that are ``bad``, by what is wrong with the first of them."""
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(f"{place(row)}: {what if isinstance(what, str) else what(row)}")
+    @property
+    def open_end(self) -> str:
+        """What to note of the last row if it is cut short; "" where its line has an end."""
+        return cut_note(self.path, self.open_line) if self.open_line else ""
 
 
 def bounded(values: Array) -> Array:
     """Numbers, with infinity for those too large for any measurement, as a filter that broke down writes."""
     return np.where(np.abs(values) > HUGE, np.copysign(np.inf, values), values)
-
-
-def exact(value: float) -> str:
-    """A number with all its digits, as a file has it."""
-    return repr(float(value)).removesuffix(".0")
 
 
 def are_dof(values: Array) -> Array:
@@ -176,7 +170,8 @@ def read_sheet(path: Path) -> TableRows:
     elif path.suffix.lower() in (".jsonl", ".ndjson"):
         from consistency.referee.readers.formats.json_lines import read_json_lines
 
-        sheet = TableRows(path, *read_json_lines(path), "line")
+        columns, line, open_line, cut = read_json_lines(path)
+        sheet = TableRows(path, columns, line, "line", open_line, cut)
     else:
         sheet = _read_csv(path)
     if not len(sheet):
@@ -215,7 +210,9 @@ def _cells(values: Array) -> Column:
 
 def _read_csv(path: Path) -> TableRows:
     names: list[str] = []
-    separator, tables, line = ",", list[dict[str, Column]](), list[Indices]()
+    tables: list[dict[str, Column]] = []
+    line: list[Indices] = []
+    separator, open_line, cut = ",", 0, ""
     for block in blocks(path):
         if not names:
             lines = block.lines()
@@ -223,18 +220,35 @@ def _read_csv(path: Path) -> TableRows:
                 continue
             names, separator = _header(path, lines[0][1])
             found = _rows(path, lines[1:], names, separator)
+        elif tables and not block.ends and not _is_like(block.lines(), tables[-1], separator):
+            cut = cut_note(path, block.first)
+            break
         else:
             found = _plain_rows(block, names, separator) or _rows(path, block.lines(), names, separator)
         if found is not None:
             tables.append(found[0])
             line.append(found[1])
+            open_line = 0 if block.ends else block.first
     if not names:
         raise InputError(f"{path}: is empty")
     if not tables:
         raise InputError(f"{path}: holds no row under its header")
-    return TableRows(
-        path, {name: _joined([table[name] for table in tables]) for name in names}, np.concatenate(line), "line"
-    )
+    data = {name: _joined([table[name] for table in tables]) for name in names}
+    return TableRows(path, data, np.concatenate(line), "line", open_line, cut)
+
+
+def _is_like(lines: list[tuple[int, str]], above: dict[str, Column], separator: str) -> bool:
+    """Whether a line is as long as the rows above it, with numbers where they have numbers."""
+    for _, line in lines:
+        cells = [cell.strip() for cell in line.split(separator)]
+        if '"' not in line and len(cells) != len(above):
+            return False
+        if line.count('"') % 2:
+            return False
+        for cell, column in zip(cells, above.values(), strict=False):
+            if '"' not in line and column.dtype.kind == "f" and cell not in EMPTY and math.isnan(_number(cell)):
+                return False
+    return True
 
 
 def _header(path: Path, line: str) -> tuple[list[str], str]:
@@ -322,8 +336,13 @@ def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
 
 def read_rows(path: Path, widths: Sequence[int], layout: str, header: int = 0) -> Lines:
     """A text file of numbers, every line but ``header``, counted from 1, of the same one of the ``widths``."""
-    values, line, width = list[Array](), list[Indices](), 0
+    values: list[Array] = []
+    line: list[Indices] = []
+    width, open_line, cut = 0, 0, ""
     for block in blocks(path):
+        if width and not block.ends and not _are_numbers(block.lines(), width):
+            cut = cut_note(path, block.first)
+            break
         found = block.numbers()
         if found is None or found[0].shape[1] not in widths or width not in (0, found[0].shape[1]):
             rows = [(number, text) for number, text in block.lines() if number != header]
@@ -332,13 +351,25 @@ def read_rows(path: Path, widths: Sequence[int], layout: str, header: int = 0) -
             width = found[0].shape[1]
             values.append(bounded(found[0]))
             line.append(found[1])
+            open_line = 0 if block.ends else block.first
     if not values:
         raise InputError(f"{path}: is empty; each line should be {layout}")
-    return Lines(path, np.concatenate(values), np.concatenate(line))
+    return Lines(path, np.concatenate(values), np.concatenate(line), open_line=open_line, cut=cut)
+
+
+def _are_numbers(lines: list[tuple[int, str]], width: int) -> bool:
+    """Whether all lines are ``width`` numbers."""
+    rows = [line.replace(",", " ").split() for _, line in lines]
+    try:
+        return all(len([float(field) for field in row]) == width for row in rows)
+    except ValueError:
+        return False
 
 
 def increasing(lines: Lines) -> Lines:
     """Lines whose first column is finite and increases; others are refused."""
+    late = np.append(True, np.diff(lines.t) > 0)
+    lines = lines.without_cut(~(late & np.isfinite(lines.t)))
     t = lines.t
     refuse(~np.isfinite(t), lines.place, "the timestamp is not finite")
 
@@ -358,7 +389,9 @@ def _number_rows(
     for number, line in lines:
         fields = line.replace(",", " ").split()
         if len(fields) not in widths:
-            hint = "; columns apart by semicolons need names, and numbers decimal points" * (";" in line)
+            hint = ""
+            if ";" in line:
+                hint = "; columns apart by semicolons need names, and numbers decimal points"
             raise InputError(f"{path}, line {number}: has {len(fields)} columns; should be {layout}{hint}")
         width = width or len(fields)
         if len(fields) != width:

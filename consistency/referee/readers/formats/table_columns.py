@@ -1,21 +1,17 @@
-"""Columns of a table as arrays: order of its rows, covariances, deviations, innovations, and the truth of its rows."""
+"""Columns of a table as arrays: order of its rows, covariances, deviations, innovations."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE
-from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.named_columns import DEVIATIONS
-from consistency.referee.readers.formats.sheet import TableRows, are_dof, exact, refuse
-from consistency.referee.readers.options import COLUMNS
-from consistency.referee.readers.runs_to_record import listed, symmetric
-from consistency.referee.readers.truth_matching import Known, Manifold, Poses, unit_apart
+from consistency.referee.readers.formats.sheet import TableRows, are_dof
+from consistency.referee.readers.places import exact, refuse
+from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.types import Array, Indices
 
 POSE = ("x", "y", "heading")
@@ -41,8 +37,11 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
         row = int(order[stuck[0] + 1])
         of = f" of run {runs[row]}" if "run" in sheet else ""
         what = "is there twice" if values[order[stuck[0]]] == values[row] else "is less than the one before"
-        hint = "" if "run" in sheet else "; several runs need a column 'run'"
-        hint += "" if "filter" in sheet else "; several estimators need a column 'filter'" if "run" in sheet else ""
+        hint = ""
+        if "run" not in sheet:
+            hint = "; several runs need a column 'run'"
+        elif "filter" not in sheet:
+            hint = "; several estimators need a column 'filter'"
         raise InputError(f"{sheet.place(row)}: {key} {exact(values[row])}{of} {what}{hint}")
     return order
 
@@ -137,82 +136,3 @@ def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:
     what = "nis {:g} with nis_dof {:g}; nis must be 0 or more, nis_dof a whole number from 0 to below 2^31".format
     refuse(bad, sheet.place, lambda row: what(nis[row], dof[row]))
     return nis, np.where(np.isfinite(nis), dof, 0.0)
-
-
-class Samples(NamedTuple):
-    """The truth of all runs, in order of the runs and of time."""
-
-    keys: Array  # (M,), step, or s
-    values: Array  # (M, n)
-    covariance: Array | None  # (M, n, n), of the truth itself
-    row: Indices  # (M,), of the file
-    runs: Indices | None  # (M,); None: it serves all
-
-    def of(self, run: int) -> Samples:
-        if self.runs is None:
-            return self
-        here = self.runs == run
-        P = None if self.covariance is None else self.covariance[here]
-        return Samples(self.keys[here], self.values[here], P, self.row[here], self.runs[here])
-
-
-def samples_of(truth: TableRows, axes: tuple[str, ...], key: str, stated: str | None) -> Samples:
-    """Samples of a true table; with ``stated`` their covariances, too."""
-    if stated not in (None, COLUMNS):
-        raise InputError(f"--truth-covariance {stated}: for tables it is '{COLUMNS}', those of the truth")
-    require_columns(truth, axes)
-    values = np.column_stack([truth.numbers(axis, finite=True) for axis in axes])
-    runs = truth.numbers("run", whole=True).astype(int) if "run" in truth else None
-    order = row_order(truth, runs if runs is not None else np.zeros(len(values), int), key)
-    P = None if stated is None else stated_covariance(truth, axes)[order]
-    return Samples(truth.numbers(key)[order], values[order], P, order, None if runs is None else runs[order])
-
-
-def manifold_of(convention: str) -> Manifold:
-    """What errors of a convention in a table live on."""
-    return "vector" if convention == "vector" else "planar"
-
-
-def matched(
-    name: str,
-    sheet: TableRows,
-    truth: TableRows,
-    samples: Samples,
-    key: str,
-    numbers: Sequence[int],
-    members: Sequence[Indices],
-    poses: Sequence[Poses],
-    shift: float,
-    max_dt: float,
-) -> tuple[list[Known], list[str]]:
-    """The truth of each run, and notes on the matching; ``numbers`` and ``members`` are the runs and their rows."""
-    known, partner = [p.known(shift) for p in poses], np.full(len(sheet), np.nan)
-    timed = key == "step" and "t" in sheet and "t" in truth
-    for run, rows, p, found in zip(numbers, members, poses, known, strict=True):
-        if not len(found.rows):
-            t = p.t + shift
-            spans = [f"{each.min():.15g} to {each.max():.15g}" for each in (t, p.true_t)]
-            odd = unit_apart(t, p.true_t, (sheet.path, truth.path))
-            within = f" within {p.max_dt:g} s (--max-dt){odd}" if key == "t" else ""
-            raise InputError(
-                f"{sheet.path}: no {key} of run {run} ({spans[0]}) is in {truth.path} ({spans[1]}){within}"
-            )
-        if timed:
-            partner[rows[found.rows]] = truth.numbers("t")[samples.of(run).row[found.before]]
-    if timed:
-        t = sheet.numbers("t")
-        where = f"in the same step of {truth.path}; number the same instants by the same step, or raise --max-dt"
-        off = np.abs(t - partner) > max_dt + 1e-6
-        refuse(off, sheet.place, lambda row: f"t is {exact(t[row])}, but {exact(partner[row])} {where}")
-    notes = []
-    absent = [] if samples.runs is None else sorted({int(run) for run in samples.runs} - {*numbers})
-    if absent:
-        notes.append(
-            f"{name}: no estimates of {plural(len(absent), 'run')} of the truth ({listed(absent)}); "
-            "if the filter broke down there, write a row of NaN, so that the failure counts"
-        )
-    if left_out := len(sheet) - sum(len(found.rows) for found in known):
-        notes.append(f"{name}: {left_out} of {len(sheet)} estimates have no truth and are left out")
-    if (furthest := max(float(found.apart.max(initial=0.0)) for found in known)) > 1e-6:
-        notes.append(f"{name}: the truth is interpolated, from samples up to {furthest:.2g} s away")
-    return known, notes

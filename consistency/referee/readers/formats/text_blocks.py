@@ -5,8 +5,6 @@ from __future__ import annotations
 import gzip
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +13,7 @@ from typing import BinaryIO, cast
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import is_file, reading, require_room
+from consistency.referee.parsing import reading, require_room
 from consistency.referee.types import Array, Indices
 
 BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as much
@@ -25,7 +23,6 @@ WIDE = re.compile(rb"\xff\xfe[^\0]\0|\xfe\xff\0[^\0]")  # the mark of UTF-16 and
 SPECIAL = b'"#\x0b\x0c\x1c\x1d\x1e'  # quotes, comments, and what str.splitlines takes for the end of a line
 IS_SPACE = np.isin(np.arange(256), np.frombuffer(b" \t\r\n", np.uint8))
 NEWLINE = ord("\n")
-_CUT: ContextVar[frozenset[Path]] = ContextVar("cut", default=frozenset())  # read without a last line that has no end
 
 
 @dataclass(frozen=True)
@@ -35,6 +32,7 @@ class Block:
     path: Path
     data: bytes
     first: int  # number of its first line in the file, from 1
+    ends: bool = True  # its last line has an end; otherwise it is the last line of the file alone
 
     @cached_property
     def plain(self) -> bool:
@@ -117,29 +115,8 @@ def blocks(path: Path) -> Iterator[Block]:
                 yield block
                 first, pieces = first + block.count, [tail]
             pieces.append(_read(path, file))
-    if (last := b"".join(pieces)) and path not in _CUT.get():
-        yield Block(path, last, first)
-
-
-@contextmanager
-def without_end(paths: frozenset[Path]) -> Iterator[None]:
-    """Text files that are read without their last line, where no end of line follows it."""
-    token = _CUT.set(paths)
-    try:
-        yield
-    finally:
-        _CUT.reset(token)
-
-
-def is_cut(path: Path, number: int) -> bool:
-    """Whether a line, counted from 1, is the last one of a file and has no end."""
-    if not is_file(path):
-        return False
-    ends = 0
-    with reading(path, REFUSAL), opened(path) as file:
-        while piece := file.read(BLOCK):
-            ends += piece.count(b"\n")
-    return number == ends + 1
+    if last := b"".join(pieces):
+        yield Block(path, last, first, ends=False)
 
 
 def opened(path: Path) -> BinaryIO:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
-from consistency.referee.readers.file_kinds import TABLES, is_drive, trajectory_files
+from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
+from consistency.referee.readers.clock_units import nothing_near
+from consistency.referee.readers.formats.file_kinds import TABLES, is_drive, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.readers.formats.named_columns import head_of, numbered
@@ -25,27 +27,34 @@ from consistency.referee.readers.formats.pose_rows import (
     SPLIT,
     TRIANGLE,
     States,
+    read_beside,
     read_deviations,
     read_poses,
 )
-from consistency.referee.readers.formats.position_truth import fixed, placeholder, position_source, positions
-from consistency.referee.readers.formats.sheet import Lines, Places, read_numbers, refuse
+from consistency.referee.readers.formats.position_truth import (
+    fixed,
+    placeholder,
+    position_note,
+    positions,
+    require_positions,
+)
+from consistency.referee.readers.formats.sheet import Lines, read_numbers
 from consistency.referee.readers.options import COLUMNS, Reading
+from consistency.referee.readers.places import Places, refuse
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.space_trajectories import (
+from consistency.referee.readers.truth_matching import (
     ALONE,
     BLOCKS,
     POINTS,
     SINGLE,
     STATE,
     WHOLE,
-    TrajectorySource,
-    apart,
-    recordings_of,
-    require_axes,
+    Estimator,
+    Poses,
+    Stated,
+    associate,
+    unstated,
 )
-from consistency.referee.readers.truth_matching import NamedPoses, Poses, associate
-from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 
 ORDERS = ("translation-rotation", "rotation-translation")
@@ -54,87 +63,156 @@ BOTH = 2 * FULL  # and a cross-covariance with the line before
 UNIT = 1e-3  # quaternions of four decimals pass
 
 
-def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Evidence]:
-    """Evidence of one estimator: a file, or a folder with a file for each run.
+@dataclass(frozen=True)
+class SpaceRun:
+    """A run in space as its files have it."""
+
+    own: Lines
+    true: Lines
+    files: tuple[Path | str, Path | str]  # of the estimates, of the truth
+    covariance: Path | None = None  # where it is not in the lines
+    notes: Sequence[str] = ()
+
+
+def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Estimator]:
+    """One estimator: a file, or a folder with a file for each run.
 
     With axes named only these components of the error are judged, by their part of the covariance.
 
-    With the 20 columns that the tools of OpenVINS write, position and rotation are two recordings: their
-    cross-covariance is not in the file, so a joint NEES would be wrong. With the states and standard deviations of a
-    simulation each component is one. The truth may be a drive of KITTI.
-    """
-    if r.error not in (None, *INERTIAL):
-        raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    require_axes(r.axes, STATE)
-    if r.truth is None:
-        raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
-    files = _runs(estimates, r.truth, r.covariance)
-    truth_of = _truths(r)
-    runs = ((read_trajectory(path), truth_of(true), P, list[str]()) for path, true, P in files)
-    source, poses, parts = poses_of(estimates, [(path, true) for path, true, _ in files], runs, r, relative)
-    return recordings_of(source, poses, parts, r, relative)
-
-
-def poses_of(
-    estimates: Path,
-    files: Sequence[tuple[Path | str, Path | str]],
-    runs: Iterable[tuple[Lines, Lines, Path | None, list[str]]],
-    r: Reading,
-    relative: Relative | None = None,
-    why: str = "",
-    mixed: str = "",
-) -> tuple[TrajectorySource, list[Poses], Mapping[str, range]]:
-    """Runs before any error is taken, with their origin, and the components whose covariance is known.
+    With the 20 columns that the tools of OpenVINS write, position and rotation are two records: their cross-covariance
+    is not in the file, so a joint NEES would be wrong. With the states and standard deviations of a simulation each
+    component is one. The truth may be a drive of KITTI.
 
     Parameters
     ----------
-    files : of each run: its estimates, its truth
-    runs : estimates and truth, a file of covariances where they are not in the lines, and notes
+    poses_alone : covariances are not looked at
+    """
+    if r.error not in (None, *INERTIAL):
+        raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
+    truth_of = _truths(estimates, r)
+    files = _runs(estimates, r.truth, None if poses_alone else r.covariance)
+    runs = (SpaceRun(read_trajectory(own), truth_of(true), (own, true), P) for own, true, P in files)
+    if poses_alone:
+        return [poses_of(estimates, runs, r)]
+    return [space_estimator(estimates, runs, r)]
+
+
+def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str = "", mixed: str = "") -> Estimator:
+    """An estimator in space, before any error is taken.
+
+    Parameters
+    ----------
     why : reason for the default error, as the end of a note; that of the layout where empty
     mixed : message where runs are of different layouts
     """
-    order = r.covariance_order or ORDERS[0]
-    parts: Mapping[str, range] = WHOLE
+    arm = r.lever_arm or (0.0, 0.0, 0.0)
     poses: list[Poses] = []
     notes: list[str] = []
-    for (path, _), (own, true, P_path, said) in zip(files, runs, strict=True):
-        own, true, world = localised(own, true)
-        notes += [note for note in (own.note, true.note, world, unused(true, r), *said) if note]
-        if not poses:
-            parts, is_fixed = _parts(own), isinstance(own, Fixes)
-            error_kind = r.error or ("so3" if parts in (WHOLE, ALONE) else "so3-body")
-            require_error(own, r.error)
-            notes += _order_note(path, _width(own), r.covariance_order)
-        if parts not in (WHOLE, ALONE) and r.covariance_order not in (None, ORDERS[1]):
-            raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
-        if _parts(own) is not parts:
-            raise InputError(mixed or f"{path}: has {own.values.shape[1]} columns, {files[0][0]} another layout")
+    layout: Layout | None = None
+    for run in runs:
+        own, true, world = localised(run.own, run.true)
+        notes += [own.cut, true.cut, own.note, true.note, world, _unused(true, r), *run.notes]
+        if layout is None:
+            layout = _layout_of(own, run.files, r)
+            notes += _order_note(run.files[0], _width(own), r.covariance_order)
+        elif _stated(own) != layout.stated:
+            what = f"{run.files[0]}: has {own.values.shape[1]} columns, {layout.files[0]} another layout"
+            raise InputError(mixed or what)
         if isinstance(own, Fixes):
-            poses.append(fixed(own, true, r, of_truth(true, own, ORDERS[0], r)))
-            continue
-        k, unjudged = judged_rest(own, true, r, relative)
-        notes += [unjudged] * bool(unjudged)
-        poses.append(_poses(own, true, P_path, error_kind, order, r, k))
-        if _is_point(true):
-            poses[-1] = positions(poses[-1], r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE)
-    if poses[0].manifold == "spatial" and r.axes is None and relative is None:
+            one = fixed(own, true, r, _of_truth(true, own, ORDERS[0], r))
+        else:
+            k, unjudged = judged_rest(own, true, r)
+            notes.append(unjudged)
+            one = _poses(own, true, run.covariance, layout.convention, r, k)
+            if _is_point(true):
+                one = positions(one, arm, layout.stated != WHOLE)
+        poses.append(replace(one, run=len(poses), files=run.files, open_end=own.open_end))
+    assert layout is not None
+    if poses[0].manifold == "spatial" and r.axes is None and r.relative is None:
         empty, what = placeholder(poses)
-        notes += [f"{files[0][1]}: {what}"] * bool(what)
+        if what:
+            notes.append(f"{layout.files[1]}: {what}")
         if empty:
-            poses = [positions(one, r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE) for one in poses]
-    why = "" if r.error else why or f"; the default of this layout, {_origin(parts)}"
-    source = TrajectorySource(estimates, files, r.covariance or estimates, why, tuple(dict.fromkeys(notes)))
+            poses = [positions(one, arm, layout.stated != WHOLE) for one in poses]
     if any(one.manifold == "vector" for one in poses):
-        source = position_source(source, poses, "" if is_fixed else error_kind, r, relative)
+        require_positions(path, poses, r)
     elif r.lever_arm is not None:
         raise InputError("--lever-arm: goes with a truth of positions alone; this one has the orientation of its body")
-    return source, poses, parts
+    kind = poses[0].convention
+    if kind == "vector" and layout.convention:
+        notes.append(position_note(layout.files[1], r.lever_arm))
+        why = f"; of the position, whose covariance follows from that of the error {layout.convention}"
+    elif r.error is not None:
+        why = ""
+    elif not why:
+        why = f"; the default of this layout, {_origin(layout.stated)}"
+    return Estimator(
+        path.stem, path, poses, STATE[: poses[0].covariance.shape[-1]], kind,
+        f"{INERTIAL.get(kind) or PLANAR[kind]}{why}", layout.stated, path.name, r.covariance,
+        tuple(dict.fromkeys(note for note in notes if note)), in_space=True, position=3,
+    )  # fmt: skip
 
 
-def _truths(r: Reading) -> Callable[[Path], Lines]:
+class Layout(NamedTuple):
+    """What the files of all runs have in common."""
+
+    stated: Stated
+    convention: str  # of the error of poses; "" of positions by satellite
+    files: tuple[Path | str, Path | str]  # of the first run
+
+
+def _layout_of(own: Lines, files: tuple[Path | str, Path | str], r: Reading) -> Layout:
+    """The layout of the first run.
+
+    Raises
+    ------
+    InputError
+        An option does not go with it.
+    """
+    stated = _stated(own)
+    require_error(own, r.error)
+    if stated not in (WHOLE, ALONE) and r.covariance_order not in (None, ORDERS[1]):
+        raise InputError(f"--covariance-order: {files[0]} is written by OpenVINS, rotation before translation")
+    if isinstance(own, Fixes):
+        return Layout(stated, "", files)
+    return Layout(stated, r.error or ("so3" if stated in (WHOLE, ALONE) else "so3-body"), files)
+
+
+def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
+    """Poses in space without their covariances.
+
+    Raises
+    ------
+    InputError
+        A file holds positions alone.
+    """
+    poses, pose = [], slice(1, POSE)
+    for run in runs:
+        for lines, name in zip((run.own, run.true), run.files, strict=True):
+            if _is_point(lines):
+                raise InputError(f"{name}: holds positions alone; motions need orientations, too")
+        own, true = run.own, run.true
+        place = Places(own.place, np.arange(len(own.t)))
+        poses.append(
+            Poses(
+                place, own.t, own.values[:, pose], *unstated(len(own.t), 6), true.t, true.values[:, pose], "spatial",
+                "left", r.tolerance, name=own.path.stem, files=run.files,
+            )
+        )  # fmt: skip
+    return Estimator(path.stem, path, poses, STATE[:6], in_space=True)
+
+
+def _truths(estimates: Path, r: Reading) -> Callable[[Path], Lines]:
+    """What reads a truth: a file of its own, a drive, or columns beside the estimates."""
+
     @lru_cache(maxsize=1)
     def read(path: Path) -> Lines:
-        return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, true=True)
+        if r.truth is not None:
+            return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, true=True)
+        beside = read_beside(path)
+        if beside is None:
+            raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
+        return _checked(beside)
 
     return read
 
@@ -143,35 +221,41 @@ def _is_point(lines: Lines) -> bool:
     return lines.values.shape[1] == POINT or isinstance(lines, Fixes)
 
 
-def _parts(own: Lines) -> Mapping[str, range]:
+def _stated(own: Lines) -> Stated:
     """Components whose covariance is known, by the layout of a file."""
     if isinstance(own, Fixes):
         return ALONE if own.alone else POINTS
     if isinstance(own, States):
         return SINGLE
-    stated = own.values.shape[1] - POSE
-    return BLOCKS if stated == SPLIT - POSE else ALONE if stated in DEVIATIONS else WHOLE
+    width = own.values.shape[1]
+    if width == SPLIT:
+        return BLOCKS
+    return ALONE if width - POSE in DEVIATIONS else WHOLE
 
 
-def _origin(parts: Mapping[str, range]) -> str:
-    if parts in (WHOLE, ALONE):
+def _origin(stated: Stated) -> str:
+    """Where a layout of covariances comes from."""
+    if stated in (WHOLE, ALONE):
         return "as in ROS messages with a covariance; declare yours with --error"
-    if parts is POINTS:
+    if stated == POINTS:
         return "positions alone"
-    return "written by OpenVINS" + "; --error so3 where it comes from another ROS topic" * (parts is BLOCKS)
+    if stated == BLOCKS:
+        return "written by OpenVINS; --error so3 where it comes from another ROS topic"
+    return "written by OpenVINS"
 
 
-def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
-    """Files of every run: estimates, truth, covariance."""
+def _runs(estimates: Path, truth: Path | None, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
+    """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
     if not estimates.is_dir():
         for option, path in (("--truth", truth), ("--covariance", covariance)):
             if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
                 raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
-        return [(estimates, truth, covariance)]
+        return [(estimates, truth or estimates, covariance)]
     files = trajectory_files(estimates)
     if not files:
-        tables = any(path.suffix.lower() in TABLES for path in estimates.iterdir())
-        hint = "; tables of several runs go into one file with a column 'run'" * tables
+        hint = ""
+        if any(path.suffix.lower() in TABLES for path in estimates.iterdir()):
+            hint = "; tables of several runs go into one file with a column 'run'"
         raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json{hint}")
     stems = [path.stem for path in files]
     if twice := next((path for path in files if stems.count(path.stem) > 1), None):
@@ -180,7 +264,9 @@ def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[P
         raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
     out = []
     for path in files:
-        own_truth = _same_stem(truth, path, "--truth") if truth.is_dir() and not is_drive(truth) else truth
+        own_truth = truth or path
+        if truth is not None and truth.is_dir() and not is_drive(truth):
+            own_truth = _same_stem(truth, path, "--truth")
         own_covariance = None if covariance is None else _same_stem(covariance, path, "--covariance")
         out.append((path, own_truth, own_covariance))
     return out
@@ -200,12 +286,11 @@ def _poses(
     truth: Lines,
     covariance_path: Path | None,
     convention: str,
-    order: str,
     r: Reading,
     k: int,
 ) -> Poses:
     """A run with its truth, of poses and ``k`` numbers of velocity and biases; P is NaN where none is near."""
-    tolerance = r.tolerance
+    order, tolerance = r.covariance_order or ORDERS[0], r.tolerance
     covariance, source, cross = _inline(own, order), own, None
     rows = picked = np.arange(len(own.t))
     if covariance_path is not None:
@@ -220,29 +305,28 @@ def _poses(
         if source.values.shape[1] == 1 + BOTH:
             cross = _cross(own, source, rows, picked, order)
     if covariance is None:
-        of = (
-            f"the standard deviations of {DEVIATIONS_LAYOUT}"
-            if isinstance(own, States)
-            else f"lines of t and {FULL} numbers"
-        )
+        of = f"lines of t and {FULL} numbers"
+        if isinstance(own, States):
+            of = f"the standard deviations of {DEVIATIONS_LAYOUT}"
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
     covariance = covariance[:, : 6 + k, : 6 + k]
     P = np.full((len(own.t), 6 + k, 6 + k), np.nan)
     P[rows] = symmetric(covariance if source is own else covariance[picked], lambda row: source.place(int(picked[row])))
     with_P = np.zeros(len(own.t), bool)
     with_P[rows] = True
+    of_truth = _of_truth(truth, own, order, r)
     own = own.of(slice(0, POSE))
-    estimate, true = (
-        np.column_stack([each.values[:, 1:POSE], each.rest[:, :k]])
-        if k and each.rest is not None
-        else each.values[:, 1:POSE]
-        for each in (own, truth)
-    )
     place = Places(own.place, np.arange(len(own.t)))
     return Poses(
-        place, own.t, estimate, P, with_P, truth.t, true, "spatial", convention, tolerance, cross,
-        of_truth(truth, own, order, r),
+        place, own.t, _states(own, k), P, with_P, truth.t, _states(truth, k), "spatial", convention, tolerance, cross,
+        of_truth,
     )  # fmt: skip
+
+
+def _states(lines: Lines, k: int) -> Array:
+    """Poses with the first ``k`` numbers of velocity and biases behind them, (N, 7 + k)."""
+    pose = lines.values[:, 1:POSE]
+    return np.column_stack([pose, lines.rest[:, :k]]) if k and lines.rest is not None else pose
 
 
 def _width(lines: Lines) -> int:
@@ -260,11 +344,11 @@ def require_error(own: Lines, error: str | None) -> None:
         raise InputError(f"--error {error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
 
 
-def judged_rest(own: Lines, true: Lines, r: Reading, relative: Relative | None) -> tuple[int, str]:
+def judged_rest(own: Lines, true: Lines, r: Reading) -> tuple[int, str]:
     """How many numbers of velocity and biases are judged beside the poses, and a note where they are not."""
     stated = 9 if isinstance(own, States) else _width(own) - 6
     k = min(stated, *(0 if lines.rest is None else lines.rest.shape[1] for lines in (own, true)))
-    moving = {"--relative": relative, "--align": r.align, "--truth-covariance": r.truth_covariance}
+    moving = {"--relative": r.relative, "--align": r.align, "--truth-covariance": r.truth_covariance}
     options = [option for option, value in moving.items() if value is not None]
     if k and options:
         return 0, f"{own.path}: with {options[0]} the poses alone are judged, not their velocities and biases"
@@ -274,7 +358,7 @@ def judged_rest(own: Lines, true: Lines, r: Reading, relative: Relative | None) 
     return k, ""
 
 
-def unused(truth: Lines, r: Reading) -> str:
+def _unused(truth: Lines, r: Reading) -> str:
     """A note on a covariance of the truth that nothing is done with, "" without one."""
     stated = isinstance(truth, Fixes) or bool((truth.values[:, POSE:] > 0).any())
     if r.truth_covariance is not None or not stated or isinstance(truth, States):
@@ -282,7 +366,7 @@ def unused(truth: Lines, r: Reading) -> str:
     return f"{truth.path}: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"
 
 
-def of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
+def _of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
     """Covariance of the truth, (M, 6, 6) or of fixes (M, 3, 3): of its columns, or of a file; NaN without one."""
     if r.truth_covariance is None:
         return None
@@ -315,7 +399,7 @@ def _cross(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str
 def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indices, Indices]:
     rows, match = associate(own.t, other.t, tolerance)
     if not len(rows):
-        raise apart(own.path, own.t, other.path, other.t, tolerance, what)
+        raise nothing_near((own.path, other.path), own.t, other.t, tolerance, "estimate", what)
     return rows, match
 
 
@@ -324,7 +408,11 @@ def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indic
 
 def read_trajectory(path: Path, true: bool = False) -> Lines:
     """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
-    lines = read_poses(path, true)
+    return _checked(read_poses(path, true), true)
+
+
+def _checked(lines: Lines, true: bool = True) -> Lines:
+    """Poses whose quaternions have unit length, and which are finite if they are a truth."""
     pose = lines.values[:, 1:POSE]
     finite = np.isfinite(pose).all(axis=1)
     if true:
@@ -332,9 +420,12 @@ def read_trajectory(path: Path, true: bool = False) -> Lines:
     if _is_point(lines):
         return lines
     length = np.linalg.norm(pose[:, 3:], axis=1)
+    bad = finite & (np.abs(length - 1.0) > UNIT)
+    whole = lines.without_cut(bad)
+    if whole is not lines:
+        return whole
     columns = f"columns {'2 to 5' if isinstance(lines, States) else '5 to 8'} must be qx qy qz qw"
     where = lines.note.partition(": ")[2] or columns
-    bad = finite & (np.abs(length - 1.0) > UNIT)
     refuse(bad, lines.place, lambda row: f"the quaternion has length {length[row]:.4g}, not 1; {where}")
     return lines
 
@@ -403,26 +494,3 @@ def _triangle(numbers: Array, n: int) -> Array:
     i, j = np.triu_indices(n)
     out[:, i, j] = out[:, j, i] = numbers
     return out
-
-
-# --- poses alone -------------------------------------------------------------------------------------
-
-
-def trajectory_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
-    """Poses of each run of a file or folder beside a truth with orientations; covariances are not looked at."""
-    if r.truth is None:
-        raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
-    truth_of = _truths(r)
-    for path, true_path, _ in _runs(estimates, r.truth, None):
-        own, truth = read_trajectory(path), truth_of(true_path)
-        for lines, name in ((own, path), (truth, true_path)):
-            if _is_point(lines):
-                raise InputError(f"{name}: holds positions alone; motions need orientations, too")
-        yield bare_poses(path.stem, own, truth, r)
-
-
-def bare_poses(name: str, own: Lines, truth: Lines, r: Reading) -> NamedPoses:
-    """A run of poses in space without covariances."""
-    place, pose = Places(own.place, np.arange(len(own.t))), slice(1, POSE)
-    poses = Poses.bare(place, own.t, own.values[:, pose], truth.t, truth.values[:, pose], "spatial", r.tolerance)
-    return NamedPoses(name, poses, own.t)

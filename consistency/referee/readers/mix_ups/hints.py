@@ -6,15 +6,14 @@ leaves are judged in the same way for all causes, and a cause is named if they c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.validity import Validity, classify
-from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.readers.mix_ups.reading_fit import ReadingFit, fit_of
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
@@ -22,16 +21,29 @@ if TYPE_CHECKING:
     from consistency.referee.readers.mix_ups.known import Guess
 
 MOST = 1000  # estimates that are looked at, of all runs together
-MOST_RUNS = 200  # that are looked at, evenly over all
+MOST_NUMBERS = 4_000_000  # of their covariances
+MOST_RUNS, LEAST_EACH = 200, 20  # that are looked at, evenly over all, and estimates of each
 WRONG = 1.0  # decades that the NEES is off, from which on causes are named that look like a bias or a drift
 APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
-RIGHT = 0.4  # decades that components may differ by with the mix-up undone
-SCALE = 1.0  # decades that all may be off by with the mix-up undone: a filter's own fault beside it
-SAID = 0.2  # decades from which on this is said
-LEAST_GAIN = float(np.log(1e4))  # log likelihood that a cause gains over simple faults, and as much as it has rivals
-ENOUGH = 30.0  # independent estimates that show a scale to be the one that a cause makes
+SAID = 0.2  # decades from which on the scale that remains is stated
+LEAST_GAIN = float(np.log(1e3))  # log likelihood that a cause gains over simple faults, and as much as it has rivals
+LIKE = 1.0  # log likelihood by which two causes may differ that are equally likely
 ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
 NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
+
+Change = Callable[[Poses], Poses]
+Pairs = Sequence[tuple[Array, Array]]
+ErrorsWithout = Callable[[Change], Pairs]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A possible mix-up, and how the errors fit without it."""
+
+    guess: Guess
+    fit: ReadingFit
+    size: float  # independent estimates
+    gain: float  # log likelihood of each over the simple faults of the errors as declared; -inf where it is none
 
 
 def hints(
@@ -40,6 +52,7 @@ def hints(
     runs: Sequence[Poses],
     shift: float = 0.0,
     judged: Sequence[int] | None = None,
+    errors_without: ErrorsWithout | None = None,
 ) -> list[str]:
     """Hints on a probable mix-up, where the covariance does not fit and one other reading of the files does; or none.
 
@@ -50,87 +63,46 @@ def hints(
     Parameters
     ----------
     axes : names of the components of the error, ``judged`` are the indices of those that count
+    errors_without : errors (k, n) of the motions of each run over windows, with their covariances, after a change of
+        the motions that ``runs`` are; none where no window is left
     """
     if not runs:
         return []
-    runs = runs[:: -(-len(runs) // MOST_RUNS)]
-    some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs]
-    if _same(some):
-        return [
-            f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies of "
-            "one; give the true poses as the truth"
-        ]
     part = list(range(len(axes)) if judged is None else judged)
-
-    def errors_of(p: Poses, old: Poses | None = None, known: Array | None = None) -> tuple[Array, Array]:
-        """Errors of a run with their covariances; ``known`` are those of ``old``, before a cause was undone."""
-        if old is not None and known is not None and _same_poses(p, old):
-            return known, p.covariance[:, part][:, :, part]
-        error, P = p.errors(), p.covariance
-        kept = part if error.shape[1] == len(axes) else list(range(error.shape[1]))  # of a quaternion as a rotation
-        return error[:, kept], P[:, kept][:, :, kept]
-
-    before = [errors_of(p) for p in some]
-    declared = fit_of(before)
-    if declared is None or declared.size * declared.fault() < LEAST_GAIN:
+    some, worlds = runs, errors_without is None
+    if errors_without is None:
+        some = _thinned(runs, shift)
+        errors_without = partial(_errors_without, some)
+        if _same(some):
+            return [
+                f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies "
+                "of one; give the true poses as the truth"
+            ]
+    fit_without = partial(_fit_without, errors_without, part, len(axes))
+    declared = fit_without(lambda p: p)
+    if declared is not None and declared.size * declared.fault() < LEAST_GAIN:
         return []
     from consistency.referee.readers.mix_ups.known import guesses_of  # few files need them
 
-    found = [
-        (guess, fit_of([errors_of(guess.change(p), p, e)
-                        for p, (e, _) in zip(some, before, strict=True)]))
-        for guess in guesses_of(some, axes, part)
-    ]  # fmt: skip
-    cause = _cause(found, declared)
+    guesses = guesses_of(some, axes, part, worlds)
+    fits = [(guess, fit_without(guess.change)) for guess in guesses]
+    if declared is None:
+        shown = [guess.text for guess, fit in fits if fit is not None and fit.is_shown()]
+        return [f"{name}: the covariance is not positive definite, but right if {text}" for text in shown[:1]]
+    cause = _cause(fits, declared)
     if cause is None:
         return []
-    off = declared.decades
-    worst = int(np.argmax(np.abs(off)))
-    of = [axes[i] for i in part]
-    return [f"{name}: the NEES{_of(of, worst)} is {_times(off[worst])}, but about right if {cause}"]
+    worst = int(np.argmax(np.abs(declared.decades)))
+    of_axis = f" of {axes[part[worst - 1]]} by itself" if worst > 0 else ""
+    return [f"{name}: the NEES{of_axis} is {_times(declared.decades[worst])}, but about right if {cause}"]
 
 
-def _same_poses(p: Poses, old: Poses) -> bool:
-    return p.estimate is old.estimate and p.truth is old.truth and p.convention == old.convention
-
-
-def _cause(found: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFit) -> str | None:
-    """The likeliest cause in words, if any is confirmed."""
-    off = np.abs(declared.decades)
-    gross = bool(off[0] > WRONG or (off > APART).any())
-    bar, simple = LEAST_GAIN + np.log(max(len(found), 1)), declared.simple()
-    named: list[tuple[float, Guess, ReadingFit]] = []
-    scaled: list[tuple[Guess, ReadingFit]] = []
-    for guess, fit in found:
-        if fit is None or len(fit.w) < NEARLY_ALL * len(declared.w) or not (gross or guess.fine):
-            continue
-        nearer = fit.near() - simple if fit.n == declared.n else -np.inf
-        gain = min(fit.size, declared.size) * nearer if nearer > 0 else -np.inf
-        if gain >= bar and fit.right(gross) and _status(fit) <= _status(declared):
-            named.append((gain, guess, fit))
-        elif (gross or guess.exact) and fit.is_shown():
-            scaled.append((guess, fit))
-    first = [each for each in named if not each[1].last]
-    named = first or named
-    if named:
-        most = max(gain for gain, *_ in named)
-        guess, fit = next(
-            (guess, fit) for gain, guess, fit in named if gain >= most - 1.0
-        )  # nearly as likely: the first
-        rest = fit.decades[0]
-        return guess.text + (f"; the NEES is then {_times(rest)} in all components" if abs(rest) > SAID else "")
-    if not scaled:
-        return None
-    guess, fit = scaled[0]
-    return guess.text + "; a covariance of a wrong scale looks the same" * (fit.n == declared.n)
-
-
-def _of(axes: Sequence[str], worst: int) -> str:
-    return "" if worst == 0 else f" of {axes[worst - 1]} by itself"
-
-
-def _times(off: float) -> str:
-    return f"{10.0 ** abs(off):.2g} times too {'large' if off > 0 else 'small'}"
+def _thinned(runs: Sequence[Poses], shift: float) -> list[Poses]:
+    """Some estimates of some runs, without those that are not finite."""
+    most = max(MOST_NUMBERS // runs[0].covariance.shape[-1] ** 2, 1)
+    runs = runs[:: -(-len(runs) // min(MOST_RUNS, most))]
+    each = max(min(MOST, most) // len(runs), min(LEAST_EACH, most // len(runs)))
+    return [p.later(shift).some(each).sound() for p in runs]
 
 
 def _same(runs: Sequence[Poses]) -> bool:
@@ -144,6 +116,76 @@ def _same(runs: Sequence[Poses]) -> bool:
             same += int(((error[known] <= rounding) & (error[known] <= NEGLIGIBLE * sigma)).all(axis=1).sum())
         total += len(known)
     return total >= LEAST and same >= NEARLY_ALL * total
+
+
+def _errors_without(runs: Sequence[Poses], change: Change) -> Pairs:
+    changed = map(change, runs)
+    return [(p.errors(), p.covariance) for p in changed]
+
+
+def _fit_without(errors_without: ErrorsWithout, part: list[int], n: int, change: Change) -> ReadingFit | None:
+    """Fit of the components that are judged; of all of a state whose quaternion became a rotation of three."""
+    pairs = errors_without(change)
+    if len(part) == n or not all(error.shape[1] == n for error, _ in pairs):
+        return fit_of(pairs)
+    return fit_of([(error[:, part], P[:, part][:, :, part]) for error, P in pairs])
+
+
+def _cause(fits: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFit) -> str | None:
+    """The likeliest cause in words, if any is confirmed."""
+    gross = bool(abs(declared.decades[0]) > WRONG or (np.abs(declared.decades) > APART).any())
+    candidates = list(_candidates(fits, declared, gross))
+    named = _likeliest(candidates, declared, gross, LEAST_GAIN + np.log(max(len(fits), 1)))
+    if named is not None:
+        rest = named.fit.decades[0]
+        if abs(rest) <= SAID:
+            return named.guess.text
+        return f"{named.guess.text}; the NEES is then {_times(rest)} in all components"
+    for one in candidates:
+        if (gross or one.guess.exact) and one.fit.is_shown():
+            if one.fit.n != declared.n:
+                return one.guess.text
+            return f"{one.guess.text}; a covariance of a wrong scale looks the same"
+    return None
+
+
+def _candidates(
+    fits: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFit, gross: bool
+) -> Iterator[Candidate]:
+    """Possible mix-ups without which nearly all errors can be whitened."""
+    simple = declared.simple()
+    for guess, fit in fits:
+        if fit is None or len(fit.w) < NEARLY_ALL * len(declared.w) or not (gross or guess.fine):
+            continue
+        size = max(min(fit.size, declared.size), len(declared.whitened))  # runs are independent
+        gain = -np.inf
+        if fit.n == declared.n:
+            gain = fit.near() + guess.volume - simple
+        yield Candidate(guess, fit, size, gain)
+
+
+def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Candidate | None:
+    """The likeliest candidate that is right but for a common factor; of like ones the first, and the last at need."""
+    right = [one for one in candidates if one.size * one.gain >= bar and one.fit.right(gross)]
+    right = [one for one in right if _status(one.fit) <= _status(declared)]
+    right = [one for one in right if not one.guess.last] or right
+    most = max((one.gain for one in right), default=0.0)
+    return next((one for one in right if one.size * (most - one.gain) <= LIKE), None)
+
+
+def _status(fit: ReadingFit) -> int:
+    """0 where the NEES is shown to be consistent, 1 where it may be, 2 where it is not."""
+    from consistency.referee.diagnostics import Record, judge
+
+    nees = np.full((len(fit.whitened), max(map(len, fit.whitened))), np.nan)
+    for row, w in zip(nees, fit.whitened, strict=True):
+        row[: len(w)] = np.square(w).sum(axis=1)
+    return {"consistent": 0, "undecided": 1}.get(judge(Record("", nees=nees, dof=fit.n)).status, 2)
+
+
+def _times(off: float) -> str:
+    size = "large" if off > 0 else "small"
+    return f"{10.0 ** abs(off):.2g} times too {size}"
 
 
 def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
@@ -161,170 +203,3 @@ def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remed
                 steps = f"{jumps} of {int(np.isfinite(error[..., k]).sum())} steps"
                 found.append(f"{name}: the error of {axis} is off by {by} in {steps}, as that of an angle; {how}")
     return found
-
-
-BIAS = 6.0  # standard deviations that a filter is off by without a mix-up
-FACTOR = 6.0  # by which a wrong filter's covariance is off without a mix-up: the table of benchmarks/hints.py has 4
-ODD = 1e-3  # chance that errors with the stated covariance are not taken for such
-GROUPS = {3: ([0, 1],), 6: ([0, 1, 2], [3, 4, 5])}  # position and attitude, of poses
-
-
-@dataclass(frozen=True)
-class ReadingFit:
-    """Errors of K estimates in n components under one reading; those that cannot be whitened are left out."""
-
-    whitened: Sequence[Array]  # of each run, (k, n)
-    root: Array  # (K, n, n), L^-1 of P = L L'
-    error: Array  # (K, n)
-    own: Array  # (K, n), errors over their standard deviations
-    log_det: float  # of P, the mean
-
-    @property
-    def n(self) -> int:
-        return int(self.error.shape[1])
-
-    @cached_property
-    def w(self) -> Array:
-        """(K, n)."""
-        return np.concatenate(self.whitened)
-
-    @cached_property
-    def decades(self) -> Array:
-        """log10 of the median NEES over that of chi-square, of all n components and of each alone, (1 + n,)."""
-        nees = np.median(np.column_stack([np.square(self.w).sum(axis=1), np.square(self.own)]), axis=0)
-        right = distributions.chi2.ppf(0.5, np.append(self.n, np.ones(self.n)))
-        return np.asarray(np.log10(np.maximum(nees, 1e-300) / right))
-
-    @cached_property
-    def likelihood(self) -> float:
-        """Mean log likelihood of an estimate, but for a constant."""
-        return -0.5 * (float(np.square(self.w).sum(axis=1).mean()) + self.log_det)
-
-    @cached_property
-    def size(self) -> float:
-        """Effective number of independent estimates, for the scale.
-
-        Squares of Gaussian errors with the autocorrelation rho have that of rho^2, so that K of them say as much as
-        K / (1 + 2 sum (1 - l / k) rho_l^2) independent ones; the mean is 0 by assumption, and an error that is constant
-        over a run counts once. Chance in the rho of a single run leaves down to a third of that. It is no more than the
-        spread of the NEES over estimates, and over 8 or more runs, allows.
-        """
-        K, n = self.w.shape
-        size = K / max(_memory(self.whitened, j) for j in range(n))
-        nees = np.square(self.w).sum(axis=1) / n
-        size *= min(1.0, 2.0 * float(nees.mean()) ** 2 / (n * max(float(nees.var()), 1e-300)))
-        means = np.array([np.square(w).mean() for w in self.whitened])
-        if len(means) >= 8 and means.std() > 0:
-            size = min(size, 2.0 * float(means.mean()) ** 2 * len(means) / (n * float(means.var(ddof=1))))
-        return max(float(size), 1.0)
-
-    def right(self, roughly: bool) -> bool:
-        """Whether all is right but for a factor that all components share: within decades, or at a rate of ``ODD``."""
-        if roughly:
-            off = self.decades
-            return bool(abs(off[0]) < SCALE and (np.abs(off[1:] - off[0]) < RIGHT).all())
-        n, size, common = self.n, self.size, float(np.square(self.w).mean())
-        w = self.w / np.sqrt(common)
-        pairs = np.triu_indices(n, 1)
-        asked = n + n + len(pairs[0]) + 1
-        ratios = np.square(self.own).mean(axis=0) / common
-        scale = size * (ratios - np.log(np.maximum(ratios, 1e-300)) - 1.0)
-        products = (w.T @ w / len(w))[pairs]
-        below = float((np.square(w).sum(axis=1) < distributions.chi2.ppf(0.5, n)).mean())
-        normal = np.concatenate([w.mean(axis=0), products, [2.0 * below - 1.0]]) * np.sqrt(size)
-        limit = distributions.chi2.isf(ODD / asked, 1)
-        return bool((scale <= limit).all() and (np.square(normal) <= limit).all())
-
-    def is_shown(self) -> bool:
-        """Whether all is right, the common factor too, with enough independent estimates to show it."""
-        ratio = float(np.square(self.w).mean())
-        off = self.n * self.size * (ratio - np.log(max(ratio, 1e-300)) - 1.0)
-        return self.size >= ENOUGH and self.right(False) and bool(off <= distributions.chi2.isf(ODD, 1))
-
-    def near(self) -> float:
-        """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``."""
-        mean = float(np.square(self.w).mean())
-        f = float(np.clip(mean, 10.0**-SCALE, 10.0**SCALE))
-        return self.likelihood + 0.5 * self.n * (mean - mean / f - float(np.log(f)))
-
-    def fault(self) -> float:
-        """Log likelihood of an estimate that another covariance, the same for all whitened errors, would gain."""
-        M = self.w.T @ self.w / len(self.w)
-        sign, log_det = np.linalg.slogdet(M)
-        return 0.5 * float(np.trace(M) - (log_det if sign > 0 else -np.inf) - self.n)
-
-    def simple(self) -> float:
-        """Log likelihood of an estimate with the simple fault that explains the errors best.
-
-        That is any factor on the covariance of all components, with one of at most ``FACTOR`` on that of a single one,
-        of position or of attitude; or a bias of at most ``BIAS`` standard deviations with a factor within ``SCALE``.
-        """
-        n, w = self.n, self.w
-        before = float(np.square(w).sum(axis=1).mean())
-        shift = self.root @ self.error.mean(axis=0)
-        part = min(1.0, BIAS / max(float(np.sqrt(np.square(shift).sum(axis=1).mean())), 1e-300))
-        after = before - float((2.0 * part * w * shift - (part * shift) ** 2).sum(axis=1).mean())
-        common = float(np.clip(after / n, 10.0**-SCALE, 10.0**SCALE))
-        best = 0.5 * (before - after / common - n * float(np.log(common)))
-        f = np.exp(np.linspace(-np.log(FACTOR), np.log(FACTOR), 61))
-        for group in [*([j] for j in range(n)), *GROUPS.get(n, ())]:
-            own = (self.root[:, :, group] @ self.error[:, group, None])[..., 0]
-            a = f**-0.5 - 1.0
-            left = before + 2.0 * a * float((w * own).sum(axis=1).mean()) + a**2 * float((own**2).sum(axis=1).mean())
-            of_all = n + n * np.log(np.maximum(left, 1e-300) / n)
-            best = max(best, float((0.5 * (before - of_all - len(group) * np.log(f))).max()))
-        return self.likelihood + best
-
-
-def _status(fit: ReadingFit) -> int:
-    """0 where the NEES is shown to be consistent, 1 where it may be, 2 where it is not."""
-    from consistency.referee.diagnostics import judge
-    from consistency.referee.diagnostics.records.record import Record
-
-    nees = np.full((len(fit.whitened), max(map(len, fit.whitened))), np.nan)
-    for row, w in zip(nees, fit.whitened, strict=True):
-        row[: len(w)] = np.square(w).sum(axis=1)
-    return {"consistent": 0, "undecided": 1}.get(judge(Record("", nees=nees, dof=fit.n)).status, 2)
-
-
-def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
-    """Errors (k, n) of some runs with their covariances (k, n, n); None without any that can be whitened."""
-    errors, P = (np.concatenate(each) for each in zip(*runs, strict=True))
-    ends = np.cumsum([len(error) for error, _ in runs])[:-1]
-    with np.errstate(invalid="ignore"):
-        variance = np.diagonal(P, axis1=1, axis2=2)
-        good = np.isfinite(errors).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (variance > 0).all(axis=1)
-    if not good.any():
-        return None
-    sigma = np.sqrt(variance[good])
-    R = P[good] / sigma[:, :, None] / sigma[:, None, :]
-    try:
-        L = np.linalg.cholesky(R)
-    except np.linalg.LinAlgError:
-        definite = classify(R) == Validity.VALID
-        if not definite.any():
-            return None
-        good[good], sigma = definite, sigma[definite]
-        L = np.linalg.cholesky(R[definite])
-    error, root = errors[good], np.linalg.inv(L) / sigma[:, None, :]
-    w = np.full(errors.shape, np.nan)
-    w[good] = (root @ error[..., None])[..., 0]
-    whitened = [part[np.isfinite(part).all(axis=1)] for part in np.split(w, ends)]
-    log_det = 2.0 * (np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + np.log(sigma).sum(axis=1))
-    return ReadingFit([part for part in whitened if len(part)], root, error, error / sigma, float(log_det.mean()))
-
-
-def _memory(runs: Sequence[Array], axis: int) -> float:
-    """1 + 2 sum over lags l of (1 - l / k) rho_l^2 of one component, over all runs; k is the longest of them."""
-    k = max(map(len, runs))
-    total, pairs = np.zeros(k), np.zeros(k)
-    for run in runs:
-        x, own = run[:, axis], len(run)
-        transform = np.fft.rfft(x, 2 * own)
-        total[:own] += np.fft.irfft(transform * transform.conj(), 2 * own)[:own]
-        pairs[:own] += own - np.arange(own)
-    if not total[0] > 0:
-        return float(k)
-    rho = total / np.maximum(pairs, 1) * (pairs[0] / total[0])
-    square = rho**2 - 1.0 / np.maximum(pairs, 1)  # less what chance makes
-    return max(1.0, float(1.0 + 2.0 * ((1.0 - np.arange(1, k) / k) * square[1:]).sum()))

@@ -47,10 +47,11 @@ class Guess:
     last: bool = False  # named only where nothing else fits: it has a fit of its own for each run
     fine: bool = True  # named where less than a decade is wrong too: no bias and no drift looks like it
     exact: bool = False  # named by its NEES alone, however little is wrong
+    volume: float = 0.0  # log of the factor of volumes of the truth, whose density it divides
 
 
-def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> list[Guess]:
-    """Possible mix-ups, the likelier first; ``part`` is judged."""
+def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], worlds: bool = True) -> list[Guess]:
+    """Possible mix-ups, the likelier first; ``part`` is judged. Motions have no ``worlds``."""
     kind, convention = runs[0].manifold, runs[0].convention
     n = runs[0].covariance.shape[-1]
     if kind == "spatial" and n > 6:
@@ -60,8 +61,9 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
         Guess("it is an information matrix; invert it", _covariance(partial(_inverted, part=part))),
         Guess(
             "it holds the upper root U of an information matrix U'U; write the inverse of U'U",
-            _covariance(lambda P: _inverted(np.swapaxes(np.triu(P), 1, 2) @ np.triu(P), part)),
+            _covariance(lambda P: _inverted(_of_root(P), part)),
         ),
+        Guess("it holds the lower root L of the covariance; write L L'", _covariance(_of_root)),
         *_singular(runs, axes, part),
     ]
     if kind == "vector":
@@ -69,12 +71,16 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
         return [*own, *_quaternion_states(runs, axes)]
     if kind == "spatial":
         own = [*_orders(convention), *_quaternions(), *scales, *_permuted(axes, 3), *_units(3, slice(3, 6))]
-        own += [_half_angles(), *_positions(3)]
+        words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
+        half = Guess(words, lambda p: _weighed(p, slice(3, 6), 2.0), exact=True)
+        own += [half, *_positions(3)]
     else:
         own = [*_sides(convention), *_headings(), *scales, *_permuted(axes, 3), *_units(2, slice(2, 3)), *_positions(2)]
     own.append(Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False))
-    worlds = [*_ned(convention)] if kind == "spatial" else [_mirrored(convention)]
-    return [*own, *worlds, *_frames(runs), *_bodies(runs)]
+    if not worlds:
+        return own
+    own += _ned(convention) if kind == "spatial" else [_mirrored(convention)]
+    return [*own, *_frames(runs), *_bodies(runs)]
 
 
 def _blocks(n: int) -> Iterator[Guess]:
@@ -92,6 +98,7 @@ def _blocks(n: int) -> Iterator[Guess]:
 def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> Iterator[Guess]:
     """Cross terms that make the covariance nearly singular, while each component by itself is right."""
     P = np.concatenate([p.covariance for p in runs])[:, part][:, :, part]
+    P = P[np.isfinite(P).all(axis=(1, 2))]
     sigma = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
     with np.errstate(invalid="ignore", divide="ignore"):
         R = np.median(P / sigma[:, :, None] / sigma[:, None, :], axis=0)
@@ -111,12 +118,6 @@ def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> It
 
 def _diagonal(P: Array) -> Array:
     return np.diagonal(P, axis1=1, axis2=2)[:, :, None]
-
-
-def _half_angles() -> Guess:
-    """The vector part of a small quaternion is half its rotation vector."""
-    words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
-    return Guess(words, lambda p: _weighed(p, slice(3, 6), 2.0), exact=True)
 
 
 def _inverse(p: Poses) -> Poses:
@@ -157,7 +158,7 @@ def _rotation_vectors(p: Poses, first: int, w: int) -> Poses:
     P = J @ p.covariance[known.rows] @ np.swapaxes(J, 1, 2)
     truth = np.hstack([known.truth[:, rest], small])
     estimate = np.hstack([p.estimate[known.rows][:, rest], np.zeros_like(small)])
-    return replace(p._of(known.rows), estimate=estimate, covariance=P, true_t=p.t[known.rows], truth=truth)
+    return replace(p.of_rows(known.rows), estimate=estimate, covariance=P, true_t=p.t[known.rows], truth=truth)
 
 
 def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator[Guess]:
@@ -199,9 +200,11 @@ def _reordered(
     """Columns of the estimates, components of their covariance, and its error, in place of others where given."""
 
     def change(p: Poses) -> Poses:
-        p = p if estimate is None else replace(p, estimate=p.estimate[:, estimate])
-        p = p if covariance is None else replace(p, covariance=p.covariance[:, covariance][:, :, covariance])
-        return p if convention is None else replace(p, convention=convention)
+        if estimate is not None:
+            p = replace(p, estimate=p.estimate[:, estimate])
+        if covariance is not None:
+            p = replace(p, covariance=p.covariance[:, covariance][:, :, covariance])
+        return replace(p, convention=convention or p.convention)
 
     return change
 
@@ -242,13 +245,14 @@ def _mirrored(convention: str) -> Guess:
 
 
 def _orders(convention: str) -> Iterator[Guess]:
-    swap = [3, 4, 5, 0, 1, 2]
+    whole = [0, 1, 2, 3, 4, 5]
+    turned = "the covariance has its two blocks in the other order (--covariance-order)"
+    yield Guess(turned, _reordered(None, [*whole[3:], *whole[:3]]))
     for other in SPATIAL:
-        for turned in (False, True):
-            if (other, turned) != (convention, False):
-                words = [] if other == convention else [f"the error is '{other}' (--error {other})"]
-                words += ["the covariance has its two blocks in the other order (--covariance-order)"] if turned else []
-                yield Guess(" and ".join(words), _reordered(None, swap if turned else [0, 1, 2, 3, 4, 5], other))
+        if other != convention:
+            words = f"the error is '{other}' (--error {other})"
+            yield Guess(words, _reordered(None, whole, other))
+            yield Guess(f"{words} and {turned}", _reordered(None, [*whole[3:], *whole[:3]], other))
 
 
 def _sides(convention: str) -> Iterator[Guess]:
@@ -277,17 +281,20 @@ def _headings() -> Iterator[Guess]:
     degrees = np.array([1.0, 1.0, DEGREE])
     remedy = "; multiply them by pi / 180"
     for of, names in OF.items():
-        change = partial(_scaled, names, degrees)
-        yield Guess(f"the headings of {of} are in degrees{remedy}", change, fine="truth" not in names)
-    for of in ("both files", "the estimates"):
-        change = partial(_scaled, OF[of], degrees)
-        words = f"the headings of {of} and their variances are in degrees{remedy}"
-        yield Guess(words, lambda p, change=change: _weighed(change(p), slice(2, 3), DEGREE), fine=False)  # type: ignore[misc]
+        volume = float(np.log(DEGREE)) if "truth" in names else 0.0
+        for what in ("", " and their variances"):
+            words = f"the headings of {of}{what} are in degrees{remedy}"
+            change = partial(_scaled, names, degrees, variances=bool(what))
+            yield Guess(words, change, fine="truth" not in names, volume=volume)
 
 
-def _scaled(names: Sequence[str], factors: Array, p: Poses) -> Poses:
+def _scaled(names: Sequence[str], factors: Array, p: Poses, variances: bool = False) -> Poses:
     """Estimates and truth with the columns of ``names`` times factors, and headings within half a turn."""
-    p = replace(p, **{name: getattr(p, name) * (factors if name in names else 1.0) for name in ("estimate", "truth")})
+    if variances:
+        p = _weighed(p, slice(0, 3), factors)
+    p = replace(p, estimate=p.estimate.copy(), truth=p.truth.copy())
+    for name in names:
+        getattr(p, name)[:] *= factors
     for values in (p.estimate, p.truth):
         values[:, 2] = wrap(values[:, 2])
     return p
@@ -312,16 +319,17 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
         "the positions of the estimates and their covariance are in millimetres; divide them by 1000",
         lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),
     )
-    for of in ("the truth", "the estimates"):
-        words = f"the positions of {of} are in millimetres; divide them by 1000"
-        yield Guess(words, _changed(OF[of], shrunk), fine=of != "the truth")
+    words = "the positions of {} are in millimetres; divide them by 1000"
+    yield Guess(words.format("the estimates"), _changed(["estimate"], shrunk))
+    volume = width * float(np.log(MILLI))
+    yield Guess(words.format("the truth"), _changed(["truth"], shrunk), fine=False, volume=volume)
 
 
 def _covariance(function: Callable[[Array], Array]) -> Change:
     return lambda p: replace(p, covariance=function(p.covariance))
 
 
-def _weighed(p: Poses, part: slice, factor: float) -> Poses:
+def _weighed(p: Poses, part: slice, factor: float | Array) -> Poses:
     scale = np.ones(p.covariance.shape[-1])
     scale[part] = factor
     return replace(p, covariance=p.covariance * scale[:, None] * scale)
@@ -331,10 +339,17 @@ def _squared(P: Array) -> Array:
     return np.square(_diagonal(P)) * np.eye(P.shape[-1])
 
 
+def _of_root(P: Array) -> Array:
+    """U'U of the upper triangles U, which are the lower ones L turned over."""
+    U = np.triu(P)
+    return np.asarray(np.swapaxes(U, 1, 2) @ U)
+
+
 def _inverted(P: Array, part: list[int]) -> Array:
     """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
     out, block = np.full_like(P, np.nan), P[:, part][:, :, part]
-    regular = np.flatnonzero(np.abs(np.linalg.det(block)) > 0)
+    finite = np.flatnonzero(np.isfinite(block).all(axis=(1, 2)))
+    regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
     out[np.ix_(regular, np.array(part), np.array(part))] = np.linalg.inv(block[regular])
     return out
 
@@ -349,10 +364,11 @@ def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
         return
     angle = np.rad2deg(frame.heading)
     if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
-        turn = f"turned by {angle:.1f} degrees about z and " if abs(angle) > TURN else ""
-        where = ", ".join(f"{value:.3g}" for value in frame.shift[: 3 if runs[0].manifold == "spatial" else 2])
+        turn = ""
+        if abs(angle) > TURN:
+            turn = f"turned by {angle:.1f} degrees about z and "
         words = (
-            f"the world of the estimates is {turn}shifted by ({where}) m to meet that of the truth; "
+            f"the world of the estimates is {turn}shifted by {_place(frame.shift, runs)} m to meet that of the truth; "
             f"write both in one world, or add --align posyaw{'-all' * (len(runs) > 1)}"
         )
         yield Guess(words, lambda p: moved(p, frame), fine=False)
@@ -369,13 +385,18 @@ def _bodies(runs: Sequence[Poses]) -> Iterator[Guess]:
     angle, size = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0, spread(runs)
     parts = []
     if np.linalg.norm(angle) >= TURN:
-        planar = runs[0].manifold == "planar"
-        about = "z" if planar else "x, y, z"
-        turned = f"{angle[2]:.1f}" if planar else f"({', '.join(f'{value:.1f}' for value in angle)})"
-        parts.append(f"turned by {turned} degrees about {about}")
+        turned = f"({angle[0]:.1f}, {angle[1]:.1f}, {angle[2]:.1f}) degrees about x, y, z"
+        if runs[0].manifold == "planar":
+            turned = f"{angle[2]:.1f} degrees about z"
+        parts.append(f"turned by {turned}")
     if np.linalg.norm(body.arm) >= ARM * size:
-        arm = ", ".join(f"{value:.3g}" for value in body.arm[: 2 if runs[0].manifold == "planar" else 3])
-        parts.append(f"shifted by a lever arm of ({arm}) m")
+        parts.append(f"shifted by a lever arm of {_place(body.arm, runs)} m")
     if parts:
         words = f"the body of the truth is {' and '.join(parts)} against that of the estimates; write poses of one body"
         yield Guess(words, lambda p: on_body(p, body), fine=False)
+
+
+def _place(values: Array, runs: Sequence[Poses]) -> str:
+    """Coordinates in space, or x and y."""
+    d = 2 if runs[0].manifold == "planar" else 3
+    return f"({', '.join(f'{value:.3g}' for value in values[:d])})"

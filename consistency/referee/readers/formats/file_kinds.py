@@ -1,14 +1,10 @@
-"""Which kind a file of estimates is, by its name and its first lines, and the reader of each kind.
-
-A reader is loaded when a file of its kind is read.
-"""
+"""What a file of estimates is, by its name and its first lines."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.named_columns import (
@@ -19,14 +15,11 @@ from consistency.referee.readers.formats.named_columns import (
     places_of,
     roles_of,
 )
-from consistency.referee.readers.options import Reading
 
 TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
 ARCHIVES = (".npz", ".mat")
 TRAJECTORIES = (".txt", ".tum")
 BAGS = (".bag", ".mcap", ".db3")
-OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
-OF_BAGS = ("topic", "truth_topic")
 SPEEDS = ("v", "speed", "velocity", "forward_velocity", "linear_velocity", "linear_x", "vx", "v_x")
 TURNS = ("omega", "w", "yaw_rate", "yawrate", "turn_rate", "angular_velocity", "angular_z", "wz", "w_z")
 HEADINGS = ("heading", "theta", "yaw", "orientation", "psi")
@@ -82,46 +75,6 @@ def trajectory_files(folder: Path) -> list[Path]:
     return named or [p for p in files if is_spatial(p) or is_solution(p)]
 
 
-class Kind(NamedTuple):
-    """A kind of files: how one is told, options that do not go with it, and ``module:function`` of what reads it."""
-
-    is_one: Callable[[Path, Reading], bool]
-    refused: tuple[str, ...]
-    records: str  # path, options, windows -> records
-    poses: str = ""  # path, options -> poses of each run; covariances are not looked at
-
-
-KINDS = (  # a file is of the first that knows it
-    Kind(
-        lambda path, r: is_bag(path),
-        ("state", "covariance", "covariance_order", "truth", "lever_arm"),
-        "referee.readers.formats.ros_bag:read_bags",
-        "referee.readers.formats.ros_bag:bag_poses",
-    ),
-    Kind(
-        lambda path, r: path.suffix.lower() in ARCHIVES,
-        (
-            *OF_BAGS, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align",
-            "lever_arm", "truth_covariance",
-        ),
-        "referee.readers.formats.numpy_archive:read_archive",
-        "referee.readers.formats.numpy_archive:archive_poses",
-    ),
-    Kind(
-        lambda path, r: (
-            (path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path))) or is_plane(path)
-        ),
-        (*OF_BAGS, *OF_TRAJECTORIES),
-        "referee.readers.formats.table:read_tables",
-        "referee.readers.formats.table:table_poses",
-    ),
-    Kind(
-        lambda path, r: path.suffix.lower() in (*TRAJECTORIES, ".csv", ".pos") or path.is_dir(),
-        (*OF_BAGS, "state"),
-        "referee.readers.formats.tum:read_tum",
-        "referee.readers.formats.tum:trajectory_poses",
-    ),
-)  # fmt: skip
 SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
 ARRAYS = "errors=truth - estimates, covariances=P"
 WAYS_IN = {
@@ -138,11 +91,6 @@ FOREIGN = (
     (rb"(?m)^(# )?(Raw|Fix),", "a log of Android, whose accuracies are radii of 68 %; RTKLIB solves its raw data"),
     (rb"(?m)^\$G[A-Z]{4},", "a log of NMEA, which has deviations in its GST sentences alone"),
 )  # fmt: skip
-
-
-def kind_of(path: Path, r: Reading) -> Kind | None:
-    """The kind of a file or folder; None if it is of none."""
-    return None if is_foreign(path) else next((kind for kind in KINDS if kind.is_one(path, r)), None)
 
 
 def is_foreign(path: Path) -> str:

@@ -1,0 +1,1 @@
+"""From files to records: the kind of a file, its reader, and the one way from poses to a record."""

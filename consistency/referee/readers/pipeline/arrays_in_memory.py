@@ -1,0 +1,130 @@
+"""Arrays in memory as a record, checked as those of an archive are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from consistency.referee.diagnostics import Record
+from consistency.referee.diagnostics.records.large_arrays import diagonal
+from consistency.referee.diagnostics.records.record import each_alone
+from consistency.referee.errors import InputError
+from consistency.referee.parsing import require_name
+from consistency.referee.readers.formats.numpy_archive import estimator_of_arrays
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.pipeline.records import records_of
+from consistency.referee.readers.truth_matching import Estimator
+from consistency.referee.types import Array, Indices
+
+
+def record_of_arrays(
+    given: Mapping[str, ArrayLike], axes: Sequence[str] | None, name: str, independent: bool = False
+) -> Record:
+    """Arrays in memory as a record, like those of an archive; see :func:`consistency.judge`.
+
+    Parameters
+    ----------
+    given : errors with covariances or deviations, or nees with dof; steps that are masked in a masked array of any
+        of them have no truth and do not count
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, a step that is masked in part, a covariance that is not symmetric, a step that is not
+        finite in any run.
+    """
+    first = next(iter(given))
+    arrays = {key: in_memory(key, value) for key, value in given.items()}
+    if independent:
+        _require_rows({key: array.shape for key, array in arrays.items()})
+        arrays = {key: array[:, None] for key, array in arrays.items()}
+    shape, wanted = arrays[first].shape, ("runs", "steps", "n")[: 3 if first == "errors" else 2]
+    if len(shape) != len(wanted) or 0 in shape:
+        text = f"{first} has shape {shape}, needs ({', '.join(wanted)})"
+        if len(shape) == len(wanted) - 1:
+            one, row = (" and ".join(f"{key}{at}" for key in given if key != "dof") for at in ("[None]", "[:, None]"))
+            text += f": {one} {'are' if 'and' in one else 'is'} one run of many steps; {row}, or independent=True of "
+            text += "cs.judge, says that each row is a run of its own, which the steps of a log are not"
+        raise InputError(text)
+    sigma = arrays.pop("deviations", None)
+    if sigma is not None:
+        if sigma.shape != shape:
+            raise InputError(f"deviations has shape {sigma.shape}, needs that of errors, {shape}")
+        arrays["covariances"] = diagonal(sigma)
+    mask = np.zeros(shape[:2], bool)
+    for key, value in given.items():
+        mask |= masked_steps(key, value, shape[:2])
+    for key, array in arrays.items():
+        if array.ndim < 2 or array.shape[:2] != shape[:2]:  # shapes that do not fit are refused below
+            continue
+        there = np.isfinite(array).reshape(*array.shape[:2], -1).all(axis=-1)
+        never = ~(there | mask).any(axis=0)
+        if never.any():
+            step = int(np.argmax(never)) + 1
+            raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
+    if mask.any():
+        arrays["mask"] = mask
+    arrays |= {} if axes is None else {"axes": np.asarray(axes, str)}
+    record = estimator_of_arrays(Path("arrays"), arrays, Reading())
+    if isinstance(record, Estimator):
+        (record,) = records_of(record, Reading())
+    record = record if sigma is None else each_alone(record)
+    failures = tuple(replace(failure, filter=name) for failure in record.failures)
+    return replace(record, name=require_name(name, "name"), failures=failures)
+
+
+def _require_rows(shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuse errors and what is stated of them, each row a run, if their shapes do not fit."""
+    shape = shapes["errors"]
+    if len(shape) != 2 or 0 in shape:
+        text = f"errors has shape {shape}, needs (N, n) with independent=True"
+        if len(shape) == 1:
+            stated = "deviations[:, None]" if "deviations" in shapes else "covariances[:, None, None] of its variances"
+            text += f"; one component is errors[:, None] and {stated}"
+        raise InputError(text)
+    for key, own in shapes.items():
+        needs = (*shape, shape[1]) if key.endswith("covariances") else shape
+        if own == needs:
+            continue
+        remedy = ""
+        if own == needs[1:]:
+            remedy = f"; one for all rows is np.broadcast_to({key}, {needs})"
+        elif own == shape:
+            remedy = f"; variances are {key}[:, :, None] * np.eye({shape[1]}), standard deviations go into deviations="
+        raise InputError(f"{key} has shape {own}, needs {needs} beside errors of shape {shape}{remedy}")
+
+
+def masked_steps(key: str, value: ArrayLike, shape: tuple[int, ...]) -> Indices:
+    """Steps that a masked array leaves out, (runs, steps); none of any other array.
+
+    Raises
+    ------
+    InputError
+        A step is masked in part: it could not count with the components that are known alone.
+    """
+    if not np.ma.is_masked(value) or np.size(value) % math.prod(shape):  # shapes that do not fit are refused later
+        return np.zeros(shape, bool)
+    masked = np.ma.getmaskarray(np.ma.asarray(value)).reshape(*shape, -1)
+    some = masked.any(axis=-1)
+    partly = some & ~masked.all(axis=-1)
+    if partly.any():
+        run, step = np.argwhere(partly)[0]
+        raise InputError(
+            f"{key}, run {run}, step {step + 1}: {masked[run, step].sum()} of {masked.shape[-1]} numbers are masked; "
+            "mask all of a step without a value, and judge components that are known in other steps than the rest by "
+            "themselves, each group in arrays of its own"
+        )
+    return np.asarray(some)
+
+
+def in_memory(key: str, value: ArrayLike) -> Array:
+    """Floats; raises InputError with the name of the argument."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{key}: not an array of numbers with as many steps in each run; pad runs with NaN") from None

@@ -1,0 +1,48 @@
+"""Places of rows in a file, for messages, and the refusal of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.types import Indices
+
+
+class Places:
+    """Places of some rows of a file, put into words when asked for."""
+
+    def __init__(self, of: Callable[[int], str], rows: Indices) -> None:
+        self._of, self._rows = of, rows
+
+    def __getitem__(self, which: int) -> str:
+        return self._of(int(self._rows[which]))
+
+    def at(self, rows: Indices | slice) -> Places:
+        return Places(self._of, self._rows[rows])
+
+
+def refuse(bad: Any, place: Callable[[int], str], what: str | Callable[[int], str]) -> None:
+    """Refuse rows, (N,) of bool, that are ``bad``, by what is wrong with the first of them."""
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(f"{place(row)}: {what if isinstance(what, str) else what(row)}")
+
+
+def exact(value: float) -> str:
+    """A number with all its digits, as a file has it."""
+    return repr(float(value)).removesuffix(".0")
+
+
+def cut_note(path: Path, line: int) -> str:
+    """A note that the last line of a text is left out."""
+    return f"{path}: the last line, {line}, has no end and is left out; it seems to be cut short"
+
+
+def listed(items: Sequence[object], most: int = 5) -> str:
+    """The first of some items, separated by commas."""
+    text = ", ".join(map(str, items[:most]))
+    return f"{text}, …" if len(items) > most else text

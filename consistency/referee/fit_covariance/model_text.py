@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.defaults import DETECT
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.diagnostics.words.sentences import plural, short
+from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, IN_TURN, JudgedSpan, Ratio
 from consistency.referee.fit_covariance.mean_by_motion import MotionDependence

@@ -176,7 +176,7 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(pose_errors.pose_error, study.tracks), paths_and_landmarks.read(study).paths,
+        anees.read(study).curves, map(pose_errors.pose_error_series, study.tracks), paths_and_landmarks.read(study).paths,
         strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
@@ -924,7 +924,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
     for number, track in enumerate(study.tracks):
         drawn_panels = panels(figure, number)
         assert titles(drawn_panels)[0] == track.name
-        of = pose_errors.pose_error(track)
+        of = pose_errors.pose_error_series(track)
         for axes, error, sigma in zip(drawn_panels, of.error.T, of.sigma.T, strict=True):
             _, low, high, curve = axes.lines
             np.testing.assert_array_equal(curve.get_ydata(), error)

@@ -21,8 +21,10 @@ from consistency.bench.runs.montecarlo import resolve_filters, run_trials
 from consistency.bench.scenario import Scenario, load_scenario
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM
-from consistency.referee.diagnostics import Settings, Verdict, gate_runs
+from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.verdict.answers import JOINT, SCALE
+from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.command_settings import refused
 

@@ -22,9 +22,9 @@ from consistency.bench.runs.results_to_records import design_of, longest_run, re
 from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
 from consistency.bench.types import outcome
-from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.wording import listed

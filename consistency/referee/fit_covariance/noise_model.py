@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg, stats
 
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import (
     DECIDE,

@@ -8,8 +8,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from consistency.referee.diagnostics import Record, Verdict
-from consistency.referee.diagnostics.records.record import numbered_axes
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Bullets, Facts, Figure
 from consistency.referee.document.judged_filters import summary

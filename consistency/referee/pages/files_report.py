@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics.records.record import Evidence
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Chapter, Document, Facts, Text
 from consistency.referee.pages import questions, verdicts

@@ -19,7 +19,7 @@ from consistency.bench.store.journal import Unfinished
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import StoredResults, open_results
 from consistency.bench.store.trial_rows import RunOutcome
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 from consistency.referee.document.judged_filters import document
 from consistency.referee.show.as_json import render
 

@@ -36,8 +36,8 @@ from consistency.bench.pages.sections.study_sections import without_truth
 from consistency.bench.runs.findings import Finding
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.results import read_results
+from consistency.diagnostics import Answer, Interval, Record, Settings, judge
 from consistency.referee.column_names import COVARIANCE
-from consistency.referee.diagnostics import Answer, Interval, Record, Settings, judge
 from consistency.referee.diagnostics.verdict.answers import DIRECTION, STEP
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import short
@@ -176,8 +176,8 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(pose_errors.pose_error_series, study.tracks), paths_and_landmarks.read(study).paths,
-        strict=True,
+        anees.read(study).curves, map(pose_errors.pose_error_series, study.tracks),
+        paths_and_landmarks.read(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
         verdict = by_filter[track.name]

@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from consistency.referee.diagnostics import Comparison, Interval, MapScore, Record, Verdict, judge
+from consistency.diagnostics import Comparison, Interval, MapScore, Record, Verdict, judge
 from consistency.referee.diagnostics.comparison import Difference
 from consistency.referee.diagnostics.verdict.answers import ABOUT, ALONE
 from consistency.referee.diagnostics.verdict.parts import JointScore, RejectionScore

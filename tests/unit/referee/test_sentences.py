@@ -14,7 +14,7 @@ import pytest
 from draws import fully_dependent, identities, independent
 from scipy import stats
 
-from consistency.referee.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.faults import bias_text, scale_text, shape_text
 from consistency.referee.diagnostics.words.numbers import ratio_text, short

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.judging.status import deciding_axis
-from consistency.referee.diagnostics.questions.innovation_causes import innovation_causes
-from consistency.referee.diagnostics.questions.innovations import nis_and_dof
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
@@ -131,8 +129,8 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
     causes, nees_ratio = list(record.causes), float("nan")
     if found.scale is not None:
         nees_ratio = found.scale.mean_anees / found.scale.dof
-    if (innovations := nis_and_dof(record)) is not None:
-        causes += innovation_causes(*innovations, nees_ratio)
+    if record.nis is not None or record.innovations is not None:
+        causes += _innovation_causes(record, nees_ratio)
     fields = vars(found) | {"left_out_steps": tuple(sorted(left_out))}
     return Verdict(
         **fields,
@@ -144,6 +142,15 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
         causes=tuple(causes),
         **beside._asdict(),
     )
+
+
+def _innovation_causes(record: Record, nees_ratio: float) -> list[str]:
+    """Return what the innovations say of the causes; their modules are loaded for a record that has some."""
+    from consistency.referee.diagnostics.questions.innovation_causes import innovation_causes
+    from consistency.referee.diagnostics.questions.innovations import nis_and_dof
+
+    innovations = nis_and_dof(record)
+    return [] if innovations is None else innovation_causes(*innovations, nees_ratio)
 
 
 def _map_of(record: Record, settings: Settings | None) -> MapScore | None:

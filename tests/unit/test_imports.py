@@ -79,7 +79,7 @@ def test_a_direction_that_is_turned_is_reported(above: str, below: str, tmp_path
 
 
 def test_no_two_modules_import_each_other() -> None:
-    """Wherever in them, for the type checker too; but a noise model shows itself by the modules that show noise models."""
+    """Wherever in them, for the type checker too; but a noise model shows itself by the modules for that."""
     modules = grimp.build_graph("consistency", cache_dir=None)
     graph = {name: modules.find_modules_directly_imported_by(name) for name in modules.modules}
     fit = "consistency.referee.fit_covariance"

@@ -23,7 +23,7 @@ from calibration_windows import undoubted, windows_of
 from scipy import stats
 from script_options import options_of
 
-from consistency.referee.diagnostics import Record, Verdict, compare, e_process, judge
+from consistency.diagnostics import Record, Verdict, compare, e_process, judge
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array
 

@@ -20,7 +20,7 @@ from scipy import stats
 from scipy.linalg import expm
 from script_options import options_of
 
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.statistics.number_of_runs import power_of
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.geometry.groups import composed, propagated, to_left, vectors

@@ -16,7 +16,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics import Record
+    from consistency.referee.diagnostics.records.record import Record
     from consistency.referee.document.blocks import Document
 
 Out = Annotated[Path, typer.Option("--out", help="Folder to write; must not exist.")]

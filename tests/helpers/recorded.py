@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline import read_files
 

@@ -91,7 +91,7 @@ def test_the_question_of_the_document_is_asked(copy: Path) -> None:
         """
 import numpy as np
 from scipy import stats
-from consistency.referee.diagnostics import Record, judge
+from consistency.diagnostics import Record, judge
 
 n = 200
 size = np.sqrt(stats.chi2.ppf((np.arange(n) + 0.5) / n, 1))  # errors of a right estimator by their size

@@ -18,7 +18,7 @@ from joblib.externals.loky.backend import get_context
 
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.backends.local import worker_count
+from consistency.bench.runs.backends.threads import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import record_of
@@ -27,7 +27,8 @@ from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding, outcome
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.document.blocks import Cell, Column, Status, Table, table
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_json, reading

@@ -140,7 +140,7 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
 
 
 def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
-    """Probable mix-ups of the innovations."""
+    """Probable mix-ups of the innovations; their modules are loaded for a record that has some."""
     if record.nis is None and record.innovations is None:
         return []
     from consistency.referee.diagnostics.questions.innovations import innovation_causes, nis_and_dof

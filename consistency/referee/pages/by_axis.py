@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import EXPECTED, solid
 from consistency.referee.pages.judged import Judged

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Chapter, Document, Facts, Text
 from consistency.referee.pages import questions, verdicts
 from consistency.referee.pages.by_axis import by_axis
 from consistency.referee.pages.judged import Estimator, Judged, clock_of
-from consistency.referee.pages.provenance import facts
+from consistency.referee.pages.origin import facts
 from consistency.referee.pages.record_figures import record_figures
 
 

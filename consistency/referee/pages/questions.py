@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from consistency.referee.diagnostics import Answer
 from consistency.referee.diagnostics.verdict.answers import ABOUT, MAIN
+from consistency.referee.diagnostics.verdict.parts import Answer
 from consistency.referee.document import blocks
 from consistency.referee.document.blocks import Block, Column, Heading, Small, Stack, Text, table
 from consistency.referee.document.wording import p_cell

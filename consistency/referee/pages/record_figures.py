@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import of_both
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SIGMAS, ZERO, Look, style

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.document.colours import TRUTH, Look, style
 from consistency.referee.show.painting import dots, make_map, path

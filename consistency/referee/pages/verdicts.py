@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Reasons, table
-from consistency.referee.document.verdict import FILTER, cells, columns, page, reason, with_values
+from consistency.referee.document.judged_filters import FILTER, cells, columns, page, reason, with_values
 from consistency.referee.document.wording import listed
 from consistency.referee.pages.judged import Estimator, Judged
 

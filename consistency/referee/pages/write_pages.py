@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure as Drawing
 
-    from consistency.referee.diagnostics import Record, Verdict
+    from consistency.referee.diagnostics.records.record import Record
+    from consistency.referee.diagnostics.verdict.verdict import Verdict
     from consistency.referee.document.blocks import Document
     from consistency.referee.system.progress import Advance
 

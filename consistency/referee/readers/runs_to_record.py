@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.records.large_arrays import of_runs
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, asymmetric, classify
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural

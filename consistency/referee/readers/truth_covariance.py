@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import DECLARED
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError

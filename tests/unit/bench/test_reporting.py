@@ -21,27 +21,27 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.build import answer, build_report, compose
-from consistency.bench.pages.report_input import Report, Study, Track
 from consistency.bench.pages.sections import (
     anees,
     calibration_rates,
     front_end,
-    innovations,
     nees_distribution,
+    nis,
+    paths_and_landmarks,
     pose_errors,
     stereo_noise,
-    world,
 )
+from consistency.bench.pages.sections.report_input import Report, Study, Track
 from consistency.bench.pages.sections.study_sections import without_truth
 from consistency.bench.runs.findings import Finding
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.results import read_results
+from consistency.diagnostics import Answer, Interval, Record, Settings, judge
 from consistency.referee.column_names import COVARIANCE
-from consistency.referee.diagnostics import Answer, Interval, Record, Settings, judge
 from consistency.referee.diagnostics.verdict.answers import DIRECTION, STEP
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import short
-from consistency.referee.document.verdict import FURTHER, page, shown_inside
+from consistency.referee.document.judged_filters import FURTHER, page, shown_inside
 from consistency.referee.document.wording import written
 from consistency.referee.pages import by_axis, questions, verdicts
 from consistency.referee.pages.judged import clock_of
@@ -176,7 +176,8 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(pose_errors.pose_error, study.tracks), world.read(study).paths, strict=True,
+        anees.read(study).curves, map(pose_errors.pose_error_series, study.tracks),
+        paths_and_landmarks.read(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
         verdict = by_filter[track.name]
@@ -196,9 +197,9 @@ def test_the_model_is_what_analyse_says(folder):
 def test_the_odometry_is_that_of_the_trial(report, uvd):
     (study,) = report.studies
     trial = cs.simulate(uvd, run=0, seed=1)
-    np.testing.assert_array_equal(world.read(study).truth, trial.truth[:, :2])
+    np.testing.assert_array_equal(paths_and_landmarks.read(study).truth, trial.truth[:, :2])
     step = trial.controls[0, 0] * trial.controls[0, 1]
-    odometry = world.read(study).odometry
+    odometry = paths_and_landmarks.read(study).odometry
     np.testing.assert_allclose(np.linalg.norm(odometry[1] - odometry[0]), abs(step))
 
 
@@ -249,7 +250,7 @@ def test_the_diagnosis_is_what_the_verdict_holds(report):
         of = nees_distribution.steps(track)
         np.testing.assert_array_equal(of.x[1:-1], v.tails.pit)
         np.testing.assert_allclose(of.y, [0, 0.25, 0.5, 0.75, 1, 1])
-        assert innovations.lags(track) is None  # four runs of 60 steps have too few innovations
+        assert nis.lags(track) is None  # four runs of 60 steps have too few innovations
     text = "".join(Page(shown(report)).text)
     assert all(question.name in text and question.about in text for question in questions.asked(study))
 
@@ -434,7 +435,7 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, l
     (study,) = report.studies
     for track in study.tracks:
         assert not track.innovations_judged
-    caption = innovations.innovations_caption(study)
+    caption = nis.caption(study)
     assert "No filter here declares one: its innovations are reported and not judged." in caption
     assert "shaded bound" not in caption
     assert "NIS in parentheses: reported and not judged" in verdicts.verdicts_caption(study)
@@ -451,15 +452,15 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, l
     low, high = found.interval
     assert row(study, kf)["NIS / dof"] == f"{found.ratio:.3f}"
     assert further_row(kf)["NIS / dof (95 % expected)"] == f"{found.ratio:.3f} ({low:.3f} to {high:.3f})"
-    assert innovations.lags(kf).bound == found.bound
-    np.testing.assert_array_equal(innovations.lags(kf).values, found.autocorrelation)
-    assert innovations.lags(silent).bound is None
-    np.testing.assert_array_equal(innovations.lags(silent).values, found.autocorrelation)
+    assert nis.lags(kf).bound == found.bound
+    np.testing.assert_array_equal(nis.lags(kf).values, found.autocorrelation)
+    assert nis.lags(silent).bound is None
+    np.testing.assert_array_equal(nis.lags(silent).values, found.autocorrelation)
     asked = [question.answers for question in questions.asked(study)]
     (innovation,) = {first.question for first, second in asked if second is None and "scale" in first.question}
     assert innovation == "innovation scale"
-    assert "Only kf declares one; the innovations of the others are reported" in innovations.innovations_caption(study)
-    (both_filters,) = innovations.innovations(study)
+    assert "Only kf declares one; the innovations of the others are reported" in nis.caption(study)
+    (both_filters,) = nis.innovations(study)
     assert [bounds_of(panels(both_filters, number)[1]) for number in (0, 1)] == [[found.bound], []]
     assert [titles(panels(both_filters, number))[0] for number in (0, 1)] == ["kf", "silent"]
     assert shown(report).count("(not judged)") == 1
@@ -723,7 +724,7 @@ def test_odd_names_are_shown_literally_and_failed_runs_are_listed(results, tmp_p
     (study,) = report.studies
     assert len(study.failures) == 6
     assert study.tracks[1].verdict.status == "failed"
-    assert not np.isfinite(world.read(study).paths[1][1]).any()
+    assert not np.isfinite(paths_and_landmarks.read(study).paths[1][1]).any()
     assert "6 of 8 runs" in compose(report).answer
 
 
@@ -925,7 +926,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
     for number, track in enumerate(study.tracks):
         drawn_panels = panels(figure, number)
         assert titles(drawn_panels)[0] == track.name
-        of = pose_errors.pose_error(track)
+        of = pose_errors.pose_error_series(track)
         for axes, error, sigma in zip(drawn_panels, of.error.T, of.sigma.T, strict=True):
             _, low, high, curve = axes.lines
             np.testing.assert_array_equal(curve.get_ydata(), error)
@@ -934,7 +935,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
 
 def test_the_map_shows_truth_and_estimates(report):
     (study,) = report.studies
-    found = world.read(study)
+    found = paths_and_landmarks.read(study)
     (axes,) = panels(by_title(compose(report))["Scenario and estimates, run 0"])
     (truth,), (odometry,) = lines(axes, "true path"), lines(axes, "odometry alone")
     np.testing.assert_array_equal(truth.get_xydata(), found.truth)
@@ -1011,7 +1012,7 @@ def test_a_log_without_truth_says_so(uvd, tmp_path):
     report = build_report(tmp_path / "run")
     (study,) = report.studies
     assert not study.has_truth
-    assert world.read(study).odometry is None
+    assert paths_and_landmarks.read(study).odometry is None
     assert str(tmp_path) not in study.name
     source = shown(report)
     assert "The truth of log is not known" in source

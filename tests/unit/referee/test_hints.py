@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error

@@ -11,12 +11,12 @@ from invariant import Invariant
 import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.report_input import Study
 from consistency.bench.pages.sections import anees
+from consistency.bench.pages.sections.report_input import Study
 from consistency.bench.pages.sections.study_sections import maps, of_own_errors, own_errors
-from consistency.referee.diagnostics import Interval, MapScore
+from consistency.diagnostics import Interval, MapScore
 from consistency.referee.document.blocks import Cell, Name, Quantity, Status, Table
-from consistency.referee.document.verdict import page
+from consistency.referee.document.judged_filters import page
 from consistency.referee.document.wording import brief, written
 from consistency.referee.pages import verdicts
 

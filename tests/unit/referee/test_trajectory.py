@@ -12,7 +12,7 @@ from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 from consistency.referee.document.blocks import Figure
 from consistency.referee.pages.record_figures import overview, record_figures, unit_of
 from consistency.referee.pages.trajectory import MOST, ellipse, trajectory_panel

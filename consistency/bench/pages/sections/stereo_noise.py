@@ -11,8 +11,8 @@ import pandas as pd
 from scipy import stats
 
 from consistency.bench.models.stereo import project, triangulate_jacobian
-from consistency.bench.pages.exhibits import extra_table
-from consistency.bench.pages.report_input import Report
+from consistency.bench.pages.sections.exhibits import extra_table
+from consistency.bench.pages.sections.report_input import Report
 from consistency.bench.types import Gaussian
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import Look, style

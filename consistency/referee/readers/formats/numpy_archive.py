@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
-from consistency.referee.diagnostics.records.record import numbered_axes
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR
 from consistency.referee.parsing import is_file, reading, require_name, require_room

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.records.large_arrays import diagonal
-from consistency.referee.diagnostics.records.record import each_alone
+from consistency.referee.diagnostics.records.record import Record, each_alone
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
 from consistency.referee.readers.formats.numpy_archive import estimator_of_arrays

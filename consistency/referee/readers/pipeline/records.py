@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
-from consistency.referee.diagnostics.records.record import each_alone
+from consistency.referee.diagnostics.records.record import Record, each_alone
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.readers.heading_units import require_radians

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.questions.independence import ENOUGH, Independence, independence
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.words.numbers import p_text, plural
 from consistency.referee.errors import InputError

@@ -37,7 +37,7 @@ NAMES = {  # module -> its public names; also those of CONTRACT.md, of docs/api,
         track_means""",
     "consistency.protocols": "Filter Problem TrialTruth WholeTrial",
     "consistency.runs": """
-        Interrupted Study backend_for read_findings reproduce run_log run_trials run_until_decided""",
+        Interrupted Study executor_for read_findings reproduce run_log run_trials run_until_decided""",
     "consistency.scenario": """
         Belief BelievedMotion BelievedSensor BiasMap DisparityGrowth Distortion GuardSettings LocalBias Mount Scenario
         SigmaPoints TrueSensor Truth UvdSensor load_scenario scenario_names scenario_text""",

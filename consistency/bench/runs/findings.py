@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -317,7 +317,12 @@ def read_findings(folder: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     with reading(path, "not a list of findings"):
-        return [asdict(Finding(**entry)) for entry in read_json(path)]
+        entries, keys = read_json(path), [each.name for each in fields(Finding)]
+        if not isinstance(entries, list):
+            raise ValueError("no list")
+        if not all(isinstance(entry, dict) and {*entry} == {*keys} for entry in entries):
+            raise ValueError(f"a finding has the keys {', '.join(keys)}")
+        return [asdict(Finding(**entry)) for entry in entries]
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:

@@ -71,6 +71,7 @@ from .statistics.number_of_runs import gate_runs as gate_runs
 from .statistics.number_of_runs import lost_runs as lost_runs
 from .statistics.number_of_runs import power_of as power_of
 from .statistics.number_of_runs import required_runs as required_runs
+from .verdict.answers import Settings as Settings
 from .verdict.answers import answers as answers
 from .verdict.parts import Answer as Answer
 from .verdict.parts import EarlyEnds as EarlyEnds
@@ -78,6 +79,5 @@ from .verdict.parts import Equivalence as Equivalence
 from .verdict.parts import Interval as Interval
 from .verdict.parts import NisTest as NisTest
 from .verdict.parts import RejectionScore as RejectionScore
-from .verdict.settings import Settings as Settings
 from .verdict.verdict import MapScore as MapScore
 from .verdict.verdict import Verdict as Verdict

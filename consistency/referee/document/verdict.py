@@ -117,7 +117,7 @@ def _failed(v: Verdict) -> Cell:
     return f"{len(v.failures)} of {v.runs}"
 
 
-FILTER = Column("Filter", width="1.3fr")
+FILTER = Column("Filter")
 BRIEF = (
     Measure(Column("Verdict"), lambda v: Status(v.status)),
     Measure(Column("Mean ANEES", "Mean\nANEES", number=True), _mean_anees),

@@ -40,7 +40,7 @@ from consistency.referee.fit_covariance.persistence import (
 from consistency.referee.fit_covariance.refusals import RotationGrowth, require_poses, require_sound, rotation_growth
 from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, intervals, jitter_of
 from consistency.referee.geometry.groups import log, matrices
-from consistency.referee.readers.relative_motions import Stretch
+from consistency.referee.readers.pipeline.relative_motions import Stretch
 from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import analyse
 

@@ -45,7 +45,7 @@ def diagnosis(study: Judged) -> tuple[Block, ...]:
         (Stack(q.name, (Small(q.about),), bold=True), *map(_cell, q.answers)) for q in questions
     ]
     label = f"Questions asked of the filters of {study.name}"
-    return heading, table(columns, rows, label, caption=caption(study), style="marks", whole=True)
+    return heading, table(columns, rows, label, caption=marks_caption(study), style="marks", whole=True)
 
 
 def answer_cell(answer: Answer | None) -> tuple[str, str]:
@@ -62,7 +62,7 @@ def _cell(answer: Answer | None) -> blocks.Answer:
     return blocks.Answer(mark, MARKS[mark], p, emphasis)  # type: ignore[arg-type]
 
 
-def caption(study: Judged) -> str:
+def marks_caption(study: Judged) -> str:
     """How to read the table."""
     tracks = study.tracks
     rate = 100 * tracks[0].verdict.settings.false_alarm if tracks else 5.0

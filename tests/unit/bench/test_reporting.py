@@ -119,7 +119,7 @@ def printed(report: Report) -> bytes:
 
 
 def axis_caption(study: Study) -> str:
-    return by_axis.caption(study, by_axis.forests(study))
+    return by_axis.axis_caption(study, by_axis.forests(study))
 
 
 def with_tracks(report, *tracks: Track):
@@ -327,7 +327,7 @@ def test_nees_alone_without_axes(report):
 def test_the_captions_state_the_rates_in_force(report):
     v = report.studies[0].tracks[0].verdict
     (share,) = (a.share for a in v.answers if a.question == STEP)
-    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in anees.caption(anees.read(report.studies[0]))
+    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in anees.anees_caption(anees.read(report.studies[0]))
     assert "probability 5 % at most" in verdicts.method(report.studies)
     assert "two one-sided tests, each at 5 %, put the ratio of true to stated covariance between 0.67 and 1.50" in (
         verdicts.method(report.studies)
@@ -338,7 +338,7 @@ def test_the_captions_state_the_rates_in_force(report):
     assert "each at 10 %, put the ratio of true to stated covariance between 0.50 and 2.00" in verdicts.method(
         other.studies
     )
-    assert "Shown inside [0.50,\u00a02.00]" in verdicts.caption(other.studies[0])
+    assert "Shown inside [0.50,\u00a02.00]" in verdicts.verdicts_caption(other.studies[0])
 
 
 # --- what the referee can say -----------------------------------------------------------------
@@ -390,7 +390,7 @@ def test_consistent_has_been_shown_and_undecided_says_what_would_decide(report):
 
 
 def test_a_fault_within_the_tolerance_has_a_mark_of_its_own(report):
-    assert "≈" not in questions.caption(report.studies[0])
+    assert "≈" not in questions.marks_caption(report.studies[0])
     error, P = drawn(3, 300, np.sqrt(1.1))
     track = judged(report.studies[0].tracks[0], error, P, Settings(0.05, tolerance=1.3))
     marks = {a.question: questions.answer_cell(a)[0] for a in track.verdict.answers}
@@ -398,7 +398,9 @@ def test_a_fault_within_the_tolerance_has_a_mark_of_its_own(report):
     assert marks["scale"] == "≈"
     assert set(marks.values()) == {"≈", "○"}
     report = with_tracks(report, track)
-    assert "≈ one was found, but is shown to lie within the tolerance of ×1.3" in (questions.caption(report.studies[0]))
+    assert "≈ one was found, but is shown to lie within the tolerance of ×1.3" in (
+        questions.marks_caption(report.studies[0])
+    )
     source = shown(report)
     cell = (
         r'<td class="number tolerated" data-head="[^"]*"><span role="img" aria-label="found, within the tolerance">≈<'
@@ -432,10 +434,10 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, l
     (study,) = report.studies
     for track in study.tracks:
         assert not track.innovations_judged
-    caption = innovations.caption(study)
+    caption = innovations.innovations_caption(study)
     assert "No filter here declares one: its innovations are reported and not judged." in caption
     assert "shaded bound" not in caption
-    assert "NIS in parentheses: reported and not judged" in verdicts.caption(study)
+    assert "NIS in parentheses: reported and not judged" in verdicts.verdicts_caption(study)
 
     results = cs.run_trials(linear, ["kf"], runs=20, seed=1, jobs=1)
     both = pd.concat([results.estimates, results.estimates.assign(filter="silent")], ignore_index=True)
@@ -456,7 +458,7 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, l
     asked = [question.answers for question in questions.asked(study)]
     (innovation,) = {first.question for first, second in asked if second is None and "scale" in first.question}
     assert innovation == "innovation scale"
-    assert "Only kf declares one; the innovations of the others are reported" in innovations.caption(study)
+    assert "Only kf declares one; the innovations of the others are reported" in innovations.innovations_caption(study)
     (both_filters,) = innovations.innovations(study)
     assert [bounds_of(panels(both_filters, number)[1]) for number in (0, 1)] == [[found.bound], []]
     assert [titles(panels(both_filters, number))[0] for number in (0, 1)] == ["kf", "silent"]
@@ -517,11 +519,11 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     np.testing.assert_allclose(
         study.tracks[1].nis_ratio, first["nis"].sum() / first["nis_dof"].sum().replace(0, np.nan)
     )
-    assert "kf after 24 runs and small after 12 runs" in verdicts.caption(study)
-    assert "Average NEES over 24 runs" in anees.caption(anees.read(study))
+    assert "kf after 24 runs and small after 12 runs" in verdicts.verdicts_caption(study)
+    assert "Average NEES over 24 runs" in anees.anees_caption(anees.read(study))
     assert "judged by an e-process" in verdicts.method(report.studies)
     assert "they are listed below and counted in the verdicts that looked at them" in compose(report).answer
-    assert "asks scale alone" in questions.caption(study)
+    assert "asks scale alone" in questions.marks_caption(study)
     shown(report)
     assert printed(report).startswith(b"%PDF")
 
@@ -539,7 +541,7 @@ def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
 
 def test_runs_of_a_fixed_number_say_nothing_of_looks(report):
     assert not report.studies[0].until_decided
-    for text in (verdicts.caption(report.studies[0]), verdicts.method(report.studies), compose(report).answer):
+    for text in (verdicts.verdicts_caption(report.studies[0]), verdicts.method(report.studies), compose(report).answer):
         assert "look" not in text
 
 

@@ -20,7 +20,7 @@ from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.geometry.groups import composed, matrices, propagated, to_left
-from consistency.referee.readers.relative_motions import Stretch, windows_of
+from consistency.referee.readers.pipeline.relative_motions import Stretch, windows_of
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline

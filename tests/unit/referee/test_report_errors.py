@@ -57,11 +57,11 @@ def test_both_errors_stand_below_each_other(study: Study) -> None:
 
 
 def test_captions_name_the_filters_with_an_error_of_their_own(study: Study) -> None:
-    assert "Judged in an error of their own, but for the RMSE: right (right)" in verdicts.caption(study)
-    assert anees.caption(anees.read(study)).endswith("In the filter's own error: right (right).")
+    assert "Judged in an error of their own, but for the RMSE: right (right)" in verdicts.verdicts_caption(study)
+    assert anees.anees_caption(anees.read(study)).endswith("In the filter's own error: right (right).")
     alone = replace(study, tracks=study.tracks[:1])
-    assert "own" not in anees.caption(anees.read(alone)).replace("shown", "")
-    assert "error of their own" not in verdicts.caption(alone)
+    assert "own" not in anees.anees_caption(anees.read(alone)).replace("shown", "")
+    assert "error of their own" not in verdicts.verdicts_caption(alone)
     assert own_errors(alone) == ()
 
 

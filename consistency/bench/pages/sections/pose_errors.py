@@ -36,7 +36,7 @@ def pose_errors(study: Study) -> tuple[Figure, ...]:
     if not study.has_truth or not filters:
         return ()
     drawings = tuple(partial(_draw, study, of) for of in filters)
-    return (Figure(f"Pose errors, run {study.shown_run}", caption(study), drawings),)
+    return (Figure(f"Pose errors, run {study.shown_run}", errors_caption(study), drawings),)
 
 
 def _draw(study: Study, of: PoseError) -> Drawing:
@@ -67,7 +67,7 @@ def pose_error(track: Track) -> PoseError | None:
     return PoseError(track, DEGREES * run.error[0], DEGREES * np.sqrt(np.maximum(variance, 0.0)))
 
 
-def caption(study: Study) -> str:
+def errors_caption(study: Study) -> str:
     """What the figure shows."""
     return (
         f"Pose error (truth minus estimate) of run {study.shown_run}, the lowest run number, with the filter's "

@@ -202,7 +202,9 @@ class _Worker:
             if filter_.pickled not in self._loaded:
                 loading = None if timeout is None else max(timeout, LOADING)
                 reason = "time-out while it was loaded"
-                self._pid = self._pool.schedule(load, args=(filter_.pickled, *place), timeout=loading).result()
+                self._pid = 0
+                task = self._pool.schedule(load, args=(filter_.pickled, *place), timeout=loading)
+                self._pid = self._result(task)
                 self._loaded.add(filter_.pickled)
             reason = f"time-out after {timeout:g} s" if timeout is not None else ""
             task = self._pool.schedule(run, args=(filter_, trial, belief, memory), timeout=timeout)
@@ -219,13 +221,15 @@ class _Worker:
             raise
         return estimates
 
-    def _result(self, task: Future[Estimates]) -> Estimates:
-        """Wait for a task; Pebble does not report a process that ends with exit status 0."""
+    def _result(self, task: Future[Any]) -> Any:
+        """Wait for a task; Pebble forgets some when it is stopped, and does not report exit status 0."""
         from pebble import ProcessExpired
 
         ended: Any = ProcessExpired
         while not wait([task], GLANCE).done:
-            if not _lives(self._pid) and not wait([task], GLANCE).done:
+            if not self.is_alive:
+                raise CancelledError
+            if self._pid and not _lives(self._pid) and not wait([task], GLANCE).done:
                 task.cancel()
                 raise ended("ended", 0, self._pid)
         return task.result()

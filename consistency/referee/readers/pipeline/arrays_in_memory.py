@@ -69,11 +69,13 @@ def record_of_arrays(
             raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
     if mask.any():
         arrays["mask"] = mask
-    arrays |= {} if axes is None else {"axes": np.asarray(axes, str)}
+    if axes is not None:
+        arrays["axes"] = np.asarray(axes, str)
     record = estimator_of_arrays(Path("arrays"), arrays, Reading())
     if isinstance(record, Estimator):
         (record,) = records_of(record, Reading())
-    record = record if sigma is None else each_alone(record)
+    if sigma is not None:
+        record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     return replace(record, name=require_name(name, "name"), failures=failures)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.readers.mix_ups.hints import Change, Pairs, hints
-from consistency.referee.readers.relative_motions import Stretch, windows_of
+from consistency.referee.readers.pipeline.relative_motions import Stretch, windows_of
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.readers.windows import Relative
 

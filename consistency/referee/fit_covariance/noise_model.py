@@ -38,7 +38,7 @@ from consistency.referee.fit_covariance.persistence import (
     persistent_errors,
 )
 from consistency.referee.fit_covariance.refusals import RotationGrowth, require_poses, require_sound, rotation_growth
-from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, intervals, jitter_of
+from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, jitter_of, variance_intervals
 from consistency.referee.geometry.groups import log, matrices
 from consistency.referee.readers.relative_motions import Stretch
 from consistency.referee.types import Array
@@ -206,7 +206,7 @@ def fit_covariance(
     is_by_name = not (by_halves or held_out is None)
     fitted = windows.of(~np.isin(windows.drive, judged)) if is_by_name else windows
     n = len(windows.axes)
-    variances = intervals(noise, fitted)
+    variances = variance_intervals(noise, fitted)
     return NoiseModel(
         name=name,
         span=length.option,

@@ -435,7 +435,7 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, l
     (study,) = report.studies
     for track in study.tracks:
         assert not track.innovations_judged
-    caption = nis.caption(study)
+    caption = nis.innovations_caption(study)
     assert "No filter here declares one: its innovations are reported and not judged." in caption
     assert "shaded bound" not in caption
     assert "NIS in parentheses: reported and not judged" in verdicts.verdicts_caption(study)
@@ -459,7 +459,7 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, l
     asked = [question.answers for question in questions.asked(study)]
     (innovation,) = {first.question for first, second in asked if second is None and "scale" in first.question}
     assert innovation == "innovation scale"
-    assert "Only kf declares one; the innovations of the others are reported" in nis.caption(study)
+    assert "Only kf declares one; the innovations of the others are reported" in nis.innovations_caption(study)
     (both_filters,) = nis.innovations(study)
     assert [bounds_of(panels(both_filters, number)[1]) for number in (0, 1)] == [[found.bound], []]
     assert [titles(panels(both_filters, number))[0] for number in (0, 1)] == ["kf", "silent"]

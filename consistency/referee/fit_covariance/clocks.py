@@ -22,13 +22,7 @@ STEPS = np.geomspace(0.004, REACH, 12)
 GRID = np.concatenate([-STEPS[::-1], [0.0], STEPS])
 
 
-<<<<<<< HEAD
-class ClockPart(NamedTuple):
-||||||| e6e4b16c
-class Part(NamedTuple):
-=======
 class TimedMotions(NamedTuple):
->>>>>>> fitroom
     """Some motions of a drive, K of them."""
 
     poses: Poses
@@ -67,13 +61,7 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     InputError
         The motions do not tell it.
     """
-<<<<<<< HEAD
-    parts: list[ClockPart] = []
-||||||| e6e4b16c
-    parts: list[Part] = []
-=======
     parts: list[TimedMotions] = []
->>>>>>> fitroom
     for poses, T in drives:
         last = np.searchsorted(poses.t, poses.t + LONG)
         first = np.flatnonzero(last < len(poses.t))
@@ -82,13 +70,7 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
             if len(rows):
                 ends = last[rows]
                 motions = inverse(T[rows]) @ T[ends]
-<<<<<<< HEAD
-                parts.append(ClockPart(poses, poses.t[rows], poses.t[ends], motions))
-||||||| e6e4b16c
-                parts.append(Part(poses, poses.t[rows], poses.t[ends], motions))
-=======
                 parts.append(TimedMotions(poses, poses.t[rows], poses.t[ends], motions))
->>>>>>> fitroom
     if len(parts) > 1:
         offset = _best(parts)
         spread = float(np.std([_best([part]) for part in parts], ddof=1))
@@ -100,13 +82,7 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     )
 
 
-<<<<<<< HEAD
-def _best(parts: Sequence[ClockPart]) -> float:
-||||||| e6e4b16c
-def _best(parts: Sequence[Part]) -> float:
-=======
 def _best(parts: Sequence[TimedMotions]) -> float:
->>>>>>> fitroom
     """The offset with the smallest errors; NaN where that is at an end of ``GRID``, or no offset is better."""
 
     def size(shift: float) -> float:

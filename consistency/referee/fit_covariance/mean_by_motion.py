@@ -42,13 +42,7 @@ class MotionDependence:
         return self.p_value <= SURE and self.share >= LEAST
 
 
-<<<<<<< HEAD
-class MotionQuestion(NamedTuple):
-||||||| e6e4b16c
-class Question(NamedTuple):
-=======
 class ScaleTest(NamedTuple):
->>>>>>> fitroom
     """Whether a scale differs between bins of the windows."""
 
     p_value: float
@@ -89,13 +83,7 @@ def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> MotionDependence
     return dependence
 
 
-<<<<<<< HEAD
-def _questions(corrected: DriveWindows) -> list[MotionQuestion]:
-||||||| e6e4b16c
-def _questions(corrected: DriveWindows) -> list[Question]:
-=======
 def _questions(corrected: DriveWindows) -> list[ScaleTest]:
->>>>>>> fitroom
     """All questions that are asked.
 
     Windows are divided once by the estimated and once by the true motion, and both must show it: the noise of a motion
@@ -113,13 +101,7 @@ def _questions(corrected: DriveWindows) -> list[ScaleTest]:
         for scale in range(len(SCALES)):
             by_estimate = p_value_of(corrected, corrected.pieces, bins, scale)
             by_truth = p_value_of(corrected, corrected.true_pieces, true_bins, scale)
-<<<<<<< HEAD
-            found.append(MotionQuestion(max(by_estimate, by_truth), by, scale, sizes, bins))
-||||||| e6e4b16c
-            found.append(Question(max(by_estimate, by_truth), by, scale, sizes, bins))
-=======
             found.append(ScaleTest(max(by_estimate, by_truth), by, scale, sizes, bins))
->>>>>>> fitroom
     return found
 
 

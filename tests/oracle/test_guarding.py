@@ -181,7 +181,7 @@ def interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels as Python runs them; guards meet all filters in one place, which is compiled in other tests."""
     for name, stand_in in {"by_reference": lambda record: record, "keep": lambda _: None}.items():
         monkeypatch.setattr(loop, name, stand_in)
-    monkeypatch.setattr(Kernel, "__call__", lambda kernel, *args, stop: kernel.function(*args))
+    monkeypatch.setattr(Kernel, "__call__", lambda kernel, *args: kernel.function(*args))
 
 
 def of_tracks(scenario: cs.Scenario) -> cs.Scenario:

@@ -53,8 +53,8 @@ class LocalThreads:
                         return
                     ready = _ready(finished)
                     under_way -= len(ready)
-                    for future in ready:
-                        yield future.result()
+                    while ready:  # an outcome that was taken is not held
+                        yield ready.pop(0).result()
         finally:
             pool.shutdown(cancel_futures=True)
 

@@ -199,11 +199,16 @@ def plain_numbers(result: CellResult) -> dict[str, Any]:
 
 
 def result_from(numbers: Mapping[str, Any]) -> CellResult:
-    """The result that :func:`plain_numbers` gave; raises TypeError where a field is missing or unknown."""
+    """The result that :func:`plain_numbers` gave; raises ValueError where a field is missing, unknown or no number."""
+    if not isinstance(numbers, Mapping) or set(numbers) != {f.name for f in fields(CellResult)}:
+        raise ValueError("the fields are not those of a cell's result")
     given = dict(numbers)
-    for name in given:
-        if given[name] is None:
+    for name in NUMBERS:
+        value = given[name]
+        if value is None:
             given[name] = np.nan
-        elif name in NUMBERS:
-            given[name] = float(given[name])
+        elif isinstance(value, (int, float, str)):
+            given[name] = float(value)
+        else:
+            raise ValueError(f"'{name}' is no number")
     return CellResult(**given)

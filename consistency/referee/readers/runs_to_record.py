@@ -128,13 +128,21 @@ def _require_different(file: str, tracks: Sequence[Track]) -> None:
             )
 
 
-def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
-    """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so, nor one triangle alone."""
+def symmetric(covariance: Array, place: Callable[[int], str], one_triangle: bool = False) -> Array:
+    """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so.
+
+    With ``one_triangle`` zeros take the value of their mirror image, where one triangle of every matrix is all zeros
+    and the other of none.
+    """
     out = np.empty(covariance.shape)
+    if one_triangle:
+        upper = np.triu(covariance, 1).any(axis=(1, 2))
+        lower = np.tril(covariance, -1).any(axis=(1, 2))
+        one_triangle = bool((upper.all() and not lower.any()) or (lower.all() and not upper.any()))
     with np.errstate(invalid="ignore"):  # of infinite ones
         for piece in of_runs(out):
             P = covariance[piece]
-            if np.triu(P, 1).any() != np.tril(P, -1).any():
+            if one_triangle:
                 P = np.where(P == 0, np.swapaxes(P, -1, -2), P)
             rows = Places(place, np.arange(piece.start, piece.stop))
             what = "the covariance is not symmetric; write P = (P + P') / 2"

@@ -661,10 +661,12 @@ def test_one_triangle_of_36_numbers_is_read(
 
 
 def test_a_matrix_with_two_triangles_that_differ_is_still_refused() -> None:
-    both, upper = np.array([[[1.0, 0.2], [0.4, 1.0]]]), np.array([[[1.0, 0.4], [0.0, np.inf]]])
+    both, upper = np.array([[[1.0, 0.2], [0.4, 1.0]]]), np.array([[[1.0, 0.4], [0.0, 2.0]]])
     with pytest.raises(InputError, match="line 3: the covariance is not symmetric"):
         symmetric(both, lambda row: f"line {row + 3}")
-    np.testing.assert_array_equal(symmetric(upper, str), [[[1.0, 0.4], [0.4, np.inf]]])
+    np.testing.assert_array_equal(symmetric(upper, str, one_triangle=True), [[[1.0, 0.4], [0.4, 2.0]]])
+    with pytest.raises(InputError, match="not symmetric"):
+        symmetric(np.concatenate([upper, np.eye(2)[None]]), str, one_triangle=True)
 
 
 def gated(nis: Array) -> Array:

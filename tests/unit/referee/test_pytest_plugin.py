@@ -165,8 +165,8 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         self.seen.append(tag)
-        self.loaded += [value or "" for key, value in attributes if key in ("src", "href")]
-        if tag != "meta":
+        self.loaded += [value or "" for key, value in attributes if key in ("src", "href") and value != "data:,"]
+        if tag not in ("meta", "link"):
             self.open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:

@@ -311,7 +311,9 @@ def _poses(
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
     covariance = covariance[:, : 6 + k, : 6 + k]
     P = np.full((len(own.t), 6 + k, 6 + k), np.nan)
-    P[rows] = symmetric(covariance if source is own else covariance[picked], lambda row: source.place(int(picked[row])))
+    if source is not own:
+        covariance = covariance[picked]
+    P[rows] = symmetric(covariance, lambda row: source.place(int(picked[row])), one_triangle=True)
     with_P = np.zeros(len(own.t), bool)
     with_P[rows] = True
     of_truth = _of_truth(truth, own, order, r)
@@ -378,13 +380,13 @@ def _of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
             raise InputError(
                 f"--truth-covariance {COLUMNS}: {truth.path} has none; give a file of t and {FULL} numbers"
             )
-        return symmetric(P[:, :6, :6], truth.place)
+        return symmetric(P[:, :6, :6], truth.place, one_triangle=True)
     path = Path(r.truth_covariance)
     source = read_covariances(_same_stem(path, own.path, "--truth-covariance") if path.is_dir() else path)
     rows, picked = _pairs(truth, source, r.tolerance, "covariance")
     out = np.full((len(truth.t), 6, 6), np.nan)
     P = _matrices(source.values[picked, 1 : 1 + FULL], order)
-    out[rows] = symmetric(P, lambda row: source.place(int(picked[row])))
+    out[rows] = symmetric(P, lambda row: source.place(int(picked[row])), one_triangle=True)
     return out
 
 

@@ -46,6 +46,7 @@ class Candidate:
     gain: float  # log likelihood of each over the simple faults of the errors as declared; -inf where it is none
 
 
+@np.errstate(invalid="ignore")  # of poses that are not finite, which no reading makes fit
 def hints(
     name: str,
     axes: Sequence[str],

@@ -99,10 +99,12 @@ def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> It
     """Cross terms that make the covariance nearly singular, while each component by itself is right."""
     P = np.concatenate([p.covariance for p in runs])[:, part][:, :, part]
     P = P[np.isfinite(P).all(axis=(1, 2))]
+    if len(part) < 2 or not len(P):
+        return
     sigma = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
     with np.errstate(invalid="ignore", divide="ignore"):
         R = np.median(P / sigma[:, :, None] / sigma[:, None, :], axis=0)
-    if len(part) < 2 or not np.isfinite(R).all():
+    if not np.isfinite(R).all():
         return
     values, vectors = np.linalg.eigh(R)
     if values[0] > SINGULAR:

@@ -23,7 +23,7 @@ import numpy as np
 from scipy import signal, stats
 from script_options import options_of
 
-from consistency.referee.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.alignment.residuals import clocks_and_frames
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved

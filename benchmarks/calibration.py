@@ -35,7 +35,7 @@ from script_options import options_of
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
-from consistency.referee.diagnostics import Record, Settings, Verdict, e_process, follow, judge, sequential_design
+from consistency.diagnostics import Record, Settings, Verdict, e_process, follow, judge, sequential_design
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.types import Array
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from calibration_gates import DOF, STEPS
 from calibration_worlds import HEAVY, LOGS, WORLDS
 
-from consistency.referee.diagnostics import gate_runs
+from consistency.diagnostics import gate_runs
 
 FALSE_ALARM, POWER, DETECT = 0.05, 0.95, 1.5
 QUICK_FAILURE = 2e-4  # chance that the quick rows of a referee that keeps its promises fail

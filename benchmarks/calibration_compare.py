@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from calibration_gates import row
 
-from consistency.referee.diagnostics import RunSummary, compare
+from consistency.diagnostics import RunSummary, compare
 
 STEPS = 100
 RUNS = (8, 21, 100)

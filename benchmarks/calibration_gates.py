@@ -36,7 +36,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class Gate:
-    """Arrays of one gate, named as those of ``consistency.referee.diagnostics.Record``; R runs, T steps."""
+    """Arrays of one gate, named as those of ``consistency.Record``; R runs, T steps."""
 
     error: Array | None = None  # (R, T, n)
     covariance: Array | None = None  # (R, T, n, n)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from calibration_gates import row
 
-from consistency.referee.diagnostics import Record, Settings, Verdict, follow, gate_runs, judge, sequential_design
+from consistency.diagnostics import Record, Settings, Verdict, follow, gate_runs, judge, sequential_design
 from consistency.referee.types import Array
 
 STEPS, DOF, SHARE, DETECT = 20, 3, 0.05, 1.5

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from calibration_gates import row
 
-from consistency.referee.diagnostics import JointNees, Record, Verdict, judge
+from consistency.diagnostics import JointNees, Record, Verdict, judge
 from consistency.referee.types import Array
 
 LANDMARKS, POSE = 12, 3

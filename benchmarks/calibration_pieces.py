@@ -12,7 +12,7 @@ import numpy as np
 from calibration_gates import row, stationary
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics import Record, judge
+from consistency.diagnostics import Record, judge
 from consistency.referee.diagnostics.planning.single_log import in_pieces
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import SPATIAL

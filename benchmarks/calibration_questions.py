@@ -14,7 +14,7 @@ import numpy as np
 from calibration_gates import row
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics import Record, Verdict, judge, mean_shape
+from consistency.diagnostics import Record, Verdict, judge, mean_shape
 from consistency.referee.diagnostics.verdict.answers import SHARES, STEP
 from consistency.referee.types import Array
 

@@ -15,7 +15,7 @@ import numpy as np
 from calibration_gates import row
 from scipy import special, stats
 
-from consistency.referee.diagnostics import Record, judge, ratio_interval
+from consistency.diagnostics import Record, judge, ratio_interval
 from consistency.referee.diagnostics.comparison import RunSummary, compare
 from consistency.referee.diagnostics.questions import scale
 from consistency.referee.diagnostics.verdict.answers import SHARES

@@ -12,7 +12,7 @@ import numpy as np
 from calibration_gates import row, stationary
 from scipy import optimize
 
-from consistency.referee.diagnostics import Record, judge
+from consistency.diagnostics import Record, judge
 from consistency.referee.types import Array
 
 RUNS, STEPS, DOF = 50, 20, 3

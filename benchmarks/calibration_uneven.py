@@ -14,7 +14,7 @@ import numpy as np
 from calibration_cases import DETECT, FALSE_ALARM, POWER
 from calibration_gates import row, shared
 
-from consistency.referee.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.planning.pilot import pilot_plan
 from consistency.referee.diagnostics.questions.innovations import whiteness
 from consistency.referee.diagnostics.questions.scale import scale_test

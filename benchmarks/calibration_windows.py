@@ -13,7 +13,7 @@ import numpy as np
 from calibration_gates import row, stationary
 from scipy import stats
 
-from consistency.referee.diagnostics import Record, judge
+from consistency.diagnostics import Record, judge
 from consistency.referee.diagnostics.questions.independence import ENOUGH, independence
 from consistency.referee.types import Array
 

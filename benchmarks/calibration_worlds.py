@@ -27,7 +27,7 @@ from calibration_gates import (
 )
 from scipy import special
 
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.formats.numpy_archive import steps_of
 from consistency.referee.readers.runs_to_record import Track, assemble, symmetric

@@ -16,7 +16,7 @@ import numpy as np
 from calibration_gates import stationary
 from scipy import stats
 
-from consistency.referee.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.types import Array
 
 WORLDS = {"independent": 0.0, "AR(0.9)": 0.9, "AR(0.99)": 0.99, "one error a run": 1.0}

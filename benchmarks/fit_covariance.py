@@ -34,7 +34,7 @@ from consistency.referee.fit_covariance.motion_windows import PLANE, SPACE, Driv
 from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.persistence import doubts, persistent_errors
 from consistency.referee.fit_covariance.refusals import require_sound, rotation_growth
-from consistency.referee.fit_covariance.white_noise import fit_noise, intervals, terms_of
+from consistency.referee.fit_covariance.white_noise import fit_noise, terms_of, variance_intervals
 from consistency.referee.geometry.groups import composed, matrices, vectors
 from consistency.referee.types import Array
 
@@ -173,7 +173,7 @@ def recovery(rng: np.random.Generator, world: World, number: int, draws: int) ->
         own = np.diagonal(F.mean(axis=0), axis1=1, axis2=2)  # (2 n, n)
         main += theta * own[np.arange(2 * n), np.arange(2 * n) % n] / np.tile(theta @ own, 2) / draws
         best += within_at_best(theta, F) / draws
-        found = intervals(fit_noise(windows), windows)
+        found = variance_intervals(fit_noise(windows), windows)
         fitted = np.array([each.value for each in found])
         ratios[k], whole[k] = fitted / theta, fitted @ own / (theta @ own)
         covered[k] = [each.holds(true) for each, true in zip(found, theta, strict=True)]

@@ -22,7 +22,7 @@ from relative_poses import exp
 from scipy.spatial.transform import Rotation
 from script_options import options_of
 
-from consistency.referee.diagnostics import Verdict, judge
+from consistency.diagnostics import Verdict, judge
 from consistency.referee.geometry.groups import composed, vectors
 from consistency.referee.readers.formats.geodetic import axes_at, centred, geodetic
 from consistency.referee.readers.options import Reading

@@ -20,12 +20,12 @@ from scipy import stats
 from scipy.linalg import expm
 from script_options import options_of
 
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.statistics.number_of_runs import power_of
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.geometry.groups import composed, propagated, to_left, vectors
+from consistency.referee.readers.pipeline.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.windows import relative_of
 from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import analyse

@@ -20,7 +20,7 @@ from calibration_gates import stationary
 from scipy import stats
 from script_options import options_of
 
-from consistency.referee.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.planning.single_log import within
 from consistency.referee.types import Array
 

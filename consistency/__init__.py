@@ -6,7 +6,7 @@ from typing import Any
 # where each public name stands; it is loaded when it is first used, so that `import consistency` and `--help` stay
 # fast, and the core works without the packages of the bench. __init__.pyi has the same names for type checkers.
 _MODULES = {
-    "Alarm": "referee.diagnostics",
+    "Alarm": "referee.diagnostics.monitoring.monitor",
     "Control": "bench.types",
     "Drive": "referee.fit_covariance.drives",
     "Finding": "bench.types",
@@ -14,7 +14,7 @@ _MODULES = {
     "Info": "bench.types",
     "InputError": "referee.errors",
     "Log": "bench.store.log",
-    "Monitor": "referee.diagnostics",
+    "Monitor": "referee.diagnostics.monitoring.monitor",
     "NoiseModel": "referee.fit_covariance.noise_model",
     "Observation": "bench.types",
     "Record": "referee.diagnostics.records.record",
@@ -25,8 +25,8 @@ _MODULES = {
     "Tuning": "bench.tuning.result",
     "Verdict": "referee.diagnostics.verdict.verdict",
     "analyse": "bench.runs.analyse_results",
-    "anees": "referee.diagnostics",
-    "anees_interval": "referee.diagnostics",
+    "anees": "referee.diagnostics.statistics.nees",
+    "anees_interval": "referee.diagnostics.statistics.nees",
     "drive_of": "referee.fit_covariance.drives",
     "filter_names": "bench.filters",
     "fit_covariance": "referee.fit_covariance.noise_model",
@@ -34,7 +34,7 @@ _MODULES = {
     "guarded": "bench.filters.compiled",
     "judge": "referee.notebook.read_and_judge",
     "load_scenario": "bench.scenario",
-    "nees": "referee.diagnostics",
+    "nees": "referee.diagnostics.statistics.nees",
     "read": "referee.notebook.read_and_judge",
     "read_drives": "referee.fit_covariance.drives",
     "read_log": "bench.store.log",

@@ -22,12 +22,12 @@ from .bench.types import Gaussian as Gaussian
 from .bench.types import Info as Info
 from .bench.types import Observation as Observation
 from .bench.types import Trial as Trial
-from .referee.diagnostics import Alarm as Alarm
-from .referee.diagnostics import Monitor as Monitor
-from .referee.diagnostics import anees as anees
-from .referee.diagnostics import anees_interval as anees_interval
-from .referee.diagnostics import nees as nees
+from .referee.diagnostics.monitoring.monitor import Alarm as Alarm
+from .referee.diagnostics.monitoring.monitor import Monitor as Monitor
 from .referee.diagnostics.records.record import Record as Record
+from .referee.diagnostics.statistics.nees import anees as anees
+from .referee.diagnostics.statistics.nees import anees_interval as anees_interval
+from .referee.diagnostics.statistics.nees import nees as nees
 from .referee.diagnostics.verdict.verdict import Verdict as Verdict
 from .referee.errors import InputError as InputError
 from .referee.fit_covariance.drives import Drive as Drive

@@ -104,7 +104,7 @@ class Gates:
 
     def runs_of(self, item: pytest.Item, dof: int | None = None) -> int:
         """Runs given on the command line, or planned for the marker of a test, or as if it had ``dof``."""
-        from consistency.referee.diagnostics import gate_runs
+        from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
 
         if self.runs is not None:
             return self.runs

@@ -10,9 +10,13 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics import Comparison, Record, Settings, Verdict, gate_runs, judge
-from consistency.referee.diagnostics.comparison import FEWEST
+from consistency.referee.diagnostics.comparison import FEWEST, Comparison
+from consistency.referee.diagnostics.judge_record import judge
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
+from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.gating.candidates import Sides, of_arrays, of_filters
 from consistency.referee.gating.checked_arrays import planned_dof, rate_shares, record_of_checked, record_of_filter
 from consistency.referee.gating.watch import (

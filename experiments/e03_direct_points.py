@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import consistency as cs
 from consistency.bench.runs.findings import script
-from consistency.referee.diagnostics import detectable_ratio, simultaneous_band
+from consistency.diagnostics import detectable_ratio, simultaneous_band
 
 FINDINGS = ("fig11a",)
 KERNELS = {"herath2007-xyz": ("ekf-xyz",), "linear-gaussian": ("kf",)}

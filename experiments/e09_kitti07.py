@@ -31,7 +31,7 @@ from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.log import Log, write_log
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
-from consistency.referee.diagnostics import anees_interval, chi2_mean_interval
+from consistency.diagnostics import anees_interval, chi2_mean_interval
 from consistency.referee.diagnostics.statistics.accuracy import coverage
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array

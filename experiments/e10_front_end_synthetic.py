@@ -14,7 +14,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.findings import OURS, script, sibling
-from consistency.referee.diagnostics import chi2_mean_interval
+from consistency.diagnostics import chi2_mean_interval
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.registration import rigid_motions
 from consistency.stereo.visual_odometry.relative_pose import euler_angles

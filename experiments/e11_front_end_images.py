@@ -18,7 +18,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.findings import OURS, command_line, sibling
-from consistency.referee.diagnostics import Record, Verdict, judge
+from consistency.diagnostics import Record, Verdict, judge
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.types import Array

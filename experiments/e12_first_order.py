@@ -14,7 +14,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.bench.runs.findings import OURS, script, sibling
-from consistency.referee.diagnostics import Record, Settings, detectable_ratio, judge
+from consistency.diagnostics import Record, Settings, detectable_ratio, judge
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure
 from consistency.vision import (

@@ -24,7 +24,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics import Record
+    from consistency.referee.diagnostics.records.record import Record
     from consistency.referee.diagnostics.records.skipping import Skip as FirstSteps
     from consistency.referee.verdicts.baselines import Baseline
     from consistency.referee.verdicts.sources import Source

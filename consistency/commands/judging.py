@@ -76,7 +76,7 @@ def analyse_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
 ) -> None:
     """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
-    from consistency.referee.document.verdict import document
+    from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.command_settings import settings_of, skip_asked
     from consistency.referee.verdicts.sources import analyse as judge
@@ -200,7 +200,7 @@ def plan_command(
     as_json: AsJson = False,
 ) -> None:
     """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
-    from consistency.referee.document.plan import plan_lines
+    from consistency.referee.document.needed_runs import plan_lines
     from consistency.referee.verdicts.command_settings import plan as plan_runs
 
     if scenario is not None and like is not None:

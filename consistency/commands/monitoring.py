@@ -54,7 +54,7 @@ def monitor_command(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
 ) -> None:
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
-    from consistency.referee.document.monitor import monitor_document
+    from consistency.referee.document.alarms import monitor_document
     from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash
     from consistency.referee.verdicts.monitor_sources import make_monitor, watch, watch_lines
@@ -80,7 +80,7 @@ def monitor_command(
             require_plot(plot, overwrite)
         watched = watch(log, watcher)
     if plot is not None:
-        from consistency.referee.pages.monitor import monitor_drawing
+        from consistency.referee.pages.nis_over_time import monitor_drawing
 
         plotted(partial(monitor_drawing, watched), plot)
     print_document(
@@ -105,7 +105,7 @@ def _show_ratios(
     path: Path, sensor: str | None, core: int | None, plot: Path | None, overwrite: bool, as_json: bool
 ) -> None:
     """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
-    from consistency.referee.document.monitor import ratios_document
+    from consistency.referee.document.alarms import ratios_document
     from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.ardupilot_log import read_ratios
 
@@ -114,7 +114,7 @@ def _show_ratios(
     ratios, notes = read_ratios(path, sensor, core)
     tell(notes)
     if plot is not None:
-        from consistency.referee.pages.monitor import monitor_drawing
+        from consistency.referee.pages.nis_over_time import monitor_drawing
 
         plotted(partial(monitor_drawing, ratios), plot)
     print_document(ratios_document(path.stem, ratios), as_json)

@@ -78,7 +78,7 @@ ROWS = (
         "characterise IMAGES --board 9x6 --square 0.024 --out s.toml"),
     Row("sweep", "searching:sweep_command", "bench report",
         "sweep regime --out regime",
-        "sweep grid.toml --share 1/4 --out cells"),
+        "sweep grid.toml --filter ekf-uvd --out cells"),
     Row("tune", "searching:tune_command", "bench",
         "tune herath2007-optimistic --filter oc-ekf-xyz",
         "tune --log log --filter ekf-uvd"),

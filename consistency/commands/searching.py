@@ -108,7 +108,7 @@ def tune_command(
     from consistency.bench.store.log import read_log
     from consistency.bench.tuning.result import KIND, tuning_data, tuning_lines, tuning_verdicts, write
     from consistency.bench.tuning.tune import tune as tune_filter
-    from consistency.referee.document.verdict import document
+    from consistency.referee.document.judged_filters import document
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free
     from consistency.referee.verdicts.command_settings import settings_of

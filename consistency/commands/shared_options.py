@@ -16,7 +16,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics import Evidence
+    from consistency.referee.diagnostics.records.record import Record
     from consistency.referee.document.blocks import Document
 
 Out = Annotated[Path, typer.Option("--out", help="Folder to write; must not exist.")]
@@ -92,13 +92,13 @@ def are_files(path: Path, files: Reading) -> bool:
     return is_recording(path, files)
 
 
-def read_files(path: Path, files: Reading) -> list[Evidence]:
+def read_files(path: Path, files: Reading) -> list[Record]:
     from consistency.referee.readers.pipeline.read_files import read_recordings
 
     return read_recordings(path, files)
 
 
-def tell_notes(*read: list[Evidence]) -> None:
+def tell_notes(*read: list[Record]) -> None:
     """What was assumed and left out, to standard error; said when nothing is refused any more."""
     tell(
         dict.fromkeys(note for recordings in read for one in recordings for note in one.notes if note not in one.causes)

@@ -92,7 +92,7 @@ def run_command(
     from consistency.bench.scenario import load_scenario
     from consistency.bench.store.log import read_log
     from consistency.bench.store.results import Results, StoredResults
-    from consistency.referee.document.verdict import document
+    from consistency.referee.document.judged_filters import document
     from consistency.referee.show import terminal
     from consistency.referee.system.progress import say
 

@@ -42,7 +42,7 @@ NOT_RUN = [
     ("docs/files.md", "consistency analyse est.tum", "tests/oracle/test_gtsam_windows.py has such marginals"),
     ("docs/files.md", "joint = marginals", "tests/oracle/test_gtsam_windows.py does the same"),
     ("docs/fit-covariance.md", "consistency", "needs real drives; unit/referee/test_fit_command.py simulates"),
-    ("docs/front-end.md", "import fit_shared", "tests/unit/stereo/test_vision_shared.py has its inputs"),
+    ("docs/front-end.md", "from consistency.vision import fit_shared", "tests/unit/stereo/test_vision_shared.py"),
     ("docs/front-end.md", "python experiments/e11", REAL),
     ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/bench/test_guards.py runs such"),
     ("docs/kitti07.md", "", REAL),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from consistency.referee.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.types import Array
 
 

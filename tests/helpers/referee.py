@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from consistency.referee.diagnostics import Record, Settings, Verdict
-from consistency.referee.diagnostics import judge as judge_evidence
+from consistency.diagnostics import Record, Settings, Verdict
+from consistency.diagnostics import judge as judge_evidence
 
 OF_SETTINGS = {field.name for field in fields(Settings)}
 

@@ -15,7 +15,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from mismatch import WrongMatch
 
 import consistency as cs
 from consistency.bench.scenario.effects import EFFECTS
-from consistency.referee.diagnostics import Settings, Verdict
+from consistency.diagnostics import Settings, Verdict
 
 pytestmark = pytest.mark.slow
 RATE = 1e-6  # at which the referee may find a fault in a filter that has none

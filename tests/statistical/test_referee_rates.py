@@ -14,7 +14,7 @@ from draws import errs_at_most, identities
 from referee import judge
 from scipy import stats
 
-from consistency.referee.diagnostics import mean_shape, mean_test, nis_whiteness, simultaneous_band
+from consistency.diagnostics import mean_shape, mean_test, nis_whiteness, simultaneous_band
 from consistency.referee.types import Array
 
 pytestmark = pytest.mark.slow

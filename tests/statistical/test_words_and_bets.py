@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from draws import autoregression, errs_at_most, fully_dependent, independent, slow_axis
 
-from consistency.referee.diagnostics import e_process, largest_direction
+from consistency.diagnostics import e_process, largest_direction
 from consistency.referee.types import Array
 
 pytestmark = pytest.mark.slow

@@ -78,12 +78,14 @@ def test_the_question_of_the_document_is_asked(copy: Path) -> None:
     statistic, table, line = code("Add a question of the verdict")
     folder = copy / "consistency/referee/diagnostics"
     (folder / "questions/trend.py").write_text(statistic, encoding="utf-8")
-    changed(folder / "verdict/answers.py", "\n\ndef answers(", f"{table}\n\ndef answers(")
+    tests = folder / "judging/hypothesis_tests.py"
     first = "    distribution = pit(sample.nees, sample.dof)\n"
-    changed(folder / "verdict/answers.py", first, f"    {line.strip()}\n{first}")
+    changed(tests, first, f"    {line.strip()}\n{first}")
+    changed(tests, "\n\n@dataclass(frozen=True)\nclass Tests", f"\n{table}\n\n@dataclass(frozen=True)\nclass Tests")
     changed(
-        folder / "verdict/answers.py", "from consistency.referee.diagnostics.records.whitening",
+        tests, "from consistency.referee.diagnostics.records.whitening",
         "from consistency.referee.diagnostics.questions.trend import trend\n"
+        "from consistency.referee.diagnostics.verdict.answers import ABOUT, ALONE, SHARES\n"
         "from consistency.referee.diagnostics.records.whitening",
     )  # fmt: skip
     done = python(
@@ -91,7 +93,7 @@ def test_the_question_of_the_document_is_asked(copy: Path) -> None:
         """
 import numpy as np
 from scipy import stats
-from consistency.referee.diagnostics import Record, judge
+from consistency.diagnostics import Record, judge
 
 n = 200
 size = np.sqrt(stats.chi2.ppf((np.arange(n) + 0.5) / n, 1))  # errors of a right estimator by their size

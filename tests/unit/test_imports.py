@@ -148,7 +148,7 @@ def loaded(statement: str) -> set[str]:
 
 
 def test_diagnostics_load_arrays_and_distributions_only() -> None:
-    names = "import consistency.referee.diagnostics as d\n_ = [getattr(d, name) for name in d.__all__]"
+    names = "import consistency.diagnostics as d\n_ = [getattr(d, name) for name in d.__all__]"
     modules_ = loaded(names)
     assert {"numpy", "scipy"} <= modules_
     assert not modules_ & {"pandas", "matplotlib", "numba", "pydantic", "joblib"}

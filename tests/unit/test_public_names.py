@@ -22,7 +22,7 @@ NAMES = {  # module -> its public names; also those of CONTRACT.md, of docs/api,
         judge load_scenario nees read read_drives read_log read_results run_trials scenario_names simulate tune""",
     "consistency.challenging": "Challenge Plan challenge",
     "consistency.diagnostics": """
-        Alarm Answer Band Comparison Design Difference EProcess EarlyEnds Equivalence Evidence Hotelling Independence
+        Alarm Answer Band Comparison Design Difference EProcess EarlyEnds Equivalence Record Hotelling Independence
         Interval JointNees Largest MapRecord MapScore MeanTest Monitor NisTest Normality Outlier PilotPlan Pit Record
         RejectionScore Rejections RunSummary Settings Skip Verdict Whiteness anees anees_interval answers
         chi2_mean_interval clustered_share compare coverage coverage_interval detectable_ratio e_process early_ends

@@ -20,7 +20,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
-from consistency.referee.diagnostics import Interval, Record, Settings, Verdict, judge
+from consistency.diagnostics import Interval, Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.questions.outliers import outliers
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import STATUSES

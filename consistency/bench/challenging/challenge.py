@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search
+from consistency.bench.challenging.search import RUNGS, Budget, ScoredWorld, ranked, search
 from consistency.bench.challenging.world_scores import ChallengeScorer
 from consistency.bench.challenging.worlds import Point, Space, require_right_belief, space_of
 from consistency.bench.filters import get_filter
@@ -21,8 +21,9 @@ from consistency.bench.runs.montecarlo import resolve_filters, run_trials
 from consistency.bench.scenario import Scenario, load_scenario
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM
-from consistency.referee.diagnostics import Settings, Verdict, gate_runs
-from consistency.referee.diagnostics.verdict.answers import JOINT, SCALE
+from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
+from consistency.referee.diagnostics.verdict.answers import JOINT, SCALE, Settings
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.command_settings import refused
 
@@ -198,7 +199,7 @@ class ChallengePhases:
         self.budget = Budget(None if plan.minutes is None else 60.0 * plan.minutes, plan.trials)
         seconds = self.budget.seconds
         self.slowest = np.inf if seconds is None else CONFIRM * seconds * bench.workers / plan.runs  # for one trial
-        self.tried: dict[Point, Candidate] = {}
+        self.tried: dict[Point, ScoredWorld] = {}
         self.told = time.monotonic()
 
     def run(self) -> Challenge:
@@ -224,7 +225,7 @@ class ChallengePhases:
             seconds=self.budget.elapsed,
         )
 
-    def search(self) -> Candidate:
+    def search(self) -> ScoredWorld:
         """Return the most overconfident candidate."""
         rng = np.random.default_rng(self.search_seed)
         search(self.space, self.evaluate, partial(self.budget.left, SEARCH), rng, self.tried)
@@ -236,7 +237,7 @@ class ChallengePhases:
             )
         return usable[0]
 
-    def evaluate(self, candidates: Sequence[Candidate], trials: int) -> None:
+    def evaluate(self, candidates: Sequence[ScoredWorld], trials: int) -> None:
         """Give candidates trials up to this number in all."""
         ready = []
         for candidate in candidates:

@@ -32,7 +32,7 @@ LEAST_SPREAD = 0.3  # of a trial's score, where a few agree by chance
 
 
 @dataclass
-class Candidate:
+class ScoredWorld:
     """A point with the scores of its trials so far."""
 
     point: Point
@@ -53,7 +53,7 @@ def standard_error(scores: Sequence[float]) -> float:
 
 
 # gives each candidate scores up to a number of trials, as far as the budget goes, or marks it as not usable
-Evaluate = Callable[[Sequence[Candidate], int], None]
+Evaluate = Callable[[Sequence[ScoredWorld], int], None]
 
 
 class Budget:
@@ -83,7 +83,7 @@ def search(
     evaluate: Evaluate,
     left: Callable[[], bool],
     rng: np.random.Generator,
-    tried: dict[Point, Candidate],
+    tried: dict[Point, ScoredWorld],
 ) -> None:
     """Try batches of points, which are added to those ``tried`` before.
 
@@ -103,13 +103,13 @@ def search(
             break
 
 
-def ranked(candidates: Iterable[Candidate]) -> list[Candidate]:
+def ranked(candidates: Iterable[ScoredWorld]) -> list[ScoredWorld]:
     """Usable candidates, the worst first; those with the trials of the last rung before the others."""
     usable = [c for c in candidates if c.usable and c.scores]
     return sorted(usable, key=lambda c: (len(c.scores) >= RUNGS[-1], c.score), reverse=True)
 
 
-def _race(batch: list[Candidate], evaluate: Evaluate, left: Callable[[], bool]) -> None:
+def _race(batch: list[ScoredWorld], evaluate: Evaluate, left: Callable[[], bool]) -> None:
     alive = batch
     for trials in RUNGS:
         if not left():
@@ -119,10 +119,12 @@ def _race(batch: list[Candidate], evaluate: Evaluate, left: Callable[[], bool]) 
         alive = alive[: max(1, len(alive) // 2)]
 
 
-def _batch(space: Space, tried: dict[Point, Candidate], even: qmc.Halton, rng: np.random.Generator) -> list[Candidate]:
+def _batch(
+    space: Space, tried: dict[Point, ScoredWorld], even: qmc.Halton, rng: np.random.Generator
+) -> list[ScoredWorld]:
     """New points; the first of all is that of the base."""
     elite = sorted((c for c in tried.values() if c.usable and c.scores), key=lambda c: c.score, reverse=True)[:ELITE]
-    new: dict[Point, Candidate] = {} if tried else {space.plain: Candidate(space.plain)}
+    new: dict[Point, ScoredWorld] = {} if tried else {space.plain: ScoredWorld(space.plain)}
     for _ in range(20 * BATCH):  # a small space has no more to offer
         if len(new) == BATCH:
             break
@@ -130,7 +132,7 @@ def _batch(space: Space, tried: dict[Point, Candidate], even: qmc.Halton, rng: n
         u = _varied(np.array([space.where(c.point) for c in elite]), rng) if varied else even.random()[0]
         point = space.at(u)
         if point not in tried and point not in new:
-            new[point] = Candidate(point)
+            new[point] = ScoredWorld(point)
     return list(new.values())
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.backends.local import worker_count
+from consistency.bench.runs.backends.threads import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.scenario import Scenario

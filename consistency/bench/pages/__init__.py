@@ -59,7 +59,7 @@ def write_regime_reports(regime: Regime, folder: Path) -> list[Path]:
     targets = [folder / "report.html", folder / "report.pdf"]
     for path in targets:
         require_writable(path, overwrite=True)
-    from consistency.bench.pages.regime import compose_regime
+    from consistency.bench.pages.maps_of_worlds import compose_regime
 
     write_document(compose_regime(regime), *targets)
     return targets

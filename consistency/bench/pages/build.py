@@ -9,22 +9,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.bench.pages import exhibits
-from consistency.bench.pages.report_input import Report, Study, Track
-from consistency.bench.pages.sections import images, overview, sensor_issues
+from consistency.bench.pages.sections import exhibits, images, overview, sensor_issues
 from consistency.bench.pages.sections.calibration_rates import calibration_rates
 from consistency.bench.pages.sections.filters_table import filters_table
 from consistency.bench.pages.sections.front_end import front_end
-from consistency.bench.pages.sections.provenance import provenance
+from consistency.bench.pages.sections.report_input import Report, Study, Track
 from consistency.bench.pages.sections.stereo_noise import stereo_noise
+from consistency.bench.pages.sections.study_origin import provenance
 from consistency.bench.pages.sections.study_sections import SECTIONS
 from consistency.bench.runs.findings import read_findings
 from consistency.bench.runs.results_to_records import design_of, longest_run, record_of
 from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
 from consistency.bench.types import outcome
-from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.judge_record import judge
+from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Block, Chapter, Document

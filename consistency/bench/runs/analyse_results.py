@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from consistency.referee.diagnostics import Record, Settings, Verdict
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.verdict.answers import Settings
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.verdicts.sources import Source
 from consistency.referee.verdicts.sources import analyse as analyse_records
 

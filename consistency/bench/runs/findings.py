@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -18,7 +18,7 @@ from joblib.externals.loky.backend import get_context
 
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.backends.local import worker_count
+from consistency.bench.runs.backends.threads import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import record_of
@@ -27,7 +27,8 @@ from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding, outcome
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.document.blocks import Cell, Column, Status, Table, table
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_json, reading
@@ -317,7 +318,12 @@ def read_findings(folder: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     with reading(path, "not a list of findings"):
-        return [asdict(Finding(**entry)) for entry in read_json(path)]
+        entries, keys = read_json(path), [each.name for each in fields(Finding)]
+        if not isinstance(entries, list):
+            raise ValueError("no list")
+        if not all(isinstance(entry, dict) and {*entry} == {*keys} for entry in entries):
+            raise ValueError(f"a finding has the keys {', '.join(keys)}")
+        return [asdict(Finding(**entry)) for entry in entries]
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:

@@ -9,7 +9,7 @@ from itertools import islice
 from queue import Empty, SimpleQueue
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.runs.backends.local import worker_count
+from consistency.bench.runs.backends.threads import worker_count
 from consistency.bench.runs.trial_work import Outcomes, TrialWork
 from consistency.bench.store.trial_rows import RunOutcome
 

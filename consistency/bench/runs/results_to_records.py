@@ -17,8 +17,9 @@ import numpy as np
 from consistency.bench.store.parquet import Columns
 from consistency.bench.store.results import JOINT, Tables, open_results
 from consistency.referee.column_names import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
-from consistency.referee.diagnostics import Design, JointNees, MapRecord, Record, Rejections, sequential_design
+from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
 from consistency.referee.diagnostics.records.large_arrays import by_runs
+from consistency.referee.diagnostics.records.record import JointNees, MapRecord, Record, Rejections
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, planar_error
 from consistency.referee.parsing import LARGEST_NUMBER, one_line

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
-from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.questions import scale
 from consistency.referee.diagnostics.records.large_arrays import by_steps
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.types import Array
 
 

@@ -20,8 +20,11 @@ from consistency.bench.store.journal import Journal
 from consistency.bench.store.results import Results, StoredResults, Tables, open_results
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics import Design, Record, Verdict, look, sequential_design, speaks
+from consistency.referee.diagnostics.judge_record import look, speaks
+from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
 from consistency.referee.diagnostics.questions.scale import FEW
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
 from consistency.referee.types import Array

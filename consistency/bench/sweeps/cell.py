@@ -25,7 +25,8 @@ from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import simulate
 from consistency.bench.sweeps.plan import Cell, Sweep
 from consistency.bench.types import Trial
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.system.progress import quiet
 
 TIMED = 3  # times that a trial is timed, of which the least counts, and trials that are tried

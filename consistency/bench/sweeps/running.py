@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from consistency.bench.runs.backends.local import worker_count
+from consistency.bench.runs.backends.threads import worker_count
 from consistency.bench.store.journal import Busy
 from consistency.bench.sweeps.cell import CellResult, run_cell
 from consistency.bench.sweeps.plan import Sweep

@@ -18,9 +18,9 @@ from consistency.bench.tuning.fit import LIMIT
 from consistency.bench.tuning.noise_groups import NoiseGroup, sigma_by_channel
 from consistency.bench.tuning.split import Parts, with_belief
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.system.provenance import manifest_of
 

@@ -21,8 +21,9 @@ from consistency.bench.tuning.noise_groups import NoiseGroup, groups_of, rounded
 from consistency.bench.tuning.result import Factor, Setting, Tuning
 from consistency.bench.tuning.scores import BeliefScorer, require_scorable
 from consistency.bench.tuning.split import parts_of
-from consistency.referee.diagnostics import Settings, Verdict
+from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import quiet
 from consistency.referee.types import Array

@@ -9,15 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.judging.status import deciding_axis
-from consistency.referee.diagnostics.questions.innovation_causes import innovation_causes
-from consistency.referee.diagnostics.questions.innovations import nis_and_dof
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.e_process import e_process, ever
-from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
+from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import RejectionScore, Scale
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, MapScore, Verdict
 from consistency.referee.diagnostics.words.sentences import (
     LATER,
@@ -128,11 +125,7 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
     left_out = set(found.left_out_steps)
     if record.align:
         left_out.update(record.left_out_steps)
-    causes, nees_ratio = list(record.causes), float("nan")
-    if found.scale is not None:
-        nees_ratio = found.scale.mean_anees / found.scale.dof
-    if (innovations := nis_and_dof(record)) is not None:
-        causes += innovation_causes(*innovations, nees_ratio)
+    causes = (*record.causes, *_causes_of_innovations(record, found))
     fields = vars(found) | {"left_out_steps": tuple(sorted(left_out))}
     return Verdict(
         **fields,
@@ -141,9 +134,23 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
         convention=convention,
         align=align,
         notes=tuple(record.notes),
-        causes=tuple(causes),
+        causes=causes,
         **beside._asdict(),
     )
+
+
+def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
+    """Probable mix-ups of the innovations; their modules are loaded for a record that has some."""
+    if record.nis is None and record.innovations is None:
+        return []
+    from consistency.referee.diagnostics.questions.innovations import innovation_causes, nis_and_dof
+
+    innovations, nees_ratio = nis_and_dof(record), float("nan")
+    if innovations is None:
+        return []
+    if found.scale is not None:
+        nees_ratio = found.scale.mean_anees / found.scale.dof
+    return innovation_causes(*innovations, nees_ratio)
 
 
 def _map_of(record: Record, settings: Settings | None) -> MapScore | None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from consistency.referee.diagnostics import Interval
-from consistency.referee.diagnostics.verdict.parts import RejectionScore
+from consistency.referee.diagnostics.verdict.parts import Interval, RejectionScore
 from consistency.referee.document.blocks import Cell, Column, Quantity
 from consistency.referee.document.wording import NONE
 

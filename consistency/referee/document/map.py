@@ -1,10 +1,11 @@
-"""The score of a map in rows and columns, as :mod:`consistency.referee.document.verdict` has those of a pose."""
+"""The score of a map in rows and columns, as :mod:`consistency.referee.document.judged_filters` has those of a pose."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from consistency.referee.diagnostics import Interval, MapScore
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict.verdict import MapScore
 from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.document.blocks import Cell, Column, Quantity
 from consistency.referee.document.wording import NONE, PLAIN, written

@@ -22,7 +22,7 @@ STEPS = np.geomspace(0.004, REACH, 12)
 GRID = np.concatenate([-STEPS[::-1], [0.0], STEPS])
 
 
-class Part(NamedTuple):
+class TimedMotions(NamedTuple):
     """Some motions of a drive, K of them."""
 
     poses: Poses
@@ -61,7 +61,7 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     InputError
         The motions do not tell it.
     """
-    parts: list[Part] = []
+    parts: list[TimedMotions] = []
     for poses, T in drives:
         last = np.searchsorted(poses.t, poses.t + LONG)
         first = np.flatnonzero(last < len(poses.t))
@@ -70,7 +70,7 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
             if len(rows):
                 ends = last[rows]
                 motions = inverse(T[rows]) @ T[ends]
-                parts.append(Part(poses, poses.t[rows], poses.t[ends], motions))
+                parts.append(TimedMotions(poses, poses.t[rows], poses.t[ends], motions))
     if len(parts) > 1:
         offset = _best(parts)
         spread = float(np.std([_best([part]) for part in parts], ddof=1))
@@ -82,7 +82,7 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     )
 
 
-def _best(parts: Sequence[Part]) -> float:
+def _best(parts: Sequence[TimedMotions]) -> float:
     """The offset with the smallest errors; NaN where that is at an end of ``GRID``, or no offset is better."""
 
     def size(shift: float) -> float:

@@ -42,7 +42,7 @@ class MotionDependence:
         return self.p_value <= SURE and self.share >= LEAST
 
 
-class Question(NamedTuple):
+class ScaleTest(NamedTuple):
     """Whether a scale differs between bins of the windows."""
 
     p_value: float
@@ -83,7 +83,7 @@ def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> MotionDependence
     return dependence
 
 
-def _questions(corrected: DriveWindows) -> list[Question]:
+def _questions(corrected: DriveWindows) -> list[ScaleTest]:
     """All questions that are asked.
 
     Windows are divided once by the estimated and once by the true motion, and both must show it: the noise of a motion
@@ -101,7 +101,7 @@ def _questions(corrected: DriveWindows) -> list[Question]:
         for scale in range(len(SCALES)):
             by_estimate = p_value_of(corrected, corrected.pieces, bins, scale)
             by_truth = p_value_of(corrected, corrected.true_pieces, true_bins, scale)
-            found.append(Question(max(by_estimate, by_truth), by, scale, sizes, bins))
+            found.append(ScaleTest(max(by_estimate, by_truth), by, scale, sizes, bins))
     return found
 
 

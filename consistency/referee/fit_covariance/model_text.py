@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.defaults import DETECT
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.diagnostics.words.sentences import plural, short
+from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, IN_TURN, JudgedSpan, Ratio
 from consistency.referee.fit_covariance.mean_by_motion import MotionDependence
@@ -259,7 +259,7 @@ def data(model: NoiseModel) -> dict[str, Any]:
         "second_correlation": second.correlation if second is not None else None,
         "second_size": second.size if second is not None else None,
         "spans": [_data_of_span(each, noise.axes) for each in model.spans],
-        "referee": plain(model.verdict),
+        "referee": model.verdict.statistics,
     })  # fmt: skip
     return found
 

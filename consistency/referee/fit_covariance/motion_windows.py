@@ -71,7 +71,7 @@ class DriveWindows:
     def follows(self) -> Array:
         """Whether each window but the first begins where the one before ends, (W - 1,)."""
         same_drive = self.drive[1:] == self.drive[:-1]
-        return same_drive & (self.first[1:] == self.last[:-1])
+        return np.asarray(same_drive & (self.first[1:] == self.last[:-1]))
 
     def of(self, keep: Indices | Array) -> DriveWindows:
         """Some of the windows, by index or mask."""

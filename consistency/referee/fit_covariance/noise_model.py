@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg, stats
 
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import (
     DECIDE,
@@ -38,9 +39,9 @@ from consistency.referee.fit_covariance.persistence import (
     persistent_errors,
 )
 from consistency.referee.fit_covariance.refusals import RotationGrowth, require_poses, require_sound, rotation_growth
-from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, intervals, jitter_of
+from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, jitter_of, variance_intervals
 from consistency.referee.geometry.groups import log, matrices
-from consistency.referee.readers.relative_motions import Stretch
+from consistency.referee.readers.pipeline.relative_motions import Stretch
 from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import analyse
 
@@ -206,7 +207,7 @@ def fit_covariance(
     is_by_name = not (by_halves or held_out is None)
     fitted = windows.of(~np.isin(windows.drive, judged)) if is_by_name else windows
     n = len(windows.axes)
-    variances = intervals(noise, fitted)
+    variances = variance_intervals(noise, fitted)
     return NoiseModel(
         name=name,
         span=length.option,

@@ -22,7 +22,7 @@ from consistency.referee.fit_covariance.refusals import RotationGrowth
 from consistency.referee.fit_covariance.systematic_errors import FORWARD, jacobian_of_mean, normal_equations
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.geometry.groups import inverse, log
-from consistency.referee.readers.relative_motions import BENT
+from consistency.referee.readers.pipeline.relative_motions import BENT
 from consistency.referee.types import Array, Indices
 
 SURE = 0.01  # chance to name a term where there is none, all terms together
@@ -97,7 +97,7 @@ def persistent_errors(noise: WhiteNoise, windows: DriveWindows) -> tuple[Persist
     terms = values.shape[1]
     found: dict[str, PersistentError] = {}
     for term in range(terms):
-        variance = _between(values[:, term], variances[:, term], SURE / terms)
+        variance = variance_between(values[:, term], variances[:, term], SURE / terms)
         if variance > 0:
             name = TERMS[min(term, len(TERMS) - 1)]
             share = float((variance * effects[:, term] / stated).max())
@@ -105,7 +105,7 @@ def persistent_errors(noise: WhiteNoise, windows: DriveWindows) -> tuple[Persist
     return tuple(found.values())
 
 
-def _between(values: Array, variances: Array, chance: float) -> float:
+def variance_between(values: Array, variances: Array, chance: float) -> float:
     """Variance between drives, beyond that of their values, (drives,); 0 where none is shown."""
     known = np.isfinite(variances) & (variances > 0)
     if known.sum() < ENOUGH:

@@ -202,7 +202,7 @@ def constant_of(squares: Array, stated: Array, counts: Array) -> float:
     return float(constant) if is_shown else 0.0
 
 
-def intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[Interval, ...]:
+def variance_intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[Interval, ...]:
     """Intervals of the variances a metre and a radian, (2 n,), from the jackknife over drives or blocks of windows."""
     corrected = noise.mean.applied(windows)
     error = corrected.errors

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from consistency.referee.column_names import POSE
-from consistency.referee.diagnostics import Comparison, Record, RunSummary, compare, summary
-from consistency.referee.diagnostics.comparison import FailedRuns
+from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, RunSummary, compare, summary
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.skipping import Skip
 from consistency.referee.gating.checked_arrays import record_of_checked, record_of_filter
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics import Record, nis_of
+from consistency.referee.diagnostics.questions.innovations import nis_of
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.skipping import Skip, skip_of
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.numpy_archive import steps_of

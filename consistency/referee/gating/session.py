@@ -106,7 +106,8 @@ def settled(entry: Entry, rate: float, budget: float, gates: int) -> tuple[Entry
 
 def needed_at(entry: Entry, rate: float) -> int:
     """Runs that a gate asks for at a false-alarm rate."""
-    from consistency.referee.diagnostics import Comparison, gate_runs
+    from consistency.referee.diagnostics.comparison import Comparison
+    from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
 
     if entry.standard_error is None:
         return gate_runs(entry.dof, entry.detect, rate / entry.parts, entry.power, entry.allow, entry.lost)

@@ -148,7 +148,7 @@ def terms(
     ValueError
         An argument out of its range.
     """
-    from consistency.referee.diagnostics import Settings
+    from consistency.referee.diagnostics.verdict.answers import Settings
 
     watch = current()
     given: dict[str, Any] = {

@@ -9,8 +9,9 @@ from typing import Any, cast
 
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics import Record, Verdict
-from consistency.referee.diagnostics import judge as judge_record
+from consistency.referee.diagnostics.judge_record import judge as judge_record
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays

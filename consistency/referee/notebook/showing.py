@@ -8,11 +8,11 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from consistency.referee.diagnostics import Record, Verdict
-from consistency.referee.diagnostics.records.record import numbered_axes
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Bullets, Facts, Figure
-from consistency.referee.document.verdict import summary
+from consistency.referee.document.judged_filters import summary
 from consistency.referee.errors import InputError
 from consistency.referee.show import as_html, text
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import EXPECTED, solid
 from consistency.referee.pages.judged import Judged
@@ -54,7 +54,7 @@ def by_axis(study: Judged) -> tuple[Figure, ...]:
             axes.set_yticklabels([])
         return add_legend(figure)
 
-    return (Figure("By axis", caption(study, found), (draw,), level=4),)
+    return (Figure("By axis", axis_caption(study, found), (draw,), level=4),)
 
 
 def row_labels(found: tuple[Forest, ...]) -> tuple[str, ...]:
@@ -140,10 +140,10 @@ def _coverage_window(intervals: list[Interval]) -> tuple[float, float]:
     return max(min(low for _, low, _ in intervals) - 5.0, -3.0), 103.0
 
 
-def caption(study: Judged, found: tuple[Forest, ...]) -> str:
+def axis_caption(study: Judged, found: tuple[Forest, ...]) -> str:
     """What the panels show."""
     parts, tracks = {forest.name for forest in found}, study.tracks
-    text = "By axis of the pose. Covariance ratio: 1 is right (line), above is overconfident; log axis."
+    text = "Covariance ratio: 1 is right (line), above is overconfident; log axis."
     if any(t.verdict.location is not None and t.verdict.location.since is not None for t in tracks):
         text += " Ratio and bias are those since the step that the verdict names."
     if any(track.verdict.axes is not None and track.verdict.axes.largest is not None for track in tracks):

@@ -7,18 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Chapter, Document, Facts, Text
 from consistency.referee.pages import questions, verdicts
 from consistency.referee.pages.by_axis import by_axis
 from consistency.referee.pages.judged import Estimator, Judged, clock_of
-from consistency.referee.pages.provenance import facts
+from consistency.referee.pages.origin import facts
 from consistency.referee.pages.record_figures import record_figures
 
 
 def compose_files(
-    records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str, manifest: Mapping[str, Any]
+    records: Sequence[Record], judged: Mapping[str, Verdict], title: str, manifest: Mapping[str, Any]
 ) -> Document:
     """The document that HTML and PDF show; a chapter for each of the records that has a verdict."""
     named = {record.name: record for record in records}
@@ -62,7 +63,7 @@ def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
     return Judged(title, "", runs, 0, clock_of(np.full(steps, np.nan)), np.arange(1, steps + 1), tracks, False)
 
 
-def _counts(record: Evidence, verdict: Verdict) -> str:
+def _counts(record: Record, verdict: Verdict) -> str:
     clock = clock_of(record.t)
     length = plural(verdict.steps, "step" if record.window is None else "window")
     size = f"{plural(verdict.runs, verdict.unit)} of {record.window if record.independent else length}"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics import Verdict
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.document.blocks import Switch
 from consistency.referee.document.colours import Look, style
 from consistency.referee.types import Array, Failure, Indices

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from consistency.referee.diagnostics import Answer
 from consistency.referee.diagnostics.verdict.answers import ABOUT, MAIN
+from consistency.referee.diagnostics.verdict.parts import Answer
 from consistency.referee.document import blocks
 from consistency.referee.document.blocks import Block, Column, Heading, Small, Stack, Text, table
 from consistency.referee.document.wording import p_cell
@@ -45,7 +45,7 @@ def diagnosis(study: Judged) -> tuple[Block, ...]:
         (Stack(q.name, (Small(q.about),), bold=True), *map(_cell, q.answers)) for q in questions
     ]
     label = f"Questions asked of the filters of {study.name}"
-    return heading, table(columns, rows, label, caption=caption(study), style="marks", whole=True)
+    return heading, table(columns, rows, label, caption=marks_caption(study), style="marks", whole=True)
 
 
 def answer_cell(answer: Answer | None) -> tuple[str, str]:
@@ -62,7 +62,7 @@ def _cell(answer: Answer | None) -> blocks.Answer:
     return blocks.Answer(mark, MARKS[mark], p, emphasis)  # type: ignore[arg-type]
 
 
-def caption(study: Judged) -> str:
+def marks_caption(study: Judged) -> str:
     """How to read the table."""
     tracks = study.tracks
     rate = 100 * tracks[0].verdict.settings.false_alarm if tracks else 5.0

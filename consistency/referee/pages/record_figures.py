@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import of_both
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SIGMAS, ZERO, Look, style
@@ -77,7 +78,7 @@ class Picture:
         return add_legend(figure)
 
 
-def record_figures(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
+def record_figures(record: Record, verdict: Verdict) -> tuple[Figure, ...]:
     """Errors with their bounds, NEES, trajectory, coverage, and innovations; those that the record has."""
     both = of_both(record)
     pictures = (*_pictures(both, verdict), _innovations(both, verdict))
@@ -87,7 +88,7 @@ def record_figures(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
     )
 
 
-def overview(record: Evidence, verdict: Verdict | None = None) -> Callable[[], Drawing]:
+def overview(record: Record, verdict: Verdict | None = None) -> Callable[[], Drawing]:
     """Draws errors with their bounds, trajectory, coverage, and with a ``verdict`` the NEES with its band.
 
     Raises
@@ -112,17 +113,17 @@ def overview(record: Evidence, verdict: Verdict | None = None) -> Callable[[], D
     return draw
 
 
-def _pictures(record: Evidence, verdict: Verdict | None) -> tuple[Picture | None, ...]:
+def _pictures(record: Record, verdict: Verdict | None) -> tuple[Picture | None, ...]:
     nees = None if verdict is None else _nees(record, verdict)
     return _errors(record), nees, _trajectory(record), _coverage(record)
 
 
-def has_one_step(record: Evidence) -> bool:
+def has_one_step(record: Record) -> bool:
     """Whether a curve along the steps would be a point, and one along the runs is not."""
     return len(record.t) == 1 and len(record.run_numbers) > 1
 
 
-def _span_runs(axes: Axes, record: Evidence) -> None:
+def _span_runs(axes: Axes, record: Record) -> None:
     """Draw the axis from the first run to the last."""
     axes.set(xlabel="run", xlim=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
 
@@ -150,7 +151,7 @@ class Errors:
     bound: Array  # (R, T)
 
 
-def errors_of(record: Evidence) -> list[Errors]:
+def errors_of(record: Record) -> list[Errors]:
     """Of each component that is drawn."""
     assert record.error is not None
     assert record.covariance is not None
@@ -162,7 +163,7 @@ def errors_of(record: Evidence) -> list[Errors]:
     return found
 
 
-def _errors(record: Evidence) -> Picture | None:
+def _errors(record: Record) -> Picture | None:
     """Error of each component with its 2-sigma bounds, as fig. 2b of Herath et al. (2007)."""
     if record.error is None or record.covariance is None:
         return None
@@ -184,7 +185,7 @@ def _errors(record: Evidence) -> Picture | None:
     return Picture("Errors and stated bounds", caption, tuple(_error_curves(record, clock, row, c) for c in components))
 
 
-def _errors_of_runs(record: Evidence, of: Errors) -> Paint:
+def _errors_of_runs(record: Record, of: Errors) -> Paint:
     def paint(axes: Axes) -> None:
         runs, bound = record.run_numbers.astype(float), of.bound[:, 0]
         band(axes, runs, np.column_stack([-bound, bound]), "2-sigma bounds")
@@ -196,7 +197,7 @@ def _errors_of_runs(record: Evidence, of: Errors) -> Paint:
     return paint
 
 
-def _error_curves(record: Evidence, clock: Clock, row: int, of: Errors) -> Paint:
+def _error_curves(record: Record, clock: Clock, row: int, of: Errors) -> Paint:
     others = np.linspace(0, len(of.error) - 1, MOST_RUNS + 1).astype(int)
 
     def paint(axes: Axes) -> None:
@@ -223,7 +224,7 @@ def draw_bounded(axes: Axes, x: Array, error: Array, bound: Array, label: str) -
 # --- trajectory -------------------------------------------------------------------------------------
 
 
-def _trajectory(record: Evidence) -> Picture | None:
+def _trajectory(record: Record) -> Picture | None:
     found = None if has_one_step(record) else trajectory_panel(record)
     if found is None:
         return None
@@ -234,7 +235,7 @@ def _trajectory(record: Evidence) -> Picture | None:
 # --- NEES -------------------------------------------------------------------------------------------
 
 
-def _nees(record: Evidence, verdict: Verdict) -> Picture | None:
+def _nees(record: Record, verdict: Verdict) -> Picture | None:
     """NEES of one run, or its average over runs, with the bands of a right estimator."""
     if record.parts:  # of the whole no distribution is known
         return None
@@ -269,7 +270,7 @@ def _nees(record: Evidence, verdict: Verdict) -> Picture | None:
     return Picture("NEES", caption, (paint,), height=1.9)
 
 
-def _single_nees(record: Evidence) -> Picture | None:
+def _single_nees(record: Record) -> Picture | None:
     """NEES of each run of one step, or of each window, independent of the others."""
     nees = record.nees
     if nees is None or not np.isfinite(nees).any():
@@ -309,7 +310,7 @@ def _single_nees(record: Evidence) -> Picture | None:
 # --- coverage ---------------------------------------------------------------------------------------
 
 
-def observed_coverage(record: Evidence, p: Array) -> dict[str, Array]:
+def observed_coverage(record: Record, p: Array) -> dict[str, Array]:
     """Share of errors inside the interval that should hold them with probability ``p`` (N,), by component and jointly.
 
     Of all steps of all runs; -> (N,) each.
@@ -333,7 +334,7 @@ def _shares(values: Array, limits: Array) -> Array:
     return np.searchsorted(known, limits, side="right") / len(known)
 
 
-def _coverage(record: Evidence) -> Picture | None:
+def _coverage(record: Record) -> Picture | None:
     """Share of errors within an interval against the probability that it should hold them with."""
     p = np.linspace(0.0, 0.999, 200)
     found = observed_coverage(record, p)
@@ -348,7 +349,7 @@ def _coverage(record: Evidence) -> Picture | None:
         axes.set(xlabel="stated probability", ylabel="share of errors inside", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
 
     caption = (
-        "Coverage: share of errors inside the interval that should hold them with the stated probability, over all "
+        "Share of errors inside the interval that should hold them with the stated probability, over all "
         "steps of all runs. On the diagonal the covariance is right; below it is overconfident, above conservative."
     )
     return Picture("Coverage", caption, (paint,), height=2.1)
@@ -357,7 +358,7 @@ def _coverage(record: Evidence) -> Picture | None:
 # --- innovations ------------------------------------------------------------------------------------
 
 
-def _innovations(record: Evidence, verdict: Verdict) -> Picture | None:
+def _innovations(record: Record, verdict: Verdict) -> Picture | None:
     """NIS over its degrees of freedom, averaged over runs."""
     if record.nis is None or record.nis_dof is None:
         return None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.document.colours import TRUTH, Look, style
 from consistency.referee.show.painting import dots, make_map, path
@@ -27,13 +27,13 @@ TRUE, ESTIMATED = Look(TRUTH, width=0.9), replace(style(0), width=1.0)
 ELLIPSE, AT = replace(style(1), dash=(), width=0.9), Look(TRUTH, marker="X", size=5.0)
 
 
-def shown_run(record: Evidence) -> int:
+def shown_run(record: Record) -> int:
     """Row of the run that is drawn: the first that reaches furthest."""
     assert record.error is not None
     return int(np.argmax(np.isfinite(record.error).all(axis=-1).sum(axis=1)))
 
 
-def trajectory_panel(record: Evidence) -> tuple[str, Callable[[Axes], None]] | None:
+def trajectory_panel(record: Record) -> tuple[str, Callable[[Axes], None]] | None:
     """Caption, and what draws the shown run on axes; None where positions are not known.
 
     It shows the two axes over which the path reaches furthest.
@@ -72,13 +72,13 @@ def trajectory_panel(record: Evidence) -> tuple[str, Callable[[Axes], None]] | N
     return caption, paint
 
 
-def furthest(record: Evidence, reach: Array) -> list[int]:
+def furthest(record: Record, reach: Array) -> list[int]:
     """Two of the position's axes that are judged, with the largest product of their reach (3,); else the first."""
     judged = [i for i, name in enumerate(NAMES) if name in record.axes]
     return list(max(itertools.combinations(judged, 2), key=lambda two: float(np.prod(reach[list(two)]))))
 
 
-def ellipses_at(record: Evidence, row: int, steps: Indices, pair: Sequence[int]) -> list[Array]:
+def ellipses_at(record: Record, row: int, steps: Indices, pair: Sequence[int]) -> list[Array]:
     """Outlines (corners, 2) of the 95 % regions of one run in some steps, about the estimates."""
     if not len(steps):
         return []
@@ -97,7 +97,7 @@ def ellipse(centre: Array, P: Array) -> Array:
     return np.asarray(centre + circle @ np.linalg.cholesky(P).T)
 
 
-def _worst(record: Evidence, row: int) -> Indices:
+def _worst(record: Record, row: int) -> Indices:
     """Steps of the largest NEES, at most five, and apart from each other by a twentieth of the run."""
     if record.nees is None:
         return np.empty(0, np.int64)

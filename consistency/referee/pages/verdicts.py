@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Reasons, table
-from consistency.referee.document.verdict import FILTER, cells, columns, page, reason, with_values
+from consistency.referee.document.judged_filters import FILTER, cells, columns, page, reason, with_values
 from consistency.referee.document.wording import listed
 from consistency.referee.pages.judged import Estimator, Judged
 
@@ -24,7 +24,7 @@ def judgement(study: Judged) -> list[Block]:
     view = with_values(page(equivalence_interval(study)), [track.verdict for track in study.tracks])
     cells_of = [(Name(track.name, track.look), *cells(view, track.verdict)) for track in study.tracks]
     label = f"Verdicts of {study.name}"
-    shown = table((FILTER, *columns(view)), cells_of, label, caption=caption(study), style="narrow")
+    shown = table((FILTER, *columns(view)), cells_of, label, caption=verdicts_caption(study), style="narrow")
     blocks: list[Block] = [Heading(study.name), shown, reasons]
     if study.failures:
         rows: list[tuple[Cell, ...]] = [(name, str(run), str(step), why) for name, run, step, why in study.failures]
@@ -44,7 +44,7 @@ def equivalence_interval(study: Judged) -> str:
     return f"{low},\u00a0{short(factor)}]"
 
 
-def caption(study: Judged) -> str:
+def verdicts_caption(study: Judged) -> str:
     """How large the study is, and how to read the table of verdicts."""
     text = f"{plural(study.runs, 'run')} of {plural(len(study.steps), 'step')}"
     if _windows(study):

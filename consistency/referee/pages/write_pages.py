@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure as Drawing
 
-    from consistency.referee.diagnostics import Evidence, Verdict
+    from consistency.referee.diagnostics.records.record import Record
+    from consistency.referee.diagnostics.verdict.verdict import Verdict
     from consistency.referee.document.blocks import Document
     from consistency.referee.system.progress import Advance
 
@@ -42,7 +43,7 @@ def require_pages(html: Path | None, pdf: Path | None, overwrite: bool) -> None:
 
 
 def write_file_pages(
-    records: Sequence[Evidence], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
+    records: Sequence[Record], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
 ) -> None:
     """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
     from consistency.referee.pages.files_report import compose_files
@@ -52,7 +53,7 @@ def write_file_pages(
 
 
 def write_file_reports(
-    records: Sequence[Evidence],
+    records: Sequence[Record],
     judged: Mapping[str, Verdict],
     folder: Path,
     title: str,

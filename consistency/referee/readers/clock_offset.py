@@ -95,23 +95,29 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     best = int(np.nanargmin(sizes))
     low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     found = optimize.minimize_scalar(size, bounds=(low, high), method="bounded", options={"xatol": 1e-5})
-    value = float(found.x) if found.fun < sizes[best] else float(grid[best])
+    value = float(grid[best])
+    if found.fun < sizes[best]:
+        value = float(found.x)
     each = np.concatenate([steps_of(poses, value, 1 if len(some) > 1 else PARTS) for poses in some])
     each = value + each[np.isfinite(each)]
     if len(each) < 3:
         return None
     spread = each.std(ddof=1) / np.sqrt(len(each))
     reach = float(distributions.t.ppf(0.975, len(each) - 1) * spread)
-    p = 2.0 * float(distributions.t.sf(abs(each.mean()) / spread, len(each) - 1)) if spread > 0 else float(value == 0.0)
+    p = float(value == 0.0)
+    if spread > 0:
+        p = 2.0 * float(distributions.t.sf(abs(each.mean()) / spread, len(each) - 1))
     alone = len(some) == 1 and not (size(0.0) > GROSS and size(value) < 0.5 * size(0.0))
     return Offset(value, value - reach, value + reach, p, 1.0 - size(value) / size(0.0), alone)
 
 
 def _size(poses: Poses, shift: float, judged: Array) -> float:
     """Mean NEES of ``judged`` over its degrees of freedom, capped, as it is where there is no truth then."""
+    if not judged.any():
+        return np.nan
     w = whiten(poses.errors(shift), poses.covariance)
     nees = np.square(w).sum(axis=1) / w.shape[1]
-    return float(np.minimum(np.where(np.isfinite(nees), nees, CAP), CAP)[judged].mean()) if judged.any() else np.nan
+    return float(np.minimum(np.where(np.isfinite(nees), nees, CAP), CAP)[judged].mean())
 
 
 def steps_of(poses: Poses, shift: float, parts: int) -> Array:

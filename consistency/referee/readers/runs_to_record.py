@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.records.large_arrays import of_runs
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, asymmetric, classify
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
@@ -59,7 +59,7 @@ def assemble(
     convention: str = "",
     notes: Sequence[str] = (),
     may_end: bool = False,
-) -> Evidence:
+) -> Record:
     """Assemble tracks on the common steps, find failures, and leave out exactly known starts.
 
     Parameters
@@ -107,7 +107,7 @@ def assemble(
         return out
 
     arrays: dict[str, Any] = {key: grid(key) for key in ARRAYS}
-    return Evidence(
+    return Record(
         name, runs=np.array([part.run for part in parts], dtype=np.int64), t=t, nees=grid("nees"),
         dof=len(axes) if arrays["error"] is not None else 0, axes=axes, failures=tuple(failures),
         convention=convention, notes=tuple(notes), times=grid("t"), **arrays,
@@ -149,7 +149,9 @@ def longest_start(tracks: Sequence[Track]) -> int:
     ended = [start for start, rows in starts if start < rows]
     if not ended:
         return max((rows for _, rows in starts), default=0)
-    return max(ended) if min(start for start, _ in starts) > 0 else 0
+    if min(start for start, _ in starts) == 0:
+        return 0
+    return max(ended)
 
 
 def _first_full(track: Track) -> int:
@@ -158,17 +160,24 @@ def _first_full(track: Track) -> int:
         return 0
     if classify(track.covariance[:1], ROUNDED)[0] == Validity.VALID:
         return 0
-    full = classify(track.covariance, ROUNDED) == Validity.VALID
-    return int(np.argmax(full)) if full.any() else len(full)
+    return _first(classify(track.covariance, ROUNDED) == Validity.VALID)
+
+
+def _first(full: Array) -> int:
+    """Index of the first that is true; their number if none is."""
+    return int(np.argmax(np.append(full, True)))
 
 
 def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int, int, str]:
     """First row that is judged, first broken row, and why it is broken: ``what`` is not finite, ..."""
     rows = len(track.column)
-    error_ok: Array = np.all(np.isfinite(np.zeros((rows, 1)) if track.error is None else track.error), axis=1)
-    kind = np.zeros(rows, int) if track.covariance is None else classify(track.covariance, ROUNDED)
+    error_ok, kind = np.ones(rows, bool), np.zeros(rows, int)
+    if track.error is not None:
+        error_ok = np.asarray(np.isfinite(track.error).all(axis=1))
+    if track.covariance is not None:
+        kind = classify(track.covariance, ROUNDED)
     full: Array = np.asarray(kind == Validity.VALID)
-    start = min(int(np.argmax(full)) if full.any() else rows, longest)
+    start = min(_first(full), longest)
     bad: Array = ~error_ok | ~full
     bad[:start] = ~error_ok[:start] | (kind[:start] != Validity.DEFICIENT)
     if not bad.any():

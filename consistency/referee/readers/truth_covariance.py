@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import DECLARED
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
@@ -36,7 +36,7 @@ def require_truth_options(r: Reading) -> None:
         r.refuse(flag_of(asked[0]), REFUSED)
 
 
-def declared(records: Sequence[Evidence], r: Reading) -> list[Evidence]:
+def declared(records: Sequence[Record], r: Reading) -> list[Record]:
     """Records with what is declared of the errors of the truth.
 
     Raises

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.places import Places

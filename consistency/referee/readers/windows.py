@@ -14,6 +14,10 @@ from consistency.referee.types import Array, Indices
 UNITS = {"": "step", "s": "s", "m": "m"}
 FORMS = "a whole number of steps (100), seconds (10s) or metres along the true path (50m)"
 ROUNDING = 1e-6  # of steps, s or m: a double holds the seconds since 1970 to a quarter of that
+MARGINAL = (
+    "covariances of two poses do not tell that of the motion between them; give their cross-covariances, or motions "
+    "with --motions (docs/files.md, Relative poses)"
+)
 OVERSHOOT = 0.5  # of its size that a window may be too long, where rows or truth are missing
 
 

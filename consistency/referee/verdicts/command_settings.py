@@ -6,8 +6,8 @@ import itertools
 from collections.abc import Mapping
 from typing import Any
 
-from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.records.skipping import Skip, skip_of
+from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
@@ -76,7 +76,9 @@ def plan(
         A number out of its range, or pilots without truth.
     """
     from consistency.referee.column_names import POSE
-    from consistency.referee.diagnostics import Design, gate_runs, lost_runs, pilot_plan, required_runs
+    from consistency.referee.diagnostics.planning.early_stopping import Design
+    from consistency.referee.diagnostics.planning.pilot import pilot_plan
+    from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs, lost_runs, required_runs
 
     if allow not in (None, "conservative"):
         raise InputError(f"--allow must be 'conservative', got '{allow}'")

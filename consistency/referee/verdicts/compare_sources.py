@@ -8,10 +8,9 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics import Comparison, compare
-from consistency.referee.diagnostics.comparison import FailedRuns
+from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, compare
 from consistency.referee.document.blocks import Block, Document, Text
-from consistency.referee.document.comparison import comparison_table
+from consistency.referee.document.compared_filters import comparison_table
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.baselines import Baseline
 

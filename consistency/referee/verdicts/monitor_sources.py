@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Alarm, Monitor
+from consistency.referee.diagnostics.monitoring.monitor import Alarm, Monitor
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash, read_stated
 from consistency.referee.readers.formats.innovation_files import NisLog, choose, read_nis, stream_nis

@@ -6,13 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from consistency.referee.diagnostics import Record, Settings, Verdict, judge
+from consistency.referee.diagnostics.judge_record import judge
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.verdict.answers import Settings
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.command_settings import settings_of, skip_asked
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics import Design
+    from consistency.referee.diagnostics.planning.early_stopping import Design
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ def write_sensor_reports(of: Characterisation, folder: Path, data: str, overwrit
     from consistency.referee.pages.write_pages import write_document, write_file
     from consistency.referee.system.folders import write_folder
     from consistency.referee.system.provenance import manifest_of
-    from consistency.stereo.pages.sensor import compose_sensor
+    from consistency.stereo.pages.characterisation import compose_sensor
 
     manifest = manifest_of(kind="characterisation", source=of.source)
     document = compose_sensor(of, manifest)

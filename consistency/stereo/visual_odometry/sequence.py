@@ -261,6 +261,8 @@ def _camera(folder: Path) -> dict[int, Path]:
         if table.is_file():
             lines = read_text(table, "cannot be read").splitlines()
             rows = [row for row in csv.reader(lines) if row and not row[0].startswith("#")]
+            if any(len(row) < 2 for row in rows):
+                raise ValueError("a line without the name of an image")
             pairs = [(int(row[0]), images / row[1].strip()) for row in rows]
         else:
             pairs = [(int(path.stem), path) for path in _images(images)]

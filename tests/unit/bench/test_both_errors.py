@@ -18,12 +18,12 @@ from consistency.bench.runs.results_to_records import record_of, results_source
 from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.store.results import open_results
+from consistency.diagnostics import Interval, Settings, judge, map_score, sequential_design
 from consistency.referee.column_names import OWN_COVARIANCE
-from consistency.referee.diagnostics import Interval, Settings, judge, map_score, sequential_design
 from consistency.referee.diagnostics.questions.scale import ratio_interval
 from consistency.referee.diagnostics.verdict.verdict import MapScore
+from consistency.referee.document.judged_filters import document
 from consistency.referee.document.map import map_text
-from consistency.referee.document.verdict import document
 from consistency.referee.gating.checked_arrays import record_of_filter
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Failure

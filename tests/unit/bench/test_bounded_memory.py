@@ -18,10 +18,10 @@ import consistency as cs
 from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.results import open_results
-from consistency.referee.diagnostics import Record, Settings, judge, summary
+from consistency.diagnostics import Record, Settings, judge, summary
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
-from consistency.referee.document.verdict import document
+from consistency.referee.document.judged_filters import document
 from consistency.referee.show.as_json import render
 
 STEPS = 200

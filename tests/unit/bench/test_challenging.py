@@ -24,7 +24,7 @@ from consistency.bench.challenging.search import (
     BATCH,
     RUNGS,
     Budget,
-    Candidate,
+    ScoredWorld,
     ranked,
     search,
     standard_error,
@@ -242,7 +242,7 @@ class Scripted:
         bad = 4.0 * np.log(float(values["range"]) / 4.0) - np.log(float(values["density"]))
         return float(bad) if values["path"] == "figure-of-eight" else 0.5 * float(bad)
 
-    def __call__(self, candidates: Sequence[Candidate], trials: int) -> None:
+    def __call__(self, candidates: Sequence[ScoredWorld], trials: int) -> None:
         self.rungs.append((len(candidates), trials))
         for candidate in candidates:
             more = trials - len(candidate.scores)
@@ -251,9 +251,9 @@ class Scripted:
             self.budget.used += more
 
 
-def searched(trials: int, seed: int) -> tuple[Scripted, dict[Point, Candidate]]:
+def searched(trials: int, seed: int) -> tuple[Scripted, dict[Point, ScoredWorld]]:
     space, budget = space_of(STEREO), Budget(trials=trials)
-    scripted, tried = Scripted(space, budget), dict[Point, Candidate]()
+    scripted, tried = Scripted(space, budget), dict[Point, ScoredWorld]()
     search(space, scripted, lambda: budget.left(1.0), np.random.default_rng(seed), tried)
     return scripted, tried
 
@@ -281,9 +281,9 @@ def test_time_goes_to_the_promising() -> None:
 def test_a_space_of_one_world_ends() -> None:
     fixed = ("baseline=0.09", "density=1", "range=4", "steps=500", "lap=1", "dt=0.1", "tilt=0", "height=0", *SMALL[1:])
     space, budget = space_of(STEREO, fixed), Budget(trials=100)
-    tried: dict[Point, Candidate] = {}
+    tried: dict[Point, ScoredWorld] = {}
 
-    def evaluate(candidates: Sequence[Candidate], trials: int) -> None:
+    def evaluate(candidates: Sequence[ScoredWorld], trials: int) -> None:
         for candidate in candidates:
             candidate.scores += [0.0] * (trials - len(candidate.scores))
 
@@ -292,10 +292,10 @@ def test_a_space_of_one_world_ends() -> None:
 
 
 def test_a_lucky_few_do_not_beat_many() -> None:
-    few, many = Candidate((1,), [2.0, 2.0]), Candidate((2,), [1.9] * 16)
+    few, many = ScoredWorld((1,), [2.0, 2.0]), ScoredWorld((2,), [1.9] * 16)
     assert few.score < many.score
     assert ranked([few, many]) == [many, few]
-    assert Candidate((3,)).score == -np.inf
+    assert ScoredWorld((3,)).score == -np.inf
     assert standard_error([0.0, 2.0]) == pytest.approx(1.0)
 
 
@@ -468,7 +468,7 @@ def test_the_search_has_most_of_the_budget_and_trials_of_its_own() -> None:
 def test_worlds_whose_confirmation_takes_too_long_are_passed_over() -> None:
     bench: Any = Constant(1.0)
     campaign = ChallengePhases(bench, space_of(STEREO), Plan(minutes=1.0))
-    slow, fast = Candidate(campaign.space.plain), Candidate(point_with(campaign.space, density=0.5))
+    slow, fast = ScoredWorld(campaign.space.plain), ScoredWorld(point_with(campaign.space, density=0.5))
     assert campaign.slowest == pytest.approx(0.2 * 60.0 / 61)
     campaign.evaluate([fast], 2)
     campaign.slowest = -1.0

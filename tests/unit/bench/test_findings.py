@@ -165,3 +165,10 @@ def test_what_nobody_published_holds_or_does_not() -> None:
     assert [outcome("Herath 2007", verdict) for verdict in ("reproduced", "refuted")] == ["reproduced", "refuted"]
     assert outcome("this project, measured", "reproduced") == "holds"
     assert {outcome("this project", verdict) for verdict in ("not reproduced", "refuted")} == {"does not hold"}
+
+
+@pytest.mark.parametrize("content", ["{}", "[1]", '[{"id": "one"}]', '[{"other": 1}]'])
+def test_findings_of_other_keys_are_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "findings.json").write_text(content)
+    with pytest.raises(InputError, match=r"findings\.json: not a list of findings"):
+        module.read_findings(tmp_path)

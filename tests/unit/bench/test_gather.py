@@ -29,7 +29,7 @@ from consistency.bench.store import parquet
 from consistency.bench.store.results import StoredResults, open_results
 from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.bench.types import Trial
-from consistency.referee.document.verdict import document
+from consistency.referee.document.judged_filters import document
 from consistency.referee.show.as_json import render
 
 TABLES = ("estimates", "failures", "truth", "landmarks", "map")

@@ -28,9 +28,9 @@ from consistency.bench.store.log import read_log
 from consistency.bench.store.results import open_results
 from consistency.bench.types import Info, Observation
 from consistency.commands.app import app
-from consistency.referee.diagnostics import clustered_share, rejection_score
+from consistency.diagnostics import clustered_share, rejection_score
 from consistency.referee.document.blocks import Name, Table
-from consistency.referee.document.verdict import document
+from consistency.referee.document.judged_filters import document
 from consistency.referee.document.wording import brief, written
 from consistency.referee.show.as_json import render
 

@@ -13,7 +13,7 @@ import consistency as cs
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.trial_rows import outcome_of
-from consistency.referee.diagnostics import JointNees, Record, Settings, Verdict, judge
+from consistency.diagnostics import JointNees, Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.maps.map_nees import joint_nees, joint_test, last_nees
 from consistency.referee.diagnostics.questions.equivalence import is_tolerated
 from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION

@@ -19,8 +19,8 @@ from consistency.bench.store.journal import Unfinished
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import StoredResults, open_results
 from consistency.bench.store.trial_rows import RunOutcome
-from consistency.referee.diagnostics import Record
-from consistency.referee.document.verdict import document
+from consistency.diagnostics import Record
+from consistency.referee.document.judged_filters import document
 from consistency.referee.show.as_json import render
 
 OPEN: dict[str, Any] = {"detect": 1.05, "false_alarm": 1e-6, "max_runs": 20, "seed": 3, "jobs": 1}  # looks at 12 to 20

@@ -17,10 +17,10 @@ from matplotlib import image
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import innovations_of
+from consistency.referee.document.alarms import monitor_document
 from consistency.referee.document.blocks import Document
-from consistency.referee.document.monitor import monitor_document
 from consistency.referee.errors import InputError
-from consistency.referee.pages.monitor import POINTS, averaged, monitor_drawing
+from consistency.referee.pages.nis_over_time import POINTS, averaged, monitor_drawing
 from consistency.referee.pages.write_pages import plotted, require_plot
 from consistency.referee.readers.formats.innovation_files import NisLog
 from consistency.referee.show.as_json import render

@@ -12,8 +12,8 @@ from painted import lines, panels
 
 import consistency as cs
 from consistency.bench.pages.build import answer, build_report, compose
-from consistency.bench.pages.report_input import Report
 from consistency.bench.pages.sections import overview
+from consistency.bench.pages.sections.report_input import Report
 from consistency.referee.document.blocks import Figure, Name, Status, Table
 from consistency.referee.document.wording import written
 from consistency.referee.show import pdf

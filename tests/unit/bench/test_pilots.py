@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from consistency.bench.runs import sequential
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 
 
 def test_a_pilot_runs_what_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

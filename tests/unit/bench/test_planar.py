@@ -26,7 +26,7 @@ from consistency.bench.runs.findings import sibling
 from consistency.bench.simulation import draw_landmarks
 from consistency.bench.store.log import read_log, write_log
 from consistency.bench.store.trial_rows import is_flat
-from consistency.referee.diagnostics import map_score
+from consistency.diagnostics import map_score
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 

@@ -21,27 +21,27 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.build import answer, build_report, compose
-from consistency.bench.pages.report_input import Report, Study, Track
 from consistency.bench.pages.sections import (
     anees,
     calibration_rates,
     front_end,
-    innovations,
     nees_distribution,
+    nis,
+    paths_and_landmarks,
     pose_errors,
     stereo_noise,
-    world,
 )
+from consistency.bench.pages.sections.report_input import Report, Study, Track
 from consistency.bench.pages.sections.study_sections import without_truth
 from consistency.bench.runs.findings import Finding
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.results import read_results
+from consistency.diagnostics import Answer, Interval, Record, Settings, judge
 from consistency.referee.column_names import COVARIANCE
-from consistency.referee.diagnostics import Answer, Interval, Record, Settings, judge
 from consistency.referee.diagnostics.verdict.answers import DIRECTION, STEP
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import short
-from consistency.referee.document.verdict import FURTHER, page, shown_inside
+from consistency.referee.document.judged_filters import FURTHER, page, shown_inside
 from consistency.referee.document.wording import written
 from consistency.referee.pages import by_axis, questions, verdicts
 from consistency.referee.pages.judged import clock_of
@@ -119,7 +119,7 @@ def printed(report: Report) -> bytes:
 
 
 def axis_caption(study: Study) -> str:
-    return by_axis.caption(study, by_axis.forests(study))
+    return by_axis.axis_caption(study, by_axis.forests(study))
 
 
 def with_tracks(report, *tracks: Track):
@@ -176,7 +176,8 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(pose_errors.pose_error, study.tracks), world.read(study).paths, strict=True,
+        anees.read(study).curves, map(pose_errors.pose_error_series, study.tracks),
+        paths_and_landmarks.read(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
         verdict = by_filter[track.name]
@@ -196,9 +197,9 @@ def test_the_model_is_what_analyse_says(folder):
 def test_the_odometry_is_that_of_the_trial(report, uvd):
     (study,) = report.studies
     trial = cs.simulate(uvd, run=0, seed=1)
-    np.testing.assert_array_equal(world.read(study).truth, trial.truth[:, :2])
+    np.testing.assert_array_equal(paths_and_landmarks.read(study).truth, trial.truth[:, :2])
     step = trial.controls[0, 0] * trial.controls[0, 1]
-    odometry = world.read(study).odometry
+    odometry = paths_and_landmarks.read(study).odometry
     np.testing.assert_allclose(np.linalg.norm(odometry[1] - odometry[0]), abs(step))
 
 
@@ -249,7 +250,7 @@ def test_the_diagnosis_is_what_the_verdict_holds(report):
         of = nees_distribution.steps(track)
         np.testing.assert_array_equal(of.x[1:-1], v.tails.pit)
         np.testing.assert_allclose(of.y, [0, 0.25, 0.5, 0.75, 1, 1])
-        assert innovations.lags(track) is None  # four runs of 60 steps have too few innovations
+        assert nis.lags(track) is None  # four runs of 60 steps have too few innovations
     text = "".join(Page(shown(report)).text)
     assert all(question.name in text and question.about in text for question in questions.asked(study))
 
@@ -327,7 +328,7 @@ def test_nees_alone_without_axes(report):
 def test_the_captions_state_the_rates_in_force(report):
     v = report.studies[0].tracks[0].verdict
     (share,) = (a.share for a in v.answers if a.question == STEP)
-    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in anees.caption(anees.read(report.studies[0]))
+    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in anees.anees_caption(anees.read(report.studies[0]))
     assert "probability 5 % at most" in verdicts.method(report.studies)
     assert "two one-sided tests, each at 5 %, put the ratio of true to stated covariance between 0.67 and 1.50" in (
         verdicts.method(report.studies)
@@ -338,7 +339,7 @@ def test_the_captions_state_the_rates_in_force(report):
     assert "each at 10 %, put the ratio of true to stated covariance between 0.50 and 2.00" in verdicts.method(
         other.studies
     )
-    assert "Shown inside [0.50,\u00a02.00]" in verdicts.caption(other.studies[0])
+    assert "Shown inside [0.50,\u00a02.00]" in verdicts.verdicts_caption(other.studies[0])
 
 
 # --- what the referee can say -----------------------------------------------------------------
@@ -390,7 +391,7 @@ def test_consistent_has_been_shown_and_undecided_says_what_would_decide(report):
 
 
 def test_a_fault_within_the_tolerance_has_a_mark_of_its_own(report):
-    assert "≈" not in questions.caption(report.studies[0])
+    assert "≈" not in questions.marks_caption(report.studies[0])
     error, P = drawn(3, 300, np.sqrt(1.1))
     track = judged(report.studies[0].tracks[0], error, P, Settings(0.05, tolerance=1.3))
     marks = {a.question: questions.answer_cell(a)[0] for a in track.verdict.answers}
@@ -398,7 +399,9 @@ def test_a_fault_within_the_tolerance_has_a_mark_of_its_own(report):
     assert marks["scale"] == "≈"
     assert set(marks.values()) == {"≈", "○"}
     report = with_tracks(report, track)
-    assert "≈ one was found, but is shown to lie within the tolerance of ×1.3" in (questions.caption(report.studies[0]))
+    assert "≈ one was found, but is shown to lie within the tolerance of ×1.3" in (
+        questions.marks_caption(report.studies[0])
+    )
     source = shown(report)
     cell = (
         r'<td class="number tolerated" data-head="[^"]*"><span role="img" aria-label="found, within the tolerance">≈<'
@@ -432,10 +435,10 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, l
     (study,) = report.studies
     for track in study.tracks:
         assert not track.innovations_judged
-    caption = innovations.caption(study)
+    caption = nis.innovations_caption(study)
     assert "No filter here declares one: its innovations are reported and not judged." in caption
     assert "shaded bound" not in caption
-    assert "NIS in parentheses: reported and not judged" in verdicts.caption(study)
+    assert "NIS in parentheses: reported and not judged" in verdicts.verdicts_caption(study)
 
     results = cs.run_trials(linear, ["kf"], runs=20, seed=1, jobs=1)
     both = pd.concat([results.estimates, results.estimates.assign(filter="silent")], ignore_index=True)
@@ -449,15 +452,15 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, l
     low, high = found.interval
     assert row(study, kf)["NIS / dof"] == f"{found.ratio:.3f}"
     assert further_row(kf)["NIS / dof (95 % expected)"] == f"{found.ratio:.3f} ({low:.3f} to {high:.3f})"
-    assert innovations.lags(kf).bound == found.bound
-    np.testing.assert_array_equal(innovations.lags(kf).values, found.autocorrelation)
-    assert innovations.lags(silent).bound is None
-    np.testing.assert_array_equal(innovations.lags(silent).values, found.autocorrelation)
+    assert nis.lags(kf).bound == found.bound
+    np.testing.assert_array_equal(nis.lags(kf).values, found.autocorrelation)
+    assert nis.lags(silent).bound is None
+    np.testing.assert_array_equal(nis.lags(silent).values, found.autocorrelation)
     asked = [question.answers for question in questions.asked(study)]
     (innovation,) = {first.question for first, second in asked if second is None and "scale" in first.question}
     assert innovation == "innovation scale"
-    assert "Only kf declares one; the innovations of the others are reported" in innovations.caption(study)
-    (both_filters,) = innovations.innovations(study)
+    assert "Only kf declares one; the innovations of the others are reported" in nis.innovations_caption(study)
+    (both_filters,) = nis.innovations(study)
     assert [bounds_of(panels(both_filters, number)[1]) for number in (0, 1)] == [[found.bound], []]
     assert [titles(panels(both_filters, number))[0] for number in (0, 1)] == ["kf", "silent"]
     assert shown(report).count("(not judged)") == 1
@@ -517,11 +520,11 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     np.testing.assert_allclose(
         study.tracks[1].nis_ratio, first["nis"].sum() / first["nis_dof"].sum().replace(0, np.nan)
     )
-    assert "kf after 24 runs and small after 12 runs" in verdicts.caption(study)
-    assert "Average NEES over 24 runs" in anees.caption(anees.read(study))
+    assert "kf after 24 runs and small after 12 runs" in verdicts.verdicts_caption(study)
+    assert "Average NEES over 24 runs" in anees.anees_caption(anees.read(study))
     assert "judged by an e-process" in verdicts.method(report.studies)
     assert "they are listed below and counted in the verdicts that looked at them" in compose(report).answer
-    assert "asks scale alone" in questions.caption(study)
+    assert "asks scale alone" in questions.marks_caption(study)
     shown(report)
     assert printed(report).startswith(b"%PDF")
 
@@ -539,7 +542,7 @@ def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
 
 def test_runs_of_a_fixed_number_say_nothing_of_looks(report):
     assert not report.studies[0].until_decided
-    for text in (verdicts.caption(report.studies[0]), verdicts.method(report.studies), compose(report).answer):
+    for text in (verdicts.verdicts_caption(report.studies[0]), verdicts.method(report.studies), compose(report).answer):
         assert "look" not in text
 
 
@@ -721,7 +724,7 @@ def test_odd_names_are_shown_literally_and_failed_runs_are_listed(results, tmp_p
     (study,) = report.studies
     assert len(study.failures) == 6
     assert study.tracks[1].verdict.status == "failed"
-    assert not np.isfinite(world.read(study).paths[1][1]).any()
+    assert not np.isfinite(paths_and_landmarks.read(study).paths[1][1]).any()
     assert "6 of 8 runs" in compose(report).answer
 
 
@@ -923,7 +926,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
     for number, track in enumerate(study.tracks):
         drawn_panels = panels(figure, number)
         assert titles(drawn_panels)[0] == track.name
-        of = pose_errors.pose_error(track)
+        of = pose_errors.pose_error_series(track)
         for axes, error, sigma in zip(drawn_panels, of.error.T, of.sigma.T, strict=True):
             _, low, high, curve = axes.lines
             np.testing.assert_array_equal(curve.get_ydata(), error)
@@ -932,7 +935,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
 
 def test_the_map_shows_truth_and_estimates(report):
     (study,) = report.studies
-    found = world.read(study)
+    found = paths_and_landmarks.read(study)
     (axes,) = panels(by_title(compose(report))["Scenario and estimates, run 0"])
     (truth,), (odometry,) = lines(axes, "true path"), lines(axes, "odometry alone")
     np.testing.assert_array_equal(truth.get_xydata(), found.truth)
@@ -1009,7 +1012,7 @@ def test_a_log_without_truth_says_so(uvd, tmp_path):
     report = build_report(tmp_path / "run")
     (study,) = report.studies
     assert not study.has_truth
-    assert world.read(study).odometry is None
+    assert paths_and_landmarks.read(study).odometry is None
     assert str(tmp_path) not in study.name
     source = shown(report)
     assert "The truth of log is not known" in source

@@ -12,7 +12,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.referee.diagnostics import Design, Record, follow, look, sequential_design
+from consistency.diagnostics import Design, Record, follow, look, sequential_design
 from consistency.referee.types import Array
 
 SHORT = {"truth__steps": 60}

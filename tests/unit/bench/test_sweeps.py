@@ -419,7 +419,7 @@ def test_only_consistent_filters_are_trusted() -> None:
 
 
 def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
-    from consistency.bench.pages.regime import LOOKS, compose_regime
+    from consistency.bench.pages.maps_of_worlds import LOOKS, compose_regime
     from consistency.referee.show.as_html import render
     from consistency.referee.show.pdf import render_pdf
 
@@ -445,7 +445,7 @@ def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
 
 
 def test_a_map_without_numbers_on_its_axes_has_heat_maps_alone(at: Path) -> None:
-    from consistency.bench.pages.regime import compose_regime
+    from consistency.bench.pages.maps_of_worlds import compose_regime
     from consistency.referee.show.as_html import render
 
     path = edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "truth.sensor.range = [[0.5, 3.0], [0.5, 4.0]]")

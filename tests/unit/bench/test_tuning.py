@@ -26,7 +26,7 @@ from consistency.bench.tuning.scores import BeliefScorer, score_of
 from consistency.bench.tuning.split import part_of, parts_of
 from consistency.bench.tuning.tune import MOST_TOLERATED, tolerant
 from consistency.commands import main
-from consistency.referee.diagnostics import Settings
+from consistency.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import short
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 import consistency as cs
 from consistency.commands.app import app
-from consistency.referee.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.imperfect_truth import residuals_of_fit
 from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import (
     _at_most,

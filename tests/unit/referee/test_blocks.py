@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from referee import judge
 
-from consistency.referee.diagnostics import Verdict
+from consistency.diagnostics import Verdict
 from consistency.referee.diagnostics.records import large_arrays
 from consistency.referee.types import Array, Failure
 

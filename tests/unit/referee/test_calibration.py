@@ -22,7 +22,7 @@ from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.diagnostics import nis_of
+from consistency.diagnostics import nis_of
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import planar_error
 

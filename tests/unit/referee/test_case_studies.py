@@ -18,7 +18,7 @@ import pytest
 from command import consistency
 
 import consistency as cs
-from consistency.referee.diagnostics import gate_runs
+from consistency.diagnostics import gate_runs
 
 ROOT = Path(__file__).parents[3]
 DOCS = ROOT / "docs"

@@ -14,7 +14,7 @@ from scipy import optimize, special, stats
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import results_source
-from consistency.referee.diagnostics import Comparison, RunSummary, compare, summary
+from consistency.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.referee.diagnostics.statistics.log_ratio import Contrast, contrast, margin
 from consistency.referee.gating.session import needed_at
 from consistency.referee.gating.watch import RunningTest, watching

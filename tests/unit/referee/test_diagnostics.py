@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.spatial.distance import mahalanobis
 
 import consistency as cs
-from consistency.referee.diagnostics import chi2_mean_interval, detectable_ratio, normality, rmse
+from consistency.diagnostics import chi2_mean_interval, detectable_ratio, normality, rmse
 from consistency.referee.diagnostics.questions import lost_runs
 from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
 from consistency.referee.diagnostics.records.validity import (  # fmt: skip

@@ -12,7 +12,7 @@ import pytest
 from draws import autoregression, fully_dependent, independent, slow_axis, verdict_on
 from scipy import stats
 
-from consistency.referee.diagnostics import largest_direction, ratio_interval
+from consistency.diagnostics import largest_direction, ratio_interval
 from consistency.referee.diagnostics.questions.scale import scale_test
 from consistency.referee.types import Array
 

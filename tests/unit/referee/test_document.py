@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from consistency.referee.diagnostics import Comparison, Interval, MapScore, Record, Verdict, judge
+from consistency.diagnostics import Comparison, Interval, MapScore, Record, Verdict, judge
 from consistency.referee.diagnostics.comparison import Difference
 from consistency.referee.diagnostics.verdict.answers import ABOUT, ALONE
 from consistency.referee.diagnostics.verdict.parts import JointScore, RejectionScore
@@ -34,11 +34,11 @@ from consistency.referee.document.blocks import (
     table,
 )
 from consistency.referee.document.colours import style
-from consistency.referee.document.comparison import comparison_table
+from consistency.referee.document.compared_filters import comparison_table
 from consistency.referee.document.guard import rejection_cells, rejection_text
+from consistency.referee.document.judged_filters import FURTHER, TERMINAL, cells, document, page, with_values
 from consistency.referee.document.map import COLUMNS, map_cells, map_lines, map_text
-from consistency.referee.document.plan import plan_lines
-from consistency.referee.document.verdict import FURTHER, TERMINAL, cells, document, page, with_values
+from consistency.referee.document.needed_runs import plan_lines
 from consistency.referee.document.wording import PLAIN, PRINTED, written
 from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal, text
 

@@ -21,7 +21,7 @@ from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.model_text import noise_lines, sentence
 from consistency.referee.fit_covariance.motion_windows import DriveWindows, blocks_of, cut_windows, in_plane, span_of
 from consistency.referee.fit_covariance.noise_model import caution
-from consistency.referee.fit_covariance.persistence import TERMS, PersistentError
+from consistency.referee.fit_covariance.persistence import TERMS, PersistentError, variance_between
 from consistency.referee.fit_covariance.refusals import RotationGrowth, body_turn, revisits, rotation_growth
 from consistency.referee.fit_covariance.systematic_errors import (
     FORWARD,
@@ -68,6 +68,15 @@ def test_errors_are_those_of_whole_motions(group: str, rng: np.random.Generator)
     np.testing.assert_allclose(w.motions, D, atol=1e-12)
     np.testing.assert_allclose(w.errors, log(inverse(D) @ M), atol=1e-10)
     assert (w.first[1:] == w.last[:-1]).all()
+
+
+def test_pieces_of_other_spans_have_the_same_size(rng: np.random.Generator) -> None:
+    w = cut_windows(drives(rng, 1, length=200.0), span_of("10m"))
+    for size, pieces in ((10.0, 20), (20.0, 40), (2.5, 5), (0.1, 1)):
+        found = w.over(size)
+        assert found is None or found.pieces.shape[1] == pieces
+        assert (found is None) == (size < 0.5)  # m, a step
+    assert w.over(500.0) is None
 
 
 def test_a_jump_is_cut_and_counted(rng: np.random.Generator) -> None:
@@ -490,6 +499,16 @@ def test_terms_that_persist_are_named_from_five_drives_on(world: World, word: st
     assert replace(right, lasting=()).status == "consistent"
     wrong = replace(RIGHT, low=2.0, value=2.5, high=3.0)
     assert replace(model, spans=(replace(model.spans[0], whole=wrong), *model.spans[1:])).status == "overconfident"
+
+
+def test_variance_between_drives() -> None:
+    """Five values with a variance of 0.1 each have Q = 100 with 4 degrees of freedom; weights sum to 50."""
+    values, variances = 7.0 + np.arange(5.0), np.full(5, 0.1)
+    assert variance_between(values, variances, 0.01) == pytest.approx((100 - 4) / (50 - 10))
+    unknown = np.append(values, 1e3), np.append(variances, np.inf)
+    assert variance_between(*unknown, 0.01) == pytest.approx((100 - 4) / (50 - 10))
+    assert variance_between(values, 100 * variances, 0.01) == 0.0  # Q = 1
+    assert variance_between(values[:4], variances[:4], 0.01) == 0.0
 
 
 def test_a_second_estimator_with_the_same_errors(rng: np.random.Generator) -> None:

@@ -244,6 +244,8 @@ def test_an_undecided_axis_makes_it_undecided_and_is_named(rng: np.random.Genera
     shown = replace(model, spans=(judged, *model.spans[1:]), lasting=(), by_motion=None)
     assert shown.status == "undecided"
     assert sentence(shown).endswith("; undecided: yaw")
+    without_error = replace(judged, axes=(RIGHT, unknown, RIGHT))
+    assert "undecided" not in sentence(replace(shown, spans=(without_error, *model.spans[1:])))
 
 
 def test_what_decides_beside_the_ratio() -> None:
@@ -299,6 +301,13 @@ def test_an_offset_that_nothing_tells_is_refused() -> None:
     poses = bare(np.arange(300.0), M, np.arange(300.0), M, "planar", 0.5)
     with pytest.raises(InputError, match="--time-offset estimate: the motions do not tell it"):
         clock_offset([(poses, matrices_of(M))])
+
+
+def test_drives_whose_clocks_differ_are_refused(rng: np.random.Generator) -> None:
+    made = [*uneven(rng, 0.2, World(), 1), *uneven(rng, -0.8, World(), 1)]
+    wide = [(replace(poses, max_dt=1.0), T) for poses, T in made]
+    with pytest.raises(InputError, match="--time-offset estimate: the motions do not tell it"):
+        clock_offset(wide)
 
 
 def test_the_command_reads_an_offset_that_is_estimated(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -12,7 +12,7 @@ from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.diagnostics import judge
+from consistency.diagnostics import judge
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.types import Array
 

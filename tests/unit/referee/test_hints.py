@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
@@ -34,8 +34,9 @@ from consistency.referee.readers.mix_ups import reading_fit
 from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.mix_ups.known import Guess, _ned
 from consistency.referee.readers.mix_ups.reading_fit import FACTOR, ReadingFit, fit_of
+from consistency.referee.readers.pipeline.motion_causes import causes_of_motions
+from consistency.referee.readers.pipeline.relative_motions import Stretch
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.relative_motions import Stretch, relative_recording
 from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.readers.windows import Relative
@@ -521,6 +522,15 @@ def test_the_likeliest_cause_is_named_whatever_its_size() -> None:
     assert str(readers_hints._cause([(other, worse), (one, better)], declared)).startswith("one")
 
 
+@pytest.mark.parametrize("size", [30.0, 100.0, 300.0])
+def test_a_truth_is_not_shrunk_into_errors_of_any_size(size: float, rng: np.random.Generator) -> None:
+    """A path of some 10 m beside deviations of as many: the truth in mm would leave errors like the path."""
+    sigma = np.array([size, 0.7 * size, 1.4 * size, 0.01, 0.02, 0.015])
+    runs = world.log(rng, "spatial", 5, 100, 0.0, sigma=sigma, correlated=False)
+    (said,) = hints("est", SIX, [world.deviations(p) for p in runs])
+    assert "its diagonal holds standard deviations" in said
+
+
 def test_a_bias_of_few_standard_deviations_explains_a_large_nees(rng: np.random.Generator) -> None:
     """3 sigma of one axis, growing with sigma, beside a covariance in which a sum is known 1,000 times better."""
     R = np.array([[1.0, 1.0 - 1e-6], [1.0 - 1e-6, 1.0]])
@@ -530,6 +540,10 @@ def test_a_bias_of_few_standard_deviations_explains_a_large_nees(rng: np.random.
     run = replace(poses(np.arange(400.0), np.zeros_like(e), R, e, "vector", "vector"), covariance=P)
     assert decades([run])[0] > 5.0
     assert hints("est", ("a", "b"), [run]) == []
+    found, unbiased = fit_of([(e, P)]), fit_of([(e - [3.0, 0.0] * grown, P)])
+    assert found is not None
+    assert unbiased is not None
+    assert found.simple() >= unbiased.likelihood
 
 
 def test_one_number_for_all_variances_is_no_covariance_of_an_estimator(rng: np.random.Generator) -> None:
@@ -615,7 +629,7 @@ def test_mix_ups_of_poses_with_cross_covariances_are_named(rng: np.random.Genera
             0, "est", Places("line {}".format, np.arange(400)), np.arange(400.0), pose, P_, C, np.arange(400),
             pose + e, "so2",
         )  # fmt: skip
-        return list(relative_recording("est", "est", [track], THREE, range(3), Relative(1.0, "step")).causes)
+        return causes_of_motions("est", [track], THREE, range(3), Relative(1.0, "step"))
 
     assert causes([0, 1, 2]) == []
     (said,) = causes(order)

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from consistency.bench.runs.run_scores import run_means, wins
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 from consistency.referee.types import Array, Failure
 
 

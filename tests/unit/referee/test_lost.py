@@ -12,7 +12,7 @@ import pytest
 from draws import identities, independent
 from scipy import integrate, stats
 
-from consistency.referee.diagnostics import (
+from consistency.diagnostics import (
     Design,
     Record,
     Settings,

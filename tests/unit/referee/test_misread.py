@@ -14,7 +14,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.questions.innovations import outliers_of
 from consistency.referee.gating.checked_arrays import record_of_checked
 from consistency.referee.readers.formats.position_truth import placeholder

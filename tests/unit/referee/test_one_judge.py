@@ -10,17 +10,7 @@ import pytest
 from draws import identities, independent
 
 import consistency as cs
-from consistency.referee.diagnostics import (
-    Design,
-    MapRecord,
-    Record,
-    Rejections,
-    Settings,
-    Verdict,
-    follow,
-    judge,
-    look,
-)
+from consistency.diagnostics import Design, MapRecord, Record, Rejections, Settings, Verdict, follow, judge, look
 from consistency.referee.diagnostics.maps.map_nees import last_nees
 from consistency.referee.diagnostics.records.large_arrays import every_entry
 from consistency.referee.diagnostics.records.whitening import whiten, whiten_group

@@ -14,7 +14,7 @@ from draws import independent
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.diagnostics import Record, Settings, gate_runs, judge, ratio_interval
+from consistency.diagnostics import Record, Settings, gate_runs, judge, ratio_interval
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.gating.session import needed_at

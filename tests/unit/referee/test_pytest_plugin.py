@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from consistency.referee.diagnostics import gate_runs
+from consistency.diagnostics import gate_runs
 from consistency.referee.gating.session import path_fault
 from consistency.referee.gating.watch import FIRST, final_rate, in_place_rate
 
@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from consistency.referee.diagnostics import Record, compare, judge, summary
+from consistency.diagnostics import Record, compare, judge, summary
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 

@@ -21,7 +21,7 @@ from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.diagnostics import Settings
+from consistency.diagnostics import Settings
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import planar_error, se2_log

@@ -22,7 +22,7 @@ from scipy import stats
 from statsmodels.stats.diagnostic import acorr_ljungbox
 
 import consistency as cs
-from consistency.referee.diagnostics import (
+from consistency.diagnostics import (
     Record,
     Settings,
     answers,
@@ -44,7 +44,7 @@ from consistency.referee.diagnostics import (
     whiten,
     whiteness,
 )
-from consistency.referee.diagnostics import judge as judge_record
+from consistency.diagnostics import judge as judge_record
 from consistency.referee.diagnostics.questions.outliers import beyond_stated, outliers
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.types import Array

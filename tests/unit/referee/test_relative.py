@@ -16,11 +16,11 @@ from documents import blocks
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
-from consistency.referee.diagnostics import Record, Verdict
+from consistency.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.geometry.groups import composed, matrices, propagated, to_left
-from consistency.referee.readers.relative_motions import Stretch, windows_of
+from consistency.referee.readers.pipeline.relative_motions import Stretch, windows_of
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline

@@ -11,12 +11,12 @@ from invariant import Invariant
 import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.report_input import Study
 from consistency.bench.pages.sections import anees
+from consistency.bench.pages.sections.report_input import Study
 from consistency.bench.pages.sections.study_sections import maps, of_own_errors, own_errors
-from consistency.referee.diagnostics import Interval, MapScore
+from consistency.diagnostics import Interval, MapScore
 from consistency.referee.document.blocks import Cell, Name, Quantity, Status, Table
-from consistency.referee.document.verdict import page
+from consistency.referee.document.judged_filters import page
 from consistency.referee.document.wording import brief, written
 from consistency.referee.pages import verdicts
 
@@ -57,11 +57,11 @@ def test_both_errors_stand_below_each_other(study: Study) -> None:
 
 
 def test_captions_name_the_filters_with_an_error_of_their_own(study: Study) -> None:
-    assert "Judged in an error of their own, but for the RMSE: right (right)" in verdicts.caption(study)
-    assert anees.caption(anees.read(study)).endswith("In the filter's own error: right (right).")
+    assert "Judged in an error of their own, but for the RMSE: right (right)" in verdicts.verdicts_caption(study)
+    assert anees.anees_caption(anees.read(study)).endswith("In the filter's own error: right (right).")
     alone = replace(study, tracks=study.tracks[:1])
-    assert "own" not in anees.caption(anees.read(alone)).replace("shown", "")
-    assert "error of their own" not in verdicts.caption(alone)
+    assert "own" not in anees.anees_caption(anees.read(alone)).replace("shown", "")
+    assert "error of their own" not in verdicts.verdicts_caption(alone)
     assert own_errors(alone) == ()
 
 

@@ -14,7 +14,7 @@ import pytest
 from draws import autoregression, independent, verdict_on
 from scipy import optimize, special, stats
 
-from consistency.referee.diagnostics import (
+from consistency.diagnostics import (
     Record,
     Settings,
     e_process,

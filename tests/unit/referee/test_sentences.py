@@ -14,13 +14,13 @@ import pytest
 from draws import fully_dependent, identities, independent
 from scipy import stats
 
-from consistency.referee.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.faults import bias_text, scale_text, shape_text
 from consistency.referee.diagnostics.words.numbers import ratio_text, short
 from consistency.referee.diagnostics.words.sentences import reasons
 from consistency.referee.document.blocks import Quantity
-from consistency.referee.document.verdict import TERMINAL, document, rows
+from consistency.referee.document.judged_filters import TERMINAL, document, rows
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Array
 

@@ -15,17 +15,7 @@ from draws import identities, independent
 from scipy import integrate, stats
 
 from consistency.bench.runs import sequential
-from consistency.referee.diagnostics import (
-    Design,
-    Record,
-    Verdict,
-    e_process,
-    ever,
-    follow,
-    judge,
-    look,
-    sequential_design,
-)
+from consistency.diagnostics import Design, Record, Verdict, e_process, ever, follow, judge, look, sequential_design
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
 from consistency.referee.diagnostics.statistics import e_process as betting

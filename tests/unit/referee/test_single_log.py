@@ -15,7 +15,7 @@ from scipy import signal, stats
 from single_log import errors
 
 import consistency as cs
-from consistency.referee.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.planning.single_log import (
     APART,
     MOST,

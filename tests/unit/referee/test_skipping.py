@@ -13,7 +13,7 @@ from draws import autoregression, identities, independent, verdict_on
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.referee.diagnostics import Record
+from consistency.diagnostics import Record
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped, skip_of, without_first
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array

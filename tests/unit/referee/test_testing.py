@@ -17,7 +17,7 @@ import pytest
 from draws import autoregression
 
 import consistency as cs
-from consistency.referee.diagnostics import gate_runs
+from consistency.diagnostics import gate_runs
 from consistency.referee.gating.checked_arrays import planned_dof, record_of_checked
 from consistency.referee.types import Array
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse

@@ -12,7 +12,7 @@ from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.diagnostics import Evidence
+from consistency.diagnostics import Record
 from consistency.referee.document.blocks import Figure
 from consistency.referee.pages.record_figures import overview, record_figures, unit_of
 from consistency.referee.pages.trajectory import MOST, ellipse, trajectory_panel
@@ -22,7 +22,7 @@ from consistency.referee.types import Array
 STEPS = 60
 
 
-def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> Evidence:
+def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> Record:
     """A path along x and z, with errors of 1 sigma but for three steps."""
     k = np.arange(float(STEPS))
     true = np.column_stack([k, 0.01 * k, 5.0 * np.sin(k / 10.0)])
@@ -34,16 +34,16 @@ def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> 
     nees = np.square(error / sigma)[:, index].sum(axis=1)
     P = np.broadcast_to(np.diag(sigma**2)[np.ix_(index, index)], (1, STEPS, len(axes), len(axes)))
     path = np.stack([true, true - error], axis=1)[None]
-    return Evidence(
+    return Record(
         "est", error[None][..., index], P, nees[None], len(axes), axes=axes, t=k, convention=convention, path=path
     )
 
 
-def figure(one: Evidence) -> Figure:
+def figure(one: Record) -> Figure:
     return by_title(record_figures(one, cs.judge(one)))["Trajectory"]
 
 
-def axes_of(one: Evidence) -> Axes:
+def axes_of(one: Record) -> Axes:
     (axes,) = panels(figure(one))
     return axes
 
@@ -86,7 +86,7 @@ def test_only_what_is_judged_is_drawn() -> None:
     assert axes_of(record(axes=("x", "y"))).get_ylabel() == "y (m)"
     assert trajectory_panel(record(axes=("z",))) is None
     bare = record()
-    assert trajectory_panel(Evidence("est", bare.error, bare.covariance, axes=bare.axes)) is None
+    assert trajectory_panel(Record("est", bare.error, bare.covariance, axes=bare.axes)) is None
 
 
 def test_units() -> None:

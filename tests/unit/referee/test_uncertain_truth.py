@@ -15,7 +15,7 @@ from painted import lines, panels
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.referee.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
     contrasts,
     of_both,

@@ -12,10 +12,8 @@ from referee import judge
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.diagnostics import Answer, Equivalence, Interval, Record, Settings, Verdict, anees_interval
-from consistency.referee.diagnostics import (
-    judge as judge_evidence,
-)
+from consistency.diagnostics import Answer, Equivalence, Interval, Record, Settings, Verdict, anees_interval
+from consistency.diagnostics import judge as judge_evidence
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped
 from consistency.referee.diagnostics.verdict import parts
 from consistency.referee.diagnostics.verdict.answers import ABOUT, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, answers

@@ -13,7 +13,7 @@ from consistency.bench.models import planar, point, stereo
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.store.log import Log
 from consistency.bench.types import Trial
-from consistency.referee.pages.provenance import facts
+from consistency.referee.pages.origin import facts
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import common_motion
 from consistency.stereo.visual_odometry.common_motion import screened, screened_log, screening_line

@@ -13,8 +13,8 @@ from scripts import experiment
 
 import consistency as cs
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, shown
 from consistency.bench.pages.sections import images, sensor_issues
+from consistency.bench.pages.sections.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, shown
 from consistency.referee.document.blocks import Block, Column, Heading, Stack, Status, Table
 
 SECTIONS = (sensor_issues, images)

@@ -59,6 +59,13 @@ def euroc_folder(folder: Path, k: float = 0.0, second: float = 0.11) -> Path:
     return folder
 
 
+def test_a_line_of_images_without_a_name_is_refused(tmp_path: Path) -> None:
+    table = euroc_folder(tmp_path) / "mav0" / "cam1" / "data.csv"
+    table.write_text(table.read_text()[: table.read_text().rindex(",")])
+    with pytest.raises(cs.InputError, match=r"times must be whole nanoseconds.*without the name of an image"):
+        read_sequence(tmp_path)
+
+
 @pytest.fixture
 def kitti(tmp_path: Path) -> Path:
     write_kitti(tmp_path / "seq", drive(3), np.zeros((900, 900), np.uint8))

@@ -14,8 +14,8 @@ from scripts import experiment
 
 import consistency as cs
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.exhibits import shown
 from consistency.bench.pages.sections import images
+from consistency.bench.pages.sections.exhibits import shown
 from consistency.referee.document.blocks import Heading, Table
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Tracks
 from consistency.stereo.rendered_images.scene import Layer, Scene

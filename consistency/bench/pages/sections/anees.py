@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.pages.report_input import Study, Track
-from consistency.referee.diagnostics import Verdict
+from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.diagnostics.verdict.answers import STEP
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import EXPECTED, LIMIT
 from consistency.referee.document.wording import listed
@@ -105,7 +105,7 @@ def anees_curves(study: Study) -> tuple[Figure, ...]:
             log_axis(axes, "y")
         return add_legend(figure)
 
-    return (Figure(name, caption(anees), (draw,)),)
+    return (Figure(name, anees_caption(anees), (draw,)),)
 
 
 def _draw_bands(axes: Axes, anees: Anees) -> None:
@@ -123,7 +123,7 @@ def _draw_bands(axes: Axes, anees: Anees) -> None:
         edges(axes, steps, own.band, replace(look, dash=(1.0, 2.0), width=0.7), tag=own.track.tag)
 
 
-def caption(anees: Anees) -> str:
+def anees_caption(anees: Anees) -> str:
     """What the figure shows."""
     study, shared = anees.study, anees.common
     runs = shared.track.verdict.runs if shared else study.runs

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from consistency.bench.pages.exhibits import Exhibit, Source, groups, listing, several, single
+from consistency.bench.pages.sections.exhibits import Exhibit, Source, groups, listing, several, single
 from consistency.referee.document.blocks import Figure, Table
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, Look, style
 from consistency.referee.show.painting import curve, dots, log_axis, stroke

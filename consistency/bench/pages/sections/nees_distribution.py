@@ -72,7 +72,7 @@ def _draw_steps(axes: Axes, of: Steps) -> None:
 
 
 CAPTION = (
-    "Distribution of the NEES: chi-square probability of the NEES in one step of each run, with nothing fitted. "
+    "Chi-square probability of the NEES in one step of each run, with nothing fitted. "
     "On the diagonal the covariance is right; a curve below it has too many large values (overconfident), above it "
     "too many small ones. Shaded: where the whole curve of a right filter lies with probability 95 %."
 )

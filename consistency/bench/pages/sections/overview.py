@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.pages.report_input import Report, Track
-from consistency.referee.diagnostics import Interval
+from consistency.bench.pages.sections.report_input import Report, Track
+from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.document.blocks import Block, Column, Figure, Name, Table, Text, table
 from consistency.referee.document.colours import BAND, EXPECTED, solid
-from consistency.referee.document.verdict import BRIEF, cells, columns
+from consistency.referee.document.judged_filters import BRIEF, cells, columns
 from consistency.referee.pages.verdicts import judgement, method
 from consistency.referee.show.painting import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.pages.report_input import Study, Track
+from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import SIGMAS, ZERO, solid
 from consistency.referee.show.painting import canvas, curve, edges, say, stroke
@@ -32,11 +32,11 @@ class PoseError:
 
 def pose_errors(study: Study) -> tuple[Figure, ...]:
     """A row of x, y and heading for each filter; nothing where the truth is not known."""
-    filters = [of for track in study.tracks if (of := pose_error(track)) is not None]
+    filters = [of for track in study.tracks if (of := pose_error_series(track)) is not None]
     if not study.has_truth or not filters:
         return ()
     drawings = tuple(partial(_draw, study, of) for of in filters)
-    return (Figure(f"Pose errors, run {study.shown_run}", caption(study), drawings),)
+    return (Figure(f"Pose errors, run {study.shown_run}", errors_caption(study), drawings),)
 
 
 def _draw(study: Study, of: PoseError) -> Drawing:
@@ -55,7 +55,7 @@ def _draw(study: Study, of: PoseError) -> Drawing:
     return figure
 
 
-def pose_error(track: Track) -> PoseError | None:
+def pose_error_series(track: Track) -> PoseError | None:
     """Errors of the shown run; None where they are not known."""
     run = track.shown.in_world
     if run.error is None or run.covariance is None:
@@ -67,7 +67,7 @@ def pose_error(track: Track) -> PoseError | None:
     return PoseError(track, DEGREES * run.error[0], DEGREES * np.sqrt(np.maximum(variance, 0.0)))
 
 
-def caption(study: Study) -> str:
+def errors_caption(study: Study) -> str:
     """What the figure shows."""
     return (
         f"Pose error (truth minus estimate) of run {study.shown_run}, the lowest run number, with the filter's "

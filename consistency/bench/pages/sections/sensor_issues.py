@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, groups, listing, several, single
+from consistency.bench.pages.sections.exhibits import P_VALUE, STATUS, Exhibit, Source, groups, listing, several, single
 from consistency.referee.document.blocks import Figure, Table
 from consistency.referee.document.colours import COLOURS, EXPECTED, Look, style
 from consistency.referee.show.painting import curve, edges, log_axis, stroke

@@ -11,8 +11,8 @@ import pandas as pd
 from scipy import stats
 
 from consistency.bench.models.stereo import project, triangulate_jacobian
-from consistency.bench.pages.exhibits import extra_table
-from consistency.bench.pages.report_input import Report
+from consistency.bench.pages.sections.exhibits import extra_table
+from consistency.bench.pages.sections.report_input import Report
 from consistency.bench.types import Gaussian
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import Look, style
@@ -106,7 +106,7 @@ def ellipse(gaussian: Gaussian) -> Array:
 
 def stereo_noise(report: Report) -> tuple[Figure, ...]:
     """For each baseline samples with two ellipses, and the histogram of x with two densities."""
-    return tuple(Figure(f"Baseline {d.baseline:g} m", caption(d), (partial(_draw, d),)) for d in read(report))
+    return tuple(Figure(f"Baseline {d.baseline:g} m", noise_caption(d), (partial(_draw, d),)) for d in read(report))
 
 
 def _draw(d: Distribution) -> Drawing:
@@ -129,13 +129,13 @@ def _draw(d: Distribution) -> Drawing:
     return add_legend(figure)
 
 
-def caption(d: Distribution) -> str:
+def noise_caption(d: Distribution) -> str:
     """What one panel pair of fig. 12 shows, with its numbers."""
     linear, fitted = (float(np.sqrt(g.covariance[0, 0])) for g in (d.linear, d.fitted))
     outside = 1.0 - d.inside.mean()
     beyond = f" {100 * outside:.1f} % of the samples lie beyond the axes." if outside >= 0.0005 else ""
     return (
-        f"Baseline {d.baseline:g} m: {len(d.samples)} samples of eq. 21 within the search range, for a point at "
+        f"{len(d.samples)} samples of eq. 21 within the search range, for a point at "
         f"x = 10 m, y = 1 m ({len(d.drawn)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m "
         f"from the samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
     )

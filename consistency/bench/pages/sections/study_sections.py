@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from consistency.bench.pages.report_input import Study
 from consistency.bench.pages.sections.anees import anees_curves
-from consistency.bench.pages.sections.innovations import innovations
 from consistency.bench.pages.sections.nees_distribution import nees_distribution
+from consistency.bench.pages.sections.nis import innovations
+from consistency.bench.pages.sections.paths_and_landmarks import world_map
 from consistency.bench.pages.sections.pose_errors import pose_errors
-from consistency.bench.pages.sections.world import world_map
+from consistency.bench.pages.sections.report_input import Study
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Text, table
 from consistency.referee.document.guard import COLUMNS as GUARD_COLUMNS
 from consistency.referee.document.guard import rejection_cells
+from consistency.referee.document.judged_filters import BRIEF, FILTER, cells, columns
+from consistency.referee.document.judged_filters import FURTHER as FURTHER_COLUMNS
 from consistency.referee.document.map import COLUMNS as MAP_COLUMNS
 from consistency.referee.document.map import map_cells
-from consistency.referee.document.verdict import BRIEF, FILTER, cells, columns
-from consistency.referee.document.verdict import FURTHER as FURTHER_COLUMNS
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.pages.by_axis import by_axis
 from consistency.referee.pages.questions import diagnosis

@@ -15,7 +15,7 @@ from typing import Any, NoReturn, TypeVar
 
 from distributed import Client, LocalCluster, Security
 
-from consistency.bench.runs.backends.local import worker_count
+from consistency.bench.runs.backends.threads import worker_count
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
 

@@ -18,9 +18,8 @@ from consistency.referee.diagnostics.questions.shape import weighted_chi_square_
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES, at_share, least_of_steps
+from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES, Settings, at_share, least_of_steps
 from consistency.referee.diagnostics.verdict.parts import Answer, Equivalence, ErrorParts, Interval, TruthShare
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.types import Array
 
 DECLARED = ("independent", "per-run", "common")  # how errors of the truth depend on each other

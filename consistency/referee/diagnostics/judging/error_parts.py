@@ -28,6 +28,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     SHAPE,
     SHARES,
     STEP,
+    Settings,
     at_share,
     with_tolerated,
 )
@@ -44,7 +45,6 @@ from consistency.referee.diagnostics.verdict.parts import (
     Shape,
     Tails,
 )
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.types import Array, Indices
 
 SIGN = 2.0  # standard errors from 0, of steps that are all one and the same, at which a correlation has a sign

@@ -12,9 +12,8 @@ from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, STEP
+from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, STEP, Settings
 from consistency.referee.diagnostics.verdict.parts import Answer, Location, Until
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.types import Array, Indices
 
 DETECT = Settings().factor

@@ -15,8 +15,15 @@ from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test
 from consistency.referee.diagnostics.questions.shape import Largest, largest_direction, mean_shape, sphericity
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics.nees import Pit, pit
-from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP, least_of_steps, shares_of
-from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.diagnostics.verdict.answers import (
+    AXIS,
+    DIRECTION,
+    MAIN,
+    STEP,
+    Settings,
+    least_of_steps,
+    shares_of,
+)
 from consistency.referee.types import Array
 
 GRID = 9  # ratios within the tolerance at which the distribution is compared

@@ -29,7 +29,14 @@ from consistency.referee.diagnostics.questions.sample import Sample, impossible_
 from consistency.referee.diagnostics.records.large_arrays import every_entry
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.nees import chi2_mean_interval
-from consistency.referee.diagnostics.verdict.answers import JOINT, MAIN, answers, least_of_steps, with_tolerated
+from consistency.referee.diagnostics.verdict.answers import (
+    JOINT,
+    MAIN,
+    Settings,
+    answers,
+    least_of_steps,
+    with_tolerated,
+)
 from consistency.referee.diagnostics.verdict.parts import (
     Answer,
     EarlyEnds,
@@ -37,7 +44,6 @@ from consistency.referee.diagnostics.verdict.parts import (
     ErrorParts,
     Innovations,
 )
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, Findings
 
 if TYPE_CHECKING:

@@ -15,9 +15,8 @@ from consistency.referee.diagnostics.questions.sample import names_of
 from consistency.referee.diagnostics.questions.scale import FEW, ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
-from consistency.referee.diagnostics.verdict.answers import SHARES
+from consistency.referee.diagnostics.verdict.answers import SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import Answer, Lost, Scale
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, Findings, Verdict
 from consistency.referee.types import Array
 

@@ -21,6 +21,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     SCALE,
     SHARES,
     STEP,
+    Settings,
     answers,
     at_share,
 )
@@ -33,7 +34,6 @@ from consistency.referee.diagnostics.verdict.parts import (
     Lost,
     Scale,
 )
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.types import Array
 

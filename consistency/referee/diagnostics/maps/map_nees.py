@@ -13,9 +13,8 @@ from consistency.referee.diagnostics.records.large_arrays import by_runs
 from consistency.referee.diagnostics.records.record import JointNees, Record
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import kolmogorov
-from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
+from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION, Settings
 from consistency.referee.diagnostics.verdict.parts import JointScore
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.diagnostics.verdict.verdict import MapScore, Verdict
 from consistency.referee.types import Array, Indices
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.diagnostics.verdict.answers import Settings
 
 FIRST = 12  # runs at the first look; with fewer hardly anything but a failed run would be found
 PARTS = 4  # times that the scale is looked at from one look to the next

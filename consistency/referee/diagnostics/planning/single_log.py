@@ -14,9 +14,8 @@ from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest
 from consistency.referee.diagnostics.records.record import Record, arrays_of, numbered_axes
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.answers import BIAS
+from consistency.referee.diagnostics.verdict.answers import BIAS, Settings
 from consistency.referee.diagnostics.verdict.parts import Interval, Within
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 

@@ -12,9 +12,8 @@ from consistency.referee.diagnostics.questions.scale import FEW, MeanTest, scale
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.e_process import e_process, ever
 from consistency.referee.diagnostics.statistics.number_of_runs import LARGEST
-from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
+from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import Equivalence
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.types import Array
 
 

@@ -9,8 +9,8 @@ from consistency.referee.diagnostics.questions.scale import run_means
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.e_process import ever
 from consistency.referee.diagnostics.statistics.number_of_runs import lost_runs, share_limit
+from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import EarlyEnds, Lost
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.types import Array
 
 PARTS = np.array([0.0, 0.125, 0.25, 0.5])  # of the share in question: what the bet takes the true share to be

@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.records.large_arrays import by_runs, by_ste
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.validity import negative
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, whiten, whiten_group
-from consistency.referee.diagnostics.verdict.settings import Settings
+from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}

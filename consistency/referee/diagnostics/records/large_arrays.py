@@ -16,7 +16,10 @@ FEWER = 2**16  # in a block of whole runs, which lies together in memory: what i
 def diagonal(deviations: Array) -> Array:
     """Covariances of standard deviations without cross terms, (..., n) -> (..., n, n); indefinite of a negative one."""
     sigma = np.asarray(deviations, float)
-    return np.asarray((sigma * np.abs(sigma))[..., None] * np.eye(sigma.shape[-1]))
+    n = sigma.shape[-1]
+    P = np.zeros((*sigma.shape, n))
+    P[..., range(n), range(n)] = sigma * np.abs(sigma)  # infinite ones leave the zeros as they are
+    return P
 
 
 def every_entry(holds: Callable[[Array], Array], matrices: Array) -> Array:

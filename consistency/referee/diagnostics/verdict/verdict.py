@@ -12,6 +12,7 @@ import numpy as np
 from consistency.referee.diagnostics.records.record import Record, shown_by
 from consistency.referee.diagnostics.records.skipping import Skipped
 from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
+from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import (
     TINY,
     Accuracy,
@@ -31,7 +32,6 @@ from consistency.referee.diagnostics.verdict.parts import (
     Tails,
     TruthShare,
 )
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.types import Failure, Indices
 

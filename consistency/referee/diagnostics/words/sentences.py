@@ -10,9 +10,8 @@ from consistency.referee.diagnostics.judging.status import smaller
 from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
-from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, JOINT, SCALE, SHAPE
+from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, JOINT, SCALE, SHAPE, Settings
 from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Location, Scale, Within
-from consistency.referee.diagnostics.verdict.settings import Settings
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.words.faults import (
     MOST,

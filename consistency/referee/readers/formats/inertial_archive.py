@@ -67,7 +67,9 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
     rest = {key: array for key, array in arrays.items() if key.removeprefix(TRUE) not in (*AXES, "order")}
     axes = [axis for part in order for axis in AXES[part]]
     rest |= {"errors": np.concatenate([errors[part] for part in order], axis=-1), "axes": np.array(axes)}
-    of = "with the velocity, of SE2(3)" if convention in ("left", "right") else "and the difference of the velocity"
+    of = "and the difference of the velocity"
+    if convention in ("left", "right"):
+        of = "with the velocity, of SE2(3)"
     return rest, f"{INERTIAL[convention]}, {of}; in the order {', '.join(order)}"
 
 
@@ -76,7 +78,7 @@ def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[st
         raise InputError(f"{path}: key '{'ba' if 'bg' in parts else 'bg'}' is missing; there are two biases or none")
     if missing := [f"{TRUE}{part}" for part in parts if f"{TRUE}{part}" not in arrays]:
         raise InputError(f"{path}: key '{missing[0]}' is missing, of the true states")
-    order = [str(part) for part in np.atleast_1d(arrays["order"])] if "order" in arrays else parts
+    order = [str(part) for part in np.atleast_1d(arrays.get("order", np.array(parts)))]
     if sorted(order) != sorted(parts):
         raise InputError(f"{path}: key 'order' is {', '.join(order)}; must name {', '.join(parts)}, each once")
     return order

@@ -65,9 +65,14 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     sheet = with_clock(sheet, required=False)
     nis = sheet.numbers("nis")
     dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
-    step = sheet.numbers("step") if "step" in sheet else np.arange(1.0, len(nis) + 1)
-    t = sheet.numbers("t") if "t" in sheet else np.full(len(nis), np.nan)
-    return NisLog(str(sheet.data["filter"][0]) if "filter" in sheet else path.stem, step, t, nis, dof)
+    name, step, t = path.stem, np.arange(1.0, len(nis) + 1), np.full(len(nis), np.nan)
+    if "filter" in sheet:
+        name = str(sheet.data["filter"][0])
+    if "step" in sheet:
+        step = sheet.numbers("step")
+    if "t" in sheet:
+        t = sheet.numbers("t")
+    return NisLog(name, step, t, nis, dof, tuple(filter(None, [sheet.cut])))
 
 
 def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "") -> Any:
@@ -115,8 +120,10 @@ def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRow
         if choice is not None:
             raise InputError(f"--{column} {choice}: {sheet.path} has no column '{column}'")
         return sheet
-    values = sheet.texts(column) if column == "filter" else sheet.numbers(column, whole=True)
-    there = [str(v) if column == "filter" else int(v) for v in dict.fromkeys(values.tolist())]
+    values = sheet.texts(column)
+    if column != "filter":
+        values = sheet.numbers(column, whole=True).astype(int)
+    there = list(dict.fromkeys(values.tolist()))
     return sheet.rows(values == choose(sheet.path, column, there, choice))
 
 

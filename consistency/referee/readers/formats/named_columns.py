@@ -82,7 +82,9 @@ def head_of(path: Path) -> Head | None:
     comment = line.lstrip().startswith("#")
     if not comment and len([text for _, text in lines if not text.lstrip().startswith("#")]) > 1:
         return None
-    text, width = line.strip().lstrip("#") if comment else line, len(fields_of(row))
+    text, width = line, len(fields_of(row))
+    if comment:
+        text = line.strip().lstrip("#")
     names = fields_of(text)
     if len(names) != width and comment:
         names = re.split(r"\s{2,}", text.strip())
@@ -190,9 +192,14 @@ def _roles(names: Sequence[str], where: Path) -> Roles | None:
     if position is None or clock is None:
         return None
     asl = plain[position[0]] == "p_rs_r_x" or (len(plain) == 17 and plain[-3:] == ["bax", "bay", "baz"])
-    kind = "EuRoC truth" if asl else "poses by the names of their columns"
-    rest = _rest(plain) if quaternion else ()
-    kind = kind if quaternion else kind.replace("poses", "positions")
+    kind = "poses by the names of their columns"
+    if asl:
+        kind = "EuRoC truth"
+    rest: tuple[int, ...] = ()
+    if quaternion:
+        rest = _rest(plain)
+    else:
+        kind = kind.replace("poses", "positions")
     covariance, squared = _covariance(plain, len(rest)), False
     if not covariance:
         covariance = _deviations(plain, len(rest), VARIANCES)
@@ -267,8 +274,10 @@ def _rest(plain: list[str]) -> tuple[int, ...]:
     for spellings in MOVING:
         there = ([spelling.format(axis) for axis in "xyz"] for spelling in spellings)
         places = [tuple(map(plain.index, names)) for names in there if all(plain.count(name) == 1 for name in names)]
-        found.append(places[0] if places else ())
-    return (*found[0], *found[1], *found[2]) if all(found) else found[0]
+        found.append(next(iter(places), ()))
+    if all(found):
+        return (*found[0], *found[1], *found[2])
+    return found[0]
 
 
 def numbered(name: str) -> bool:
@@ -313,7 +322,7 @@ def _numbered(plain: list[str], pattern: re.Pattern[str], sizes: Sequence[int]) 
     stated: dict[str, dict[tuple[int, int], int]] = {}
     for i, name in enumerate(plain):
         if (number := pattern.fullmatch(name)) and "twist" not in number[1]:
-            place = (int(number[2]), -1) if number[3] is None else (int(number[2]), int(number[3]))
+            place = int(number[2]), int(number[3] or -1)
             stated.setdefault(number[1], {})[place] = i
     for places in stated.values():
         if len(places) in sizes:

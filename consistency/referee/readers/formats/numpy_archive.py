@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
-from consistency.referee.diagnostics.records.record import numbered_axes
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR
 from consistency.referee.parsing import is_file, reading, require_name, require_room
@@ -24,6 +23,7 @@ from consistency.referee.types import Array, Failure, Indices
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
 OF_ERRORS, OF_POSES, OF_NEES = ("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof")
+PLANAR_POSE = ("x", "y", "heading")
 OF_STATES = {"R", "p", "v"}  # of an inertial filter
 BY_STEP: dict[str, Any] = {  # n NEES / dof of a step with n, the smallest dof, has the mean n and less spread than n
     "unavailable": ("distribution",),
@@ -94,6 +94,8 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
     if "cross_covariances" in arrays and r.relative is not None and not r.motions:
         cross = _matrices(path, arrays, "cross_covariances", covariances.shape)
     clock, axes, poses = step_times(path, arrays, steps), _axes(path, arrays, n), []
+    if r.relative is not None:  # poses, or motions of them
+        axes = PLANAR_POSE
     for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
         place, known = steps_of(path, run, np.arange(length)), there[run, :length]
         one = _beside(path, place, estimates[run, :length], truth[run, :length], known, clock)
@@ -111,7 +113,9 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
         )  # fmt: skip
     causes = []
     if convention == "vector":
-        remedy = "add --error so2, if these are x, y, heading" if declared and n == 3 else "wrap it to [-pi, pi]"
+        remedy = "wrap it to [-pi, pi]"
+        if declared and n == 3:
+            remedy = "add --error so2, if these are x, y, heading"
         gap = np.where(there[..., None], truth - estimates, np.nan)
         causes = turns(path.stem, axes, gap, covariances, remedy)
     definition = PLANAR[declared] if declared else ""
@@ -132,14 +136,16 @@ def _of_poses(path: Path, arrays: dict[str, Array]) -> Estimator:
         place, known = steps_of(path, run, np.arange(length)), there[run, :length]
         one = _beside(path, place, estimates[run, :length], truth[run, :length], known, clock)
         poses.append(replace(one, name=f"run {run}" if runs > 1 else path.stem))
-    return Estimator(path.stem, path, poses, ("x", "y", "heading"), t=clock)
+    return Estimator(path.stem, path, poses, PLANAR_POSE, t=clock)
 
 
 def _beside(path: Path, place: Places, estimate: Array, truth: Array, known: Array, clock: Array) -> Poses:
     """Estimates (T, n) of one run and their truth where it is ``known``, without covariances, in the plane."""
     steps, n = estimate.shape
     t = np.arange(float(steps))
-    true_t, truth = (t, truth) if known.all() else (t[known], truth[known])
+    true_t = t
+    if not known.all():
+        true_t, truth = t[known], truth[known]
     return Poses(
         place, t, estimate, *unstated(steps, n), true_t, truth, "planar", "left", 0.0, files=(path, path),
         numbered=True, clock=clock[:steps],

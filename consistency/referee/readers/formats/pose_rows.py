@@ -91,8 +91,10 @@ def read_poses(path: Path, true: bool = False) -> Lines:
 def read_beside(path: Path) -> Lines | None:
     """The truth in columns beside the estimates of a file with names, in rows that have one; None without any."""
     head = head_of(path)
-    roles = None if head is None else true_roles_of(head.names, path)
-    if head is None or roles is None or not roles.quaternion:
+    if head is None:
+        return None
+    roles = true_roles_of(head.names, path)
+    if roles is None or not roles.quaternion:
         return None
     lines = _named(path, head, roles, true=True)
     known = np.isfinite(lines.values).all(axis=1)
@@ -126,15 +128,23 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     if roles.squared:
         first = len(roles.time) + len(roles.position) + len(roles.quaternion)
         columns[first : len(pose)] = [np.sign(each) * np.sqrt(np.abs(each)) for each in columns[first : len(pose)]]
-    of = roles.kind if true else roles.kind.replace(" truth", " poses")
-    clock = UNIT_NAMES[unit] if len(roles.time) == 1 else "seconds and nanoseconds"
+    of, clock = roles.kind, UNIT_NAMES[unit]
+    if not true:
+        of = of.replace(" truth", " poses")
+    if len(roles.time) == 2:
+        clock = "seconds and nanoseconds"
     order = "no orientation"
     if roles.quaternion:
-        order = f"quaternion {'w first' if roles.quaternion[3] < roles.quaternion[0] else 'w last'}"
+        order = "quaternion w last"
+        if roles.quaternion[3] < roles.quaternion[0]:
+            order = "quaternion w first"
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if roles.covariance:
-        stated = "standard deviations" if len(roles.covariance) in DEVIATIONS else "covariance"
-        stated = "variances" if roles.squared else stated
+        stated = "covariance"
+        if roles.squared:
+            stated = "variances"
+        elif len(roles.covariance) in DEVIATIONS:
+            stated = "standard deviations"
         note += f", {stated} in {len(roles.covariance)} columns"
     values = np.column_stack([t, *columns[len(roles.time) : len(pose)]])
     rest = np.column_stack(columns[len(pose) :]) if roles.rest else None
@@ -237,8 +247,9 @@ def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
     """Times of matrices: those before them, those of times.txt in the same folder, or their numbers from 0 on."""
     if before.shape[1]:
         t, unit = times_of(lines, (0,), [before[:, 0]])
-        of = "the number of the step" if (t == np.round(t)).all() else f"the time in {UNIT_NAMES[unit]}"
-        return t, f"the first one {of}"
+        if (t == np.round(t)).all():
+            return t, "the first one the number of the step"
+        return t, f"the first one the time in {UNIT_NAMES[unit]}"
     times = lines.path.parent / "times.txt"
     if not times.is_file():
         return np.arange(float(len(lines.line))), "numbered from 0 on, as there is no times.txt beside them"

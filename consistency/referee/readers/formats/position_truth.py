@@ -37,7 +37,9 @@ def require_positions(path: Path, poses: Sequence[Poses], r: Reading) -> None:
     if any(one.manifold != "vector" for one in poses):
         raise InputError(f"{path}: the truth of some runs has orientations, of others none; judge them apart")
     if r.relative is not None or r.align not in (None, "posyaw", "posyaw-all"):
-        option = "--relative" if r.relative is not None else f"--align {r.align}"
+        option = f"--align {r.align}"
+        if r.relative is not None:
+            option = "--relative"
         raise InputError(f"{option}: needs a truth with orientations; {truth} holds positions alone")
     if rotations := [axis for axis in r.axes or () if axis not in AXES[:3]]:
         raise InputError(
@@ -69,7 +71,9 @@ def positions(poses: Poses, lever: Sequence[float], blocks: bool) -> Poses:
     """
     arm = np.asarray(lever, float)
     if blocks and (arm.any() or poses.convention == "right"):
-        of = "--lever-arm" if arm.any() else "--error right"
+        of = "--error right"
+        if arm.any():
+            of = "--lever-arm"
         raise InputError(
             f"{poses.place[0]}: {of} moves errors of the rotation into that of the position, whose cross terms are "
             "not stated; give covariances of whole poses"

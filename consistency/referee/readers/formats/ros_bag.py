@@ -22,8 +22,8 @@ from consistency.referee.readers.formats.pose_rows import POSE
 from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.formats.tum import UNIT, SpaceRun, poses_of, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.relative_motions import MARGINAL
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
+from consistency.referee.readers.windows import MARGINAL
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance
@@ -123,20 +123,20 @@ def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
     if not left:
         raise InputError(f"{path}: states no covariance: its variances are 0, -1 or {ENDLESS:g} in every message")
     missing = ",".join(AXES[i] for i in range(n) if i not in left)
+    if not missing:
+        return left, ""
     what = f"{path}: the variances of {missing} are 0, -1 or {ENDLESS:g} in every message, so not stated and not judged"
-    return left, what if missing else ""
+    return left, what
 
 
 def _other_frames(bag: Path, *of: tuple[str, tuple[str, str]]) -> list[str]:
     """A note on frames of estimates and truth by other names, which may be the same."""
     (topic, own), (truth, true) = of
     notes = []
-    for which, a, b in zip(("world", "body"), own, true, strict=True):
+    remedies = "add --align where they are not the same", "the poses must be of one body"
+    for which, a, b, advice in zip(("world", "body"), own, true, remedies, strict=True):
         if a and b and a != b:
-            notes.append(
-                f"{bag}: the {which} is '{a}' on {topic}, but '{b}' on {truth}; "
-                + ("add --align where they are not the same" if which == "world" else "the poses must be of one body")
-            )
+            notes.append(f"{bag}: the {which} is '{a}' on {topic}, but '{b}' on {truth}; {advice}")
     return notes
 
 
@@ -310,7 +310,9 @@ def _stamp(header: Any) -> float:
 def _bare_run(bag: Path, r: Reading) -> SpaceRun:
     """Poses of a bag, of a topic with or without covariances."""
     with _opened(bag) as reader:
-        topic = r.topic if r.topic in _topics(reader, POSES) else _chosen(bag, reader, r.topic)
+        topic = r.topic
+        if topic not in _topics(reader, POSES):
+            topic = _chosen(bag, reader, r.topic)
         if r.truth_topic is None:
             others = [name for name in _topics(reader, POSES) if name != topic]
             raise InputError(f"{bag}: needs --truth-topic; there are: {_listed(others, reader)}")

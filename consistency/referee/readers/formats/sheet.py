@@ -74,12 +74,15 @@ class TableRows:
     def numbers(self, column: str, finite: bool = False, whole: bool = False) -> Array:
         """A column as floats, NaN where empty; refused where it is text, or not finite or whole as asked for."""
         cells = self.data[column]
-        values = bounded(cells if cells.dtype.kind == "f" else np.array([_number(cell) for cell in cells], float))
-        bad = np.isnan(values) & ~self.empty(column)
-        other = not all(isinstance(cell, str) for cell in cells[bad])
-        what = "a truth value or a date, which is to be written as a number" if other else "not a number"
-        if any(hasattr(cell, "__len__") for cell in cells[bad]) and other:
-            what = "a list, of which each number needs a column of its own"
+        if cells.dtype.kind != "f":
+            cells = np.array([_number(cell) for cell in cells], float)
+        values = bounded(cells)
+        bad, cells = np.isnan(values) & ~self.empty(column), self.data[column]
+        what = "not a number"
+        if not all(isinstance(cell, str) for cell in cells[bad]):
+            what = "a truth value or a date, which is to be written as a number"
+            if any(hasattr(cell, "__len__") for cell in cells[bad]):
+                what = "a list, of which each number needs a column of its own"
         if not bad.any() and (finite or whole):
             bad, what = ~np.isfinite(values), "not a finite number"
         if not bad.any() and whole:
@@ -137,7 +140,9 @@ class Lines:
         """The lines without the last one if it alone is ``bad``, (N,) of bool, and has no end."""
         if not self.open_line or len(bad) < 2 or not bad[-1] or bad[:-1].any():
             return self
-        rest = None if self.rest is None else self.rest[:-1]
+        rest = self.rest
+        if rest is not None:
+            rest = rest[:-1]
         cut = cut_note(self.path, self.open_line)
         return replace(self, values=self.values[:-1], line=self.line[:-1], rest=rest, open_line=0, cut=cut)
 

@@ -157,7 +157,7 @@ def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
                 raise InputError("--max-dt: needs a column t in the estimates and in the truth")
             return key
     if truth is not None and ("step" in sheet or "t" in sheet):
-        has = "step" if "step" in sheet else "t"
+        has = next(key for key in ("step", "t") if key in sheet)
         raise InputError(f"{truth.path}: column '{has}' is missing; {sheet.path} is numbered by it")
     hint = ""
     if len(sheet.data) == 1 and " " in sheet.columns:
@@ -248,7 +248,9 @@ def _position(axes: Sequence[str]) -> int:
     """Leading components that are a position."""
     if tuple(axes[:2]) != ("x", "y"):
         return 0
-    return 3 if tuple(axes[2:3]) == ("z",) else 2
+    if tuple(axes[2:3]) == ("z",):
+        return 3
+    return 2
 
 
 def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: str) -> tuple[Array, Stated, list[str]]:
@@ -265,8 +267,8 @@ def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: 
 
 def _absent(name: str, truth: TableRows, runs: Array, true_runs: Array) -> list[str]:
     """A note on runs of the truth without estimates."""
-    absent = sorted({*true_runs.tolist()} - {*runs.tolist()}) if "run" in truth else []
-    if not absent:
+    absent = sorted({*true_runs.tolist()} - {*runs.tolist()})
+    if not absent or "run" not in truth:
         return []
     remedy = "if the filter broke down there, write a row of NaN, so that the failure counts"
     return [f"{name}: no estimates of {plural(len(absent), 'run')} of the truth ({listed(absent)}); {remedy}"]

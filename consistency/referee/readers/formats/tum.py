@@ -326,7 +326,9 @@ def _poses(
 def _states(lines: Lines, k: int) -> Array:
     """Poses with the first ``k`` numbers of velocity and biases behind them, (N, 7 + k)."""
     pose = lines.values[:, 1:POSE]
-    return np.column_stack([pose, lines.rest[:, :k]]) if k and lines.rest is not None else pose
+    if lines.rest is None or not k:
+        return pose
+    return np.column_stack([pose, lines.rest[:, :k]])
 
 
 def _width(lines: Lines) -> int:

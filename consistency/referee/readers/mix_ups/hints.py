@@ -175,7 +175,8 @@ def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: boo
 
 def _status(fit: ReadingFit) -> int:
     """0 where the NEES is shown to be consistent, 1 where it may be, 2 where it is not."""
-    from consistency.referee.diagnostics import Record, judge
+    from consistency.referee.diagnostics.judge_record import judge
+    from consistency.referee.diagnostics.records.record import Record
 
     nees = np.full((len(fit.whitened), max(map(len, fit.whitened))), np.nan)
     for row, w in zip(nees, fit.whitened, strict=True):

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.records.large_arrays import diagonal
-from consistency.referee.diagnostics.records.record import each_alone
+from consistency.referee.diagnostics.records.record import Record, each_alone
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
 from consistency.referee.readers.formats.numpy_archive import estimator_of_arrays
@@ -69,11 +68,13 @@ def record_of_arrays(
             raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
     if mask.any():
         arrays["mask"] = mask
-    arrays |= {} if axes is None else {"axes": np.asarray(axes, str)}
+    if axes is not None:
+        arrays["axes"] = np.asarray(axes, str)
     record = estimator_of_arrays(Path("arrays"), arrays, Reading())
     if isinstance(record, Estimator):
         (record,) = records_of(record, Reading())
-    record = record if sigma is None else each_alone(record)
+    if sigma is not None:
+        record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     return replace(record, name=require_name(name, "name"), failures=failures)
 

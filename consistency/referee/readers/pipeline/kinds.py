@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from consistency.referee.diagnostics import Record
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from consistency.referee.diagnostics import Record
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
 from consistency.referee.parsing import require_name

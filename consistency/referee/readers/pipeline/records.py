@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics import Record
-from consistency.referee.diagnostics.records.record import each_alone
+from consistency.referee.diagnostics.records.record import Record, each_alone
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.readers.heading_units import require_radians
@@ -95,7 +94,9 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
         some, axes = [track.part(part) for track in tracks], tuple(e.axes[i] for i in part)
         record = assemble(f"{e.name}{ending}", some, t, axes, str(e.covariances or e.path), e.convention, notes)
         record = replace(moved.on(record), causes=tuple(causes))
-        records.append(each_alone(record) if e.stated.alone else record)
+        if e.stated.alone:
+            record = each_alone(record)
+        records.append(record)
         notes, causes = [], []
     return records
 
@@ -153,7 +154,8 @@ def _known(e: Estimator, p: Poses, r: Reading, shift: float) -> Known:
     stated = p.stated[known.rows]
     if len(stated) and not stated.any():
         raise InputError(f"{p.files[0]}: no estimate has both a truth and a covariance within {p.max_dt:g} s")
-    known = known if stated.all() else known.of(stated)
+    if not stated.all():
+        known = known.of(stated)
     if p.numbered and p.clock is not None and p.true_clock is not None:
         t, true_t = p.clock[known.rows], p.true_clock[known.before]
         where = f"in the same step of {p.files[1]}; number the same instants by the same step, or raise --max-dt"
@@ -172,8 +174,9 @@ def _nothing_known(e: Estimator, p: Poses, shift: float) -> InputError:
         return InputError(f"{p.files[0]}: no step of run {p.run} ({own}) is in {p.files[1]} ({true})")
     from consistency.referee.readers.clock_units import nothing_near
 
-    several = len(e.runs) > 1 and e.runs[0].files == e.runs[-1].files
-    what = f"estimate of run {p.run}" if several else "estimate"
+    what = "estimate"
+    if len(e.runs) > 1 and e.runs[0].files == e.runs[-1].files:
+        what = f"estimate of run {p.run}"
     return nothing_near(p.files, p.t + shift, p.true_t, p.max_dt, what, "truth")
 
 
@@ -217,9 +220,12 @@ def _left_out(e: Estimator, runs: Sequence[Poses], known: Sequence[Known]) -> li
     """Notes on left-out rows, and on a truth between whose samples estimates are."""
     notes, total = [], sum(len(p.t) for p in runs)
     if left_out := total - sum(len(k.rows) for k in known):
-        what = "no truth" if all(p.stated.all() for p in runs) else "no truth or no covariance"
-        within = "" if runs[0].numbered else f" within {runs[0].max_dt:g} s (--max-dt)"
-        notes.append(f"{e.said}: {left_out} of {total} estimates have {what}{within} and are left out")
+        what = "no truth"
+        if not all(p.stated.all() for p in runs):
+            what = "no truth or no covariance"
+        if not runs[0].numbered:
+            what += f" within {runs[0].max_dt:g} s (--max-dt)"
+        notes.append(f"{e.said}: {left_out} of {total} estimates have {what} and are left out")
     furthest = max(float(k.apart.max(initial=0.0)) for k in known)
     if furthest > ROUNDING and not e.in_space:
         notes.append(f"{e.said}: the truth is interpolated, from samples up to {furthest:.2g} s away")
@@ -259,7 +265,9 @@ def _bend(p: Poses, known: Known) -> Array:
 def _median(values: Array) -> float:
     """Median of the finite values; 0 without any."""
     finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else 0.0
+    if not len(finite):
+        return 0.0
+    return float(np.median(finite))
 
 
 def _not_estimated(e: Estimator, tracks: Sequence[Track], judged: Sequence[int]) -> list[int]:
@@ -323,7 +331,8 @@ def _innovations(e: Estimator) -> Record:
 
 def _windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:
     """The record of motions over windows."""
-    from consistency.referee.readers.relative_motions import Stretch, relative_recording
+    from consistency.referee.readers.pipeline.motion_causes import causes_of_motions
+    from consistency.referee.readers.pipeline.relative_motions import Stretch, relative_recording
 
     if e.stated != WHOLE:
         raise InputError(f"{e.path}: --relative needs covariances of whole poses; here parts are stated apart")
@@ -345,5 +354,10 @@ def _windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative
             )
         )  # fmt: skip
     of = str(e.covariances or e.path)
-    record = relative_recording(e.name, of, stretches, e.axes[: len(AXES)], judged, relative)
-    return replace(record, notes=(*e.notes, *_left_out(e, runs, known), *record.notes))
+    axes = AXES
+    if stretches[0].d == 2:  # archives do not name them
+        axes = ("x", "y", "heading")
+    record = relative_recording(e.name, of, stretches, axes, judged, relative)
+    causes = causes_of_motions(e.said, stretches, axes, judged, relative)
+    notes = (*e.notes, *_left_out(e, runs, known), *record.notes, *causes)
+    return replace(record, notes=notes, causes=tuple(causes))

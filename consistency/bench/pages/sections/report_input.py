@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from consistency.referee.diagnostics import Record
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.pages.judged import Estimator, Judged
 from consistency.referee.types import Array
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from consistency.referee.diagnostics import Comparison
-from consistency.referee.diagnostics.comparison import Difference
+from consistency.referee.diagnostics.comparison import Comparison, Difference
 from consistency.referee.document.blocks import Column, Table, table
 
 

@@ -7,30 +7,29 @@ A change of either world frame changes neither. Log(M D^-1) is the adjoint of it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.questions.independence import ENOUGH, Independence, independence
+from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.words.numbers import p_text, plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
-from consistency.referee.readers.mix_ups.hints import Change, Pairs, hints
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble
-from consistency.referee.readers.truth_matching import Poses, common_times
-from consistency.referee.readers.windows import Relative, windows
+from consistency.referee.readers.truth_matching import common_times
+from consistency.referee.readers.windows import MARGINAL, Relative, windows
 from consistency.referee.types import Array, Indices
 
 KIND = "left"
-MARGINAL = (
-    "covariances of two poses do not tell that of the motion between them; give their cross-covariances, or motions "
-    "with --motions (docs/files.md, Relative poses)"
-)
-SEARCHED = 20_000  # rows with truth, of all runs, in which mix-ups are looked for
+DOUBTS = {  # by whether sizes of errors depend on each other, and whether they are alike: what they do, and its cause
+    (True, True): ("are of like size", "conditions that last longer than a window"),
+    (True, False): ("are of unlike size", "what takes turns from window to window"),
+    (False, True): ("go the same way", "a bias, or noise that lasts longer than a window"),
+    (False, False): ("go opposite ways", "noise of the pose that they share"),
+}
 BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
 
 
@@ -140,7 +139,7 @@ def _of_poses(s: Stretch, T: Array, D: Array, first: Indices, last: Indices, rel
 
 def relative_recording(
     name: str, file: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
-) -> Evidence:
+) -> Record:
     """The windows of some runs of one estimator as a recording, whose steps are windows.
 
     Parameters
@@ -161,46 +160,17 @@ def relative_recording(
         tracks = [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
     notes = _notes(name, found, axes, stretches[0].convention, relative)
     of = independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
-    notes += _doubt(name, of, relative) if relative.independent else []
-    causes = _causes(name, stretches, axes, judged, relative)
-    notes += causes
+    if relative.independent:
+        notes += _doubt(name, of, relative)
     names = tuple(axes[i] for i in part)
     record = assemble(name, tracks, t, names, file, KIND, notes, may_end=relative.independent)
-    record = replace(record, causes=tuple(causes))
     if not relative.independent:
         return replace(record, window=relative.text)
-    caption = f"the {_whose(relative)} do not seem to be independent, on which this rests" if of.doubtful else ""
+    caption = ""
+    if of.doubtful:
+        caption = f"the {_whose(relative)} do not seem to be independent, on which this rests"
     unshown = _too_few(of, relative)
     return replace(record, window=relative.text, independent=True, caption=caption, unshown=unshown)
-
-
-def _causes(
-    name: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
-) -> list[str]:
-    """Mix-ups of motions, or of poses with cross-covariances, without which the errors of the windows fit."""
-    most = SEARCHED // len(stretches)
-    stretches = [replace(s, rows=s.rows[:most], truth=s.truth[:most]) for s in stretches]
-    planar = len(axes) == 3
-    runs = [
-        Poses(
-            s.place, s.t, s.estimate, s.covariance, np.ones(len(s.t), bool), s.t[s.rows], s.truth,
-            "planar" if planar else "spatial", s.convention, 0.0,
-        )
-        for s in stretches
-    ]  # fmt: skip
-
-    def errors_without(change: Change) -> Pairs:
-        found = []
-        for s, p in zip(stretches, runs, strict=True):
-            with np.errstate(invalid="ignore"), suppress(InputError):  # infinite covariances; no window fits
-                q = change(p)
-                cross = None if s.cross is None else change(replace(p, covariance=s.cross)).covariance
-                s = replace(s, estimate=q.estimate, covariance=q.covariance, cross=cross, convention=q.convention)
-                one = windows_of(replace(s, truth=q.truth), relative)
-                found.append((one.error, one.covariance))
-        return found
-
-    return hints(name, axes, runs, judged=judged, errors_without=errors_without)
 
 
 def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention: str, relative: Relative) -> list[str]:
@@ -240,21 +210,20 @@ def _whose(relative: Relative) -> str:
 def _widest(found: Sequence[Windows]) -> float:
     """Largest standard deviation of a rotation about an axis, rad, in the median window."""
     P = np.concatenate([one.covariance for one in found])
-    angles = P[:, 2:, 2:] if P.shape[-1] == 3 else P[:, 3:, 3:]
+    first = {3: 2, 6: 3}[P.shape[-1]]
+    angles = P[:, first:, first:]
     angles = angles[np.isfinite(angles).all(axis=(1, 2))]
-    return float(np.median(np.sqrt(np.maximum(np.linalg.eigvalsh(angles)[:, -1], 0.0)))) if len(angles) else 0.0
+    if not len(angles):
+        return 0.0
+    largest = np.linalg.eigvalsh(angles)[:, -1]
+    return float(np.median(np.sqrt(np.maximum(largest, 0.0))))
 
 
 def _doubt(name: str, of: Independence, relative: Relative) -> list[str]:
     """Note that windows are correlated, positively or negatively, though they are declared to be independent."""
     if not of.doubtful:
         return []
-    if of.of_sizes:
-        way = "are of like size" if of.alike else "are of unlike size"
-        cause = "conditions that last longer than a window" if of.alike else "what takes turns from window to window"
-    else:
-        way = "go the same way" if of.alike else "go opposite ways"
-        cause = "a bias, or noise that lasts longer than a window" if of.alike else "noise of the pose that they share"
+    way, cause = DOUBTS[bool(of.of_sizes), bool(of.alike)]
     return [
         f"{name}: errors of neighbouring windows {way} (p {p_text(of.p_value)}), so that they do not seem to be "
         f"independent: {cause} may be behind it, and the verdict holds for independent {_whose(relative)} only"

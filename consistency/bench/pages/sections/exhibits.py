@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.report_input import Report
+from consistency.bench.pages.sections.report_input import Report
 from consistency.bench.store.parquet import read_frame
 from consistency.bench.types import outcome
 from consistency.referee.document.blocks import Block, Cell, Column, Figure, Heading, Small, Stack, Status, Table, table

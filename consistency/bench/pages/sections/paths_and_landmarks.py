@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.pages.report_input import Study, Track
+from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.bench.simulation import simulate
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import ODOMETRY, TRUTH, Look
@@ -97,10 +97,10 @@ def world_map(study: Study) -> tuple[Figure, ...]:
         make_map(axes)
         return add_legend(figure, beside=True)
 
-    return (Figure(f"Scenario and estimates, run {study.shown_run}", caption(world), (draw,)),)
+    return (Figure(f"Scenario and estimates, run {study.shown_run}", map_caption(world), (draw,)),)
 
 
-def caption(world: World) -> str:
+def map_caption(world: World) -> str:
     parts = []
     if world.truth is not None:
         parts.append("true path solid with its start as a circle")

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from consistency.referee.diagnostics import Alarm, Monitor
 from consistency.referee.diagnostics.monitoring.gate_ratios import RARE, GateRatios
-from consistency.referee.diagnostics.monitoring.monitor import CAVEAT, accepted_scales
+from consistency.referee.diagnostics.monitoring.monitor import CAVEAT, Alarm, Monitor, accepted_scales
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Text, table
 
 

@@ -32,7 +32,7 @@ from consistency.referee.document.blocks import (
 )
 from consistency.referee.document.colours import COLOURS, Look, style
 from consistency.referee.document.wording import listed, number
-from consistency.referee.pages.provenance import facts
+from consistency.referee.pages.origin import facts
 from consistency.referee.show.painting import TITLE, add_legend, canvas, dots, log_axis, say, stroke, wrapped
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics import Verdict
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, p_text, percent, plural, ratio_text, short
 from consistency.referee.diagnostics.words.sentences import question_text
 from consistency.referee.document.blocks import (
@@ -117,7 +117,7 @@ def _failed(v: Verdict) -> Cell:
     return f"{len(v.failures)} of {v.runs}"
 
 
-FILTER = Column("Filter", width="1.3fr")
+FILTER = Column("Filter")
 BRIEF = (
     Measure(Column("Verdict"), lambda v: Status(v.status)),
     Measure(Column("Mean ANEES", "Mean\nANEES", number=True), _mean_anees),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from consistency.bench.pages.report_input import Study, Track
+from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import BAND, EXPECTED, Look
 from consistency.referee.document.wording import listed
@@ -46,7 +46,7 @@ def lags(track: Track) -> Lags | None:
 def innovations(study: Study) -> tuple[Figure, ...]:
     """A row for each filter: size and, where one of the study has any, autocorrelation."""
     drawings = tuple(partial(_draw, study, track) for track in study.tracks)
-    return (Figure("Innovations", caption(study), drawings),)
+    return (Figure("Innovations", innovations_caption(study), drawings),)
 
 
 def _draw(study: Study, track: Track) -> Drawing:
@@ -80,7 +80,7 @@ def _draw_correlation(axes: Axes, track: Track) -> None:
     axes.set(xlim=(0.4, lag[-1] + 0.6), ylim=(-reach, reach), xticks=lag[:: max(1, len(lag) // 5)])
 
 
-def caption(study: Study) -> str:
+def innovations_caption(study: Study) -> str:
     """What the figure shows."""
     over = "" if study.single else ", summed over the runs of its verdict"
     judged, every = study.judged, len(study.tracks)

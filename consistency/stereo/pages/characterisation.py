@@ -11,7 +11,7 @@ from scipy import stats
 
 from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Figure, Table, Text, table
 from consistency.referee.document.colours import BAND, COLOURS, EXPECTED, Look, style
-from consistency.referee.pages.provenance import facts
+from consistency.referee.pages.origin import facts
 from consistency.referee.show.painting import add_legend, band, canvas, dots, log_axis, stroke
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from consistency.bench.pages.report_input import Report, Study
+from consistency.bench.pages.sections.report_input import Report, Study
 from consistency.referee.document.blocks import Block, Details, Facts, Settings
-from consistency.referee.pages.provenance import facts
+from consistency.referee.pages.origin import facts
 
 SHORT = 4000  # characters of settings that surely fit on one page
 

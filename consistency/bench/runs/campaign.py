@@ -166,7 +166,9 @@ def place_for(
     with Unfinished(out, resume, overwrite) as unfinished:
         before = unfinished.journal.study
         replaces = bool(before.get("overwrite", overwrite and not resume))
-        if resume and previous is None and not replaces and (out.exists() or not before):
+        if resume and not out.exists() and unfinished.is_new:
+            raise InputError(f"--out {out}: there is nothing to resume; leave --resume out")
+        if resume and previous is None and not replaces and out.exists():
             previous = open_results(out)
         goes_on = resume and not replaces and out.exists()
         with NewFolder(out, "results", replaces or goes_on, goes_on, within=unfinished.path) as new:

@@ -212,6 +212,7 @@ class Unfinished:
                         f"--out {out}: unfinished work of an earlier version is there; finish it with that version, or "
                         "add --overwrite to drop it"
                     )
+                self.is_new = not (self.path / DATABASE).exists()
                 self.journal = Journal(self.path / DATABASE)
                 make_durable(self.path)
                 make_durable(self.path.parent)

@@ -27,7 +27,8 @@ def away_from_signals(call: Callable[..., Result], *args: Any) -> Result:
         return call(*args)
     from concurrent.futures import ThreadPoolExecutor
 
-    with ThreadPoolExecutor(1) as pool:  # whose end waits for the call
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(int).result()  # a pool waits at its end for the threads that it knows to have begun
         return pool.submit(call, *args).result()
 
 

@@ -24,7 +24,7 @@ from consistency.bench.runs.gather import Gathered
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.simulation import World
 from consistency.bench.store import journal as journals
-from consistency.bench.store.journal import Journal, Unfinished
+from consistency.bench.store.journal import DATABASE, Journal, Unfinished
 from consistency.bench.store.results import open_results
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system import folders
@@ -219,6 +219,16 @@ def test_unfinished_work_is_neither_ignored_nor_dropped_unasked(tmp_path: Path) 
     with Unfinished(out, overwrite=True) as fresh:
         assert fresh.journal.runs == set()
     assert list((tmp_path / "deep").iterdir()) == [], "nothing is finished, nothing stays"
+
+
+def test_resume_where_nothing_is(uvd: cs.Scenario, tmp_path: Path) -> None:
+    """Nothing at all is refused; a journal that a process was killed in before its first run is begun."""
+    with pytest.raises(cs.InputError, match=r"out: there is nothing to resume; leave --resume out"):
+        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=True)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / ".out.unfinished").mkdir()
+    Journal(tmp_path / ".out.unfinished" / DATABASE).close()
+    assert cs.run_trials(uvd, FILTER, 1, seed=3, jobs=1, out=tmp_path / "out", resume=True).manifest["complete"]
 
 
 def test_folders_that_were_made_go_with_what_was_for_nothing(tmp_path: Path) -> None:

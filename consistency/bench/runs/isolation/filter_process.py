@@ -23,7 +23,8 @@ from typing import Any
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.stepping import error_of, name_of, reason_of, rejects
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.isolation.worker import Isolated, begin, load, nothing, run
+from consistency.bench.runs.isolation.process_start import begin, nothing
+from consistency.bench.runs.isolation.worker import Isolated, load, run
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
@@ -170,11 +171,12 @@ class _Worker:
         from pebble import ProcessPool
 
         context = get_context("loky")
+        _start_tracker()
         printed, output = context.Pipe(duplex=False)
         self._output = output  # open, so that it can be given to the next process
         threading.Thread(target=_show, args=(printed,), daemon=True).start()
         self._loaded: set[bytes] = set()
-        self._pid = 0
+        self._pid, self._stopping = 0, threading.Lock()
         initargs = (output, *link_to_parent(context))
         self._pool: Any = ProcessPool(1, initializer=begin, initargs=initargs, context=context)
         _starter().submit(self._pool.schedule, nothing).result()
@@ -235,10 +237,11 @@ class _Worker:
         return task.result()
 
     def stop(self) -> None:
-        """Kill the process at once."""
-        self._pool.stop()
-        self._pool.join()
-        self._output.close()
+        """Kill the process at once; the end of a study and the thread that waits for a result may both do so."""
+        with self._stopping:
+            self._pool.stop()
+            self._pool.join()
+            self._output.close()
 
 
 def _lives(pid: int) -> bool:
@@ -293,6 +296,20 @@ def _show(printed: Connection) -> None:
                         2, f"\nconsistency: filters print more than {SHOWN} bytes; the rest is not shown\n".encode()
                     )
                 left -= len(text)
+
+
+def _start_tracker() -> None:
+    """Start loky's tracker of semaphores, which removes those of a process that is killed, without its warning."""
+    from joblib.externals.loky.backend import resource_tracker
+
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker"
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        del os.environ["PYTHONWARNINGS"]
+        if before is not None:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def dismiss() -> None:

@@ -6,11 +6,11 @@ import contextlib
 import importlib
 import os
 import pickle
-import signal
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+
+from threadpoolctl import threadpool_limits
 
 try:
     import resource
@@ -22,7 +22,6 @@ from consistency.bench.filters.stepping import reason_of, run_filter
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
-from consistency.referee.system.stopping import end_with_parent
 
 GIB = 2**30
 
@@ -42,25 +41,6 @@ class Isolated:
         return record.estimates(self.name, trial.run, self.error, reason=reason, guarded=self.guarded)
 
 
-def begin(output: Connection, parent: int, alive: Connection) -> None:
-    """End with the parent, ignore its Ctrl-C, leave no core, use one BLAS thread, print into ``output``."""
-    from threadpoolctl import threadpool_limits
-
-    end_with_parent(parent, alive)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # Pebble has a handler, which code in C would keep waiting
-    if resource is not None:
-        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-    threadpool_limits(1)
-    for number in (1, 2):
-        with contextlib.suppress(OSError):
-            os.dup2(output.fileno(), number)
-
-
-def nothing() -> None:
-    """Let Pebble start its process."""
-
-
 def load(pickled: bytes, path: Sequence[str], folder: str) -> int:
     """Import what a filter needs, which takes no time of its first trial; return the number of the process."""
     sys.path[:] = path
@@ -69,6 +49,7 @@ def load(pickled: bytes, path: Sequence[str], folder: str) -> int:
         os.chdir(folder)
     with contextlib.suppress(Exception):
         pickle.loads(pickled)
+    threadpool_limits(1)  # of the libraries of BLAS that are loaded now
     return os.getpid()
 
 

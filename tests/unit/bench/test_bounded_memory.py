@@ -126,7 +126,8 @@ WORK = {
     "analyse": READ
     + "from consistency.bench.runs.analyse_results import analyse\nwork = lambda f: analyse(open_results(f))",
     "report": "from consistency.bench.pages.build import build_report as work",
-    "baseline": "from consistency.referee.verdicts.baselines import read_baseline as work",
+    "baseline": "from consistency.referee.verdicts.baselines import baseline\n"
+    + "from consistency.bench.runs.results_to_records import results_source\nwork = lambda f: baseline(results_source(f), str(f))",
 }
 
 

@@ -165,7 +165,9 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         self.seen.append(tag)
-        self.loaded += [value or "" for key, value in attributes if key in ("src", "href") and value != "data:,"]
+        self.loaded += [
+            value or "" for key, value in attributes if key in ("src", "href") and value not in ("data:,", "#content")
+        ]
         if tag not in ("meta", "link"):
             self.open.append(tag)
 

@@ -68,7 +68,7 @@ def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
     R : (T + 1, 3, 3)
     t : (T + 1, 3), m
     P : (T + 1, 6, 6), of the position and of the rotation vector of R_true R' about the first frame's axes (error
-        convention so3 of :mod:`consistency.referee.geometry.conventions`), m and rad; 0 for the first pose. Rotation
+        convention so3 of ``consistency.referee.geometry.conventions``), m and rad; 0 for the first pose. Rotation
         vectors have no gimbal lock, which Euler angles in camera axes have where a car turns by 90 degrees.
     """
     R, t, P = [np.eye(3)], [np.zeros(3)], [np.zeros((6, 6))]
@@ -89,7 +89,7 @@ def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
 def motion_covariances(motions: Ordered[RelativeMotion]) -> Array:
     """Covariances (T, 6, 6) of the motions, of position and rotation vector in the frame that each begins in.
 
-    Error convention so3 of :mod:`consistency.referee.geometry.conventions`, m and rad.
+    Error convention so3 of ``consistency.referee.geometry.conventions``, m and rad.
     """
     G = np.zeros((len(motions), 6, 6))
     G[:, :3, :3] = np.eye(3)

@@ -289,7 +289,7 @@ def test_memory_that_is_taken_away(fresh: Path) -> None:
     status, error = end(process)
     assert "Traceback" not in error
     if status > 0:  # below 0 a library aborted, by a signal
-        assert "memory" in error.lower()
+        assert "memory" in error.lower() or "resource temporarily unavailable" in error.lower()  # of a thread
     if (fresh / UNFINISHED).exists():  # else the results are there, and a verdict may be missing
         assert kept(fresh) >= done > 0
         resume(fresh)

@@ -231,7 +231,7 @@ def test_a_log_goes_on(log: Path, tmp_path: Path, stop_at: Any, monkeypatch: pyt
     assert not (tmp_path / "out").exists()
     done = stop_at(-1, RuntimeError())
     run_log(read_log(log), ["kf"], jobs=1, out=tmp_path / "out", resume=True)
-    assert done == [4, 5]
+    assert done in ([4], [4, 5]), "run 5 may have been finished meanwhile"
     assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 

@@ -78,7 +78,7 @@ class DaskExecutor(Executor):
     def _client(self) -> Client:
         """A client of a scheduler that has a worker."""
         for name in list(logging.root.manager.loggerDict):
-            if name.startswith("distributed"):  # workers and connections that are gone are dask's business
+            if name.startswith(("distributed", "tornado")):  # what is gone, workers and connections, is dask's business
                 logging.getLogger(name).setLevel(logging.CRITICAL)
         where, end = self._address(), time.monotonic() + self.wait
         while True:
@@ -114,7 +114,7 @@ class DaskExecutor(Executor):
     def _cluster(self) -> LocalCluster:
         return LocalCluster(
             n_workers=worker_count(self.jobs), threads_per_worker=1, memory_limit=None, host="127.0.0.1",
-            dashboard_address=None, silence_logs=logging.CRITICAL,
+            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
         )  # fmt: skip
 
     def _give_up(self, what: str, error: Exception) -> NoReturn:

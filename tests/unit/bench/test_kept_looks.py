@@ -70,7 +70,8 @@ def test_what_ends_the_process_takes_no_finished_run(
     assert [path.name for path in tmp_path.iterdir()] == [".out.unfinished"]
     done = stop_at(-1, RuntimeError())
     _, verdicts = run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
-    assert done == list(range(run, 20))
+    assert done[0] == run
+    assert set(done) <= set(range(run, 20))  # runs after it may have been finished meanwhile
     assert content(tmp_path / "out") == content(whole)
     assert render(document(verdicts)) == render(document(cs.analyse(open_results(whole))))
     assert plan_in(tmp_path / "out") == plan_in(whole)

@@ -1,7 +1,9 @@
-"""``consistency fit-covariance``: parses, calls, prints."""
+"""``consistency fit-covariance`` and ``correct``: parse, call, print."""
 
 from __future__ import annotations
 
+import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
@@ -10,10 +12,13 @@ import typer
 from consistency.commands.shared_options import (
     ESTIMATES,
     AsJson,
+    Skip,
     print_document,
+    read_files,
     reads_files,
     require_word,
     require_written,
+    tell_notes,
 )
 from consistency.referee.readers.options import Reading
 
@@ -90,4 +95,75 @@ def fit_covariance_command(
         written = write_model(model, out, overwrite)
     print_document(noise_document(model), as_json, written)
     if fail_on and model.status != "consistent":
+        raise typer.Exit(1)
+
+
+NOT_CORRECTED = ("relative", "motions", "windows", "truth_covariance", "truth_errors", "truth_shared")
+CORRECTABLE = [each.name for each in fields(Reading) if each.name not in NOT_CORRECTED]
+
+
+@reads_files(only=CORRECTABLE)
+def correct_command(
+    path: Annotated[Path, typer.Argument(metavar="ESTIMATES", help=f"Estimates with covariances: {ESTIMATES}.")],
+    files: Reading,
+    per: Annotated[
+        str | None,
+        typer.Option("--per", metavar="axis", help="'axis': a factor for each component [for each block of them]."),
+    ] = None,
+    held_out: Annotated[
+        str | None,
+        typer.Option(
+            "--held-out",
+            metavar="A,B|half",
+            help="Runs that are judged and not fitted, or the second half [each by the factors of the others].",
+        ),
+    ] = None,
+    skip: Skip = None,
+    name: Annotated[
+        str | None, typer.Option("--filter", metavar="NAME", help="Which, if the files hold several estimators.")
+    ] = None,
+    anyway: Annotated[
+        bool, typer.Option("--anyway", help="Write a correction also where no factor mends what is wrong.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for correction.toml, corrected runs, lines for other programs, page."),
+    ] = None,
+    as_json: AsJson = False,
+    fail_on: Annotated[
+        str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless consistent after.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
+) -> None:
+    """Find factors for a covariance that is stated, and judge them on runs that chose nothing."""
+    from consistency.referee.fit_covariance.correct import correct, the_record
+    from consistency.referee.fit_covariance.correction_text import correction_document
+    from consistency.referee.readers.formats.restated import text_files
+    from consistency.referee.system.folders import require_free
+    from consistency.referee.verdicts.command_settings import skip_asked
+
+    require_word("--per", per, "axis")
+    require_word("--fail-on", fail_on, "inconsistent")
+    require_written(overwrite, out, "--out")
+    if out is not None:
+        require_free(out, overwrite, "correction")
+    records = read_files(path, files)
+    record = the_record(records, name).without_first(skip_asked(skip))
+    texts = text_files(path, files)
+    names = None
+    if len(texts) == len(record.run_numbers) and record.unit == "run" and texts[0].run_column is None:
+        names = [texts[run].path.stem for run in record.run_numbers]
+    found = correct(record, held_out=held_out, per_axis=per is not None, names=names)
+    tell_notes(records)
+    written: list[Path] = []
+    is_written = out is not None and (anyway or found.status != "inconsistent")
+    if out is not None and is_written:
+        from consistency.referee.fit_covariance.correction_files import write_correction
+
+        written = write_correction(found, record, texts, out, overwrite)
+    print_document(correction_document(found), as_json, written)
+    if out is not None and not is_written:
+        print(f"consistency: {out} is not written, as the correction is inconsistent; --anyway does", file=sys.stderr)
+        raise typer.Exit(1)
+    if fail_on and found.status != "consistent":
         raise typer.Exit(1)

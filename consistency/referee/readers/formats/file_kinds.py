@@ -20,6 +20,7 @@ TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
 ARCHIVES = (".npz", ".mat")
 TRAJECTORIES = (".txt", ".tum")
 BAGS = (".bag", ".mcap", ".db3")
+HELD_OUT, CORRECTED, CORRECTION = "held-out", "corrected", "correction.toml"  # of a folder of 'correct'
 SPEEDS = ("v", "speed", "velocity", "forward_velocity", "linear_velocity", "linear_x", "vx", "v_x")
 TURNS = ("omega", "w", "yaw_rate", "yawrate", "turn_rate", "angular_velocity", "angular_z", "wz", "w_z")
 HEADINGS = ("heading", "theta", "yaw", "orientation", "psi")
@@ -73,6 +74,17 @@ def trajectory_files(folder: Path) -> list[Path]:
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     named = [p for p in files if p.suffix.lower() in TRAJECTORIES]
     return named or [p for p in files if is_spatial(p) or is_solution(p)]
+
+
+def fitted_note(path: Path) -> str:
+    """A note on files whose covariances were fitted to their own errors; "" of others."""
+    for at in (path, path.parent):
+        if at.name == CORRECTED and (at.parent / CORRECTION).is_file():
+            return (
+                f"{path}: its covariances are corrected by factors fitted to these runs, so that their verdict shows "
+                f"nothing; {at.parent / HELD_OUT} has each run by the factors of others"
+            )
+    return ""
 
 
 SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages

@@ -90,7 +90,7 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     if r.error not in (None, *INERTIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
     truth_of = _truths(estimates, r)
-    files = _runs(estimates, r.truth, None if poses_alone else r.covariance)
+    files = files_of_runs(estimates, r.truth, None if poses_alone else r.covariance)
     runs = (SpaceRun(read_trajectory(own), truth_of(true), (own, true), P) for own, true, P in files)
     if poses_alone:
         return [poses_of(estimates, runs, r)]
@@ -244,7 +244,7 @@ def _origin(stated: Stated) -> str:
     return "written by OpenVINS"
 
 
-def _runs(estimates: Path, truth: Path | None, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
+def files_of_runs(estimates: Path, truth: Path | None, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
     """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
     if not estimates.is_dir():
         for option, path in (("--truth", truth), ("--covariance", covariance)):
@@ -448,7 +448,7 @@ def _inline(own: Lines, order: str) -> Array | None:
     if not numbers.shape[1]:
         return None
     if numbers.shape[1] in DEVIATIONS:
-        return diagonal(numbers[:, _turned(numbers.shape[1], order)])
+        return diagonal(numbers[:, covariance_order(numbers.shape[1], order)])
     if own.values.shape[1] == SPLIT:  # rotation, then position
         rotation, position = _triangle(numbers[:, :6], 3), _triangle(numbers[:, 6:], 3)
         out = np.zeros((len(numbers), 6, 6))
@@ -462,11 +462,11 @@ def _matrices(numbers: Array, order: str) -> Array:
     n = next(n for n in DEVIATIONS if numbers.shape[1] in (n * n, n * (n + 1) // 2))
     P = numbers.reshape(-1, n, n) if numbers.shape[1] == n * n else _triangle(numbers, n)
     if order != ORDERS[0]:
-        P = P[:, _turned(n, order)][:, :, _turned(n, order)]
+        P = P[:, covariance_order(n, order)][:, :, covariance_order(n, order)]
     return np.asarray(P)
 
 
-def _turned(n: int, order: str) -> list[int]:
+def covariance_order(n: int, order: str) -> list[int]:
     """Places of x, y, z, the rotation and n - 6 more among components in an order."""
     there = BLOCKS_OF_STATE[: n // 3]
     blocks = [block for block in blocks_in(n, order) if block in there]

@@ -18,6 +18,7 @@ from consistency.referee.parsing import require_name
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TRAJECTORIES,
+    fitted_note,
     is_bag,
     is_drive,
     is_foreign,
@@ -166,6 +167,9 @@ def _by_kind(estimates: Path, r: Reading) -> list[Record]:
     if r.truth is not None and is_foreign(r.truth):
         raise unknown_kind(r.truth)
     records = _records(kind.read(estimates, r, False), r)
+    for path in filter(None, (estimates, r.covariance)):
+        if note := fitted_note(path):
+            records = [replace(records[0], notes=(note, *records[0].notes)), *records[1:]]
     if r.truth is None or not is_drive(r.truth):
         return records
     of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"

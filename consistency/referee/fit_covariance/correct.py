@@ -1,0 +1,248 @@
+"""A stated covariance corrected by factors and floors, and judged on runs that chose nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import special, stats
+
+from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
+from consistency.referee.diagnostics.records.whitening import squared_length, whiten
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named
+from consistency.referee.fit_covariance.factors import Block, Factors, Fit, blocks_of, fit_runs
+from consistency.referee.types import Array, Indices
+from consistency.referee.verdicts.sources import analyse
+
+LEVELS = (0.68, 0.95, 0.99)
+FEW = 30  # runs; with fewer what the uncertainty of the factors adds to a ratio is printed
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of judged runs beside a covariance."""
+
+    record: Record = field(repr=False)
+    verdict: Verdict = field(repr=False)  # what ``analyse`` says of it
+    ratio: Interval  # of true to stated covariance
+    coverage: tuple[float, ...]  # share of the errors inside the ellipsoids of LEVELS
+    scores: Array  # (R,), log density of a step, mean of each run
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Factors and floors for a stated covariance, with the verdict on errors that chose nothing."""
+
+    name: str
+    blocks: tuple[Block, ...]
+    fit: Fit = field(repr=False)
+    held_out: str  # "in turn", "half" or names
+    runs: tuple[str, ...]  # names of all runs
+    fitted: tuple[str, ...]
+    judged: tuple[str, ...]
+    used: tuple[Factors, ...]  # of each judged run, from other runs
+    before: HeldOut  # the judged runs as they are stated
+    after: HeldOut  # corrected, as the files of held-out/ have them
+    verdict: Verdict = field(repr=False)  # with the uncertainty of the factors taken in
+    excess: float  # what that uncertainty adds to the ratio of held-out runs
+    gain: Interval  # of the log score, a step
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the components of the error."""
+        return tuple(self.before.record.axes) or numbered_axes(self.before.record.dof)
+
+    @property
+    def unit(self) -> str:
+        """What a run is called."""
+        return self.before.record.unit
+
+    @property
+    def needed(self) -> int | None:
+        """Runs that would probably decide; None where that is not known."""
+        shown = self.verdict.equivalence
+        return None if shown is None else shown.runs
+
+    @property
+    def status(self) -> str:
+        """consistent, undecided, or inconsistent where no factor mends what is wrong."""
+        status = self.verdict.status
+        return status if status in ("consistent", "undecided") else "inconsistent"
+
+
+def correct(
+    record: Record,
+    *,
+    held_out: str | None = None,
+    per_axis: bool = False,
+    names: Sequence[str] | None = None,
+) -> Correction:
+    """Fit factors to the covariances that an estimator states, and judge them on runs that chose nothing.
+
+    Parameters
+    ----------
+    record : runs with errors and covariances, as of :func:`consistency.read`
+    held_out : names of runs that are judged and not fitted, with commas; "half": the second half of the runs; None:
+        each run is judged by the factors of all others
+    per_axis : a factor for each component, in place of one for position, attitude and velocity
+    names : of the runs, for messages and ``held_out``; their numbers where None
+
+    Raises
+    ------
+    InputError
+        There is one run, or none with errors and covariances; or a name is not there.
+    """
+    require_runs(record)
+    assert record.nees is not None
+    labels = tuple(map(str, record.run_numbers if names is None else names))
+    there = np.flatnonzero(np.isfinite(record.nees).any(axis=1))
+    fitted, judged = fitted_and_judged(labels, there, held_out)
+    blocks = blocks_of(record.axes, record.dof, per_axis)
+    fit = fit_runs(record.of_runs(fitted), blocks)
+    used = fit.left_out if held_out is None else (fit.factors,) * len(judged)
+    some = replace(record, map=None, rejections=None, world=None).of_runs(judged)
+    before = held_out_by(some)
+    after = held_out_by(with_factors(some, used))
+    sizes = np.array([len(block) for block in blocks])
+    excess = float((sizes * fit.dof / (fit.dof - 2.0)).sum() / sizes.sum())
+    return Correction(
+        name=record.name,
+        blocks=blocks,
+        fit=fit,
+        held_out=held_out or IN_TURN,
+        runs=labels,
+        fitted=tuple(labels[i] for i in fitted),
+        judged=tuple(labels[i] for i in judged),
+        used=used,
+        before=before,
+        after=after,
+        verdict=verdict_of(with_uncertainty(after.record, blocks, fit.dof)),
+        excess=excess,
+        gain=mean_over_runs(after.scores - before.scores),
+    )
+
+
+def the_record(records: Sequence[Record], name: str | None = None) -> Record:
+    """The record of the one estimator, or of that named.
+
+    Raises
+    ------
+    InputError
+        There are several, or none of this name.
+    """
+    named_so = [record for record in records if name in (None, record.name)]
+    if len(named_so) == 1:
+        return named_so[0]
+    there = ", ".join(record.name for record in records)
+    what = (
+        f"--filter {name}: is not in these files"
+        if name
+        else "these files hold several estimators: name one by --filter"
+    )
+    raise InputError(f"{what}; there are: {there}")
+
+
+def require_runs(record: Record) -> None:
+    """Refuse a record that has no covariances, or one run alone."""
+    if record.error is None or record.covariance is None or record.nees is None:
+        raise InputError(f"{record.name}: needs errors and covariances, of files with a truth")
+    if record.guesses:
+        raise InputError("--error guess: a correction is of one error; declare the one that the covariance is of")
+    runs = int(np.isfinite(record.nees).any(axis=1).sum())
+    if runs == 1:
+        from consistency.referee.diagnostics.planning.single_log import FEWEST
+
+        raise InputError(
+            f"{record.name}: one log has no other to judge its factors by; give several runs, or cut it with --split "
+            f"auto, which takes {FEWEST} pieces or more that do not depend on each other"
+        )
+    if runs == 0:
+        raise InputError(f"{record.name}: no run has a step with an error and a covariance of full rank")
+
+
+def fitted_and_judged(labels: Sequence[str], there: Indices, held_out: str | None) -> tuple[Indices, Indices]:
+    """Rows of the runs that are fitted, and of those that are judged."""
+    if held_out is None:
+        return there, there
+    judged = there[len(there) // 2 :]
+    if held_out != HALF:
+        judged = np.intersect1d(named(labels, held_out, "run"), there)
+    fitted = np.setdiff1d(there, judged)
+    if len(fitted) < 2 or not len(judged):
+        raise InputError(f"--held-out {held_out}: leaves {len(fitted)} runs to fit; it takes 2, and 1 to judge")
+    return fitted, judged
+
+
+def with_factors(record: Record, used: Sequence[Factors]) -> Record:
+    """The record with the covariances of each run corrected by its factors."""
+    assert record.covariance is not None
+    P = np.stack([each.applied(P) for each, P in zip(used, record.covariance, strict=True)])
+    return with_covariance(record, record.error, P)
+
+
+def with_covariance(record: Record, error: Array | None, P: Array) -> Record:
+    """The record with other errors and covariances where it had some that count."""
+    assert error is not None
+    assert record.nees is not None
+    nees = np.where(np.isfinite(record.nees), squared_length(whiten(error, P)), np.nan)
+    return replace(record, error=error, covariance=P, nees=nees)
+
+
+def with_uncertainty(record: Record, blocks: Sequence[Block], dof: Array) -> Record:
+    """Corrected errors, less what the uncertainty of their factors adds.
+
+    By a factor that is known with nu degrees of freedom the NEES of a block of n components is n times F(n, nu), not
+    chi-square(n). Errors of the block are made shorter so that their NEES is the quantile of the chi-square at the same
+    probability.
+    """
+    assert record.error is not None
+    assert record.covariance is not None
+    error = record.error.copy()
+    for block, nu in zip(blocks, dof, strict=True):
+        places, n = list(block.places), len(block)
+        P = record.covariance[:, :, places][..., places]
+        squares = squared_length(whiten(error[..., places], P))
+        known = special.chdtri(n, special.fdtrc(n, nu, squares / n))
+        shorter = np.sqrt(known / np.where(squares > 0, squares, 1.0))
+        error[..., places] *= np.where(np.isfinite(shorter) & (squares > 0), shorter, 1.0)[..., None]
+    return with_covariance(record, error, record.covariance)
+
+
+def verdict_of(record: Record) -> Verdict:
+    """What ``analyse`` says of a record."""
+    return analyse([record])[record.name]
+
+
+def held_out_by(record: Record) -> HeldOut:
+    """Figures of runs beside the covariance of their record."""
+    assert record.nees is not None
+    assert record.covariance is not None
+    verdict = verdict_of(record)
+    means, _ = run_means(record.nees)
+    ratio = ratio_interval(means / record.dof, record.dof)
+    if verdict.scale is not None:
+        ratio = verdict.scale.inflation
+    counted = np.isfinite(record.nees)
+    coverage = []
+    for level in LEVELS:
+        inside = np.where(counted, record.nees <= special.chdtri(record.dof, 1.0 - level), np.nan)
+        coverage.append(float(np.nanmean(inside, axis=1).mean()))
+    P = np.where(counted[..., None, None], record.covariance, np.eye(record.dof))
+    density = -0.5 * (record.nees + np.linalg.slogdet(2.0 * np.pi * P)[1])
+    return HeldOut(record, verdict, ratio, tuple(coverage), np.nanmean(density, axis=1))
+
+
+def mean_over_runs(values: Array) -> Interval:
+    """Mean of a value of each run, (R,), with Student's interval; of one run its ends are NaN."""
+    mean = float(values.mean())
+    if len(values) < 2:
+        return Interval(mean, float("nan"), float("nan"))
+    error = values.std(ddof=1) / np.sqrt(len(values))
+    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), len(values) - 1) * error)
+    return Interval(mean, mean - reach, mean + reach)

@@ -1,0 +1,128 @@
+"""A correction of a stated covariance in sentences, tables and numbers for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.diagnostics.verdict.as_dictionary import plain
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.words.numbers import plural, short
+from consistency.referee.document.blocks import Column, Document, Table, Text, table
+from consistency.referee.fit_covariance.correct import FEW, LEVELS, Correction, HeldOut
+from consistency.referee.fit_covariance.covariance_ratios import IN_TURN
+
+
+def sentence(found: Correction) -> str:
+    """The end that was reached, the ratios, and how they were found."""
+    before, after = found.before.ratio, found.after.ratio
+    how = f"{plural(len(found.judged), found.unit)}, each judged by the factors of the others"
+    if found.held_out != IN_TURN:
+        how = f"fitted on {plural(len(found.fitted), found.unit)}, judged on {len(found.judged)} others"
+    parts = [f"{found.status} after: held-out covariance ratio {shown(before)} before and {shown(after)} after", how]
+    if found.status == "undecided" and found.needed is not None:
+        parts.append(f"about {plural(found.needed, found.unit)} would decide")
+    if found.status == "inconsistent":
+        parts.append(f"no factor mends this: {found.verdict.reasons[0]}")
+    if all(each.holds(1.0) for each in found.fit.factor) and not found.fit.factors.floor.any():
+        parts.append("no factor is shown to be needed: 1 lies in every interval")
+    return "; ".join(parts)
+
+
+def shown(interval: Interval) -> str:
+    """A ratio with its interval."""
+    if not np.isfinite(interval.high):
+        return short(interval.value)
+    return f"{short(interval.value)} [{short(interval.low)}, {short(interval.high)}]"
+
+
+def correction_document(found: Correction) -> Document:
+    """Sentence, factors, held-out figures, and limits; numbers as data."""
+    opening = (
+        Text(f"{found.name}: {sentence(found)}"),
+        _factors(found),
+        _figures(found),
+        *map(Text, correction_lines(found)),
+    )
+    return Document(f"{found.name}: correction of the stated covariance", "", (), opening, data(found))
+
+
+def _factors(found: Correction) -> Table:
+    columns = (Column("block"), Column("components"), Column("factor on variances"), Column("on sigmas", number=True))
+    axes = found.axes
+    rows = []
+    for block, factor in zip(found.blocks, found.fit.factor, strict=True):
+        names = " ".join(axes[i] for i in block.places)
+        rows.append((block.name, names, shown(factor), f"x{short(float(np.sqrt(factor.value)))}"))
+    return table(columns, rows, "Factors of each block", style="plain")
+
+
+def _figures(found: Correction) -> Table:
+    columns = (Column("held-out"), Column("stated"), Column("corrected"), Column("expected", number=True))
+    before, after = found.before, found.after
+    rows = [("covariance ratio", shown(before.ratio), shown(after.ratio), "1")]
+    for level, stated, corrected in zip(LEVELS, before.coverage, after.coverage, strict=True):
+        rows.append((f"inside {level:.0%}", f"{stated:.1%}", f"{corrected:.1%}", f"{level:.0%}"))
+    return table(columns, rows, "Held-out errors beside the stated and the corrected covariance", style="plain")
+
+
+def correction_lines(found: Correction) -> Iterator[str]:
+    """Gain of the log score, what the uncertainty of the factors does, and limits."""
+    gain = found.gain
+    ends = f" [{gain.low:.3g}, {gain.high:.3g}]" if np.isfinite(gain.low) else ""
+    yield f"log score gained a step, on average over {found.unit}s: {gain.value:.3g}{ends}"
+    if len(found.fitted) < FEW:
+        without = found.after.ratio.value / found.excess
+        yield (
+            f"factors of {plural(len(found.fitted), found.unit)} are uncertain, which adds x{found.excess:.3g} to a "
+            f"held-out ratio; without it the ratio is {short(without)}"
+        )
+    if found.verdict.status != found.after.verdict.status:
+        yield (
+            f"analyse says of held-out/: {found.after.verdict.reasons[0]}; it takes the factors for exact, while here "
+            "their uncertainty is taken in"
+        )
+    yield from found.fit.notes
+    yield "the factors hold for data like these; those of new conditions may be others"
+
+
+def data(found: Correction) -> dict[str, Any]:
+    """Everything as plain data, as correction.toml and --json have it."""
+    fit = found.fit
+    return dict(
+        plain({
+            "name": found.name,
+            "status": found.status,
+            "sentence": sentence(found),
+            "held_out": found.held_out,
+            "fitted_runs": found.fitted,
+            "judged_runs": found.judged,
+            "needed_runs": found.needed,
+            "convention": found.before.record.convention,
+            "excess": found.excess,
+            "log_score_gain": found.gain,
+            "blocks": [
+                {
+                    "name": block.name,
+                    "components": [found.axes[i] for i in block.places],
+                    "factor": fit.factors.factor[b],
+                    "factor_interval": fit.factor[b][1:],
+                    "floor": fit.factors.floor[b],
+                    "floor_interval": fit.floor[b][1:],
+                    "degrees_of_freedom": fit.dof[b],
+                }
+                for b, block in enumerate(found.blocks)
+            ],
+            "stated": _held_out(found.before),
+            "corrected": _held_out(found.after),
+            "notes": fit.notes,
+            "referee": found.verdict.statistics,
+        })
+    )  # fmt: skip
+
+
+def _held_out(one: HeldOut) -> dict[str, Any]:
+    coverage = {f"inside_{level:.0%}".rstrip("%"): share for level, share in zip(LEVELS, one.coverage, strict=True)}
+    return {"ratio": one.ratio.value, "ratio_interval": one.ratio[1:], **coverage, "log_score": one.scores.mean()}

@@ -53,9 +53,10 @@ def fit_covariance_command(
     second: Annotated[
         Path | None, typer.Option("--second", help="Another estimator's poses of these drives: are errors the truth's?")
     ] = None,
-    no_correct: Annotated[
-        bool, typer.Option("--no-correct", help="Leave mean errors of scale and heading in.")
+    keep_mean_error: Annotated[
+        bool, typer.Option("--keep-mean-error", help="Leave mean errors of scale and heading in.")
     ] = False,
+    no_correct: Annotated[bool, typer.Option("--no-correct", hidden=True)] = False,
     by_turn: Annotated[
         bool, typer.Option("--by-turn", help="Correct a way that each turn adds, too, as of wheels that slip.")
     ] = False,
@@ -82,11 +83,14 @@ def fit_covariance_command(
     require_written(overwrite, out, "--out")
     if out is not None:
         require_free(out, overwrite, "noise")
+    if no_correct:
+        print("consistency: --no-correct is now called --keep-mean-error", file=sys.stderr)
     drives = read_drives(path, reading=replace(files, motions=motions or None))
     other = None if second is None else read_drives(second, reading=files)
+    mean = not (keep_mean_error or no_correct)
     model = fit(
-        drives, span, held_out=held_out, axes=axes, correct=not no_correct, by_turn=by_turn, cautious=cautious,
-        second=other, name=path.stem,
+        drives, span, held_out=held_out, axes=axes, correct=mean, by_turn=by_turn, cautious=cautious, second=other,
+        name=path.stem,
     )  # fmt: skip
     written: list[Path] = []
     if out is not None:
@@ -149,7 +153,7 @@ def correct_command(
         require_free(out, overwrite, "correction")
     records = read_files(path, files)
     record = the_record(records, name).without_first(skip_asked(skip))
-    texts = text_files(path, files)
+    texts = text_files(path, files, record.name)
     names = None
     if len(texts) == len(record.run_numbers) and record.unit == "run" and texts[0].run_column is None:
         names = [texts[run].path.stem for run in record.run_numbers]

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import special, stats
+from numpy.typing import ArrayLike
+from scipy import special
 
-from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
@@ -16,7 +16,9 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named
-from consistency.referee.fit_covariance.factors import Block, Factors, Fit, blocks_of, fit_runs
+from consistency.referee.fit_covariance.factors import Block, Factors, Fit, blocks_of, mean_over_runs
+from consistency.referee.fit_covariance.floors import fit_runs
+from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.sources import analyse
 
@@ -75,10 +77,21 @@ class Correction:
         status = self.verdict.status
         return status if status in ("consistent", "undecided") else "inconsistent"
 
+    def covariance(self, stated: ArrayLike) -> Array:
+        """Corrected covariances of stated ones, (..., n, n)."""
+        return self.fit.factors.applied(np.asarray(stated, float))
+
+    def __repr__(self) -> str:
+        from consistency.referee.fit_covariance.correction_text import sentence  # of this class
+
+        return f"<Correction {self.name}: {sentence(self)}>"
+
 
 def correct(
-    record: Record,
+    record: Record | ArrayLike,
+    covariances: ArrayLike | None = None,
     *,
+    axes: Sequence[str] | None = None,
     held_out: str | None = None,
     per_axis: bool = False,
     names: Sequence[str] | None = None,
@@ -87,7 +100,9 @@ def correct(
 
     Parameters
     ----------
-    record : runs with errors and covariances, as of :func:`consistency.read`
+    record : of :func:`consistency.read`; or errors (runs, steps, n), truth minus estimate
+    covariances : (runs, steps, n, n), beside errors
+    axes : (n,), names of the components of errors: x, y, z; roll, pitch, yaw or heading; vx, vy, vz make up blocks
     held_out : names of runs that are judged and not fitted, with commas; "half": the second half of the runs; None:
         each run is judged by the factors of all others
     per_axis : a factor for each component, in place of one for position, attitude and velocity
@@ -98,6 +113,8 @@ def correct(
     InputError
         There is one run, or none with errors and covariances; or a name is not there.
     """
+    if not isinstance(record, Record):
+        record = record_of_arrays({"errors": record, "covariances": covariances}, axes, "estimator", False)
     require_runs(record)
     assert record.nees is not None
     labels = tuple(map(str, record.run_numbers if names is None else names))
@@ -236,13 +253,3 @@ def held_out_by(record: Record) -> HeldOut:
     P = np.where(counted[..., None, None], record.covariance, np.eye(record.dof))
     density = -0.5 * (record.nees + np.linalg.slogdet(2.0 * np.pi * P)[1])
     return HeldOut(record, verdict, ratio, tuple(coverage), np.nanmean(density, axis=1))
-
-
-def mean_over_runs(values: Array) -> Interval:
-    """Mean of a value of each run, (R,), with Student's interval; of one run its ends are NaN."""
-    mean = float(values.mean())
-    if len(values) < 2:
-        return Interval(mean, float("nan"), float("nan"))
-    error = values.std(ddof=1) / np.sqrt(len(values))
-    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), len(values) - 1) * error)
-    return Interval(mean, mean - reach, mean + reach)

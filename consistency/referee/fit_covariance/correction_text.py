@@ -14,6 +14,8 @@ from consistency.referee.document.blocks import Column, Document, Table, Text, t
 from consistency.referee.fit_covariance.correct import FEW, LEVELS, Correction, HeldOut
 from consistency.referee.fit_covariance.covariance_ratios import IN_TURN
 
+UNITS = {"position": " m", "attitude": " rad", "velocity": " m/s"}
+
 
 def sentence(found: Correction) -> str:
     """The end that was reached, the ratios, and how they were found."""
@@ -50,13 +52,29 @@ def correction_document(found: Correction) -> Document:
 
 
 def _factors(found: Correction) -> Table:
-    columns = (Column("block"), Column("components"), Column("factor on variances"), Column("on sigmas", number=True))
-    axes = found.axes
+    axes, fit = found.axes, found.fit
+    columns = [Column("block"), Column("components"), Column("factor on variances"), Column("on sigmas", number=True)]
+    has_floors = any(each.high > 0.0 for each in fit.floor)
+    if has_floors:
+        columns.append(Column("floor, as a sigma"))
     rows = []
-    for block, factor in zip(found.blocks, found.fit.factor, strict=True):
-        names = " ".join(axes[i] for i in block.places)
-        rows.append((block.name, names, shown(factor), f"x{short(float(np.sqrt(factor.value)))}"))
-    return table(columns, rows, "Factors of each block", style="plain")
+    for b, block in enumerate(found.blocks):
+        factor = fit.factor[b]
+        row = (
+            block.name,
+            " ".join(axes[i] for i in block.places),
+            shown(factor),
+            f"x{short(float(np.sqrt(factor.value)))}",
+        )
+        rows.append((*row, _sigma(fit.floor[b], block.name)) if has_floors else row)
+    return table(tuple(columns), rows, "Factors of each block", style="plain")
+
+
+def _sigma(floor: Interval, block: str) -> str:
+    """A floor as a standard deviation, with its unit where that is known."""
+    unit = UNITS.get(block, "")
+    value, low, high = np.sqrt(floor)
+    return f"{value:.2g}{unit} [{low:.2g}, {high:.2g}]"
 
 
 def _figures(found: Correction) -> Table:

@@ -10,7 +10,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
+from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
@@ -153,8 +155,8 @@ class Fit:
     notes: tuple[str, ...] = ()
 
 
-def fit_runs(record: Record, blocks: tuple[Block, ...]) -> Fit:
-    """Fit a factor to each block of the errors of two runs or more."""
+def fit_alone(record: Record, blocks: tuple[Block, ...]) -> Fit:
+    """Fit a factor to each block of the errors of two runs or more, without floors."""
     sizes = np.array([len(block) for block in blocks], float)
     Q = run_moments(record, blocks)
     factor = fit_factors(Q.mean(axis=0), sizes)
@@ -178,3 +180,19 @@ def known_dof(left_out: Array, sizes: Array) -> Array:
     fitted = len(left_out) - 1
     variance = fitted * np.log(left_out).var(axis=0)
     return np.asarray(np.maximum(2.0 / np.maximum(variance, 1e-12), fitted * sizes))
+
+
+def run_score(C: Array, error: Array) -> float:
+    """Log density of a step, mean over errors (k, n) of a run with covariances C (k, n, n)."""
+    squares = (error * np.linalg.solve(C, error[..., None])[..., 0]).sum(axis=1)
+    return float(-0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * C)[1]).mean())
+
+
+def mean_over_runs(values: Array) -> Interval:
+    """Mean of a value of each run, (R,), with Student's interval; of one run its ends are NaN."""
+    mean = float(values.mean())
+    if len(values) < 2:
+        return Interval(mean, float("nan"), float("nan"))
+    error = values.std(ddof=1) / np.sqrt(len(values))
+    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), len(values) - 1) * error)
+    return Interval(mean, mean - reach, mean + reach)

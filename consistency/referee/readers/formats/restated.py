@@ -36,6 +36,8 @@ class TextFile:
     squared: bool  # False where they are standard deviations
     run: int = 0  # that all of its lines are of
     run_column: int | None = None  # with the run of each line
+    filter_column: int | None = None  # with the estimator of each line
+    filter: str = ""  # whose lines are written
 
     def restated(self, change: Change) -> str:
         """The text with each covariance P as D P D + F, by the factors and floors of its run; without runs of None."""
@@ -62,7 +64,9 @@ class TextFile:
         return out.getvalue() + end if restated else ""
 
     def _restated(self, fields: list[str], change: Change) -> list[str]:
-        """Fields of a line with its covariance restated; none where its run is left out."""
+        """Fields of a line with its covariance restated; none where its run or estimator is left out."""
+        if self.filter_column is not None and fields[self.filter_column].strip() != self.filter:
+            return []
         run = self.run if self.run_column is None else int(float(fields[self.run_column]))
         of = change(run)
         if of is None:
@@ -81,12 +85,17 @@ class TextFile:
         return fields
 
 
-def text_files(estimates: Path, r: Reading) -> list[TextFile]:
-    """The files that hold the covariances of estimates, in the order of runs; none where they are of another kind."""
+def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
+    """The files that hold the covariances of estimates, in the order of runs; none where they are of another kind.
+
+    Parameters
+    ----------
+    name : of the estimator, where a file holds several
+    """
     if is_bag(estimates) or estimates.suffix.lower() in ARCHIVES or is_solution(estimates):
         return []
     if estimates.is_file() and estimates.suffix.lower() == ".csv" and (r.state or not is_spatial(estimates)):
-        found = [_table(estimates, tuple(r.state or POSE))]
+        found = [_table(estimates, tuple(r.state or POSE), name)]
     elif is_plane(estimates):
         return []
     elif r.covariance is not None:
@@ -98,7 +107,7 @@ def text_files(estimates: Path, r: Reading) -> list[TextFile]:
     return known if len(known) == len(found) else []
 
 
-def _table(path: Path, axes: tuple[str, ...]) -> TextFile | None:
+def _table(path: Path, axes: tuple[str, ...], name: str) -> TextFile | None:
     """A table, whose first line names its columns."""
     head = head_of(path)
     if head is None:
@@ -106,7 +115,7 @@ def _table(path: Path, axes: tuple[str, ...]) -> TextFile | None:
     names = head.names
     if any(name.startswith("own_P") for name in names):
         return None
-    run = names.index("run") if "run" in names else None
+    run, of = (names.index(key) if key in names else None for key in ("run", "filter"))
     places = {name: i for i, name in enumerate(names)} | covariance_places(names, axes)
     entries = {}
     for a, b in itertools.product(axes, repeat=2):
@@ -115,10 +124,11 @@ def _table(path: Path, axes: tuple[str, ...]) -> TextFile | None:
             spelled = spelled[:1]
         entries |= {places[name]: (a, b) for name in spelled if name in places}
     if entries:
-        return TextFile(path, entries, True, run_column=run)
+        return TextFile(path, entries, True, run_column=run, filter_column=of, filter=name)
     for spelling in (*DEVIATIONS, "sigma_{}"):
         if all(spelling.format(a) in places for a in axes):
-            return TextFile(path, {places[spelling.format(a)]: (a, a) for a in axes}, False, run_column=run)
+            entries = {places[spelling.format(a)]: (a, a) for a in axes}
+            return TextFile(path, entries, False, run_column=run, filter_column=of, filter=name)
     return None
 
 

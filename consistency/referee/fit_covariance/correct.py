@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,8 +35,15 @@ class HeldOut:
     record: Record = field(repr=False)
     verdict: Verdict = field(repr=False)  # what ``analyse`` says of it
     ratio: Interval  # of true to stated covariance
-    coverage: tuple[float, ...]  # share of the errors inside the ellipsoids of LEVELS
     scores: Array  # (R,), log density of a step, mean of each run
+
+    def covered(self, levels: Sequence[float] | Array) -> Array:
+        """Share of the errors inside the ellipsoid of each probability, mean over runs."""
+        nees = self.record.nees
+        assert nees is not None
+        counted = np.isfinite(nees)
+        bounds = special.chdtri(self.record.dof, 1.0 - np.asarray(levels))
+        return np.array([np.nanmean(np.where(counted, nees <= bound, np.nan), axis=1).mean() for bound in bounds])
 
 
 @dataclass(frozen=True)
@@ -80,6 +89,17 @@ class Correction:
     def covariance(self, stated: ArrayLike) -> Array:
         """Corrected covariances of stated ones, (..., n, n)."""
         return self.fit.factors.applied(np.asarray(stated, float))
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Ratios of held-out runs, factors with intervals, and coverage; needs ``[plot]``.
+
+        Parameters
+        ----------
+        path : .png, .pdf or .svg to write as well; one that is there is replaced
+        """
+        from consistency.referee.fit_covariance.page import plot_correction  # draws
+
+        return plot_correction(self, path)
 
     def __repr__(self) -> str:
         from consistency.referee.fit_covariance.correction_text import sentence  # of this class
@@ -246,10 +266,6 @@ def held_out_by(record: Record) -> HeldOut:
     if verdict.scale is not None:
         ratio = verdict.scale.inflation
     counted = np.isfinite(record.nees)
-    coverage = []
-    for level in LEVELS:
-        inside = np.where(counted, record.nees <= special.chdtri(record.dof, 1.0 - level), np.nan)
-        coverage.append(float(np.nanmean(inside, axis=1).mean()))
     P = np.where(counted[..., None, None], record.covariance, np.eye(record.dof))
     density = -0.5 * (record.nees + np.linalg.slogdet(2.0 * np.pi * P)[1])
-    return HeldOut(record, verdict, ratio, tuple(coverage), np.nanmean(density, axis=1))
+    return HeldOut(record, verdict, ratio, np.nanmean(density, axis=1))

@@ -10,8 +10,9 @@ import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.fit_covariance.correct import Correction, with_factors
-from consistency.referee.fit_covariance.correction_text import correction_document, data, sentence
+from consistency.referee.fit_covariance.correction_text import data, sentence
 from consistency.referee.fit_covariance.factors import Factors
+from consistency.referee.fit_covariance.page import correction_page
 from consistency.referee.fit_covariance.writing import pairs, write_fit
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
 from consistency.referee.readers.formats.restated import TextFile
@@ -33,7 +34,7 @@ def write_correction(
     """
     write = partial(_write_runs, found, record, files)
     texts = {"correction.toml": toml(found), **snippets(found)}
-    return write_fit(folder, ("correction", found.name), texts, correction_document(found), write, overwrite)
+    return write_fit(folder, ("correction", found.name), texts, correction_page(found), write, overwrite)
 
 
 def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], folder: Path) -> list[str]:

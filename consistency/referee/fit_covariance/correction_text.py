@@ -81,7 +81,7 @@ def _figures(found: Correction) -> Table:
     columns = (Column("held-out"), Column("stated"), Column("corrected"), Column("expected", number=True))
     before, after = found.before, found.after
     rows = [("covariance ratio", shown(before.ratio), shown(after.ratio), "1")]
-    for level, stated, corrected in zip(LEVELS, before.coverage, after.coverage, strict=True):
+    for level, stated, corrected in zip(LEVELS, before.covered(LEVELS), after.covered(LEVELS), strict=True):
         rows.append((f"inside {level:.0%}", f"{stated:.1%}", f"{corrected:.1%}", f"{level:.0%}"))
     return table(columns, rows, "Held-out errors beside the stated and the corrected covariance", style="plain")
 
@@ -142,5 +142,7 @@ def data(found: Correction) -> dict[str, Any]:
 
 
 def _held_out(one: HeldOut) -> dict[str, Any]:
-    coverage = {f"inside_{level:.0%}".rstrip("%"): share for level, share in zip(LEVELS, one.coverage, strict=True)}
+    coverage = {
+        f"inside_{level:.0%}".rstrip("%"): share for level, share in zip(LEVELS, one.covered(LEVELS), strict=True)
+    }
     return {"ratio": one.ratio.value, "ratio_interval": one.ratio[1:], **coverage, "log_score": one.scores.mean()}

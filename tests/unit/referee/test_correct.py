@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,7 +147,7 @@ def test_known_factors_are_found_and_judged_right() -> None:
     assert attitude.value == pytest.approx(0.5, rel=0.15)
     assert found.before.ratio.low > 2.0
     assert found.after.ratio.value == pytest.approx(1.0, abs=0.02)
-    assert found.after.coverage == pytest.approx((0.68, 0.95, 0.99), abs=0.08)
+    assert found.after.covered((0.68, 0.95, 0.99)) == pytest.approx((0.68, 0.95, 0.99), abs=0.08)
     assert found.gain.low > 0.0
     assert not found.after.ratio.holds(1.2)
 
@@ -316,3 +317,14 @@ def test_arrays_are_corrected_in_python(rng: np.random.Generator) -> None:
     assert [block.name for block in found.blocks] == ["x", "y", "heading"]
     d = np.sqrt(found.fit.factors.factor)
     assert found.covariance(P[0, 0]) == pytest.approx(P[0, 0] * np.outer(d, d) + np.diag(found.fit.factors.floor))
+
+
+def test_pictures_are_drawn(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    found = correct(wrong(np.random.default_rng(1), runs=5))
+    figure = found.plot(tmp_path / "c.png")
+    assert (tmp_path / "c.png").stat().st_size > 1000
+    runs, factors, coverage = figure.axes
+    assert [len(line.get_xdata()) for line in runs.lines if line.get_marker() == "s"] == [5]
+    assert factors.get_xlabel() == "factor on variances"
+    assert {line.get_label() for line in coverage.lines} >= {"stated", "corrected"}

@@ -83,8 +83,6 @@ def fit_covariance_command(
     require_written(overwrite, out, "--out")
     if out is not None:
         require_free(out, overwrite, "noise")
-    if no_correct:
-        print("consistency: --no-correct is now called --keep-mean-error", file=sys.stderr)
     drives = read_drives(path, reading=replace(files, motions=motions or None))
     other = None if second is None else read_drives(second, reading=files)
     mean = not (keep_mean_error or no_correct)
@@ -97,6 +95,8 @@ def fit_covariance_command(
         from consistency.referee.fit_covariance.writing import write_model
 
         written = write_model(model, out, overwrite)
+    if no_correct:
+        print("consistency: --no-correct is now called --keep-mean-error", file=sys.stderr)
     print_document(noise_document(model), as_json, written)
     if fail_on and model.status != "consistent":
         raise typer.Exit(1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -266,12 +265,6 @@ def test_two_estimators_are_told_apart(
     assert out.startswith("b: ")
     rows = (tmp_path / "c/held-out/two.csv").read_text().splitlines()[1:]
     assert {row.split(",")[0] for row in rows} == {"b"}
-
-
-def test_no_correct_has_another_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.rmtree(tmp_path / "none", ignore_errors=True)
-    _, err = consistency(capsys, "fit-covariance", tmp_path / "none", "--span", "1m", "--no-correct", status=2)
-    assert "--keep-mean-error" in err
 
 
 def test_standard_deviations_come_back_as_such(tmp_path: Path, rng: np.random.Generator) -> None:

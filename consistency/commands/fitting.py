@@ -167,7 +167,9 @@ def correct_command(
         written = write_correction(found, record, texts, out, overwrite)
     print_document(correction_document(found), as_json, written)
     if out is not None and not is_written:
-        print(f"consistency: {out} is not written, as the correction is inconsistent; --anyway does", file=sys.stderr)
+        print(
+            f"consistency: {out} is not written, as no factor mends what is wrong; --anyway writes it", file=sys.stderr
+        )
         raise typer.Exit(1)
     if fail_on and found.status != "consistent":
         raise typer.Exit(1)

@@ -37,6 +37,12 @@ class HeldOut:
     ratio: Interval  # of true to stated covariance
     scores: Array  # (R,), log density of a step, mean of each run
 
+    @property
+    def ratios(self) -> Array:
+        """Ratio of true to stated covariance of each run, (R,)."""
+        assert self.record.nees is not None
+        return run_means(self.record.nees)[0] / self.record.dof
+
     def covered(self, levels: Sequence[float] | Array) -> Array:
         """Share of the errors inside the ellipsoid of each probability, mean over runs."""
         nees = self.record.nees
@@ -134,6 +140,8 @@ def correct(
         There is one run, or none with errors and covariances; or a name is not there.
     """
     if not isinstance(record, Record):
+        if covariances is None:
+            raise InputError("covariances: needed beside errors, (runs, steps, n, n)")
         record = record_of_arrays({"errors": record, "covariances": covariances}, axes, "estimator", False)
     require_runs(record)
     assert record.nees is not None
@@ -261,10 +269,10 @@ def held_out_by(record: Record) -> HeldOut:
     assert record.nees is not None
     assert record.covariance is not None
     verdict = verdict_of(record)
-    means, _ = run_means(record.nees)
-    ratio = ratio_interval(means / record.dof, record.dof)
     if verdict.scale is not None:
         ratio = verdict.scale.inflation
+    else:
+        ratio = ratio_interval(run_means(record.nees)[0] / record.dof, record.dof)
     counted = np.isfinite(record.nees)
     P = np.where(counted[..., None, None], record.covariance, np.eye(record.dof))
     density = -0.5 * (record.nees + np.linalg.slogdet(2.0 * np.pi * P)[1])

@@ -73,6 +73,7 @@ def _write_archive(path: Path, record: Record, of_runs: dict[int, Factors]) -> N
     corrected = with_factors(some, used)
     assert corrected.nees is not None
     assert corrected.error is not None
+    assert corrected.covariance is not None
     counted = np.isfinite(corrected.nees)
     axes = np.array(list(record.axes) or [f"axis {i}" for i in range(record.dof)])
     np.savez(

@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import plural, short
-from consistency.referee.document.blocks import Column, Document, Table, Text, table
+from consistency.referee.document.blocks import Block, Column, Document, Table, Text, table
 from consistency.referee.fit_covariance.correct import FEW, LEVELS, Correction, HeldOut
 from consistency.referee.fit_covariance.covariance_ratios import IN_TURN
 
@@ -42,13 +42,9 @@ def shown(interval: Interval) -> str:
 
 def correction_document(found: Correction) -> Document:
     """Sentence, factors, held-out figures, and limits; numbers as data."""
-    opening = (
-        Text(f"{found.name}: {sentence(found)}"),
-        _factors(found),
-        _figures(found),
-        *map(Text, correction_lines(found)),
-    )
-    return Document(f"{found.name}: correction of the stated covariance", "", (), opening, data(found))
+    opening: list[Block] = [Text(f"{found.name}: {sentence(found)}"), _factors(found), _figures(found)]
+    opening += map(Text, correction_lines(found))
+    return Document(f"{found.name}: correction of the stated covariance", "", (), tuple(opening), data(found))
 
 
 def _factors(found: Correction) -> Table:

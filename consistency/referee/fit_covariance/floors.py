@@ -41,14 +41,7 @@ def fit_runs(record: Record, blocks: tuple[Block, ...]) -> Fit:
     if not free:
         return replace(alone, notes=tuple(notes))
     both = fit_with_floors(record, alone, np.array(free))
-    scores = [
-        [
-            run_score(each.applied(P), error)
-            for each, (error, P) in zip(fit.left_out, steps_of_runs(record), strict=True)
-        ]
-        for fit in (both, alone)
-    ]
-    gain = mean_over_runs(np.subtract(*scores))
+    gain = mean_over_runs(held_out_scores(record, both) - held_out_scores(record, alone))
     if gain.low > 0.0:
         notes.append(
             f"with floors the held-out log score of a step gains {gain.value:.2g} [{gain.low:.2g}, {gain.high:.2g}]"
@@ -59,6 +52,12 @@ def fit_runs(record: Record, blocks: tuple[Block, ...]) -> Fit:
     intervals = (Interval(a.value, min(a.value, b.low), max(a.value, b.high)) for a, b in factors)
     floors = (each._replace(value=0.0, low=0.0) for each in both.floor)
     return replace(alone, factor=tuple(intervals), floor=tuple(floors), notes=tuple(notes))
+
+
+def held_out_scores(record: Record, fit: Fit) -> Array:
+    """Log density of a step of each run by the fit of the others, (R,)."""
+    runs = zip(fit.left_out, steps_of_runs(record), strict=True)
+    return np.array([run_score(factors.applied(P), error) for factors, (error, P) in runs])
 
 
 def likeness(record: Record, block: Block) -> float:

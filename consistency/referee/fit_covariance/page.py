@@ -12,7 +12,6 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE, DETECT
-from consistency.referee.diagnostics.questions.scale import run_means
 from consistency.referee.document.blocks import Chapter, Document, Figure
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, ZERO, solid, style
 from consistency.referee.fit_covariance.correct import Correction
@@ -168,7 +167,7 @@ def draw_correction(found: Correction) -> Drawing:
     """Ratios of held-out runs, factors, and coverage."""
     figure, (runs, factors, coverage) = canvas(2.4, 3, 3)
     both = (found.before, found.after)
-    ratios = [run_means(one.record.nees)[0] / one.record.dof for one in both]
+    ratios = [one.ratios for one in both]
     shown = np.linspace(0, len(ratios[0]) - 1, min(MOST_ROWS, len(ratios[0]))).round().astype(int)
     draw_ratios(runs, [found.judged[i] for i in shown], *(each[shown] for each in ratios))
     log_axis(runs, "x")

@@ -117,11 +117,11 @@ def _table(path: Path, axes: tuple[str, ...], name: str) -> TextFile | None:
         return None
     run, of = (names.index(key) if key in names else None for key in ("run", "filter"))
     places = {name: i for i, name in enumerate(names)} | covariance_places(names, axes)
-    entries = {}
+    entries: dict[int, tuple[str, str]] = {}
     for a, b in itertools.product(axes, repeat=2):
-        spelled = f"P_{a}_{b}", OWN_NAMES.get((a, b), ""), LOWER_NAMES.get((a, b), "")
-        if axes != POSE:
-            spelled = spelled[:1]
+        spelled = [f"P_{a}_{b}"]
+        if axes == POSE:
+            spelled += [OWN_NAMES.get((a, b), ""), LOWER_NAMES.get((a, b), "")]
         entries |= {places[name]: (a, b) for name in spelled if name in places}
     if entries:
         return TextFile(path, entries, True, run_column=run, filter_column=of, filter=name)
@@ -165,6 +165,9 @@ def _of_numbers(path: Path, columns: Sequence[int], run: int, r: Reading, square
         return None
     order = covariance_order(n, r.covariance_order or ORDERS[0])
     names = [STATE[order.index(place)] for place in range(n)]
-    pairs = {n: [(a, a) for a in names], n * n: list(itertools.product(names, repeat=2))}
-    pairs.setdefault(n * (n + 1) // 2, list(itertools.combinations_with_replacement(names, 2)))
-    return TextFile(path, dict(zip(columns, pairs[many], strict=True)), squared, run)
+    pairs = [(a, a) for a in names]
+    if many == n * n:
+        pairs = [(a, b) for a in names for b in names]
+    elif many > n:
+        pairs = list(itertools.combinations_with_replacement(names, 2))
+    return TextFile(path, dict(zip(columns, pairs, strict=True)), squared, run)

@@ -22,7 +22,7 @@ from consistency.referee.fit_covariance.factors import Block, Factors, Fit, bloc
 from consistency.referee.fit_covariance.floors import fit_runs
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array, Indices
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.sources import judge_all
 
 LEVELS = (0.68, 0.95, 0.99)
 FEW = 30  # runs; with fewer what the uncertainty of the factors adds to a ratio is printed
@@ -261,7 +261,7 @@ def with_uncertainty(record: Record, blocks: Sequence[Block], dof: Array) -> Rec
 
 def verdict_of(record: Record) -> Verdict:
     """What ``analyse`` says of a record."""
-    return analyse([record])[record.name]
+    return judge_all([record])[record.name]
 
 
 def held_out_by(record: Record) -> HeldOut:

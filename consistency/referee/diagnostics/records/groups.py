@@ -34,12 +34,17 @@ class Groups:
     """The group of every value of a column."""
 
     column: str
-    names: tuple[str, ...]  # of the groups: "n_matches <= 40", "40 < n_matches <= 120"; or words
+    names: tuple[str, ...]  # of the groups: "n_matches <= 40", "40 < n_matches <= 120"; "weather is rain"
     index: Indices  # of the shape of the column, -1 where a value belongs to no group
     edges: tuple[float, ...] | None  # between the groups of numbers; None for words
+    outcome: str = ""  # why the column selects on the outcome, so that groups show and do not convict; "" if it does not
 
     def __getitem__(self, rows: Any) -> Groups:
         return replace(self, index=self.index[rows])
+
+    def in_pieces(self, steps: slice, pieces: int) -> Groups:
+        """Some steps of one run, (1, steps), as runs of equal length, (pieces, length)."""
+        return replace(self, index=self.index[0, steps].reshape(pieces, -1))
 
 
 def column_of(name: str, values: ArrayLike) -> Column:
@@ -89,7 +94,13 @@ def groups_of(column: Column, bins: int | Sequence[float] = BINS, counted: Array
         raise ValueError(f"column '{column.name}' {_single(some)}; groups need different values")
     index = np.searchsorted(np.asarray(edges), column.values, side="left")
     index = np.where(np.isfinite(column.values), index, -1).astype(np.int64)
-    return Groups(column.name, _names(column.name, edges), index, edges)
+    names = tuple(range_name(column.name, *span) for span in spans_of(edges))
+    return Groups(column.name, names, index, edges)
+
+
+def spans_of(edges: Sequence[float]) -> list[tuple[float, float]]:
+    """Lower and upper end of each group of numbers."""
+    return list(itertools.pairwise((-np.inf, *edges, np.inf)))
 
 
 def _by_words(column: Column, some: Array) -> Groups:
@@ -102,7 +113,7 @@ def _by_words(column: Column, some: Array) -> Groups:
     index = np.full(column.values.shape, -1, np.int64)
     for i, place in enumerate(kept):
         index[column.values == place] = i
-    return Groups(column.name, tuple(column.words[place] for place in kept), index, None)
+    return Groups(column.name, tuple(f"{column.name} is {column.words[place]}" for place in kept), index, None)
 
 
 def _checked_edges(bins: int | Sequence[float]) -> tuple[float, ...] | None:
@@ -136,11 +147,13 @@ def _quantiles(values: Array, bins: int) -> tuple[float, ...]:
     return tuple(edges.tolist())
 
 
-def _names(column: str, edges: Sequence[float]) -> tuple[str, ...]:
-    """Names of the groups between edges."""
-    texts = [_number(edge) for edge in edges]
-    between = [f"{low} < {column} <= {high}" for low, high in itertools.pairwise(texts)]
-    return (f"{column} <= {texts[0]}", *between, f"{column} > {texts[-1]}")
+def range_name(column: str, low: float, high: float) -> str:
+    """Values above ``low`` up to ``high``, either of which may be infinite: "40 < n_matches <= 120"."""
+    if np.isneginf(low):
+        return f"{column} <= {_number(high)}"
+    if np.isposinf(high):
+        return f"{column} > {_number(low)}"
+    return f"{_number(low)} < {column} <= {_number(high)}"
 
 
 def _number(edge: float) -> str:

@@ -56,9 +56,7 @@ def mean_test(nees: Array, dof: int) -> MeanTest:
     return scale_test(means[counts > 0] / dof, dof, int(counts.max(initial=0)))
 
 
-def scale_test(
-    means: Array, dof: int, steps: int, gaussian: bool = True, weights: Array | None = None
-) -> MeanTest:
+def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True, weights: Array | None = None) -> MeanTest:
     """Test that run means of the NEES over its degrees of freedom, Y_i (runs,), have the mean 1.
 
     A run's mean NEES is a sum of dependent chi-squares. It is approximated by chi-square(nu) / nu with

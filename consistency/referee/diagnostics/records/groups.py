@@ -24,6 +24,7 @@ class Column:
     name: str
     values: Array  # any shape, NaN where there is none
     words: tuple[str, ...] = ()
+    outcome: str = ""  # why it selects on the outcome: "is a stated sigma"; "" where nothing shows that
 
     def __getitem__(self, rows: Any) -> Column:
         return replace(self, values=self.values[rows])
@@ -37,7 +38,9 @@ class Groups:
     names: tuple[str, ...]  # of the groups: "n_matches <= 40", "40 < n_matches <= 120"; "weather is rain"
     index: Indices  # of the shape of the column, -1 where a value belongs to no group
     edges: tuple[float, ...] | None  # between the groups of numbers; None for words
-    outcome: str = ""  # why the column selects on the outcome, so that groups show and do not convict; "" if it does not
+    outcome: str = (
+        ""  # why the column selects on the outcome, so that groups show and do not convict; "" if it does not
+    )
 
     def __getitem__(self, rows: Any) -> Groups:
         return replace(self, index=self.index[rows])
@@ -62,6 +65,22 @@ def column_of(name: str, values: ArrayLike) -> Column:
     words = tuple(sorted({*texts} - {""}))
     place: dict[str, float] = {word: float(i) for i, word in enumerate(words)} | {"": float("nan")}
     return Column(name, np.array([place[text] for text in texts]).reshape(cells.shape), words)
+
+
+def on_steps(values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Values (runs, steps), or (runs,) of which each holds in all steps of its run, or (steps,) of a single run.
+
+    Raises
+    ------
+    ValueError
+        Values of another shape.
+    """
+    cells = np.asarray(values)
+    if cells.ndim == 1 and len(cells) == shape[0]:
+        cells = cells[:, None]
+    if cells.shape not in (tuple(shape), (shape[0], 1), (shape[1],) if shape[0] == 1 else tuple(shape)):
+        raise ValueError(f"has shape {cells.shape}, needs ({shape[0]}, {shape[1]}) or ({shape[0]},)")
+    return np.broadcast_to(cells, shape)
 
 
 def groups_of(column: Column, bins: int | Sequence[float] = BINS, counted: Array | None = None) -> Groups:
@@ -91,11 +110,11 @@ def groups_of(column: Column, bins: int | Sequence[float] = BINS, counted: Array
         assert isinstance(bins, int)
         edges = _quantiles(some, bins)
     if not edges or not len(some):
-        raise ValueError(f"column '{column.name}' {_single(some)}; groups need different values")
+        raise ValueError(f"the column {_single(some)}; groups need different values")
     index = np.searchsorted(np.asarray(edges), column.values, side="left")
     index = np.where(np.isfinite(column.values), index, -1).astype(np.int64)
     names = tuple(range_name(column.name, *span) for span in spans_of(edges))
-    return Groups(column.name, names, index, edges)
+    return Groups(column.name, names, index, edges, column.outcome)
 
 
 def spans_of(edges: Sequence[float]) -> list[tuple[float, float]]:
@@ -107,13 +126,15 @@ def _by_words(column: Column, some: Array) -> Groups:
     """Words that are there, in order, each a group."""
     kept = np.unique(some).astype(np.int64)
     if len(kept) > MOST:
-        raise ValueError(f"column '{column.name}' has {len(kept)} different words; at most {MOST} make groups")
+        raise ValueError(f"the column has {len(kept)} different words; at most {MOST} make groups")
     if len(kept) < 2:
-        raise ValueError(f"column '{column.name}' {_single(some)}; groups need different values")
+        raise ValueError(f"the column {_single(some)}; groups need different values")
     index = np.full(column.values.shape, -1, np.int64)
     for i, place in enumerate(kept):
         index[column.values == place] = i
-    return Groups(column.name, tuple(f"{column.name} is {column.words[place]}" for place in kept), index, None)
+    return Groups(
+        column.name, tuple(f"{column.name} is {column.words[place]}" for place in kept), index, None, column.outcome
+    )
 
 
 def _checked_edges(bins: int | Sequence[float]) -> tuple[float, ...] | None:

@@ -90,7 +90,8 @@ class Record:
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
     unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
-    groups: Groups | None = None  # (runs, steps), by which the size of the errors is asked, too
+    by: Array | None = None  # (runs, steps), values of a column; of words their numbers. NaN where there is none
+    groups: Groups | None = None  # (runs, steps), of that column, in which the size of the errors is asked, too
     skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
 
     # what a fit to the truth leaves of the errors
@@ -258,7 +259,7 @@ def shown_by(function: str, *arguments: Any) -> Any:
 def arrays_of(record: Record) -> dict[str, Any]:
     """Arrays over runs and steps that a record has, by name."""
     names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times",
-             "truth_covariance", "path")  # fmt: skip
+             "truth_covariance", "path", "by")  # fmt: skip
     return {name: array for name in names if (array := getattr(record, name)) is not None}
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import FEW
@@ -11,18 +9,20 @@ from consistency.referee.diagnostics.records.groups import range_name
 from consistency.referee.diagnostics.verdict.parts import SIDES, ByGroup, Group
 from consistency.referee.diagnostics.words.numbers import is_or_are, off_by, p_text, plural, ratio_text
 
-MOST = 3  # groups of one kind that a sentence names
+MOST = 3  # groups that a sentence names
 MUCH = 100_000  # runs; more are no advice
 
 
 def faults_of_groups(by: ByGroup) -> str:
     """The worst group and those beside it, then where the covariance is shown to be right."""
     worst = by.worst
-    wrong = [group for group in by.groups if group.status in SIDES and group is not worst]
+    others = [group for group in by.groups if group.status in SIDES and group is not worst]
     text = f"covariance {off_by(worst.ratio)} where {worst.name}"
-    if wrong:
-        text += f", and {_listed([f'{off_by(group.ratio)} where {group.name}' for group in wrong])}"
-    right = _named(by, "consistent")
+    if len(others) == 1:
+        text += f", and {off_by(others[0].ratio)} where {others[0].name}"
+    elif others:
+        text += f", and wrong in {len(others)} of the {len(by.groups) - 1} other groups by {by.column}"
+    right = _consistent(by)
     if right:
         text += f"; consistent where {right}"
     return text
@@ -32,7 +32,7 @@ def groups_without_fault(by: ByGroup) -> str:
     """What is shown of the groups where none is at fault, and the one that is farthest."""
     worst, count = by.worst, len(by.groups)
     if by.outcome:
-        return f"by {by.column} reported and not judged"
+        return f"groups by {by.column} are reported and not judged"
     right = sum(group.status == "consistent" for group in by.groups)
     if right == count:
         return f"consistent in each of {count} groups by {by.column}"
@@ -46,9 +46,7 @@ def lines_of_groups(by: ByGroup, unit: str) -> list[str]:
         lines.append(f"{by.column} {by.outcome}, which selects on the outcome: groups show, they do not convict")
     lines += [f"{group.name}: {_figures(group, unit)}" for group in by.groups]
     if by.without:
-        lines.append(
-            f"{plural(by.without, 'step')} without a value of {by.column} {is_or_are(by.without)} in no group"
-        )
+        lines.append(f"{plural(by.without, 'step')} without a value of {by.column} {is_or_are(by.without)} in no group")
     return lines
 
 
@@ -76,12 +74,12 @@ def _advice(group: Group, unit: str) -> str:
     return f"{few}; {max(runs, group.runs + 1)} such {unit}s would probably decide"
 
 
-def _named(by: ByGroup, status: str) -> str:
-    """Groups of one status; neighbouring groups of numbers as one range."""
+def _consistent(by: ByGroup) -> str:
+    """The groups where the covariance is shown to be right; neighbouring groups of numbers as one range."""
     names: list[str] = []
     low = high = np.nan
     for group in by.groups:
-        if group.status != status:
+        if group.status != "consistent":
             continue
         if group.span is None:
             names.append(group.name)
@@ -91,10 +89,6 @@ def _named(by: ByGroup, status: str) -> str:
         else:
             low, high = group.span
             names.append(group.name)
-    return _listed(names)
-
-
-def _listed(texts: Sequence[str]) -> str:
-    if len(texts) > MOST:
-        return f"{', '.join(texts[:MOST])} and {len(texts) - MOST} more"
-    return ", ".join(texts)
+    if len(names) > MOST:
+        names = [*names[:MOST], f"in {len(names) - MOST} other groups"]
+    return " or ".join(names)

@@ -137,6 +137,7 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
         return _faults_of_parts(v)
     parts = []
     of_scale, of_bias = _any_of(SCALE, faults), _any_of(BIAS, faults)
+    is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
     if of_bias:
         parts.append(bias_text(v, "bias" not in faults))
     if v.status == "heavy-tailed":
@@ -160,7 +161,7 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
         parts.append(innovations_text(v, v.innovations))
     if "innovation whiteness" in faults:
         parts.append("innovations correlated over steps")
-    if (of_scale or GROUP in faults) and not of_bias and v.status != "heavy-tailed" and _any_of(BIAS, [a.question for a in v.answers]):
+    if (of_scale or GROUP in faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
 

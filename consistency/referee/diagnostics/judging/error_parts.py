@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -65,7 +66,7 @@ def error_parts(
     location = location_of(sample, band, faults, ordered=record.landmarks is None, detect=settings.factor)
     scaled = at_share(given, settings)
     scale = scale_of(sample, tests, scaled, location, shown)
-    tails, by_group = tails_of(tests, record.run_numbers), by_group_of(sample, tests, faults, settings)
+    tails, by_group = tails_of(tests, record.run_numbers), by_group_of(record, sample, tests, given, settings)
     if sample.errors is None:
         return ErrorParts(scale, location, tails=tails, by_group=by_group)
     return ErrorParts(
@@ -163,27 +164,33 @@ def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
     return Axes(errors.names, errors.groups, inflation, tests.largest.ratio, tests.largest.direction)
 
 
-def by_group_of(sample: Sample, tests: Tests, answers: Answers, settings: Settings) -> ByGroup | None:
+def by_group_of(
+    record: Record, sample: Sample, tests: Tests, given: Sequence[Answer], settings: Settings
+) -> ByGroup | None:
     """Ratio and status of each group of runs and steps that has a step; None without groups.
 
     Once some group is found at fault, each one is named whose own p value times the number of groups is at most the
-    false-alarm rate.
+    false-alarm rate. Nothing is judged where the question of groups was not asked.
     """
     groups = sample.groups
     if groups is None:
         return None
     found = [sample.in_group(number) for number in range(len(groups.names))]
     there = sum(len(one.means) > 0 for one in found)
+    answer = next((answer for answer in given if answer.question == GROUP), None)
+    is_found = answer is not None and answer.found and not answer.tolerated
+    both_sides = replace(settings, allow=None) if record.reduced else settings
+    factor = max(settings.factor, settings.tolerated)
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
     by_group, spans = [], None if groups.edges is None else spans_of(groups.edges)
     for number, (name, one) in enumerate(zip(groups.names, found, strict=True)):
         if not len(one.means):
             continue
-        shown = equivalence(one.means, sample.dof, one.longest, settings, weights=one.counts)
+        shown = equivalence(one.means, sample.dof, one.longest, both_sides, factor, weights=one.counts)
         p_value, status = float("nan"), ""
-        if tests.groups:
+        if answer is not None:
             p_value = min(1.0, sided_p_value(tests.groups[number], settings) * there)
-            is_wrong = any_found(answers, (GROUP,)) and p_value <= settings.false_alarm
+            is_wrong = is_found and p_value <= settings.false_alarm
             status = _status_of_group(tests.groups[number].ratio, is_wrong, shown)
         ratio = ratio_interval(one.means, sample.dof, confidence, one.counts)
         span = None if spans is None else spans[number]

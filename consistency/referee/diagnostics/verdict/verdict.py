@@ -254,6 +254,8 @@ class Verdict(Findings):
         if self.guesses:
             numbers["guesses"] = {kind: guess._asdict() for kind, guess in self.guesses.items()}
         numbers |= dictionary.truth_numbers(self.truth) | dictionary.group_numbers(self.by_group)
+        if of_parts := {name: part.by_group for name, part in self.parts.items() if part.by_group is not None}:
+            numbers["by_part"] = {name: dictionary.group_numbers(by)["by"] for name, by in of_parts.items()}
         if self.convention is not None or self.notes:
             numbers |= {"convention": self.convention, "align": self.align, "notes": list(self.notes)}
         if self.world is not None:

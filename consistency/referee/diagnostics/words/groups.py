@@ -31,7 +31,7 @@ def faults_of_groups(by: ByGroup) -> str:
 def groups_without_fault(by: ByGroup) -> str:
     """What is shown of the groups where none is at fault, and the one that is farthest."""
     worst, count = by.worst, len(by.groups)
-    if by.outcome:
+    if not worst.status:
         return f"groups by {by.column} are reported and not judged"
     right = sum(group.status == "consistent" for group in by.groups)
     if right == count:

@@ -300,6 +300,8 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     for name, part in v.parts.items():
         if part.scale is not None and part.location is not None:
             lines.append(f"{name}: {_level(part, part.scale, part.location)}")
+        if part.by_group is not None:
+            lines += [f"{name}: {line}" for line in lines_of_groups(part.by_group, v.unit)]
     return lines
 
 

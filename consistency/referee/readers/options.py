@@ -35,8 +35,10 @@ def _lengths(text: str) -> list[float]:
 
 
 def _bins(text: str) -> int | list[float]:
-    """A number of bins, or edges; NaN where one is none, which the readers refuse."""
-    return int(text) if text.strip().isdecimal() else _lengths(text)
+    """A number of bins, or edges, of which a single one ends with a comma; NaN where one is none."""
+    if text.strip().isdecimal():
+        return int(text)
+    return _lengths(text.strip().removesuffix(","))
 
 
 def _option(
@@ -94,7 +96,9 @@ class Reading:
     truth_shared: bool | None = _option("The estimator has fused the truth.", flag="--truth-shared/")
     by: str | None = _option("Judge groups by this column, too: bins of numbers, or words.", "COLUMN")
     by_file: Path | None = _option("Table with that column and t, run or both.")
-    bins: int | Sequence[float] | None = _option("Quantile bins of --by [5], or edges between them.", "N|A,B,C", _bins)
+    bins: int | Sequence[float] | None = _option(
+        "Quantile bins of --by [5], or edges between them (40, is one edge).", "N|A,B,C", _bins
+    )
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

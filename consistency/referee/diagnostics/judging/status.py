@@ -179,24 +179,23 @@ def _without_bias(given: Sequence[Answer], settings: Settings, sample: Sample) -
 
 def _status_of_sample(settings: Settings, faults: set[str], sample: Sample, tests: Tests) -> str:
     """The status by the errors of a sample: of the scale only where it is no matter of a few large errors."""
+    of_groups = _sides(settings, tests.groups) if GROUP in faults else set()
     if MAIN in faults:
         if not _robust(sample.means(), sample.dof, sample.longest, settings, 1):
             return "heavy-tailed"
         if AXIS in faults and _contradicted(settings, sample, tests):
             return "inconsistent"
-        if GROUP in faults and len({_side(tests.main.ratio), *_sides(settings, tests.groups)}) > 1:
-            return "inconsistent"
-        return _side(tests.main.ratio)
+        return _status_of_sides({_side(tests.main.ratio), *of_groups})
     heavy = "outliers" in faults or (STEP in faults and _heavy_steps(sample, tests))
     if STEP in faults and not heavy:
-        return _status_of_steps(settings, faults, sample, tests)
+        return _status_of_sides({_status_of_steps(settings, faults, sample, tests), *of_groups})
     if AXIS in faults or DIRECTION in faults:
         if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
-            return _status_of_axes(settings, tests)
+            return _status_of_sides({_status_of_axes(settings, tests), *of_groups})
         heavy = True
     if GROUP in faults and not heavy:
         if _robust_group(sample, tests, settings):
-            return _status_of_sides(_sides(settings, tests.groups))
+            return _status_of_sides(of_groups)
         heavy = True
     if heavy:
         return "heavy-tailed"

@@ -66,8 +66,8 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
     kind = next((keys for keys in (OF_ERRORS, OF_POSES, OF_NEES) if set(keys) <= set(arrays)), None)
     if kind is None:
         raise InputError(f"{path}: needs {KINDS}; it holds {', '.join(sorted(arrays)) or 'nothing'}")
-    unknown = sorted(set(arrays) - set(kind) - OPTIONAL - {r.by})
-    if unknown:
+    unknown = sorted(set(arrays) - set(kind) - OPTIONAL)
+    if unknown and r.by is None:
         raise InputError(f"{path}: key '{unknown[0]}' does not go with {', '.join(kind)}; needs {KINDS}")
     if r.error is not None and kind != OF_POSES:
         raise InputError(f"--error: {path} holds {kind[0]}, whose convention is settled already")

@@ -61,6 +61,7 @@ def plan(
     allow: str | None = None,
     pilots: Mapping[str, tuple[Array, int]] | None = None,
     lost: float | None = None,
+    groups: int | None = None,
 ) -> dict[str, Any]:
     """Runs that a verdict takes (``runs``), those of one chi-square test (``one_step``), and the first looks.
 
@@ -69,6 +70,7 @@ def plan(
     pilots : of each filter, mean NEES over ``dof`` of a few runs (N,), and their steps; ``like`` then has the runs that
         filters take whose steps depend on each other as theirs do
     lost : share of lost runs that is to be excluded
+    groups : number of groups, in one of which the covariance may be wrong; ``runs_in_group`` is then what each takes
 
     Raises
     ------
@@ -78,7 +80,12 @@ def plan(
     from consistency.referee.column_names import POSE
     from consistency.referee.diagnostics.planning.early_stopping import Design
     from consistency.referee.diagnostics.planning.pilot import pilot_plan
-    from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs, lost_runs, required_runs
+    from consistency.referee.diagnostics.statistics.number_of_runs import (
+        gate_runs,
+        group_runs,
+        lost_runs,
+        required_runs,
+    )
 
     if allow not in (None, "conservative"):
         raise InputError(f"--allow must be 'conservative', got '{allow}'")
@@ -92,6 +99,9 @@ def plan(
             "one_step": required_runs(dof, detect, false_alarm, power, two_sided=allow is None), "looks": looks,
         }  # fmt: skip
         planned |= {} if lost is None else {"lost": lost, "lost_runs": lost_runs(lost, power)}
+        if groups is not None:
+            each = group_runs(dof, detect, groups, false_alarm, power, allow)
+            planned |= {"groups": groups, "runs_in_group": each, "group_runs": groups * each}
         if pilots is not None:
             planned["like"] = {
                 name: vars(pilot_plan(means, dof, steps, detect, false_alarm, power, allow, lost))

@@ -26,6 +26,7 @@ from consistency.referee.readers.formats.file_kinds import (
     unknown_kind,
 )
 from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.pipeline.by_column import grouped, of_record
 from consistency.referee.readers.pipeline.kinds import OF_BAGS, OF_TRAJECTORIES, Found, kind_of
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 from consistency.referee.readers.truth_matching import Estimator
@@ -150,7 +151,7 @@ def _records(found: Found, r: Reading) -> list[Record]:
         if isinstance(one, Estimator):
             records.extend(records_of(one, r))
         else:
-            records.append(one)
+            records.append(grouped(*of_record(one, r), r))
     return records
 
 
@@ -218,6 +219,9 @@ def _checked(r: Reading) -> Reading:
         from consistency.referee.readers.truth_covariance import require_truth_options
 
         require_truth_options(r)
+    for name in ("by_file", "bins"):
+        if r.given([name]) and r.by is None:
+            raise InputError(f"{flag_of(name)}: goes with --by COLUMN")
     if r.align not in (None, *ALIGNMENTS):
         raise InputError(f"--align {r.align}: must be one of {', '.join(ALIGNMENTS)}")
     align = None if r.align == "none" else r.align

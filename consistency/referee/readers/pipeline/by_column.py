@@ -1,0 +1,173 @@
+"""The column of ``--by``: its values in every row of the estimates, and the groups of a record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from consistency.referee.diagnostics.records.groups import BINS, Column, column_of, groups_of, on_steps
+from consistency.referee.diagnostics.records.outcome import made_from_errors, selects_on_outcome
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.errors import InputError
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Known, Poses
+from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from consistency.referee.readers.formats.sheet import TableRows
+
+NO_COLUMNS = "has no columns of its own; --by-file FILE names a table with the column and t or run"
+
+
+def with_values(e: Estimator, r: Reading) -> tuple[Estimator, Column | None]:
+    """The estimator with the values of the column in each row, and the column of all rows; None without ``--by``.
+
+    Raises
+    ------
+    InputError
+        The files have no such column, or no time at which to look it up.
+    """
+    if r.by is None:
+        return e, None
+    runs = list(e.runs)
+    if r.by_file is not None:
+        sheet = _sheet(r)
+        runs = [replace(p, by=_looked_up(sheet, r.by, p.run, p.seconds)) for p in runs]
+    elif any(p.by is None for p in runs):
+        raise InputError(f"--by {r.by}: {e.path} {NO_COLUMNS}")
+    cells = [p.by for p in runs if p.by is not None]
+    column = column_of(r.by, np.concatenate(cells))
+    ends = np.cumsum([0, *map(len, cells)])
+    parts = zip(runs, ends, ends[1:], strict=False)
+    return replace(e, runs=[replace(p, by=column.values[start:end]) for p, start, end in parts]), column
+
+
+def of_record(record: Record, r: Reading) -> tuple[Record, Column | None]:
+    """A record that its reader has made, with the values of the column."""
+    if r.by is None:
+        return record, None
+    cells = record.by
+    if r.by_file is not None:
+        sheet = _sheet(r)
+        cells = np.stack([_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers])
+    if cells is None:
+        raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
+    column = column_of(r.by, cells)
+    return replace(record, by=column.values), column
+
+
+def beside_states(column: Column, e: Estimator, runs: Sequence[Poses], known: Sequence[Known]) -> Column:
+    """The column, marked where it selects on the outcome by its name, or beside the true and estimated states."""
+    rows = list(zip(runs, known, strict=True))
+    values = np.concatenate([p.by[k.rows] for p, k in rows if p.by is not None])
+    estimate = np.concatenate([p.estimate[k.rows] for p, k in rows])
+    truth, P = np.concatenate([k.truth for _, k in rows]), np.concatenate([p.covariance[k.rows] for p, k in rows])
+    has_states = e.convention != ""  # errors of an archive stand in the place of a truth
+    states = (truth, estimate) if has_states else (None, None)
+    return replace(column, outcome=selects_on_outcome(replace(column, values=values), e.axes, *states, P))
+
+
+def grouped(record: Record, column: Column | None, r: Reading, option: str = "--by") -> Record:
+    """The record with its groups; itself without a column.
+
+    Raises
+    ------
+    InputError
+        The column is made from the errors, or makes no groups.
+    """
+    if column is None or record.by is None:
+        return record
+    if record.nees is None:
+        raise InputError(f"{option} {column.name}: {record.name} has no truth, so that there are no errors to group")
+    counted = np.isfinite(record.nees)
+    if not counted.any():
+        return record
+    error = None if record.error is None else record.error[counted]
+    if why := made_from_errors(column.name, record.by[counted], error, record.nees[counted]):
+        raise InputError(
+            f"{option} {column.name}: the column is made from the errors ({why}), and groups of small and of large "
+            "errors differ in any estimator; take a column that was fixed before the error was, or rename one that is "
+            "only called so"
+        )
+    try:
+        groups = groups_of(replace(column, values=record.by), BINS if r.bins is None else r.bins, counted)
+    except ValueError as wrong:
+        raise InputError(f"{option} {column.name}: {wrong}") from None
+    return replace(record, groups=groups)
+
+
+def with_groups(
+    record: Record, by: ArrayLike | Mapping[str, ArrayLike] | None, bins: int | Sequence[float] | None
+) -> Record:
+    """The record with groups of an array in memory; see :func:`consistency.judge`.
+
+    Raises
+    ------
+    InputError
+        As :func:`grouped`; the array has another shape, or bins are given without one.
+    """
+    if by is None:
+        raise InputError("bins: goes with by=")
+    name, values = "array", by
+    if isinstance(by, Mapping):
+        if len(by) != 1:
+            raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(by)} names")
+        ((name, values),) = by.items()
+    if record.nees is None:
+        raise InputError(f"by: {record.name} has no truth, so that there are no errors to group")
+    try:
+        column = column_of(name, on_steps(values, record.nees.shape))
+    except ValueError as wrong:
+        raise InputError(f"by: {wrong}") from None
+    column = replace(column, outcome=selects_on_outcome(column, record.axes, covariance=record.covariance))
+    return grouped(replace(record, by=column.values), column, Reading(bins=bins), "by")
+
+
+# --- a table of its own -------------------------------------------------------------------------------
+
+
+def _sheet(r: Reading) -> TableRows:
+    """The table of ``--by-file``, with the column and what it is looked up by.
+
+    Raises
+    ------
+    InputError
+        It lacks one of them.
+    """
+    from consistency.referee.readers.formats.other_names import with_clock
+    from consistency.referee.readers.formats.sheet import read_sheet
+
+    assert r.by_file is not None
+    sheet = with_clock(read_sheet(r.by_file), required=False)
+    if r.by not in sheet:
+        raise InputError(f"--by {r.by}: {r.by_file} has no such column; there are: {sheet.columns}")
+    if "t" not in sheet and "run" not in sheet:
+        raise InputError(f"{r.by_file}: column 't' or 'run' is missing; there are: {sheet.columns}")
+    return sheet
+
+
+def _looked_up(sheet: TableRows, name: str, run: int, t: Array) -> Array:
+    """Cells of a column for the rows of a run at times ``t`` (N,), s: the last one at or before each."""
+    rows = np.arange(len(sheet))
+    if "run" in sheet:
+        rows = np.flatnonzero(sheet.numbers("run", whole=True) == run)
+        if not len(rows):
+            raise InputError(f"{sheet.path}: holds no run {run}")
+    cells = sheet.data[name][rows]
+    if "t" not in sheet:
+        if len(rows) > 1:
+            where = sheet.place(int(rows[1]))
+            raise InputError(f"{where}: run {run} has several rows; they need a column t")
+        return np.repeat(cells, len(t))
+    if np.isnan(t).any():
+        raise InputError(f"--by-file {sheet.path}: the estimates have no times at which to look up its column t")
+    times = sheet.numbers("t", finite=True)[rows]
+    order = np.argsort(times, kind="stable")
+    place = np.searchsorted(times[order], t + ROUNDING, side="right") - 1
+    found = cells[order][np.maximum(place, 0)]
+    found[place < 0] = np.nan if cells.dtype.kind == "f" else None
+    return np.asarray(found)

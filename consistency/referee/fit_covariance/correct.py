@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.sources import judge_all
 
 LEVELS = (0.68, 0.95, 0.99)
+ByGroup = tuple[Factors, ...]  # of each group, and last of all steps
 FEW = 30  # runs; with fewer what the uncertainty of the factors adds to a ratio is printed
 
 
@@ -58,17 +59,27 @@ class Correction:
 
     name: str
     blocks: tuple[Block, ...]
-    fit: Fit = field(repr=False)
+    fits: Mapping[str, Fit] = field(repr=False)  # by group; the last one, "", is of all steps
     held_out: str  # "in turn", "half" or names
     runs: tuple[str, ...]  # names of all runs
     fitted: tuple[str, ...]
     judged: tuple[str, ...]
-    used: tuple[Factors, ...]  # of each judged run, from other runs
+    used: tuple[ByGroup, ...]  # of each judged run, from other runs
     before: HeldOut  # the judged runs as they are stated
     after: HeldOut  # corrected, as the files of held-out/ have them
     verdict: Verdict = field(repr=False)  # with the uncertainty of the factors taken in
     excess: float  # what that uncertainty adds to the ratio of held-out runs
     gain: Interval  # of the log score, a step
+
+    @property
+    def fit(self) -> Fit:
+        """That of all steps, whatever their group."""
+        return self.fits[""]
+
+    @property
+    def shown(self) -> dict[str, Fit]:
+        """Fits by group; without groups the one of all steps, by the name ""."""
+        return {group: fit for group, fit in self.fits.items() if group or len(self.fits) == 1}
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -92,9 +103,9 @@ class Correction:
         status = self.verdict.status
         return status if status in ("consistent", "undecided") else "inconsistent"
 
-    def covariance(self, stated: ArrayLike) -> Array:
-        """Corrected covariances of stated ones, (..., n, n)."""
-        return self.fit.factors.applied(np.asarray(stated, float))
+    def covariance(self, stated: ArrayLike, group: str = "") -> Array:
+        """Corrected covariances of stated ones, (..., n, n), in a group where factors go by group."""
+        return self.fits[group].factors.applied(np.asarray(stated, float))
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Ratios of held-out runs, factors with intervals, and coverage; needs ``[plot]``.
@@ -149,17 +160,16 @@ def correct(
     there = np.flatnonzero(np.isfinite(record.nees).any(axis=1))
     fitted, judged = fitted_and_judged(labels, there, held_out)
     blocks = blocks_of(record.axes, record.dof, per_axis)
-    fit = fit_runs(record.of_runs(fitted), blocks)
-    used = fit.left_out if held_out is None else (fit.factors,) * len(judged)
+    fits = fit_groups(record.of_runs(fitted), blocks)
+    used = tuple(by_group(fits, row if held_out is None else None) for row in range(len(judged)))
     some = replace(record, map=None, rejections=None, world=None).of_runs(judged)
     before = held_out_by(some)
     after = held_out_by(with_factors(some, used))
-    sizes = np.array([len(block) for block in blocks])
-    excess = float((sizes * fit.dof / (fit.dof - 2.0)).sum() / sizes.sum())
+    dof = np.array([fit.dof for fit in fits.values()])
     return Correction(
         name=record.name,
         blocks=blocks,
-        fit=fit,
+        fits=fits,
         held_out=held_out or IN_TURN,
         runs=labels,
         fitted=tuple(labels[i] for i in fitted),
@@ -167,8 +177,8 @@ def correct(
         used=used,
         before=before,
         after=after,
-        verdict=verdict_of(with_uncertainty(after.record, blocks, fit.dof)),
-        excess=excess,
+        verdict=verdict_of(with_uncertainty(after.record, blocks, dof)),
+        excess=excess_of(after.record, blocks, dof),
         gain=mean_over_runs(after.scores - before.scores),
     )
 
@@ -197,6 +207,11 @@ def require_runs(record: Record) -> None:
     """Refuse a record that has no covariances, or one run alone."""
     if record.error is None or record.covariance is None or record.nees is None:
         raise InputError(f"{record.name}: needs errors and covariances, of files with a truth")
+    if record.groups is not None and record.groups.outcome:
+        raise InputError(
+            f"--by {record.groups.column}: {record.groups.outcome}, which selects on the outcome: by it a right "
+            "covariance has other ratios, too, so that factors would be wrong"
+        )
     if record.guesses:
         raise InputError("--error guess: a correction is of one error; declare the one that the covariance is of")
     runs = int(np.isfinite(record.nees).any(axis=1).sum())
@@ -224,11 +239,60 @@ def fitted_and_judged(labels: Sequence[str], there: Indices, held_out: str | Non
     return fitted, judged
 
 
-def with_factors(record: Record, used: Sequence[Factors]) -> Record:
+def fit_groups(record: Record, blocks: tuple[Block, ...]) -> dict[str, Fit]:
+    """Fits to the steps of each group, by its name, and last, by the name "", that of all steps.
+
+    A group that fewer than two runs pass through has the fit of all steps.
+    """
+    fits = {}
+    names = record.groups.names if record.groups is not None else ()
+    whole = fit_runs(record, blocks)
+    for number, name in enumerate(names):
+        assert record.nees is not None
+        some = replace(record, nees=np.where(group_index(record) == number, record.nees, np.nan), groups=None)
+        there = np.isfinite(some.nees).any(axis=1)
+        if there.sum() < 2:
+            fits[name] = replace(whole, notes=(f"{name}: fewer than two runs; the factors are those of all steps",))
+            continue
+        fit = fit_runs(some.of_runs(np.flatnonzero(there)), blocks)
+        rows = np.where(there, np.cumsum(there) - 1, -1)
+        left_out = tuple(fit.left_out[row] if row >= 0 else fit.factors for row in rows)
+        fits[name] = replace(fit, left_out=left_out, notes=tuple(f"{name}: {note}" for note in fit.notes))
+    return fits | {"": whole}
+
+
+def group_index(record: Record) -> Indices:
+    """The group of each step, (runs, steps), -1 where it is in none: the place of a fit among those of the groups."""
+    assert record.nees is not None
+    return np.full(record.nees.shape, -1) if record.groups is None else record.groups.index
+
+
+def by_group(fits: Mapping[str, Fit], without: int | None = None) -> ByGroup:
+    """Factors of each group, and last those of all steps; ``without`` one of the fitted runs."""
+    if without is None:
+        return tuple(fit.factors for fit in fits.values())
+    return tuple(fit.left_out[without] for fit in fits.values())
+
+
+def with_factors(record: Record, used: Sequence[ByGroup]) -> Record:
     """The record with the covariances of each run corrected by its factors."""
     assert record.covariance is not None
-    P = np.stack([each.applied(P) for each, P in zip(used, record.covariance, strict=True)])
+    P = record.covariance.copy()
+    for run, index in enumerate(group_index(record)):
+        for number in np.unique(index):
+            steps = index == number
+            P[run, steps] = used[run][number].applied(P[run, steps])
     return with_covariance(record, record.error, P)
+
+
+def excess_of(record: Record, blocks: Sequence[Block], dof: Array) -> float:
+    """What the uncertainty of factors known with dof (groups, B) adds to a ratio, on average over runs."""
+    assert record.nees is not None
+    sizes = np.array([len(block) for block in blocks])
+    of_blocks = np.where(dof > 2.0, dof / np.maximum(dof - 2.0, 1e-9), np.inf)
+    of_groups = (sizes * of_blocks).sum(axis=1) / sizes.sum()
+    steps = np.where(np.isfinite(record.nees), of_groups[group_index(record)], np.nan)
+    return float(np.nanmean(steps, axis=1).mean())
 
 
 def with_covariance(record: Record, error: Array | None, P: Array) -> Record:
@@ -245,11 +309,16 @@ def with_uncertainty(record: Record, blocks: Sequence[Block], dof: Array) -> Rec
     By a factor that is known with nu degrees of freedom the NEES of a block of n components is n times F(n, nu), not
     chi-square(n). Errors of the block are made shorter so that their NEES is the quantile of the chi-square at the same
     probability.
+
+    Parameters
+    ----------
+    dof : (groups, B), nu of each block in each group
     """
     assert record.error is not None
     assert record.covariance is not None
     error = record.error.copy()
-    for block, nu in zip(blocks, dof, strict=True):
+    for block, of_groups in zip(blocks, dof.T, strict=True):
+        nu = of_groups[group_index(record)]
         places, n = list(block.places), len(block)
         P = record.covariance[:, :, places][..., places]
         squares = squared_length(whiten(error[..., places], P))

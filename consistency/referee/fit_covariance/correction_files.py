@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.fit_covariance.correct import Correction, with_factors
+from consistency.referee.fit_covariance.correct import ByGroup, Correction, by_group, with_factors
 from consistency.referee.fit_covariance.correction_text import data, sentence
-from consistency.referee.fit_covariance.factors import Factors
 from consistency.referee.fit_covariance.page import correction_page
 from consistency.referee.fit_covariance.writing import pairs, write_fit
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
 from consistency.referee.readers.formats.restated import TextFile
+from consistency.referee.readers.formats.sheet import EMPTY
 from consistency.referee.readers.truth_matching import AXES
 from consistency.referee.types import Array
 
@@ -39,33 +40,47 @@ def write_correction(
 
 def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], folder: Path) -> list[str]:
     """Write held-out/, each judged run by the factors of others, and corrected/, all runs by the factors of all."""
+    groups = record.groups
     numbers = dict(zip(found.runs, record.run_numbers.tolist(), strict=True))
     judged = {numbers[name]: factors for name, factors in zip(found.judged, found.used, strict=True)}
-    every = dict.fromkeys(numbers.values(), found.fit.factors)
+    every = dict.fromkeys(numbers.values(), by_group(found.fits))
     for name, of_runs in ((HELD_OUT, judged), (CORRECTED, every)):
         at = folder / name
         at.mkdir()
         pieces = record.unit != "run" and name == HELD_OUT
-        if not files or pieces:
+        if not files or pieces or (groups is not None and any(file.by_column is None for file in files)):
             _write_archive(at / f"{found.name}.npz", record, of_runs)
             continue
-        of_files = every if record.unit == "run" else dict.fromkeys((file.run for file in files), found.fit.factors)
-        change = partial(_change, found.axes, judged if name == HELD_OUT else of_files)
+        of_files = every if record.unit == "run" else dict.fromkeys((file.run for file in files), by_group(found.fits))
+        change = partial(_change, found.axes, groups, judged if name == HELD_OUT else of_files)
         for file in files:
-            if file.run_column is not None or change(file.run) is not None:
+            if file.run_column is not None or change(file.run, "") is not None:
                 (at / file.path.name).write_text(file.restated(change), encoding="utf-8")
     return [HELD_OUT, CORRECTED]
 
 
-def _change(axes: Sequence[str], of_runs: dict[int, Factors], run: int) -> dict[str, tuple[float, float]] | None:
-    """Factor and floor of each component of a run by name; None of a run that is not written."""
+def _change(
+    axes: Sequence[str], groups: Groups | None, of_runs: dict[int, ByGroup], run: int, value: str
+) -> dict[str, tuple[float, float]] | None:
+    """Factor and floor of each component of a run by name, at a value of its column; None of a run that is left out."""
     if run not in of_runs:
         return None
-    factor, floor = of_runs[run].of_components()
+    factor, floor = of_runs[run][place_in(groups, value)].of_components()
     return dict(zip(axes, zip(factor.tolist(), floor.tolist(), strict=True), strict=True))
 
 
-def _write_archive(path: Path, record: Record, of_runs: dict[int, Factors]) -> None:
+def place_in(groups: Groups | None, value: str) -> int:
+    """The group of a value as it stands in a file; -1 where it is in none."""
+    if groups is None or value.strip() in EMPTY:
+        return -1
+    if groups.edges is None:
+        name = f"{groups.column} is {value.strip()}"
+        return groups.names.index(name) if name in groups.names else -1
+    number = float(value)
+    return int(np.searchsorted(groups.edges, number)) if np.isfinite(number) else -1
+
+
+def _write_archive(path: Path, record: Record, of_runs: dict[int, ByGroup]) -> None:
     """Errors and covariances as an archive that ``analyse`` reads; NaN where a step does not count."""
     rows = np.flatnonzero(np.isin(record.run_numbers, list(of_runs)))
     some = record.of_runs(rows)
@@ -108,6 +123,8 @@ def toml(found: Correction) -> str:
 def snippets(found: Correction) -> dict[str, str]:
     """Files for other programs by name: plain Python, and ROS, robot_localization and GTSAM of a pose."""
     factor, floor = found.fit.factors.of_components()
+    if len(found.fits) > 1:
+        return {"corrected_covariance.py": plain_python_by_group(found)}
     texts = {"corrected_covariance.py": plain_python(found)}
     pose = [i for i, axis in enumerate(found.axes) if axis in POSITION_AND_TURN]
     if not pose:
@@ -141,6 +158,41 @@ def corrected(P):
     scaled = [[(FACTOR[i] * FACTOR[j]) ** 0.5 * P[i][j] for j in n] for i in n]
     for i in n:
         scaled[i][i] += FLOOR[i]
+    return scaled
+'''
+
+
+def plain_python_by_group(found: Correction) -> str:
+    """A function of a covariance as lists of rows, and of the column that its factors go by."""
+    groups = found.before.record.groups
+    assert groups is not None
+    rows = []
+    for group, fit in found.shown.items():
+        factor, floor = (_numbers(values) for values in fit.factors.of_components())
+        rows.append(f"    {group!r}: ([{factor}], [{floor}]),")
+    table = "\n".join(rows)
+    place = f'GROUPS[f"{groups.column} is {{value}}"]'
+    if groups.edges is not None:
+        place = f"list(GROUPS.values())[bisect.bisect_left([{_numbers(groups.edges)}], value)]"
+    return f'''"""The corrected covariance of {", ".join(found.axes)}, by {groups.column}.
+
+{_head(found)}
+"""
+
+import bisect
+
+GROUPS = {{  # factors on the variances, and floors
+{table}
+}}
+
+
+def corrected(P, value):
+    """D P D + F of a covariance P, rows of {len(found.axes)} numbers, at a value of {groups.column}."""
+    factor, floor = {place}
+    n = range({len(found.axes)})
+    scaled = [[(factor[i] * factor[j]) ** 0.5 * P[i][j] for j in n] for i in n]
+    for i in n:
+        scaled[i][i] += floor[i]
     return scaled
 '''
 
@@ -199,5 +251,5 @@ def noise(P: np.ndarray) -> gtsam.noiseModel.Gaussian:
 '''
 
 
-def _numbers(values: Array) -> str:
+def _numbers(values: Iterable[float]) -> str:
     return ", ".join(f"{value:.17g}" for value in values)

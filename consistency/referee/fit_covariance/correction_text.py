@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import plural, short
-from consistency.referee.document.blocks import Block, Column, Document, Table, Text, table
+from consistency.referee.document.blocks import Block, Cell, Column, Document, Table, Text, table
 from consistency.referee.fit_covariance.correct import FEW, LEVELS, Correction, HeldOut
 from consistency.referee.fit_covariance.covariance_ratios import IN_TURN
 
@@ -28,7 +28,8 @@ def sentence(found: Correction) -> str:
         parts.append(f"about {plural(found.needed, found.unit)} would decide")
     if found.status == "inconsistent":
         parts.append(f"no factor mends this: {found.verdict.reasons[0]}")
-    if all(each.holds(1.0) for each in found.fit.factor) and not found.fit.factors.floor.any():
+    fits = found.shown.values()
+    if all(each.holds(1.0) for fit in fits for each in fit.factor) and not any(fit.factors.floor.any() for fit in fits):
         parts.append("no factor is shown to be needed: 1 lies in every interval")
     return "; ".join(parts)
 
@@ -48,21 +49,24 @@ def correction_document(found: Correction) -> Document:
 
 
 def _factors(found: Correction) -> Table:
-    axes, fit = found.axes, found.fit
+    fits = found.shown
     columns = [Column("block"), Column("components"), Column("factor on variances"), Column("on sigmas", number=True)]
-    has_floors = any(each.high > 0.0 for each in fit.floor)
+    has_groups = len(found.fits) > 1
+    has_floors = any(each.high > 0.0 for fit in fits.values() for each in fit.floor)
+    if has_groups:
+        columns.insert(0, Column("group"))
     if has_floors:
         columns.append(Column("floor, as a sigma"))
     rows = []
-    for b, block in enumerate(found.blocks):
-        factor = fit.factor[b]
-        row = (
-            block.name,
-            " ".join(axes[i] for i in block.places),
-            shown(factor),
-            f"x{short(float(np.sqrt(factor.value)))}",
-        )
-        rows.append((*row, _sigma(fit.floor[b], block.name)) if has_floors else row)
+    for group, fit in fits.items():
+        for block, factor, floor in zip(found.blocks, fit.factor, fit.floor, strict=True):
+            names = " ".join(found.axes[i] for i in block.places)
+            row: list[Cell] = [block.name, names, shown(factor), f"x{short(float(np.sqrt(factor.value)))}"]
+            if has_groups:
+                row.insert(0, group)
+            if has_floors:
+                row.append(_sigma(floor, block.name))
+            rows.append(tuple(row))
     return table(tuple(columns), rows, "Factors of each block", style="plain")
 
 
@@ -87,7 +91,7 @@ def correction_lines(found: Correction) -> Iterator[str]:
     gain = found.gain
     ends = f" [{gain.low:.3g}, {gain.high:.3g}]" if np.isfinite(gain.low) else ""
     yield f"log score gained a step, on average over {found.unit}s: {gain.value:.3g}{ends}"
-    if len(found.fitted) < FEW:
+    if len(found.fitted) < FEW and np.isfinite(found.excess):
         without = found.after.ratio.value / found.excess
         yield (
             f"factors of {plural(len(found.fitted), found.unit)} are uncertain, which adds x{found.excess:.3g} to a "
@@ -98,13 +102,14 @@ def correction_lines(found: Correction) -> Iterator[str]:
             f"analyse says of held-out/: {found.after.verdict.reasons[0]}; it takes the factors for exact, while here "
             "their uncertainty is taken in"
         )
-    yield from found.fit.notes
+    for fit in found.shown.values():
+        yield from fit.notes
     yield "the factors hold for data like these; those of new conditions may be others"
 
 
 def data(found: Correction) -> dict[str, Any]:
     """Everything as plain data, as correction.toml and --json have it."""
-    fit = found.fit
+    groups = found.before.record.groups
     return dict(
         plain({
             "name": found.name,
@@ -117,24 +122,30 @@ def data(found: Correction) -> dict[str, Any]:
             "convention": found.before.record.convention,
             "excess": found.excess,
             "log_score_gain": found.gain,
-            "blocks": [
-                {
-                    "name": block.name,
-                    "components": [found.axes[i] for i in block.places],
-                    "factor": fit.factors.factor[b],
-                    "factor_interval": fit.factor[b][1:],
-                    "floor": fit.factors.floor[b],
-                    "floor_interval": fit.floor[b][1:],
-                    "degrees_of_freedom": fit.dof[b],
-                }
-                for b, block in enumerate(found.blocks)
-            ],
+            "by": groups.column if groups is not None else None,
+            "edges": groups.edges if groups is not None else None,
+            "blocks": [_block(found, group, b) for group in found.shown for b in range(len(found.blocks))],
             "stated": _held_out(found.before),
             "corrected": _held_out(found.after),
-            "notes": fit.notes,
+            "notes": [note for fit in found.shown.values() for note in fit.notes],
             "referee": found.verdict.statistics,
         })
     )  # fmt: skip
+
+
+def _block(found: Correction, group: str, b: int) -> dict[str, Any]:
+    """Factor and floor of a block, in a group where there are groups."""
+    block, fit = found.blocks[b], found.fits[group]
+    return {
+        "group": group or None,
+        "name": block.name,
+        "components": [found.axes[i] for i in block.places],
+        "factor": fit.factors.factor[b],
+        "factor_interval": fit.factor[b][1:],
+        "floor": fit.factors.floor[b],
+        "floor_interval": fit.floor[b][1:],
+        "degrees_of_freedom": fit.dof[b],
+    }
 
 
 def _held_out(one: HeldOut) -> dict[str, Any]:

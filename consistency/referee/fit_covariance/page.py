@@ -171,10 +171,10 @@ def draw_correction(found: Correction) -> Drawing:
     shown = np.linspace(0, len(ratios[0]) - 1, min(MOST_ROWS, len(ratios[0]))).round().astype(int)
     draw_ratios(runs, [found.judged[i] for i in shown], *(each[shown] for each in ratios))
     log_axis(runs, "x")
-    names = [block.name for block in found.blocks]
+    names = [f"{group} {block.name}".strip() for group in found.shown for block in found.blocks]
     name_rows(factors, names)
     factors.axvline(1.0, **stroke(EXPECTED))
-    values = np.array(found.fit.factor)
+    values = np.array([factor for fit in found.shown.values() for factor in fit.factor])
     low, high = values[:, 1].min(), values[:, 2].max()
     factors.set_xlim(min(0.7, 0.8 * low), max(1.4, 1.25 * high))
     intervals(factors, np.arange(len(names), dtype=float), values, style(1))

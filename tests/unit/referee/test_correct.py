@@ -10,10 +10,11 @@ import pytest
 from scipy import optimize, stats
 
 import consistency as cs
+from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.correct import correct, held_out_by, with_uncertainty
+from consistency.referee.fit_covariance.correct import correct, fit_groups, held_out_by, with_uncertainty
 from consistency.referee.fit_covariance.factors import Block, Factors, blocks_of, fit_alone, fit_factors, run_moments
 from consistency.referee.fit_covariance.floors import fit_runs, floor_interval, likeness, scores
 from consistency.referee.types import Array
@@ -135,8 +136,8 @@ def test_a_run_has_no_say_in_its_own_factors(rng: np.random.Generator) -> None:
     error = record.error.copy()
     error[3] *= 20.0
     one, other = (correct(each) for each in (record, record_of(error, record.covariance)))
-    assert other.used[3].factor == pytest.approx(one.used[3].factor, rel=1e-9)
-    assert (other.used[2].factor > 2 * one.used[2].factor).all()
+    assert other.used[3][0].factor == pytest.approx(one.used[3][0].factor, rel=1e-9)
+    assert (other.used[2][0].factor > 2 * one.used[2][0].factor).all()
 
 
 def test_known_factors_are_found_and_judged_right() -> None:
@@ -171,7 +172,7 @@ def test_named_runs_and_half_are_judged_by_the_others(rng: np.random.Generator) 
     assert by_name.judged == ("1", "4")
     assert by_name.fitted == ("0", "2", "3", "5")
     rest = fit_runs(record.of_runs(np.array([0, 2, 3, 5])), by_name.blocks)
-    assert by_name.used[0].factor == pytest.approx(rest.factors.factor)
+    assert by_name.used[0][0].factor == pytest.approx(rest.factors.factor)
     assert correct(record, held_out="half").judged == ("3", "4", "5")
 
 
@@ -183,7 +184,7 @@ def test_uncertain_factors_lengthen_no_tails() -> None:
     error[0, :, 1] = np.sqrt(squares)
     record = record_of(error, np.broadcast_to(np.eye(3), (1, 4, 3, 3)).copy())
     blocks = blocks_of(record.axes, 3, False)
-    found = with_uncertainty(record, blocks, np.array([8.0]))
+    found = with_uncertainty(record, blocks, np.array([[8.0]]))
     assert found.nees is not None
     assert found.nees[0] == pytest.approx(stats.chi2.ppf(p, 3), rel=1e-6)
 
@@ -309,6 +310,26 @@ def test_a_floor_at_zero_has_a_one_sided_interval() -> None:
     assert tuple(found) == pytest.approx((0.0, 0.0, stats.t.isf(0.05, 4) * error))
     inside = floor_interval(0.1, 0.1, left_out)
     assert inside.high == pytest.approx(0.1 + stats.t.isf(0.025, 4) * error)
+
+
+def test_groups_have_factors_of_their_own_runs(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=6)
+    index = rng.integers(-1, 2, (6, 40))
+    index[:5][index[:5] == 1] = 0
+    groups = Groups("speed", ("slow", "fast"), index, (1.0,))
+    fits = fit_groups(replace(record, groups=groups), blocks_of(POSE, 6, False))
+    assert list(fits) == ["slow", "fast", ""]
+    assert record.nees is not None
+    slow = replace(record, nees=np.where(index == 0, record.nees, np.nan))
+    assert fits["slow"].factors.factor == pytest.approx(fit_runs(slow, fits[""].factors.blocks).factors.factor)
+    assert fits["fast"].factors == fits[""].factors
+    assert "fewer than two runs" in fits["fast"].notes[0]
+    found = correct(replace(record, groups=groups))
+    assert record.covariance is not None
+    assert found.after.record.covariance is not None
+    run, step = (int(each[0]) for each in np.nonzero(index == -1))
+    expected = fits[""].left_out[run].applied(record.covariance[run, step])
+    assert found.after.record.covariance[run, step] == pytest.approx(expected)
 
 
 def test_arrays_are_corrected_in_python(rng: np.random.Generator) -> None:

@@ -13,7 +13,6 @@ from command import consistency, refused
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.extras import is_installed
 from consistency.referee.types import Array
 
 RUNS, DRIVES, STEPS = 24, 8, 20
@@ -184,7 +183,6 @@ def test_lines_for_other_programs_have_the_same_matrix(written: tuple[Path, str]
     assert np.reshape(ros.relay(message).pose.covariance, (6, 6))[5, 5] == pytest.approx(expected[2, 2])
 
 
-@pytest.mark.skipif(not is_installed("interop"), reason="needs gtsam")
 def test_gtsam_takes_the_corrected_covariance(written: tuple[Path, str]) -> None:
     pytest.importorskip("gtsam")
     P = np.diag([0.02, 0.03, 0.0004])
@@ -267,13 +265,60 @@ def test_two_estimators_are_told_apart(
     assert {row.split(",")[0] for row in rows} == {"b"}
 
 
+def write_grouped(folder: Path, rng: np.random.Generator, words: bool = False) -> tuple[Path, Path]:
+    """A table whose covariance is right in half of the steps of each run, and too small by 16 in the others."""
+    own, true = ["run,step,a,b,P_a_a,P_a_b,P_b_b,seen"], ["run,step,a,b"]
+    for run in range(RUNS):
+        for step in range(1, STEPS + 1):
+            poor = bool(rng.integers(2))
+            a, b = (rng.normal(size=2) * (4.0 if poor else 1.0)).tolist()
+            seen = str(rng.uniform(0, 5) if poor else rng.uniform(5, 10))
+            if words:
+                seen = "tunnel" if poor else "open"
+            own.append(f"{run},{step},{a!r},{b!r},1.0,0.0,1.0,{seen}")
+            true.append(f"{run},{step},0,0")
+    paths = folder / "est.csv", folder / "truth.csv"
+    for path, lines in zip(paths, (own, true), strict=True):
+        path.write_text("\n".join(lines) + "\n")
+    return paths
+
+
+@pytest.mark.parametrize("words", [False, True])
+def test_factors_go_by_group(words: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    estimates, truth = write_grouped(tmp_path, np.random.default_rng(words), words)
+    options = ["--truth", truth, "--state", "a,b", "--by", "seen", *([] if words else ["--bins", "5,"])]
+    out, _ = consistency(capsys, "correct", estimates, *options, "--out", tmp_path / "c", "--anyway")
+    poor, good = ("seen is tunnel", "seen is open") if words else ("seen <= 5", "seen > 5")
+    data = json.loads((tmp_path / "c/verdict.json").read_text())
+    factors = {(block["group"], block["name"]): block["factor"] for block in data["blocks"]}
+    for name in "ab":
+        assert factors[poor, name] == pytest.approx(16.0, rel=0.4)
+        assert factors[good, name] == pytest.approx(1.0, rel=0.4)
+    said, _ = consistency(capsys, "analyse", tmp_path / "c/held-out/est.csv", *options)
+    assert f"{shown_ratio(said)} after" in out
+    module = loaded(tmp_path / "c/corrected_covariance.py")
+    at = {poor: "tunnel" if words else 2.0, good: "open" if words else 5.1}
+    for line in (tmp_path / "c/corrected/est.csv").read_text().splitlines()[1:20]:
+        *_, first, _, _, value = line.split(",")
+        group = poor if (value == "tunnel" if words else float(value) <= 5) else good
+        assert float(first) == pytest.approx(factors[group, "a"])
+        assert module.corrected([[1.0, 0.0], [0.0, 1.0]], at[group])[0][0] == pytest.approx(factors[group, "a"])
+
+
+def test_factors_by_what_selects_on_the_outcome_are_refused(
+    tables: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("correct", tables[0], "--truth", tables[1], "--by", "P_xx", "--out", tmp_path / "c")
+    assert "selects on the outcome" in refused(capsys, *words)
+
+
 def test_standard_deviations_come_back_as_such(tmp_path: Path, rng: np.random.Generator) -> None:
     from consistency.referee.readers.formats.restated import text_files
     from consistency.referee.readers.options import Reading
 
     (tmp_path / "s.csv").write_text('t;a;b;sigma_a;sigma_b;"note"\n0;1;2;3;4;"x; y"\n1;1;2;;4;z\n')
     (file,) = text_files(tmp_path / "s.csv", Reading(state=("a", "b")))
-    text = file.restated(lambda run: {"a": (4.0, 13.0)})
+    text = file.restated(lambda run, value: {"a": (4.0, 13.0)})
     assert text.splitlines()[1].split(";")[3:5] == ["7.0", "4.0"]
     assert text.splitlines()[2].split(";")[3:5] == ["", "4.0"]
     assert '"x; y"' in text

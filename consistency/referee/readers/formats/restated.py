@@ -24,7 +24,9 @@ from consistency.referee.readers.formats.tum import ORDERS, covariance_order, fi
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import STATE
 
-Change = Callable[[int], Mapping[str, tuple[float, float]] | None]  # factor and floor by component of a run, or None
+Change = Callable[
+    [int, str], Mapping[str, tuple[float, float]] | None
+]  # by run and value of --by: of components; or None
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class TextFile:
     run_column: int | None = None  # with the run of each line
     filter_column: int | None = None  # with the estimator of each line
     filter: str = ""  # whose lines are written
+    by_column: int | None = None  # with the value of --by of each line
 
     def restated(self, change: Change) -> str:
         """The text with each covariance P as D P D + F, by the factors and floors of its run; without runs of None."""
@@ -68,7 +71,7 @@ class TextFile:
         if self.filter_column is not None and fields[self.filter_column].strip() != self.filter:
             return []
         run = self.run if self.run_column is None else int(float(fields[self.run_column]))
-        of = change(run)
+        of = change(run, "" if self.by_column is None else fields[self.by_column])
         if of is None:
             return []
         fields = list(fields)
@@ -95,7 +98,7 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
     if is_bag(estimates) or estimates.suffix.lower() in ARCHIVES or is_solution(estimates):
         return []
     if estimates.is_file() and estimates.suffix.lower() == ".csv" and (r.state or not is_spatial(estimates)):
-        found = [_table(estimates, tuple(r.state or POSE), name)]
+        found = [_table(estimates, tuple(r.state or POSE), name, r.by if r.by_file is None else None)]
     elif is_plane(estimates):
         return []
     elif r.covariance is not None:
@@ -107,7 +110,7 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
     return known if len(known) == len(found) else []
 
 
-def _table(path: Path, axes: tuple[str, ...], name: str) -> TextFile | None:
+def _table(path: Path, axes: tuple[str, ...], name: str, by: str | None) -> TextFile | None:
     """A table, whose first line names its columns."""
     head = head_of(path)
     if head is None:
@@ -115,7 +118,8 @@ def _table(path: Path, axes: tuple[str, ...], name: str) -> TextFile | None:
     names = head.names
     if any(name.startswith("own_P") for name in names):
         return None
-    run, of = (names.index(key) if key in names else None for key in ("run", "filter"))
+    run, of, value = (names.index(key) if key in names else None for key in ("run", "filter", by))
+    where = {"run_column": run, "filter_column": of, "by_column": value}
     places = {name: i for i, name in enumerate(names)} | covariance_places(names, axes)
     entries: dict[int, tuple[str, str]] = {}
     for a, b in itertools.product(axes, repeat=2):
@@ -124,11 +128,11 @@ def _table(path: Path, axes: tuple[str, ...], name: str) -> TextFile | None:
             spelled += [OWN_NAMES.get((a, b), ""), LOWER_NAMES.get((a, b), "")]
         entries |= {places[name]: (a, b) for name in spelled if name in places}
     if entries:
-        return TextFile(path, entries, True, run_column=run, filter_column=of, filter=name)
+        return TextFile(path, entries, True, filter=name, **where)
     for spelling in (*DEVIATIONS, "sigma_{}"):
         if all(spelling.format(a) in places for a in axes):
             entries = {places[spelling.format(a)]: (a, a) for a in axes}
-            return TextFile(path, entries, False, run_column=run, filter_column=of, filter=name)
+            return TextFile(path, entries, False, filter=name, **where)
     return None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,10 +17,6 @@ from consistency.referee.fit_covariance.writing import pairs, write_fit
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
 from consistency.referee.readers.formats.restated import TextFile
 from consistency.referee.readers.formats.sheet import EMPTY
-from consistency.referee.readers.truth_matching import AXES
-from consistency.referee.types import Array
-
-POSITION_AND_TURN = {**{axis: i for i, axis in enumerate(AXES)}, "heading": 5}  # places in messages of ROS
 
 
 def write_correction(
@@ -34,7 +30,7 @@ def write_correction(
     files : that the covariances came in; without any the errors and covariances are written as archives of NumPy
     """
     write = partial(_write_runs, found, record, files)
-    texts = {"correction.toml": toml(found), **snippets(found)}
+    texts = {"correction.toml": toml(found), "corrected_covariance.py": pasted(found)}
     return write_fit(folder, ("correction", found.name), texts, correction_page(found), write, overwrite)
 
 
@@ -120,136 +116,60 @@ def toml(found: Correction) -> str:
     return "\n".join(lines) + "\n"
 
 
-def snippets(found: Correction) -> dict[str, str]:
-    """Files for other programs by name: plain Python, and ROS, robot_localization and GTSAM of a pose."""
-    factor, floor = found.fit.factors.of_components()
-    if len(found.fits) > 1:
-        return {"corrected_covariance.py": plain_python_by_group(found)}
-    texts = {"corrected_covariance.py": plain_python(found)}
-    pose = [i for i, axis in enumerate(found.axes) if axis in POSITION_AND_TURN]
-    if not pose:
-        return texts
-    d, f = np.ones(6), np.zeros(6)
-    for i in pose:
-        place = POSITION_AND_TURN[found.axes[i]]
-        d[place], f[place] = np.sqrt(factor[i]), floor[i]
-    return texts | {"ros_covariance.py": ros(found, d, f), "gtsam_noise.py": gtsam(found, d, f)}
-
-
-def _head(found: Correction) -> str:
-    return f"{found.status.capitalize()} on held-out {found.unit}s; {sentence(found).partition(': ')[2]}."
-
-
-def plain_python(found: Correction) -> str:
-    """A function of a covariance as lists of rows."""
-    factor, floor = found.fit.factors.of_components()
-    return f'''"""The corrected covariance of {", ".join(found.axes)}.
-
-{_head(found)}
-"""
-
-FACTOR = [{_numbers(factor)}]  # on the variances
-FLOOR = [{_numbers(floor)}]
-
-
-def corrected(P):
-    """D P D + F of a covariance P, rows of {len(factor)} numbers."""
-    n = range({len(factor)})
-    scaled = [[(FACTOR[i] * FACTOR[j]) ** 0.5 * P[i][j] for j in n] for i in n]
-    for i in n:
-        scaled[i][i] += FLOOR[i]
-    return scaled
-'''
-
-
-def plain_python_by_group(found: Correction) -> str:
-    """A function of a covariance as lists of rows, and of the column that its factors go by."""
+def pasted(found: Correction) -> str:
+    """corrected_covariance.py: functions of a stated covariance in plain Python, for messages of ROS, and for GTSAM."""
     groups = found.before.record.groups
-    assert groups is not None
-    rows = []
-    for group, fit in found.shown.items():
-        factor, floor = (_numbers(values) for values in fit.factors.of_components())
-        rows.append(f"    {group!r}: ([{factor}], [{floor}]),")
-    table = "\n".join(rows)
-    place = f'GROUPS[f"{groups.column} is {{value}}"]'
-    if groups.edges is not None:
-        place = f"list(GROUPS.values())[bisect.bisect_left([{_numbers(groups.edges)}], value)]"
-    return f'''"""The corrected covariance of {", ".join(found.axes)}, by {groups.column}.
-
-{_head(found)}
-"""
+    value, given, place = "", "", 'FACTORS[""]'
+    if len(found.fits) > 1 and groups is not None:
+        value, given = ", value", f" at a value of {groups.column}"
+        place = f'FACTORS[f"{groups.column} is {{value}}"]'
+        if groups.edges is not None:
+            place = f"list(FACTORS.values())[bisect.bisect_left({list(groups.edges)}, value)]"
+    turn = "heading" if "heading" in found.axes else "yaw"
+    order = ("x", "y", turn) if turn == "heading" else ("roll", "pitch", "yaw", "x", "y", "z")  # of Pose2, or Pose3
+    return f'''"""Corrected covariances. {sentence(found)}."""
 
 import bisect
 
-GROUPS = {{  # factors on the variances, and floors
-{table}
-}}
+AXES = {found.axes}
+ROS = ("x", "y", "z", "roll", "pitch", "{turn}")
+GTSAM = {order}
+FACTORS = {{  # factor and floor on the variance of each component
+{_table_of_factors(found)}}}
 
 
-def corrected(P, value):
-    """D P D + F of a covariance P, rows of {len(found.axes)} numbers, at a value of {groups.column}."""
-    factor, floor = {place}
-    n = range({len(found.axes)})
-    scaled = [[(factor[i] * factor[j]) ** 0.5 * P[i][j] for j in n] for i in n]
-    for i in n:
-        scaled[i][i] += floor[i]
-    return scaled
+def corrected(P{value}, axes=AXES):
+    """P' = D P D + F of a covariance P{given}, rows of numbers in the order of axes."""
+    known = {place}
+    factors = [known.get(axis, (1.0, 0.0)) for axis in axes]
+    better = [
+        [(s * t) ** 0.5 * number for (t, _), number in zip(factors, row)]
+        for (s, _), row in zip(factors, P)
+    ]
+    for i, (_, floor) in enumerate(factors):
+        better[i][i] += floor
+    return better
+
+
+def ros_covariance(numbers{value}):
+    """36 numbers of a PoseWithCovariance, row by row; robot_localization takes them from the message."""
+    rows = [numbers[6 * i : 6 * i + 6] for i in range(6)]
+    return [number for row in corrected(rows{value}, axes=ROS) for number in row]
+
+
+def gtsam_noise(P{value}):
+    """Noise model of a pose, for a factor: P in the order of gtsam, {", ".join(order)}."""
+    import gtsam
+
+    return gtsam.noiseModel.Gaussian.Covariance(corrected(P{value}, axes=GTSAM))
 '''
 
 
-def ros(found: Correction, d: Array, floor: Array) -> str:
-    """A function of the 36 numbers of a message, and a relay for robot_localization."""
-    rows = ["    " + _numbers(row) + "," for row in np.outer(d, d)]
-    floors = ["    " + _numbers(row) + "," for row in np.diag(floor)]
-    return "\n".join([
-        '"""ROS: the covariance of a PoseWithCovariance, 36 numbers row by row (x, y, z, roll, pitch, yaw).',
-        "",
-        _head(found),
-        '"""',
-        "",
-        "import numpy as np",
-        "",
-        "FACTOR = np.array([", *rows, "])",
-        "FLOOR = np.array([", *floors, "])",
-        "",
-        "",
-        "def corrected(covariance):",
-        '    """36 numbers of a corrected covariance."""',
-        "    return FACTOR * np.asarray(covariance) + FLOOR",
-        "",
-        "",
-        "def relay(message):",
-        '    """For robot_localization, which takes covariances from messages: publish this one in its place."""',
-        "    message.pose.covariance = corrected(message.pose.covariance)",
-        "    return message",
-        "",
-    ])  # fmt: skip
-
-
-def gtsam(found: Correction, d: Array, floor: Array) -> str:
-    """A function of a noise model."""
-    kind, order = "Pose2", [0, 1, 5]
-    if any(axis in ("z", "roll", "pitch", "yaw") for axis in found.axes):
-        kind, order = "Pose3", [3, 4, 5, 0, 1, 2]  # the rotation first
-    names = ", ".join(AXES[i] for i in order)
-    return f'''"""GTSAM: noise of a pose by a corrected covariance.
-
-{_head(found)}
-"""
-
-import gtsam
-import numpy as np
-
-# {names}: the order of gtsam.{kind}
-D = np.diag([{_numbers(d[order])}])
-FLOOR = np.diag([{_numbers(floor[order])}])
-
-
-def noise(P: np.ndarray) -> gtsam.noiseModel.Gaussian:
-    """Noise model of a stated covariance P in this order, as of gtsam.PriorFactor{kind}."""
-    return gtsam.noiseModel.Gaussian.Covariance(D @ P @ D + FLOOR)
-'''
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return ", ".join(f"{value:.17g}" for value in values)
+def _table_of_factors(found: Correction) -> str:
+    """Lines of the table of factors and floors by group and component."""
+    lines = []
+    for group, fit in found.shown.items():
+        factor, floor = fit.factors.of_components()
+        numbers = dict(zip(found.axes, zip(factor.tolist(), floor.tolist(), strict=True), strict=True))
+        lines.append(f"    {group!r}: {numbers},\n")
+    return "".join(lines)

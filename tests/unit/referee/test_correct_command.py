@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -165,29 +165,60 @@ def test_trajectories_come_back_as_trajectories(
     assert after[0, place] / before[0, place] == pytest.approx(factors["position"] ** of_sigma, rel=1e-9)
 
 
-def test_lines_for_other_programs_have_the_same_matrix(written: tuple[Path, str]) -> None:
-    folder, _ = written
+def matrix_of(folder: Path, P: Array) -> Array:
+    """D P D + F by the numbers of a correction of x, y, heading."""
     blocks = {b["name"]: b for b in json.loads((folder / "verdict.json").read_text())["blocks"]}
-    factor = np.array([blocks["position"]["factor"]] * 2 + [blocks["attitude"]["factor"]])
-    floor = np.array([blocks["position"]["floor"]] * 2 + [blocks["attitude"]["floor"]])
-    P = np.array([[0.02, 0.001, 0.0002], [0.001, 0.03, 0.0001], [0.0002, 0.0001, 0.0004]])
-    expected = P * np.sqrt(np.outer(factor, factor)) + np.diag(floor)
-    assert np.array(loaded(folder / "corrected_covariance.py").corrected(P.tolist())) == pytest.approx(expected)
-    full = np.zeros((6, 6))
-    full[np.ix_([0, 1, 5], [0, 1, 5])] = P
-    ros = loaded(folder / "ros_covariance.py")
-    assert np.reshape(ros.corrected(full.ravel().tolist()), (6, 6))[np.ix_([0, 1, 5], [0, 1, 5])] == pytest.approx(
-        expected
+    factor, floor = ([blocks["position"][key]] * 2 + [blocks["attitude"][key]] for key in ("factor", "floor"))
+    return np.asarray(P * np.sqrt(np.outer(factor, factor)) + np.diag(floor))
+
+
+P3 = np.array([[0.02, 0.001, 0.0002], [0.001, 0.03, 0.0001], [0.0002, 0.0001, 0.0004]])
+
+
+def test_plain_python_and_ros_have_the_same_matrix(written: tuple[Path, str]) -> None:
+    folder, _ = written
+    pasted, expected = loaded(folder / "corrected_covariance.py"), matrix_of(folder, P3)
+    assert np.array(pasted.corrected(P3.tolist())) == pytest.approx(expected)
+    full = np.full((6, 6), 0.001)
+    full[np.ix_([0, 1, 5], [0, 1, 5])] = P3
+    found = np.reshape(pasted.ros_covariance(full.ravel()), (6, 6))
+    assert found[np.ix_([0, 1, 5], [0, 1, 5])] == pytest.approx(expected)
+    assert found[2, 0] / 0.001 == pytest.approx((expected[0, 0] / P3[0, 0]) ** 0.5)
+    assert found[2:5, 2:5] == pytest.approx(full[2:5, 2:5])
+
+
+def test_a_message_of_ros_takes_the_numbers(written: tuple[Path, str]) -> None:
+    rosbags = pytest.importorskip("rosbags.typesys")
+    types = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
+    kind = "geometry_msgs/msg/PoseWithCovariance"
+    point, turn = (
+        types.types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0),
+        types.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
     )
-    message = SimpleNamespace(pose=SimpleNamespace(covariance=full.ravel()))
-    assert np.reshape(ros.relay(message).pose.covariance, (6, 6))[5, 5] == pytest.approx(expected[2, 2])
+    pose = types.types["geometry_msgs/msg/Pose"](point, turn)
+    full = np.zeros((6, 6))
+    full[np.ix_([0, 1, 5], [0, 1, 5])] = P3
+    stated = types.types[kind](pose, full.ravel())
+    better = np.array(loaded(written[0] / "corrected_covariance.py").ros_covariance(stated.covariance))
+    sent = types.deserialize_cdr(types.serialize_cdr(types.types[kind](pose, better), kind), kind)
+    found = sent.covariance.reshape(6, 6)[np.ix_([0, 1, 5], [0, 1, 5])]
+    assert found == pytest.approx(matrix_of(written[0], P3))
 
 
 def test_gtsam_takes_the_corrected_covariance(written: tuple[Path, str]) -> None:
-    pytest.importorskip("gtsam")
-    P = np.diag([0.02, 0.03, 0.0004])
-    plain = loaded(written[0] / "corrected_covariance.py").corrected(P.tolist())
-    assert loaded(written[0] / "gtsam_noise.py").noise(P).covariance() == pytest.approx(np.array(plain))
+    gtsam = pytest.importorskip("gtsam")
+    noise = loaded(written[0] / "corrected_covariance.py").gtsam_noise(P3)
+    assert noise.covariance() == pytest.approx(matrix_of(written[0], P3))
+    gtsam.PriorFactorPose2(0, gtsam.Pose2(), noise)
+
+
+def test_gtsam_has_the_rotation_first_in_space(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    estimates = write_trajectories(tmp_path, np.random.default_rng(3))
+    consistency(capsys, "correct", estimates, "--truth", tmp_path / "truth", "--error", "so3", "--out", tmp_path / "c")
+    pasted = loaded(tmp_path / "c/corrected_covariance.py")
+    blocks = {b["name"]: b["factor"] for b in json.loads((tmp_path / "c/verdict.json").read_text())["blocks"]}
+    variances = np.diag(np.array(pasted.corrected(np.eye(6).tolist(), axes=pasted.GTSAM)))
+    assert variances == pytest.approx([blocks["attitude"]] * 3 + [blocks["position"]] * 3)
 
 
 def test_an_inconsistent_correction_is_written_only_anyway(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -321,13 +321,14 @@ def _nees(record: Record, verdict: Verdict) -> Picture | None:
 
 def _worst_run(record: Record) -> Picture | None:
     """Mean NEES of each run, and the NEES over time of the run with the largest."""
-    if record.nees is None or record.parts or record.independent or has_one_step(record):
+    nees = record.nees
+    if nees is None or record.parts or record.independent or has_one_step(record):
         return None
-    there = np.isfinite(record.nees)
-    if len(record.nees) < 2 or not there.any():
+    there = np.isfinite(nees)
+    if len(nees) < 2 or not there.any():
         return None
     counts = np.maximum(there.sum(axis=1), 1)
-    means = np.where(there.any(axis=1), np.where(there, record.nees, 0.0).sum(axis=1) / counts, np.nan)
+    means = np.where(there.any(axis=1), np.where(there, nees, 0.0).sum(axis=1) / counts, np.nan)
     worst, clock = int(np.nanargmax(means)), clock_of(record.t)
     number = record.run_numbers[worst]
 
@@ -344,10 +345,10 @@ def _worst_run(record: Record) -> Picture | None:
         ends = [float(distributions.chi2.ppf(q, record.dof)) for q in (0.025, 0.975)]
         axes.axhspan(*ends, color=BAND, linewidth=0, zorder=0.5)
         axes.axhline(float(record.dof), **stroke(EXPECTED))
-        curve(axes, clock.values, record.nees[worst], WORST, "")
+        curve(axes, clock.values, nees[worst], WORST, "")
         axes.set_ylabel(f"NEES of run {number}")
         clock.name(axes)
-        if wide([record.nees[worst]]):
+        if wide([nees[worst]]):
             log_axis(axes, "y")
 
     caption = (

@@ -117,7 +117,9 @@ def _brief(block: Block) -> Block:
 def _baseline(study: Study) -> str:
     scenario = study.results.scenario
     assert scenario is not None
-    return f"{100.0 * scenario.truth.sensor.rig[1]:.3g} cm"
+    rig = scenario.truth.sensor.rig
+    assert rig is not None
+    return f"{100.0 * rig[1]:.3g} cm"
 
 
 def _table(report: Report) -> Table:

@@ -234,6 +234,7 @@ def _states_a_group(table: Rows, by: str) -> bool:
     except InputError:
         return by != "score"
     verdict = cs.judge(record)
+    assert verdict.by_group is not None
     return by == "score" or GROUP in verdict.faults or any(group.status for group in verdict.by_group.groups)
 
 
@@ -243,6 +244,7 @@ def _power(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
         rng, found, named, clear = np.random.default_rng((seed, 123, k)), 0, 0, 0
         for _ in range(gates):
             verdict, wrong = _with_one_wrong(rng, runs, world == EACH)
+            assert verdict.by_group is not None
             found += GROUP in verdict.faults
             named += GROUP in verdict.faults and verdict.by_group.worst.name == wrong
             clear += any(g.status == "consistent" for g in verdict.by_group.groups if g.name == wrong)

@@ -47,7 +47,7 @@ def by_group(verdict: Verdict) -> tuple[Figure, ...]:
 def _draw_groups(axes: Axes, by: ByGroup, labels: tuple[str, ...], factor: float) -> None:
     """Intervals of the groups, in a colour for each kind of verdict."""
     drawn = [group for group in by.groups if group.ratio.value > 0]
-    axes.set(xlabel="covariance ratio (true / stated)", xlim=ratio_window([tuple(group.ratio) for group in drawn]))
+    axes.set(xlabel="covariance ratio (true / stated)", xlim=ratio_window([(*group.ratio,) for group in drawn]))
     name_rows(axes, labels)
     axes.axvspan(1.0 / factor, factor, color=BAND, linewidth=0, zorder=0.5, label="consistent if shown inside")
     axes.axvline(1.0, **stroke(EXPECTED))

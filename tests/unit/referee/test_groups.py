@@ -121,7 +121,7 @@ def test_a_weighted_mean_spreads_as_fewer_runs() -> None:
     means, weights = np.array([1.0, 2.0, 3.0]), np.array([1, 1, 4])
     found = weighted_of(means, weights)
     assert found.ratio == pytest.approx((1 + 2 + 12) / 6)
-    assert found.values.mean() == pytest.approx(found.ratio)
+    assert found.values.tolist() == pytest.approx([1.75, 2.25, 3.5])
     assert found.squares == pytest.approx((0.25 + 0.25 + 4.0) / 3)
     assert found.cubes == pytest.approx((0.125 + 0.125 + 8.0) / 3)
     test = scale_test(means, 3, 5, weights=weights)  # of few runs: one error in all steps
@@ -168,6 +168,8 @@ def test_the_wrong_group_is_named_and_where_it_is_right() -> None:
     assert [group.status for group in verdict.by_group.groups] == ["overconfident", *["consistent"] * 3]
     assert verdict.by_group.worst.name == "mode <= 0"
     assert verdict.by_group.worst.ratio.low > 3.0
+    p_value = scale_test(np.square(error[column == 1]).reshape(40, -1).mean(axis=1), 2, 5).p_value
+    assert verdict.by_group.groups[1].p_value == pytest.approx(min(1.0, 4.0 * p_value))
     assert "where mode <= 0; consistent where mode > 0" in verdict.reasons[0]
     assert GROUP not in right.faults
     assert "consistent in each of 4 groups by mode" in right.reasons[0]
@@ -196,11 +198,21 @@ def test_a_wrong_group_makes_a_whole_that_is_right_wrong() -> None:
     assert "scale" not in verdict.faults
     assert GROUP in verdict.faults
     assert verdict.status == "inconsistent"
+    assert verdict.by_group.worst.name == "w is b"
     assert "where w is a" in verdict.reasons[0]
     assert "where w is b" in verdict.reasons[0]
     allowed = cs.judge(error, covariance, by={"w": names}, allow="conservative")
     assert allowed.status == "overconfident"
     assert [g.status for g in allowed.by_group.groups][:2] == ["overconfident", "consistent"]
+
+
+def test_a_group_on_the_other_side_than_the_whole_makes_it_inconsistent() -> None:
+    error, covariance = errors(runs=80)
+    kinds = np.repeat(["large", "small"], [60, 20])
+    error[kinds == "large"] *= 2.0
+    assert cs.judge(error, covariance, by={"kind": np.arange(80) % 2}).status == "overconfident"
+    error[kinds == "small"] *= 0.4
+    assert cs.judge(error, covariance, by={"kind": kinds}).status == "inconsistent"
 
 
 def test_a_group_in_few_runs_says_so() -> None:
@@ -242,6 +254,7 @@ def test_a_tolerated_ratio_is_no_fault_of_a_group() -> None:
     tolerant = cs.judge(error, covariance, by=by, tolerance=2.0)
     assert GROUP not in tolerant.faults
     assert {group.status for group in tolerant.by_group.groups} == {"consistent"}
+    assert {group.equivalence.factor for group in tolerant.by_group.groups} == {2.0}
 
 
 def test_standard_deviations_are_judged_by_group_one_by_one() -> None:

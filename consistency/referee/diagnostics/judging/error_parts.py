@@ -94,7 +94,7 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     """Answers with faults of the scale marked as tolerated whose ratio is shown to lie within the tolerance."""
     if settings.tolerance is None:
         return tuple(given)
-    R, steps = settings.tolerated, sample.longest
+    R, steps, dof = settings.tolerated, sample.longest, sample.dof
     if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
         return tuple(given)
     tolerated = {MAIN}
@@ -104,8 +104,8 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
             tolerated.add(AXIS)
     if tests.largest is not None and tests.largest.ratio.high <= R:
         tolerated.add(DIRECTION)
-    groups = [sample.in_group(number) for number in range(len(tests.groups))]
-    if all(equivalence(g.means, sample.dof, g.longest, settings, R, weights=g.counts).shown for g in groups):
+    by_group = [sample.in_group(number) for number in range(len(tests.groups))]
+    if all(equivalence(one.means, dof, one.longest, settings, R, weights=one.counts).shown for one in by_group):
         tolerated.add(GROUP)
     curve = anees(sample.nees)
     if not ((curve > tests.band.high * R) | (curve < tests.band.low / R)).any():

@@ -67,8 +67,12 @@ def beside_states(column: Column, e: Estimator, runs: Sequence[Poses], known: Se
     estimate = np.concatenate([p.estimate[k.rows] for p, k in rows])
     truth, P = np.concatenate([k.truth for _, k in rows]), np.concatenate([p.covariance[k.rows] for p, k in rows])
     has_states = e.convention != ""  # errors of an archive stand in the place of a truth
-    states = (truth, estimate) if has_states else (None, None)
-    return replace(column, outcome=selects_on_outcome(replace(column, values=values), e.axes, *states, P))
+    column_known = replace(column, values=values)
+    if has_states:
+        outcome = selects_on_outcome(column_known, e.axes, truth, estimate, P)
+    else:
+        outcome = selects_on_outcome(column_known, e.axes, covariance=P)
+    return replace(column, outcome=outcome)
 
 
 def grouped(record: Record, column: Column | None, r: Reading, option: str = "--by") -> Record:
@@ -112,11 +116,10 @@ def with_groups(
     """
     if by is None:
         raise InputError("bins: goes with by=")
-    name, values = "array", by
-    if isinstance(by, Mapping):
-        if len(by) != 1:
-            raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(by)} names")
-        ((name, values),) = by.items()
+    named = by if isinstance(by, Mapping) else {"array": by}
+    if len(named) != 1:
+        raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(named)} names")
+    ((name, values),) = named.items()
     if record.nees is None:
         raise InputError(f"by: {record.name} has no truth, so that there are no errors to group")
     try:
@@ -141,6 +144,7 @@ def _sheet(r: Reading) -> TableRows:
     from consistency.referee.readers.formats.other_names import with_clock
     from consistency.referee.readers.formats.sheet import read_sheet
 
+    assert r.by is not None
     assert r.by_file is not None
     sheet = with_clock(read_sheet(r.by_file), required=False)
     if r.by not in sheet:

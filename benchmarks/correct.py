@@ -116,7 +116,7 @@ def row_of(world: World, draws: int, rng: np.random.Generator) -> Row:
         record = world.drawn(rng)
         fit = fit_runs(record, true.blocks)
         whole = before_dropping(record, fit).factor
-        after = with_factors(record, fit.left_out)
+        after = with_factors(record, [(factors,) for factors in fit.left_out])
         assert after.nees is not None
         ratios[i] = run_means(after.nees)[0].mean() / world.n
         for b, block in enumerate(true.blocks):

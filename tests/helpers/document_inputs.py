@@ -44,7 +44,6 @@ NOT_RUN = [
     ("docs/what-to-state.md", "python docs/examples", "needs a real drive"),
     ("docs/what-to-state.md", "consistency fit-covariance", "needs real drives; test_fit_command.py simulates"),
     ("docs/what-to-state.md", "consistency correct", "needs real drives; test_correct_command.py simulates"),
-    ("docs/fit-covariance.md", "consistency", "needs real drives; unit/referee/test_fit_command.py simulates"),
     ("docs/front-end.md", "from consistency.vision import fit_shared", "tests/unit/stereo/test_vision_shared.py"),
     ("docs/front-end.md", "python experiments/e11", REAL),
     ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/bench/test_guards.py runs such"),

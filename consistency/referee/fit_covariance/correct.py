@@ -244,13 +244,14 @@ def fit_groups(record: Record, blocks: tuple[Block, ...]) -> dict[str, Fit]:
 
     A group that fewer than two runs pass through has the fit of all steps.
     """
+    assert record.nees is not None
     fits = {}
     names = record.groups.names if record.groups is not None else ()
     whole = fit_runs(record, blocks)
     for number, name in enumerate(names):
-        assert record.nees is not None
-        some = replace(record, nees=np.where(group_index(record) == number, record.nees, np.nan), groups=None)
-        there = np.isfinite(some.nees).any(axis=1)
+        nees = np.where(group_index(record) == number, record.nees, np.nan)
+        some = replace(record, nees=nees, groups=None)
+        there = np.isfinite(nees).any(axis=1)
         if there.sum() < 2:
             fits[name] = replace(whole, notes=(f"{name}: fewer than two runs; the factors are those of all steps",))
             continue

@@ -7,7 +7,7 @@ import io
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -119,7 +119,7 @@ def _table(path: Path, axes: tuple[str, ...], name: str, by: str | None) -> Text
     if any(name.startswith("own_P") for name in names):
         return None
     run, of, value = (names.index(key) if key in names else None for key in ("run", "filter", by))
-    where = {"run_column": run, "filter_column": of, "by_column": value}
+    bare = TextFile(path, {}, True, run_column=run, filter_column=of, filter=name, by_column=value)
     places = {name: i for i, name in enumerate(names)} | covariance_places(names, axes)
     entries: dict[int, tuple[str, str]] = {}
     for a, b in itertools.product(axes, repeat=2):
@@ -128,11 +128,11 @@ def _table(path: Path, axes: tuple[str, ...], name: str, by: str | None) -> Text
             spelled += [OWN_NAMES.get((a, b), ""), LOWER_NAMES.get((a, b), "")]
         entries |= {places[name]: (a, b) for name in spelled if name in places}
     if entries:
-        return TextFile(path, entries, True, filter=name, **where)
+        return replace(bare, entries=entries)
     for spelling in (*DEVIATIONS, "sigma_{}"):
         if all(spelling.format(a) in places for a in axes):
             entries = {places[spelling.format(a)]: (a, a) for a in axes}
-            return TextFile(path, entries, False, filter=name, **where)
+            return replace(bare, entries=entries, squared=False)
     return None
 
 

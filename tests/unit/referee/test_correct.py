@@ -17,6 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.correct import correct, fit_groups, held_out_by, with_uncertainty
 from consistency.referee.fit_covariance.factors import Block, Factors, blocks_of, fit_alone, fit_factors, run_moments
 from consistency.referee.fit_covariance.floors import fit_runs, floor_interval, likeness, scores
+from consistency.referee.fit_covariance.white_noise import interval_of_ratio
 from consistency.referee.types import Array
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -301,6 +302,13 @@ def test_gradients_and_information_are_those_of_the_likelihood(rng: np.random.Ge
         above, below = (scores(record, blocks, free, theta + sign * step) for sign in (1.0, -1.0))
         assert (above[0] - below[0]) / (2 * h) == pytest.approx(gradient[:, i], rel=1e-4, abs=1e-6)
     assert (np.linalg.eigvalsh(information) > 0).all()
+
+
+def test_the_interval_of_a_factor_is_that_of_the_jackknife() -> None:
+    left_out = np.array([8.0, 9.0, 9.5, 10.0])
+    error = np.sqrt(3 / 4 * np.square(np.log(left_out) - np.log(left_out).mean()).sum())
+    reach = np.exp(stats.t.ppf(0.975, 3) * error)
+    assert tuple(interval_of_ratio(9.0, left_out)) == pytest.approx((9.0, 9.0 / reach, 9.0 * reach))
 
 
 def test_a_floor_at_zero_has_a_one_sided_interval() -> None:

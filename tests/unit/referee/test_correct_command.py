@@ -13,6 +13,8 @@ from command import consistency, refused
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
+from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.fit_covariance.correction_files import place_in
 from consistency.referee.types import Array
 
 RUNS, DRIVES, STEPS = 24, 8, 20
@@ -334,6 +336,14 @@ def test_factors_go_by_group(words: bool, tmp_path: Path, capsys: pytest.Capture
         group = poor if (value == "tunnel" if words else float(value) <= 5) else good
         assert float(first) == pytest.approx(factors[group, "a"])
         assert module.corrected([[1.0, 0.0], [0.0, 1.0]], at[group])[0][0] == pytest.approx(factors[group, "a"])
+
+
+def test_a_value_on_an_edge_is_below_it() -> None:
+    numbers = Groups("n", ("n <= 5", "5 < n <= 9", "n > 9"), np.zeros(1, int), (5.0, 9.0))
+    assert [place_in(numbers, value) for value in ("5", "5.5", "9.0", "10", "", "nan")] == [0, 1, 1, 2, -1, -1]
+    words = Groups("road", ("road is dry", "road is wet"), np.zeros(1, int), None)
+    assert [place_in(words, value) for value in ("wet", " dry ", "icy")] == [1, 0, -1]
+    assert place_in(None, "7") == -1
 
 
 def test_factors_by_what_selects_on_the_outcome_are_refused(

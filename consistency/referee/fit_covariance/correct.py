@@ -36,13 +36,14 @@ class HeldOut:
     record: Record = field(repr=False)
     verdict: Verdict = field(repr=False)  # what ``analyse`` says of it
     ratio: Interval  # of true to stated covariance
-    scores: Array  # (R,), log density of a step, mean of each run
+    scores: Array  # log density of a step, mean of each run that has one
 
     @property
     def ratios(self) -> Array:
-        """Ratio of true to stated covariance of each run, (R,)."""
+        """Ratio of true to stated covariance of each run, (R,); NaN of one without a step."""
         assert self.record.nees is not None
-        return run_means(self.record.nees)[0] / self.record.dof
+        means, counts = run_means(self.record.nees)
+        return np.where(counts > 0, means, np.nan) / self.record.dof
 
     def covered(self, levels: Sequence[float] | Array) -> Array:
         """Share of the errors inside the ellipsoid of each probability, mean over runs."""
@@ -50,7 +51,7 @@ class HeldOut:
         assert nees is not None
         counted = np.isfinite(nees)
         bounds = special.chdtri(self.record.dof, 1.0 - np.asarray(levels))
-        return np.array([np.nanmean(np.where(counted, nees <= bound, np.nan), axis=1).mean() for bound in bounds])
+        return np.array([average(np.where(counted, nees <= bound, np.nan)) for bound in bounds])
 
 
 @dataclass(frozen=True)
@@ -157,11 +158,11 @@ def correct(
     require_runs(record)
     assert record.nees is not None
     labels = tuple(map(str, record.run_numbers if names is None else names))
-    there = np.flatnonzero(np.isfinite(record.nees).any(axis=1))
-    fitted, judged = fitted_and_judged(labels, there, held_out)
+    fitted, judged = fitted_and_judged(labels, np.isfinite(record.nees).any(axis=1), held_out)
     blocks = blocks_of(record.axes, record.dof, per_axis)
     fits = fit_groups(record.of_runs(fitted), blocks)
-    used = tuple(by_group(fits, row if held_out is None else None) for row in range(len(judged)))
+    place = {run: row for row, run in enumerate(fitted)}
+    used = tuple(by_group(fits, place.get(run)) for run in judged)
     some = replace(record, map=None, rejections=None, world=None).of_runs(judged)
     before = held_out_by(some)
     after = held_out_by(with_factors(some, used))
@@ -226,15 +227,21 @@ def require_runs(record: Record) -> None:
         raise InputError(f"{record.name}: no run has a step with an error and a covariance of full rank")
 
 
-def fitted_and_judged(labels: Sequence[str], there: Indices, held_out: str | None) -> tuple[Indices, Indices]:
-    """Rows of the runs that are fitted, and of those that are judged."""
+def fitted_and_judged(labels: Sequence[str], counted: Array, held_out: str | None) -> tuple[Indices, Indices]:
+    """Rows of the runs that are fitted, and of those that are judged, among them runs that failed from the start.
+
+    Parameters
+    ----------
+    counted : (runs,) of bool, runs with a step that can be fitted
+    """
+    every = np.arange(len(labels))
     if held_out is None:
-        return there, there
-    judged = there[len(there) // 2 :]
+        return every[counted], every
+    judged = every[len(every) // 2 :]
     if held_out != HALF:
-        judged = np.intersect1d(named(labels, held_out, "run"), there)
-    fitted = np.setdiff1d(there, judged)
-    if len(fitted) < 2 or not len(judged):
+        judged = named(labels, held_out, "run")
+    fitted = np.setdiff1d(every[counted], judged)
+    if len(fitted) < 2 or not counted[judged].any():
         raise InputError(f"--held-out {held_out}: leaves {len(fitted)} runs to fit; it takes 2, and 1 to judge")
     return fitted, judged
 
@@ -293,7 +300,7 @@ def excess_of(record: Record, blocks: Sequence[Block], dof: Array) -> float:
     of_blocks = np.where(dof > 2.0, dof / np.maximum(dof - 2.0, 1e-9), np.inf)
     of_groups = (sizes * of_blocks).sum(axis=1) / sizes.sum()
     steps = np.where(np.isfinite(record.nees), of_groups[group_index(record)], np.nan)
-    return float(np.nanmean(steps, axis=1).mean())
+    return average(steps)
 
 
 def with_covariance(record: Record, error: Array | None, P: Array) -> Record:
@@ -342,8 +349,16 @@ def held_out_by(record: Record) -> HeldOut:
     if verdict.scale is not None:
         ratio = verdict.scale.inflation
     else:
-        ratio = ratio_interval(run_means(record.nees)[0] / record.dof, record.dof)
+        means, counts = run_means(record.nees)
+        ratio = ratio_interval(means[counts > 0] / record.dof, record.dof)
     counted = np.isfinite(record.nees)
     P = np.where(counted[..., None, None], record.covariance, np.eye(record.dof))
     density = -0.5 * (record.nees + np.linalg.slogdet(2.0 * np.pi * P)[1])
-    return HeldOut(record, verdict, ratio, np.nanmean(density, axis=1))
+    scores, counts = run_means(density)
+    return HeldOut(record, verdict, ratio, scores[counts > 0])
+
+
+def average(values: Array) -> float:
+    """Mean over runs of the mean over the steps of each, (runs, steps), NaN where there is none."""
+    means, counts = run_means(values)
+    return float(means[counts > 0].mean())

@@ -35,7 +35,10 @@ def write_correction(
 
 
 def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], folder: Path) -> list[str]:
-    """Write held-out/, each judged run by the factors of others, and corrected/, all runs by the factors of all."""
+    """Write held-out/, each judged run by the factors of others, and corrected/, all runs by the factors of all.
+
+    Returns the names of what ``analyse`` reads: a file, or a folder of trajectories.
+    """
     groups = record.groups
     numbers = dict(zip(found.runs, record.run_numbers.tolist(), strict=True))
     judged = {numbers[name]: factors for name, factors in zip(found.judged, found.used, strict=True)}
@@ -52,7 +55,8 @@ def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], fo
         for file in files:
             if file.run_column is not None or change(file.run, "") is not None:
                 (at / file.path.name).write_text(file.restated(change), encoding="utf-8")
-    return [HELD_OUT, CORRECTED]
+    made = [(name, [path.name for path in (folder / name).iterdir()]) for name in (HELD_OUT, CORRECTED)]
+    return [f"{name}/{files[0]}" if len(files) == 1 else name for name, files in made]
 
 
 def _change(
@@ -77,7 +81,7 @@ def place_in(groups: Groups | None, value: str) -> int:
 
 
 def _write_archive(path: Path, record: Record, of_runs: dict[int, ByGroup]) -> None:
-    """Errors and covariances as an archive that ``analyse`` reads; NaN where a step does not count."""
+    """Errors and covariances as an archive that ``analyse`` reads, masked where a step does not count."""
     rows = np.flatnonzero(np.isin(record.run_numbers, list(of_runs)))
     some = record.of_runs(rows)
     used = [of_runs[run] for run in some.run_numbers.tolist()]
@@ -86,12 +90,15 @@ def _write_archive(path: Path, record: Record, of_runs: dict[int, ByGroup]) -> N
     assert corrected.error is not None
     assert corrected.covariance is not None
     counted = np.isfinite(corrected.nees)
+    mask = ~counted
+    for failure in corrected.failures:  # which stay failures
+        mask[corrected.run_numbers == failure.run, failure.step - 1 :] = False
     axes = np.array(list(record.axes) or [f"axis {i}" for i in range(record.dof)])
     np.savez(
         path,
         errors=corrected.error,
         covariances=np.where(counted[..., None, None], corrected.covariance, np.eye(record.dof)),
-        mask=~counted,
+        mask=mask,
         axes=axes,
     )
 

@@ -102,8 +102,10 @@ def correction_lines(found: Correction) -> Iterator[str]:
             f"analyse says of held-out/: {found.after.verdict.reasons[0]}; it takes the factors for exact, while here "
             "their uncertainty is taken in"
         )
-    for fit in found.shown.values():
-        yield from fit.notes
+    if len(found.fits) > 1 and not any(fit.factors.floor.any() for fit in found.shown.values()):
+        yield "floors are 0 in all groups"
+    else:
+        yield from (note for fit in found.shown.values() for note in fit.notes)
     yield "the factors hold for data like these; those of new conditions may be others"
 
 

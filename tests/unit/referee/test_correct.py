@@ -18,7 +18,7 @@ from consistency.referee.fit_covariance.correct import correct, fit_groups, held
 from consistency.referee.fit_covariance.factors import Block, Factors, blocks_of, fit_alone, fit_factors, run_moments
 from consistency.referee.fit_covariance.floors import fit_runs, floor_interval, likeness, scores
 from consistency.referee.fit_covariance.white_noise import interval_of_ratio
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Failure
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 
@@ -228,6 +228,24 @@ def test_what_no_factor_mends_is_named(rng: np.random.Generator) -> None:
         assert found.status == "inconsistent"
         assert word in found.verdict.reasons[0]
         assert "no factor mends this" in repr(found)
+
+
+def test_a_run_that_failed_from_the_start_counts(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=8)
+    assert record.error is not None
+    assert record.nees is not None
+    error, values = record.error.copy(), record.nees.copy()
+    error[2], values[2] = np.nan, np.nan
+    broken = replace(record, error=error, nees=values, failures=(Failure("est", 2, 1, "estimate is not finite"),))
+    found = correct(broken)
+    assert found.status == "inconsistent"
+    assert found.verdict.status == "failed"
+    assert found.after.verdict.runs == 8
+    assert found.fitted == ("0", "1", "3", "4", "5", "6", "7")
+    assert found.used[2][0] == found.fit.factors
+    assert found.used[3][0] == found.fit.left_out[2]
+    assert np.isfinite(found.after.covered((0.5,))).all()
+    assert np.isfinite(found.gain).all()
 
 
 def test_a_correlation_of_the_wrong_sign_is_not_mended(rng: np.random.Generator) -> None:

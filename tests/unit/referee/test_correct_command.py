@@ -239,6 +239,17 @@ def test_an_inconsistent_correction_is_written_only_anyway(tmp_path: Path, capsy
         assert archive["errors"] == pytest.approx(errors)
 
 
+def test_a_run_that_failed_is_written_as_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    errors = np.random.default_rng(8).normal(size=(24, 20, 2))
+    errors[3, 7:] = np.nan
+    P = np.broadcast_to(np.eye(2), (24, 20, 2, 2)).copy()
+    np.savez(tmp_path / "est.npz", errors=errors, covariances=P)
+    out, _ = consistency(capsys, "correct", tmp_path / "est.npz", "--out", tmp_path / "c", "--anyway")
+    assert "no factor mends this: failed: 1 of 24 runs failed" in out
+    said = json.loads(consistency(capsys, "analyse", tmp_path / "c/held-out/est.npz", "--json")[0])
+    assert [failure[:2] for failure in said["est"]["statistics"]["failures"]] == [[3, 8]]
+
+
 def test_an_undecided_correction_is_written_and_marked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     estimates, truth = write_tables(tmp_path, np.random.default_rng(2), runs=5)
     out, _ = consistency(capsys, "correct", estimates, "--truth", truth, "--out", tmp_path / "c")

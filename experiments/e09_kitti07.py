@@ -4,7 +4,7 @@
 
 ``--data`` is a file of tracks (.npz, course ECE276A), or a folder with one such file and one .txt of true poses:
 0027.npz and kitti07_gt.txt, or those of another drive (KITTI's licence, CC BY-NC-SA: not shipped). What is in them and
-how it becomes a log: docs/kitti07.md.
+how it becomes a log: docs/reference/recorded.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Where does a filter on triangulated points put a landmark that it watches from one place for ever?
 
-The closed forms are derived in docs/static-limit.md.
+The closed forms are derived in docs/consistent.md.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ALARM = 1e-3  # chance that a right closed form fails a finding, by chance at an
 
 COMMON = {
     "scenario": "none",
-    "source": f"{OURS}, docs/static-limit.md",
+    "source": f"{OURS}, docs/consistent.md",
     "published": "in brackets beside what is measured",
 }
 ACCEPT = (

@@ -1,4 +1,4 @@
-"""Stereo tracks of a KITTI drive (course ECE276A) as a planar log; why each step is there: docs/kitti07.md.
+"""Stereo tracks of a KITTI drive (course ECE276A) as a planar log; why each step is there: docs/reference/recorded.md.
 
 Only :func:`planar_truth` reads the ground truth: controls, observations and where a track is cut come from the
 recording alone. Pixels are (u, v, d): right of the principal point, below it, left minus right column.

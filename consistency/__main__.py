@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 GLANCE = 0.1  # s between looks, for a signal that another thread was given
 SHOW_CURSOR = "\x1b[?25h"
-GOES_ON = "; finished runs are kept where there are any: the same command goes on, 'run' with --resume"
+GOES_ON = "; finished runs are kept where there are any: the same command continues, 'run' with --resume"
 
 
 class Command(threading.Thread):

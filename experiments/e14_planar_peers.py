@@ -65,7 +65,7 @@ PEERS = {
     ),
 }
 # --- rules -----------------------------------------------------------------------------------
-ALARM = 0.05  # chance that some number of some peer is called different if none is
+ALARM = 0.05  # probability that some number of some peer is called different if none is
 NUMBERS = ("nees", "position", "heading")
 COMPARED = len(NUMBERS) * sum(len(rows) for rows in PEERS.values())
 LIMIT = NormalDist().inv_cdf(1.0 - ALARM / COMPARED / 2.0)  # standard errors, Bonferroni

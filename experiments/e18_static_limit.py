@@ -20,7 +20,7 @@ FINDINGS = ("static-limit", "static-growth", "static-lateral", "static-predicted
 DEPTHS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # m, straight ahead
 NEAR = (1.0, 2.0, 3.0, 4.0)  # where a disparity of 0 is 5 sigma away: beyond, a triangulated point has no mean
 OBSERVATIONS = 2000  # of a run: the estimate's own error is then a fiftieth of that of one observation
-ALARM = 1e-3  # chance that a right closed form fails a finding, by chance at any depth
+ALARM = 1e-3  # probability that a right closed form fails a finding, by chance at any depth
 
 COMMON = {
     "scenario": "none",

@@ -127,7 +127,7 @@ def analyse_command(
             )
         verdicts = judge_all(results, filters, settings=settings, skip=first)
         if results.unfinished:
-            text = f"{path}: {results.unfinished}; the same 'consistency run' with --resume goes on"
+            text = f"{path}: {results.unfinished}; the same 'consistency run' with --resume continues"
             if fail_on:
                 raise InputError(f"--fail-on: {text}")
             print(f"consistency: {text}", file=sys.stderr)

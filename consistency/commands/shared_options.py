@@ -70,7 +70,7 @@ def require_word(option: str, value: str | None, word: str) -> None:
 
 
 def require_written(overwrite: bool, out: Path | None, option: str) -> None:
-    """Refuse --overwrite where nothing is written, for want of ``option``."""
+    """Refuse --overwrite where nothing is written, without ``option``."""
     if overwrite and out is None:
         raise InputError(f"--overwrite goes with {option}: nothing else is written")
 

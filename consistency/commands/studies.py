@@ -113,7 +113,7 @@ def run_command(
     results: Results | StoredResults
     verdicts = None
     if resume and overwrite:
-        raise InputError("--resume goes on with what --overwrite would replace; give one of them")
+        raise InputError("--resume continues with what --overwrite would replace; give one of them")
     if log is not None and (runs is not None or seed is not None or until_decided):
         raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
     with executor_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out) as executor:

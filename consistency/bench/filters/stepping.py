@@ -68,7 +68,7 @@ def run_filter(filter_: Filter, trial: Trial, belief: Belief, record: RunRecord 
     Raises
     ------
     InputError
-        The filter's error is no convention, nothing gives its covariance, or estimates of a whole trial have another.
+        The filter's error is not a convention, nothing gives its covariance, or a whole trial's estimates have another.
     """
     if isinstance(filter_, WholeTrial):
         estimates, error = filter_.run(trial, belief), error_of(filter_)
@@ -92,7 +92,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, record: RunRecor
     Raises
     ------
     InputError
-        The filter's error is no convention, or nothing gives its covariance; it needs the truth and there is none.
+        The filter's error is not a convention, or nothing gives its covariance; it needs the truth and there is none.
     """
     T, name, error = trial.steps, name_of(filter_), error_of(filter_)
     record = record or RunRecord.empty(T, len(trial.landmark))

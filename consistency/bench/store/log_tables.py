@@ -52,13 +52,13 @@ def read_table_file(folder: Path, name: str, also: Sequence[str] = ()) -> pd.Dat
         require_table(folder, name, also)
         return read_parquet(folder, name)
     if not is_file(path):
-        raise InputError(f"{path}: is no file")
+        raise InputError(f"{path}: is not a file")
     names = _header(path)
     needed = dict.fromkeys((*COLUMNS[name], *also))
     if missing := [column for column in needed if column not in names]:
         raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(needed)}")
     if twice := [column for column in names if names.count(column) > 1]:
-        raise InputError(f"{path}: column '{twice[0]}' is there twice")
+        raise InputError(f"{path}: column '{twice[0]}' is duplicated")
     kinds = COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in names}
     with reading(path, DAMAGED):
         convert = pa_csv.ConvertOptions(include_columns=list(kinds), column_types=dict.fromkeys(kinds, pa.float64()))

@@ -26,7 +26,7 @@ SUFFIX = ".kernel"
 _DIGEST = hashlib.sha256().digest_size
 FILE = "seconds.txt"  # beside the compiled code: a line for each kernel, its size and seconds
 RECENT = 15  # kernels whose median counts, so that neither a busy hour nor an old processor does for long
-LONGEST = 1 << 16  # bytes of the file, after which it begins anew
+LONGEST = 1 << 16  # bytes of the file, after which it restarts
 FIRST = 4e-4  # s a byte where nothing was compiled yet: two idle cores take 3.5e-4
 AGAIN = 0.5  # share of a function's time where the process has compiled it before, for types that may differ
 _STALE = 86_400.0  # s, after which a file that a killed process was writing is removed
@@ -58,7 +58,7 @@ def read_code(path: Path, tell: bool = False) -> bytes | None:
         if not content:
             refusal = "somebody else may write there; code is compiled for this process"
         elif hashlib.sha256(payload).digest() != content[:_DIGEST]:
-            refusal = "compiled code is damaged there; it is compiled anew"
+            refusal = "compiled code is damaged there; it is compiled again"
     if refusal:
         if tell:
             _say(f"{path}: {refusal}")

@@ -29,8 +29,8 @@ class Crossings:
 class Junction(UvdEffect):
     """``count`` apparent crossings of a near vertical and a far horizontal edge, each of which is tracked as a corner.
 
-    The crossing is on the ray that meets both edges. While the robot moves, it slides up and down the near edge and to
-    and fro on the far one, as no rigid point does: for a level camera u is that of the near edge and v that of the far
+    The crossing is on the ray that meets both edges. While the robot moves, it slides up and down the near edge and back
+    and forth on the far one, as no rigid point does: for a level camera u is that of the near edge and v that of the far
     one. d is that of the far edge with probability ``far_share``, chosen once for each crossing, and else of the near.
 
     The edges have the length ``edge``; each crossing can be seen from a step of the planned path that is drawn from

@@ -50,6 +50,13 @@ def test_the_readme_prints_what_is_printed(
     assert shown[0 if fix == "0.3" else 1] in printed
 
 
+def test_the_commands_of_the_readme_are_those_that_ci_runs() -> None:
+    done = subprocess.run([sys.executable, ROOT / ".ci/readme"], capture_output=True, text=True, check=True)
+    first, second = (block for block in blocks("README.md", "indented") if block.part == "First verdict")
+    typed = (first.text + second.text).replace("https://github.com/OWNER/filter-consistency", f"file://{ROOT}")
+    assert done.stdout.split("\n") == [line for line in typed.split("\n") if line] + [""]
+
+
 def test_documents_have_the_address_of_the_project() -> None:
     """Set in pyproject.toml; `python docs/address.py` writes it into them."""
     address = runpy.run_path(str(DOCS / "address.py"))

@@ -48,8 +48,8 @@ def judge(
 
     If a fit to the truth absorbed an unknown part of the errors (``Record.reduced``), a covariance that is too large
     is not a fault, as with ``allow="conservative"``. *Consistent* is still shown on both sides, after adding the
-    largest share of the NEES that the fit may have absorbed (``Record.unseen``). Questions that cannot be answered after the
-    fit (``Record.unavailable``) are not asked.
+    largest share of the NEES that the fit may have absorbed (``Record.unseen``). Questions that cannot be answered
+    after the fit (``Record.unavailable``) are not asked.
 
     A map is judged likewise, with its landmarks in the place of steps (``Record.landmarks``) and with the NEES of
     pose and map together, where it is given.

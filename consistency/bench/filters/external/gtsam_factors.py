@@ -9,9 +9,10 @@ The motion of a step has noise in v and omega alone, two numbers for three: acro
 factor gives it ``ACROSS`` of the noise along, little enough that a covariance of rank two is taken for one.
 
 A disparity is reported only inside the search range [l, h], so its density is a normal one over Z, the probability
-that it is reported. With ``lam`` and ``kappa`` mean and variance of the normal cut to [l, h], in units of sigma, the derivative of
--log density by the expected disparity e is -(d - e - sigma lam) / sigma^2 and its Fisher information kappa / sigma^2:
-those of a normal observation d* = e + (d - e - sigma lam) / kappa with variance sigma^2 / kappa. Gauss-Newton on d*,
+that it is reported. With ``lam`` and ``kappa`` mean and variance of the normal cut to [l, h], in units of sigma, the
+derivative of -log density by the expected disparity e is -(d - e - sigma lam) / sigma^2 and its Fisher information
+kappa / sigma^2: those of a normal observation d* = e + (d - e - sigma lam) / kappa with variance sigma^2 / kappa.
+Gauss-Newton on d*,
 taken again in each iteration, is scoring, and ends where the likelihood with its Z is greatest. What is not modelled:
 that a landmark out of view was not seen.
 

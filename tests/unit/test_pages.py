@@ -53,7 +53,9 @@ def test_the_readme_prints_what_is_printed(
 def test_the_commands_of_the_readme_are_those_that_ci_runs() -> None:
     done = subprocess.run([sys.executable, ROOT / ".ci/readme"], capture_output=True, text=True, check=True)
     first, second = (block for block in blocks("README.md", "indented") if block.part == "First verdict")
-    typed = (first.text + second.text).replace("https://github.com/OWNER/filter-consistency", f"file://{ROOT}")
+    typed = (first.text + second.text).replace(
+        "https://github.com/OWNER/filter-consistency", f"file://{ROOT} filter-consistency"
+    )
     assert done.stdout.split("\n") == [line for line in typed.split("\n") if line] + [""]
 
 

@@ -179,7 +179,7 @@ DAMAGE: dict[str, tuple[str, Edit, str]] = {
     "position twice": (
         "landmarks",
         lambda t: pd.concat([t, t[:1]]),
-        r"column 'landmark': every landmark may stand there once",
+        r"column 'landmark': every landmark may be listed once",
     ),
 }
 

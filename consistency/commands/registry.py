@@ -180,7 +180,7 @@ class CommandGroup(TyperGroup):
         for group, names in GROUPS.items():
             shown = names or [name for name in COMMANDS if name not in others]
             with formatter.section(group):
-                formatter.write_dl([(name, self.get_command(ctx, name).get_short_help_str(limit)) for name in shown])
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(limit)) for name in shown])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Refuse a command without its packages, before its options are looked at; its help is there."""

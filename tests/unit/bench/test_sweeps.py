@@ -444,6 +444,23 @@ def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
     assert "not finished: 5 of 8" in unfinished.answer
 
 
+def test_a_sweep_of_one_axis_has_one_figure_of_all_filters(at: Path) -> None:
+    from painted import panels
+
+    from consistency.bench.pages.maps_of_worlds import LOOKS, compose_regime
+
+    sweep = load_sweep(edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "odometry = [1.0, 2.0]"))
+    found = {(0, "kf"): result(rmse=0.1), (1, "kf"): result("overconfident", rmse=0.3)}
+    document = compose_regime(Regime(sweep, found, {}))
+    along, _ = document.figures
+    ratios, errors = panels(along)
+    assert along.title == "Along odometry"
+    line, *markers = errors.get_lines()
+    assert line.get_xydata().tolist() == [[1.0, 0.1], [2.0, 0.3]]
+    assert [marker.get_marker() for marker in markers] == [LOOKS[s].marker for s in ("consistent", "overconfident")]
+    assert ratios.get_ylabel() == "true / stated covariance"
+
+
 def test_a_map_without_numbers_on_its_axes_has_heat_maps_alone(at: Path) -> None:
     from consistency.bench.pages.maps_of_worlds import compose_regime
     from consistency.referee.show.as_html import render

@@ -24,7 +24,7 @@ from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.gating.checked_arrays import planned_dof, rate_shares
-from consistency.referee.programs.process import Processes, run_program
+from consistency.referee.programs.process import Processes, Stopped, run_program
 from consistency.referee.programs.study_folder import new_folder, opened, require_usable, write_manifest
 from consistency.referee.programs.words import Program, seed_of
 from consistency.referee.readers.options import Reading
@@ -191,11 +191,11 @@ class _Loop:
             if self.plan.check_seed:
                 self._check_seed(stack)
             run = next(missing)
-            while True:
+            while not self._is_decided:
                 while len(pending) < self._at_once(workers) and not self._is_enough(run):
                     pending.add(pool.submit(self._done, run, new_folder(self.study.folder, run)))
                     run = next(missing)
-                if not pending or self._is_decided:
+                if not pending:
                     break
                 finished, pending = wait(pending, return_when=FIRST_COMPLETED)
                 for future in finished:
@@ -221,6 +221,9 @@ class _Loop:
         try:
             values = self._values(run, folder, worker)
             return run_program(self.program, folder, run, values, self.plan.timeout, self.processes)
+        except Stopped:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         finally:
             self.idle.put(worker)
 

@@ -57,6 +57,7 @@ class Plan:
     jobs: int = -1
     timeout: float | None = None  # s
     check_seed: bool = False
+    keep: str = "all"  # files of the runs; "failed" keeps only the numbers of the others
     inputs: Sequence[Path] = ()  # recorded files or folders, one for each run
     settings: Settings = field(default_factory=Settings)
     skip: Skip | None = None
@@ -125,6 +126,8 @@ def _required(plan: Plan, r: Reading) -> Reading:
         raise InputError(f"--timeout must be a positive number of seconds, got {plan.timeout:g}")
     if plan.until_decided and plan.runs is not None:
         raise InputError("--until-decided finds the number of runs; give --max-runs instead of --runs")
+    if plan.keep not in ("all", "failed"):
+        raise InputError(f"--keep must be 'all' or 'failed', got '{plan.keep}'")
     if plan.max_runs is not None and not plan.until_decided:
         raise InputError("--max-runs goes with --until-decided")
     if plan.inputs and (plan.runs is not None or plan.until_decided):
@@ -144,6 +147,7 @@ def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[
         "words": list(program.words), "files": program.files(), "cwd": program.cwd and str(program.cwd),
         "seed": plan.seed, "inputs": [os.path.relpath(path, here) for path in plan.inputs] or None,
         "estimates": estimates, "reading": reading, "runs": plan.runs, "until_decided": None, "complete": False,
+        "keep": plan.keep,
     }  # fmt: skip
 
 
@@ -244,6 +248,8 @@ class _Loop:
         """Read a finished run, stop where the program cannot work, and look if it is time."""
         self.logs[run.run] = run
         records = self.runs.take(run)
+        if records and self.plan.keep == "failed" and not any(record.failures for record in records):
+            self.runs.delete_files(run)
         if records and not self.names:
             self._plan_runs(records, stack)
         elif self.advance is not None:
@@ -339,7 +345,7 @@ class _Loop:
             say("--check-seed: run 0 done twice gave different tables; the program is not reproducible by {seed}")
 
 
-_KEYS = ("words", "files", "cwd", "seed", "inputs", "estimates", "reading", "runs", "until_decided", "complete")
+_KEYS = ("words", "files", "cwd", "seed", "inputs", "estimates", "reading", "runs", "until_decided", "complete", "keep")
 
 
 def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:

@@ -219,7 +219,7 @@ class Runs:
         except InputError as error:
             self.failed[run.run] = with_log(str(error).replace(f"{run.folder}/", ""), run)
             return []
-        self.found[run.run] = found
+        self.found[run.run] = [_without_folder(one, run.folder) for one in found]
         self.trials[run.run] = f"{run.source} {_digest(found)}"
         return records
 
@@ -316,6 +316,12 @@ def _nothing(path: Path, option: str, run: ProgramRun) -> str:
     others = sorted(each.name for each in run.folder.iterdir() if each.name not in (LOG, RUN_FILE))
     wrote = f" ({option}); it wrote {', '.join(others[:5])}" if others else f" ({option}), and nothing else"
     return f"the program wrote no {relative}{wrote}"
+
+
+def _without_folder(one: Estimator, folder: Path) -> Estimator:
+    """An estimator whose notes name the files of a run as any run has them."""
+    notes, causes = ([text.replace(f"{folder}/", "") for text in texts] for texts in (one.notes, one.causes))
+    return replace(one, notes=notes, causes=causes)
 
 
 def _require_whole(records: Sequence[Record]) -> None:

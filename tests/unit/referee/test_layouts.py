@@ -693,7 +693,6 @@ def test_a_lower_triangle_is_a_covariance(heading: str, inside: Path) -> None:
             "d/0.csv",
             "t,x,y,heading",
             "0,1,2,3\n",
-            r"d: holds no \.txt .*; tables of several runs go into one file with a",
         ),
     ],
 )

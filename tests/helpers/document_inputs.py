@@ -29,6 +29,7 @@ DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 STUDY = "takes from half a minute to hours even with two runs; tests of its experiment run its parts"
 REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
 NOT_RUN = [
+    ("docs/any-program.md", "", "needs MATLAB, Julia and ROS; tests/smoke/test_cpp_example.py runs what is in C++"),
     ("docs/case-studies.md", "python docs/case-studies", "needs the libraries; tests/oracle/test_case_studies_live.py"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
     ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and unit/bench/test_slurm.py stand in"),

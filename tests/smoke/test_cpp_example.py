@@ -1,0 +1,84 @@
+"""The C++ example of docs/any-program.md: the page shows what is in the files, and its commands do what it says."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from documents import ROOT, blocks, typed
+
+EXAMPLE = ROOT / "docs/examples/cpp"
+PAGE, PART = "docs/any-program.md", "A Kalman filter in C++"
+BIN = Path(sys.executable).parent
+
+
+def require(*programs: str) -> None:
+    """Skip the test where one is missing, but not in CI."""
+    missing = [program for program in programs if not shutil.which(program)]
+    if missing and os.environ.get("CONSISTENCY_REQUIRE_CPP") == "1":
+        pytest.fail(f"CONSISTENCY_REQUIRE_CPP=1, but not on the PATH: {', '.join(missing)}")
+    if missing:
+        pytest.skip(f"builds C++, and this machine lacks {', '.join(missing)}")
+
+
+def shell(text: str, folder: Path, path: Path = BIN) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PATH": f"{path}{os.pathsep}{os.environ['PATH']}"}
+    return subprocess.run(["sh", "-c", text], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+
+
+@pytest.mark.slow
+def test_the_page_leads_from_one_file_to_a_gate(tmp_path: Path) -> None:
+    """No random outcome: the seed of the runs is fixed."""
+    require("c++", "cmake", "ctest", "make")
+    folder = tmp_path / "my kalman"
+    shutil.copytree(EXAMPLE, folder)
+    compile_it, right, halved, *ctest = [
+        command.text for block in blocks(PAGE, "indented", part=PART) for command in typed(block)
+    ]
+    done = shell(f"{compile_it} -Wall -Wextra -Werror", folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    shown = [line for block in blocks(PAGE, "text", part=PART) for line in block.text.splitlines() if " is " in line]
+    for command, status, line in zip((right, halved), (0, 1), shown, strict=True):
+        done = shell(command, folder)
+        assert done.returncode == status, done.stderr
+        assert line in done.stdout
+
+    configure, build, test = ctest
+    done = shell(f"{configure} && {build} && {test} --verbose", folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    first = re.findall(r"(is consistent: .*)", done.stdout)
+    again = shell(f"{test} --verbose", folder)
+    assert first
+    assert re.findall(r"(is consistent: .*)", again.stdout) == first
+
+    source = folder / "kalman.cpp"
+    source.write_text(re.sub(r"\bQ = 1\.0;", "Q = 0.5;", source.read_text()))
+    done = shell(f"{build} && {test}", folder)
+    assert done.returncode
+    assert "overconfident: covariance too small by x1.6" in done.stdout
+    assert "The following tests FAILED" in done.stdout
+
+
+def test_what_the_page_shows_is_in_the_files() -> None:
+    shown = [block.text for block in blocks(PAGE, "text", part=PART)]
+    for name, begin in (("CMakeLists.txt", "add_test("), ("gate_test.cpp", "TEST(")):
+        (excerpt,) = (text for text in shown if text.startswith(begin))
+        assert excerpt in (EXAMPLE / name).read_text()
+
+
+def test_a_node_that_died_is_seen(tmp_path: Path) -> None:
+    """The wrapper of ROS 2, with a stand-in for ``ros2``."""
+    (script,) = (block.text for block in blocks(PAGE, "text", part="ROS 2") if block.text.startswith("#!/bin/sh"))
+    for name, text in (("run.sh", script), ("ros2", '#!/bin/sh\necho "$@ in $ROS_DOMAIN_ID"\ncat said\n')):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    for said, status in (("[INFO] [ekf-1]: process has finished cleanly", 0), ("[ERROR] [ekf-1]: process has died", 1)):
+        (tmp_path / "said").write_text(said)
+        done = shell("./run.sh 7 3", tmp_path, tmp_path)
+        assert done.returncode == status
+        assert "seed:=7 in 3" in done.stdout

@@ -73,12 +73,14 @@ def test_what_the_page_shows_is_in_the_files() -> None:
 
 def test_a_node_that_died_is_seen(tmp_path: Path) -> None:
     """The wrapper of ROS 2, with a stand-in for ``ros2``."""
-    (script,) = (block.text for block in blocks(PAGE, "text", part="ROS 2") if block.text.startswith("#!/bin/sh"))
-    for name, text in (("run.sh", script), ("ros2", '#!/bin/sh\necho "$@ in $ROS_DOMAIN_ID"\ncat said\n')):
+    (script,) = (block.text for block in blocks(PAGE, "text", part="ROS 2") if block.text.startswith("#!/bin/bash"))
+    for name, text in (("run.sh", script), ("ros2", '#!/bin/sh\necho "$@ in $ROS_DOMAIN_ID"\ncat said\nexit $(cat status)\n')):
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o755)
-    for said, status in (("[INFO] [ekf-1]: process has finished cleanly", 0), ("[ERROR] [ekf-1]: process has died", 1)):
+    died, well = "[ERROR] [ekf-1]: process has died", "[INFO] [ekf-1]: process has finished cleanly"
+    for said, launched, status in ((well, 0, 0), (died, 0, 1), (well, 1, 1)):
         (tmp_path / "said").write_text(said)
+        (tmp_path / "status").write_text(str(launched))
         done = shell("./run.sh 7 3", tmp_path, tmp_path)
         assert done.returncode == status
-        assert "seed:=7 in 3" in done.stdout
+        assert "seed:=7 in 53" in done.stdout

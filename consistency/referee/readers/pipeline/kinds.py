@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.parsing import read_json
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
@@ -18,6 +19,8 @@ from consistency.referee.readers.formats.file_kinds import (
     is_foreign,
     is_plane,
     is_spatial,
+    table_files,
+    trajectory_files,
 )
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import Estimator
@@ -26,6 +29,16 @@ OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # opt
 OF_BAGS = ("topic", "truth_topic")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
 Found = Sequence[Estimator | Record]
+PROGRAM_RUNS = "monte-carlo"  # kind of the manifest of a folder with runs of a program
+
+
+def is_program_runs(path: Path) -> bool:
+    """Whether a path is a folder that ``consistency monte-carlo`` wrote."""
+    manifest = path / "manifest.json"
+    if not manifest.is_file():
+        return False
+    data = read_json(manifest)
+    return isinstance(data, dict) and data.get("kind") == PROGRAM_RUNS
 
 
 class Kind(NamedTuple):
@@ -60,6 +73,22 @@ def _trajectories(path: Path, r: Reading, poses_alone: bool) -> Found:
     return read_tum(path, r, poses_alone)
 
 
+def _program_runs(path: Path, r: Reading, poses_alone: bool) -> Found:
+    from consistency.referee.readers.pipeline.program_runs import read_program_runs
+
+    return read_program_runs(path, r)
+
+
+def _table_folder(path: Path, r: Reading, poses_alone: bool) -> Found:
+    from consistency.referee.readers.pipeline.run_folders import read_table_folder
+
+    return read_table_folder(path, r, poses_alone)
+
+
+def _is_table_folder(path: Path, r: Reading) -> bool:
+    return path.is_dir() and bool(table_files(path)) and (r.state is not None or not trajectory_files(path))
+
+
 def _is_archive(path: Path, r: Reading) -> bool:
     return path.suffix.lower() in ARCHIVES
 
@@ -74,9 +103,11 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 
 KINDS = (  # a file is of the first that knows it
+    Kind(lambda path, r: is_program_runs(path), (), _program_runs),
     Kind(lambda path, r: is_bag(path), ("state", "covariance", "covariance_order", "truth", "lever_arm"), _bags),
     Kind(_is_archive, (*OF_BAGS, "state", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
+    Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
     Kind(_is_trajectory, (*OF_BAGS, "state"), _trajectories),
 )
 

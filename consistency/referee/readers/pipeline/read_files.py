@@ -25,8 +25,9 @@ from consistency.referee.readers.formats.file_kinds import (
     unknown_kind,
 )
 from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.pipeline.kinds import OF_BAGS, OF_TRAJECTORIES, Found, kind_of
+from consistency.referee.readers.pipeline.kinds import OF_BAGS, OF_TRAJECTORIES, Found, is_program_runs, kind_of
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
+from consistency.referee.readers.runs_to_record import with_failed_runs
 from consistency.referee.readers.truth_matching import Estimator
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
@@ -48,6 +49,8 @@ def is_recording(path: Path, reading: Reading) -> bool:
         The path is a results folder, with an option for other files; or a folder of neither kind.
     """
     given = reading.given()
+    if is_program_runs(path):
+        return True
     if path.is_dir() and not (path / "manifest.json").exists():
         recording = bool(trajectory_files(path)) or is_bag(path) or bool(given)
         if not recording:
@@ -82,7 +85,7 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
         return None if table is None else Path(table)
 
     sheet, true = rows(estimates, "estimates"), rows(truth, "truth")
-    r = _checked(replace(reading, truth=cast(Any, true)))
+    r = checked_options(replace(reading, truth=cast(Any, true)))
     _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
     return _read("tables", r, lambda options: _records(read_tables(sheet, options), options))
 
@@ -99,7 +102,12 @@ def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Rec
     InputError
         Something cannot be used: names file, line, column or option, and what is allowed.
     """
-    return _read(str(estimates), _checked(reading or Reading()), lambda r: _by_kind(estimates, r))
+    r = reading or Reading()
+    if is_program_runs(estimates):
+        from consistency.referee.readers.pipeline.program_runs import study_in, with_options
+
+        r = with_options(study_in(estimates), r)
+    return _read(str(estimates), checked_options(r), lambda r: _by_kind(estimates, r))
 
 
 def _read(name: str, r: Reading, read: Callable[[Reading], list[Record]]) -> list[Record]:
@@ -142,18 +150,26 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
     return [in_pieces(record, pieces or None) for record in records]
 
 
+def records_of_found(found: Found, r: Reading) -> list[Record]:
+    """Records of what readers gave, with what the options declare of their truth."""
+    return _declared(_records(found, r), r)
+
+
 def _records(found: Found, r: Reading) -> list[Record]:
     """Records of what a reader gives."""
     records: list[Record] = []
     for one in found:
         if isinstance(one, Estimator):
-            records.extend(records_of(one, r))
+            records += [
+                replace(with_failed_runs(record, one.failed), trials=one.trials) for record in records_of(one, r)
+            ]
         else:
             records.append(one)
     return records
 
 
-def _by_kind(estimates: Path, r: Reading) -> list[Record]:
+def found_in(estimates: Path, r: Reading) -> Found:
+    """What the reader of a file gives; raises InputError for a file of no kind, and options that do not go with it."""
     if not estimates.exists():
         raise InputError(f"{estimates}: no such file")
     require_name(estimates.name, "file")
@@ -165,7 +181,11 @@ def _by_kind(estimates: Path, r: Reading) -> list[Record]:
         raise unknown_kind(estimates)
     if r.truth is not None and is_foreign(r.truth):
         raise unknown_kind(r.truth)
-    records = _records(kind.read(estimates, r, False), r)
+    return kind.read(estimates, r, False)
+
+
+def _by_kind(estimates: Path, r: Reading) -> list[Record]:
+    records = _records(found_in(estimates, r), r)
     if r.truth is None or not is_drive(r.truth):
         return records
     of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
@@ -192,7 +212,7 @@ def pieces_asked(r: Reading) -> int | None:
     return int(r.split)
 
 
-def _checked(r: Reading) -> Reading:
+def checked_options(r: Reading) -> Reading:
     """Options that go together, whatever the file; numbers are floats, and no alignment is None."""
     windows_asked(r)
     if r.error not in (None, GUESS, *CONVENTIONS):

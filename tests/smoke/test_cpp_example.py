@@ -51,16 +51,14 @@ def test_the_page_leads_from_one_file_to_a_gate(tmp_path: Path) -> None:
     configure, build, test = ctest
     done = shell(f"{configure} && {build} && {test} --verbose", folder)
     assert done.returncode == 0, done.stdout + done.stderr
-    first = re.findall(r"(is consistent: .*)", done.stdout)
-    again = shell(f"{test} --verbose", folder)
-    assert first
-    assert re.findall(r"(is consistent: .*)", again.stdout) == first
+    first, *_ = re.findall(r"is consistent: .*", done.stdout)
+    assert first in shell(f"{test} --verbose -R 'gate$'", folder).stdout
 
     source = folder / "kalman.cpp"
-    source.write_text(re.sub(r"\bQ = 1\.0;", "Q = 0.5;", source.read_text()))
+    source.write_text(source.read_text().replace("double Q = 1.0;", "double Q = 0.5;"))
     done = shell(f"{build} && {test}", folder)
     assert done.returncode
-    assert "overconfident: covariance too small by x1.6" in done.stdout
+    assert re.search(r"is overconfident: covariance too small by x1\.[3-7]", done.stdout)
     assert "The following tests FAILED" in done.stdout
 
 

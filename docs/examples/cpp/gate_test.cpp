@@ -4,5 +4,5 @@
 
 TEST(Kalman, StatesTheCovarianceOfItsErrors) {
     EXPECT_EQ(0, std::system("consistency monte-carlo --state p,v --false-alarm 0.001 --seed 0"
-                             " --fail-on inconsistent --out gate_test --overwrite -- ./kalman {seed}"));
+                             " --fail-on inconsistent --out from_gtest --overwrite -- ./kalman {seed}"));
 }

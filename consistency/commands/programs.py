@@ -17,6 +17,7 @@ from consistency.commands.shared_options import (
     print_document,
     reads_files,
     require_word,
+    tell,
     tell_notes,
 )
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
@@ -77,6 +78,7 @@ def monte_carlo_command(
     from consistency.referee.document.judged_filters import document
     from consistency.referee.programs.study import Plan, run_study
     from consistency.referee.programs.words import inputs_of, program_of
+    from consistency.referee.readers.pipeline.program_runs import failures_in_words
     from consistency.referee.verdicts.command_settings import settings_of, skip_asked
 
     require_word("--fail-on", fail_on, "inconsistent")
@@ -93,6 +95,7 @@ def monte_carlo_command(
     require_reports(report, junit, overwrite)
     records, verdicts = run_study(program, plan, out, estimates, files, resume, overwrite)
     tell_notes(records)
+    tell(failures_in_words(records, out))
     shown = document(verdicts, out.name)
     print_document(shown, as_json, write_reports(records, verdicts, shown, report, junit, overwrite))
     if not as_json:

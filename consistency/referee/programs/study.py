@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 import queue
-import re
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -29,7 +28,16 @@ from consistency.referee.programs.process import Processes, run_program
 from consistency.referee.programs.study_folder import new_folder, opened, require_usable, write_manifest
 from consistency.referee.programs.words import Program, seed_of
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.pipeline.program_runs import PATHS, ProgramRun, ProgramStudy, Runs, log_lines, runs_in
+from consistency.referee.readers.pipeline.program_runs import (
+    PATHS,
+    ProgramRun,
+    ProgramStudy,
+    Runs,
+    kind_of_failure,
+    log_lines,
+    runs_in,
+    without_log,
+)
 from consistency.referee.readers.pipeline.read_files import GUESS, checked_options, records_of_found
 from consistency.referee.readers.truth_matching import Estimator
 from consistency.referee.system.progress import Advance, progress, say
@@ -240,7 +248,7 @@ class _Loop:
         if (
             not self.runs.found
             and len(self.runs.failed) >= ALIKE
-            and len(set(map(_kind, self.runs.failed.values()))) == 1
+            and len(set(map(kind_of_failure, self.runs.failed.values()))) == 1
         ):
             raise self._all_failed()
         if len(self.runs.found) == PROOF and records:
@@ -302,7 +310,7 @@ class _Loop:
             say(f"  {line}")
         count = len(self.runs.failed)
         which = f"the first {count} runs failed" if count > 1 else "the first run failed"
-        return InputError(f"{which}: {_without_log(why)}; the log is {log}")
+        return InputError(f"{which}: {without_log(why)}; the log is {log}")
 
     def _require_different(self) -> None:
         (one, first), (other, second) = sorted(self.runs.found.items())[:PROOF]
@@ -329,15 +337,6 @@ class _Loop:
 
 
 _KEYS = ("words", "files", "cwd", "seed", "inputs", "estimates", "reading", "runs", "until_decided", "complete")
-
-
-def _without_log(why: str) -> str:
-    return why.partition("; its log ends: ")[0]
-
-
-def _kind(why: str) -> str:
-    """A reason without its numbers and log: what failures that are alike have in common."""
-    return re.sub(r"\d+", "#", _without_log(why))
 
 
 def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:

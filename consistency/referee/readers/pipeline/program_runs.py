@@ -20,13 +20,14 @@ import numpy as np
 
 from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
 from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.read_files import found_in
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.pipeline.run_folders import merged
-from consistency.referee.readers.places import CutNote
+from consistency.referee.readers.places import CutNote, listed
 from consistency.referee.readers.truth_matching import Estimator, Poses
 from consistency.referee.system.folders import read_manifest
 
@@ -233,6 +234,31 @@ def with_log(why: str, run: ProgramRun, lines: int = 3) -> str:
     return f"{why}; its log ends: {one_line(' | '.join(last), 300)}" if last else why
 
 
+def without_log(why: str) -> str:
+    """A reason without the lines of a log."""
+    return why.partition("; its log ends: ")[0]
+
+
+def kind_of_failure(why: str) -> str:
+    """A reason without its numbers and log: what failures that are alike have in common."""
+    return re.sub(r"\d+", "#", without_log(why))
+
+
+def failures_in_words(records: Sequence[Record], folder: Path) -> list[str]:
+    """A sentence for each kind of failure, with the runs that failed so and the log of the first."""
+    kinds: dict[str, dict[int, str]] = {}
+    for record in records:
+        for failure in record.failures:
+            kinds.setdefault(kind_of_failure(failure.reason), {})[failure.run] = failure.reason
+    runs = runs_in(folder) if kinds else {}
+    said = []
+    for of_runs in kinds.values():
+        first, why = min(of_runs.items())
+        which = f"{plural(len(of_runs), 'run')} failed ({listed(sorted(of_runs))})"
+        said.append(f"{which}: {without_log(why)}; log {runs[first].log}")
+    return said
+
+
 def log_lines(path: Path, lines: int) -> list[str]:
     """The last lines of a log that are not empty."""
     try:
@@ -262,7 +288,7 @@ def _require_whole(records: Sequence[Record]) -> None:
     for record in records:
         for note in record.notes:
             if isinstance(note, CutNote):
-                raise InputError(str(note))
+                raise InputError(f"{note.rpartition(': ')[0]}: its last line is cut short")
 
 
 def _early(found: Mapping[int, Sequence[Estimator]]) -> dict[int, str]:

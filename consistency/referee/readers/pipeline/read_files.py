@@ -246,7 +246,7 @@ def checked_options(r: Reading) -> Reading:
 
 
 def _refuse(path: Path, r: Reading, *names: str) -> None:
-    if given := r.given(names):
+    if names and (given := r.given(names)):
         keys = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}
         kept = path.suffix.lower() in ARCHIVES and given[0] in keys
         instead = f", an archive; it has a key '{keys[given[0]]}' in its place" if kept else ""

@@ -58,6 +58,9 @@ def monte_carlo_command(
         str | None, typer.Option("--innovations", help="'optimal': of an optimal gain without a gate; they are judged.")
     ] = None,
     skip: Skip = None,
+    keep: Annotated[
+        str, typer.Option("--keep", help="'failed': delete files of other runs when their numbers were read.")
+    ] = "all",
     resume: Annotated[bool, typer.Option("--resume", help="Do the runs that are missing in --out.")] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace --out of an earlier call, --report and --junit.")
@@ -88,9 +91,10 @@ def monte_carlo_command(
     if each is not None:
         hint = f"; if it is one of the files of --each, quote the pattern: --each '{each}'"
     program = program_of(command, here, cwd, hint)
+    inputs = () if each is None else inputs_of(each, here)
     plan = Plan(
-        runs, until_decided, max_runs, seed, jobs, timeout, check_seed, () if each is None else inputs_of(each, here),
-        settings, skip_asked(skip), innovations is not None,
+        runs, until_decided, max_runs, seed, jobs, timeout, check_seed, keep, inputs, settings, skip_asked(skip),
+        innovations is not None,
     )  # fmt: skip
     require_reports(report, junit, overwrite)
     records, verdicts = run_study(program, plan, out, estimates, files, resume, overwrite)

@@ -24,7 +24,7 @@ from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.gating.checked_arrays import planned_dof, rate_shares
-from consistency.referee.programs.process import Processes, run_program
+from consistency.referee.programs.process import Processes, Stopped, run_program
 from consistency.referee.programs.study_folder import new_folder, opened, require_usable, write_manifest
 from consistency.referee.programs.words import Program, seed_of
 from consistency.referee.readers.options import Reading
@@ -57,6 +57,7 @@ class Plan:
     jobs: int = -1
     timeout: float | None = None  # s
     check_seed: bool = False
+    keep: str = "all"  # files of the runs; "failed" keeps only the numbers of the others
     inputs: Sequence[Path] = ()  # recorded files or folders, one for each run
     settings: Settings = field(default_factory=Settings)
     skip: Skip | None = None
@@ -125,6 +126,8 @@ def _required(plan: Plan, r: Reading) -> Reading:
         raise InputError(f"--timeout must be a positive number of seconds, got {plan.timeout:g}")
     if plan.until_decided and plan.runs is not None:
         raise InputError("--until-decided finds the number of runs; give --max-runs instead of --runs")
+    if plan.keep not in ("all", "failed"):
+        raise InputError(f"--keep must be 'all' or 'failed', got '{plan.keep}'")
     if plan.max_runs is not None and not plan.until_decided:
         raise InputError("--max-runs goes with --until-decided")
     if plan.inputs and (plan.runs is not None or plan.until_decided):
@@ -144,6 +147,7 @@ def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[
         "words": list(program.words), "files": program.files(), "cwd": program.cwd and str(program.cwd),
         "seed": plan.seed, "inputs": [os.path.relpath(path, here) for path in plan.inputs] or None,
         "estimates": estimates, "reading": reading, "runs": plan.runs, "until_decided": None, "complete": False,
+        "keep": plan.keep,
     }  # fmt: skip
 
 
@@ -191,11 +195,11 @@ class _Loop:
             if self.plan.check_seed:
                 self._check_seed(stack)
             run = next(missing)
-            while True:
+            while not self._is_decided:
                 while len(pending) < self._at_once(workers) and not self._is_enough(run):
                     pending.add(pool.submit(self._done, run, new_folder(self.study.folder, run)))
                     run = next(missing)
-                if not pending or self._is_decided:
+                if not pending:
                     break
                 finished, pending = wait(pending, return_when=FIRST_COMPLETED)
                 for future in finished:
@@ -221,6 +225,9 @@ class _Loop:
         try:
             values = self._values(run, folder, worker)
             return run_program(self.program, folder, run, values, self.plan.timeout, self.processes)
+        except Stopped:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         finally:
             self.idle.put(worker)
 
@@ -241,6 +248,8 @@ class _Loop:
         """Read a finished run, stop where the program cannot work, and look if it is time."""
         self.logs[run.run] = run
         records = self.runs.take(run)
+        if records and self.plan.keep == "failed" and not any(record.failures for record in records):
+            self.runs.delete_files(run)
         if records and not self.names:
             self._plan_runs(records, stack)
         elif self.advance is not None:
@@ -336,7 +345,7 @@ class _Loop:
             say("--check-seed: run 0 done twice gave different tables; the program is not reproducible by {seed}")
 
 
-_KEYS = ("words", "files", "cwd", "seed", "inputs", "estimates", "reading", "runs", "until_decided", "complete")
+_KEYS = ("words", "files", "cwd", "seed", "inputs", "estimates", "reading", "runs", "until_decided", "complete", "keep")
 
 
 def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:

@@ -113,7 +113,9 @@ def _found(first: str, here: Path, hint: str) -> str:
     if path.is_dir():
         raise InputError(f"{first}: is a folder, not a program")
     if not os.access(path, os.X_OK):
-        raise InputError(f"{first}: cannot be executed; make it so with chmod +x, or put its interpreter before it")
+        raise InputError(
+            f"{first}: cannot be executed; make it so with chmod +x, or put its interpreter before it{hint}"
+        )
     return os.path.abspath(path)
 
 

@@ -24,6 +24,7 @@ class Compared:
     comparison: Comparison
     failures: FailedRuns
     note: str = ""
+    same_runs: bool = True  # failures are of the same trials
 
     @property
     def sentence(self) -> str:
@@ -67,7 +68,8 @@ class Compared:
 
     @property
     def worse(self) -> bool:
-        return self.comparison.worse or (self.comparison.paired and self.failures.a > self.failures.b)
+        fails_more = self.comparison.paired and self.same_runs and self.failures.a > self.failures.b
+        return self.comparison.worse or fails_more
 
 
 def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float = FALSE_ALARM) -> list[Compared]:
@@ -98,7 +100,12 @@ def compare_with(
         if new.scenario is None and old.scenario is None:
             which = "Log or truth"
         note = f"{which} differ: the trials are not the same"
-    return [replace(_compared(new, a, old, b, same, false_alarm), note=note) for a, b in pairs]
+    found = []
+    for a, b in pairs:
+        one = _compared(new, a, old, b, same, false_alarm)
+        as_many = len(new.filters[a].runs) == len(old.filters[b].runs)
+        found.append(replace(one, note=note, same_runs=as_many or not new.trials))
+    return found
 
 
 def _numbered_alike(new: Baseline, old: Baseline) -> tuple[Baseline, int]:

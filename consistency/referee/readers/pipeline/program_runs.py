@@ -10,6 +10,7 @@ import hashlib
 import itertools
 import json
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -23,7 +24,8 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.pipeline.kept_numbers import NUMBERS, keep_numbers, kept_numbers
 from consistency.referee.readers.pipeline.read_files import found_in
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.pipeline.run_folders import merged
@@ -35,6 +37,7 @@ RUN_KIND = "run of a program"  # of run.json: a program may write a file of that
 LOG = "program.log"  # standard output and error of a run
 RUN_FILE = "run.json"
 PATHS = ("truth", "covariance")  # options of files, each with a path of its own for every run
+OF_NUMBERS = ("axes", "relative", "windows", "align", "split", "truth_errors", "truth_shared")  # options
 LATE = 1.5  # steps of the estimates: the truth may go on by less than two
 
 
@@ -148,14 +151,23 @@ class ProgramStudy:
 def study_in(folder: Path) -> ProgramStudy:
     """The study in a folder; raises InputError where its manifest is damaged."""
     manifest = read_manifest(folder)
-    keys = ("reading", "estimates", "until_decided", "complete", "runs")
+    keys = ("reading", "estimates", "until_decided", "complete", "runs", "keep")
     if missing := [key for key in keys if key not in manifest]:
         raise InputError(f"{folder / 'manifest.json'}: key '{missing[0]}' is missing; run it again with --overwrite")
     return ProgramStudy(folder, manifest)
 
 
 def with_options(study: ProgramStudy, r: Reading) -> Reading:
-    """The options by which the runs were read, with those that are given in their place."""
+    """The options by which the runs were read, with those that are given in their place.
+
+    Raises
+    ------
+    InputError
+        An option of files that were deleted.
+    """
+    deleted = [name for name in r.given() if name not in OF_NUMBERS]
+    if study.manifest["keep"] == "failed" and deleted:
+        raise InputError(f"{flag_of(deleted[0])}: {study.folder} has the numbers alone that were read (--keep failed)")
     return replace(study.reading, **{each.name: value for each in fields(r) if (value := getattr(r, each.name))})
 
 
@@ -205,7 +217,24 @@ class Runs:
         self.trials[run.run] = f"{run.source} {_digest(found)}"
         return records
 
+    def delete_files(self, run: ProgramRun) -> None:
+        """Keep the numbers that were read of a run in place of its files, unless these end before their truth."""
+        if _ends_early(self.found[run.run][0].runs[0]):
+            return
+        estimates, r = self.study.files_of(run, self.options)
+        if not (run.folder / NUMBERS).exists():
+            keep_numbers(run.folder, self.found[run.run])
+        for path in (estimates, r.truth, r.covariance):
+            if path is None or not path.is_relative_to(run.folder):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
     def _found(self, run: ProgramRun) -> list[Estimator]:
+        if (run.folder / NUMBERS).exists():
+            return kept_numbers(run.folder)
         estimates, r = self.study.files_of(run, self.options)
         for path, option in ((estimates, "--estimates"), (r.truth, "--truth"), (r.covariance, "--covariance")):
             if path is not None and not path.exists():

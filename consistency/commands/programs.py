@@ -26,7 +26,7 @@ from consistency.referee.readers.options import Reading
 
 @reads_files
 def monte_carlo_command(
-    command: Annotated[list[str], typer.Argument(metavar="-- COMMAND ...", help="The program and its arguments.")],
+    command: Annotated[list[str], typer.Argument(metavar="COMMAND", hidden=True)],
     out: Annotated[Path, typer.Option("--out", help="Folder to write, with a folder for each run.")],
     files: Reading,
     estimates: Annotated[
@@ -72,10 +72,11 @@ def monte_carlo_command(
     as_json: AsJson = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
 ) -> None:
-    """Run any program many times, with {seed} and {run} in its words replaced, and judge what it writes.
+    """Run any program many times, each time with another {seed}, and judge the estimates that it writes.
 
-    Each run has a folder of its own in --out, {out}, in which the program is started; {here} is the folder of the
-    call. The program writes estimates and truth there, as 'analyse' reads them.
+    COMMAND, behind --, is the program with its arguments, in which {run}, {seed}, {out}, {here} and {worker} are
+    replaced. Each run has a folder of its own in --out, {out}, where the program is started; {here} is the folder of
+    the call. The program writes estimates and truth there, as 'analyse' reads them.
     """
     from consistency.commands.program_reports import require_reports, write_reports
     from consistency.referee.document.judged_filters import document

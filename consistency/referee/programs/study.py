@@ -28,6 +28,7 @@ from consistency.referee.programs.process import Processes, Stopped, run_program
 from consistency.referee.programs.study_folder import new_folder, opened, require_usable, write_manifest
 from consistency.referee.programs.words import Program, seed_of
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.pipeline.kinds import found_in
 from consistency.referee.readers.pipeline.program_runs import (
     PATHS,
     ProgramRun,
@@ -157,7 +158,7 @@ class _Loop:
     def __init__(self, program: Program, plan: Plan, study: ProgramStudy, r: Reading) -> None:
         self.program, self.plan, self.study, self.options = program, plan, study, r
         self.fields = {key: value for key, value in study.manifest.items() if key in _KEYS}
-        self.runs = Runs(study, r)
+        self.runs = Runs(study, r, found_in)
         self.logs: dict[int, ProgramRun] = {}
         self.total = len(plan.inputs) or plan.runs
         self.design: Design | None = None
@@ -271,7 +272,7 @@ class _Loop:
         self.names = [record.name for record in records]
         planned = gate_runs(dof, settings.detect, rate, settings.power, settings.allow, settings.lost)
         if self.plan.until_decided:
-            looked = {
+            looked: dict[str, Any] = {
                 "dof": dof, "detect": settings.detect, "false_alarm": settings.false_alarm, "power": settings.power,
                 "max_runs": self.plan.max_runs,
             }  # fmt: skip
@@ -334,7 +335,7 @@ class _Loop:
             self._take(self._done(0, new_folder(self.study.folder, 0)), stack)
         folder = self.study.folder / "run 0 again"
         shutil.rmtree(folder, ignore_errors=True)
-        again = Runs(self.study, self.options)
+        again = Runs(self.study, self.options, found_in)
         again.take(self._done(0, folder))
         shutil.rmtree(folder, ignore_errors=True)
         if 0 not in self.runs.found or 0 not in again.found:

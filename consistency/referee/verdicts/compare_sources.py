@@ -68,8 +68,9 @@ class Compared:
 
     @property
     def worse(self) -> bool:
-        fails_more = self.comparison.paired and self.same_runs and self.failures.a > self.failures.b
-        return self.comparison.worse or fails_more
+        if self.comparison.worse or not (self.comparison.paired and self.same_runs):
+            return self.comparison.worse
+        return self.failures.a > self.failures.b
 
 
 def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float = FALSE_ALARM) -> list[Compared]:

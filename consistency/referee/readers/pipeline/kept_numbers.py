@@ -61,13 +61,14 @@ def kept_numbers(folder: Path) -> list[Estimator]:
 
 
 def _estimator(i: int, about: dict[str, Any], arrays: dict[str, Any]) -> Estimator:
-    own = {key: arrays.get(f"{i} {key}") for key in OF_POSES}
+    own: dict[str, Any] = {key: arrays.get(f"{i} {key}") for key in OF_POSES}
     if about["beside"]:
         own["true_t"] = own["t"]  # the same array says that every estimate has its truth beside it
     texts = {key: about[f"poses {key}"] for key in TEXTS_OF_POSES}
-    path, files = Path(about["path"]), tuple(Path(file) for file in about["files"])
+    path = Path(about["path"])
+    estimates, truth = (Path(file) for file in about["files"])
     place = Places(lambda row: f"{path}, row {row + 1}", np.arange(len(arrays[f"{i} t"])))
-    poses = Poses(place=place, files=files, **own, **texts)
+    poses = Poses(place=place, files=(estimates, truth), **own, **texts)
     groups = {name: slice(*ends) for name, ends in about["groups"].items()}
     return Estimator(
         path=path, runs=[poses], stated=Stated(groups, about["alone"]), t=arrays.get(f"{i} times"),

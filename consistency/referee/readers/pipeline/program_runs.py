@@ -11,7 +11,7 @@ import itertools
 import json
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +26,6 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.pipeline.kept_numbers import NUMBERS, keep_numbers, kept_numbers
-from consistency.referee.readers.pipeline.read_files import found_in
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.pipeline.run_folders import merged
 from consistency.referee.readers.places import CutNote, listed
@@ -38,6 +37,7 @@ LOG = "program.log"  # standard output and error of a run
 RUN_FILE = "run.json"
 PATHS = ("truth", "covariance")  # options of files, each with a path of its own for every run
 OF_NUMBERS = ("axes", "relative", "windows", "align", "split", "truth_errors", "truth_shared")  # options
+Reader = Callable[[Path, Reading], Sequence[Estimator | Record]]
 LATE = 1.5  # steps of the estimates: the truth may go on by less than two
 
 
@@ -103,7 +103,8 @@ class ProgramStudy:
     @cached_property
     def reading(self) -> Reading:
         """Options by which the files of each run are read."""
-        given = {name: Path(value) if name in PATHS else value for name, value in self.manifest["reading"].items()}
+        given: dict[str, Any] = dict(self.manifest["reading"])
+        given |= {name: Path(given[name]) for name in PATHS if name in given}
         return Reading(**given)
 
     @property
@@ -174,7 +175,7 @@ def with_options(study: ProgramStudy, r: Reading) -> Reading:
 # --- from runs to estimators -----------------------------------------------------------------------
 
 
-def read_program_runs(folder: Path, r: Reading) -> list[Estimator]:
+def read_program_runs(folder: Path, r: Reading, found_in: Reader) -> list[Estimator]:
     """The estimators of all finished runs in a folder; those of a study until decided up to the first missing run.
 
     Raises
@@ -183,7 +184,7 @@ def read_program_runs(folder: Path, r: Reading) -> list[Estimator]:
         No run can be judged.
     """
     study = study_in(folder)
-    runs = Runs(study, r)
+    runs = Runs(study, r, found_in)
     for run in runs_in(folder).values():
         runs.take(run)
     if not runs.found:
@@ -193,10 +194,15 @@ def read_program_runs(folder: Path, r: Reading) -> list[Estimator]:
 
 
 class Runs:
-    """Runs of a program as they come, each read once."""
+    """Runs of a program as they come, each read once.
 
-    def __init__(self, study: ProgramStudy, r: Reading) -> None:
-        self.study, self.options = study, r
+    Parameters
+    ----------
+    found_in : what the reader of any file gives, by its path and options
+    """
+
+    def __init__(self, study: ProgramStudy, r: Reading, found_in: Reader) -> None:
+        self.study, self.options, self._found_in = study, r, found_in
         self.found: dict[int, Sequence[Estimator]] = {}
         self.failed: dict[int, str] = {}
         self.trials: dict[int, str] = {}
@@ -213,7 +219,7 @@ class Runs:
         except InputError as error:
             self.failed[run.run] = with_log(str(error).replace(f"{run.folder}/", ""), run)
             return []
-        self.found[run.run] = found
+        self.found[run.run] = [_without_folder(one, run.folder) for one in found]
         self.trials[run.run] = f"{run.source} {_digest(found)}"
         return records
 
@@ -239,7 +245,7 @@ class Runs:
         for path, option in ((estimates, "--estimates"), (r.truth, "--truth"), (r.covariance, "--covariance")):
             if path is not None and not path.exists():
                 raise InputError(_nothing(path, option, run))
-        return merged({run.run: found_in(estimates, r)}, self.study.name)
+        return merged({run.run: self._found_in(estimates, r)}, self.study.name)
 
     @property
     def first(self) -> int:
@@ -310,6 +316,12 @@ def _nothing(path: Path, option: str, run: ProgramRun) -> str:
     others = sorted(each.name for each in run.folder.iterdir() if each.name not in (LOG, RUN_FILE))
     wrote = f" ({option}); it wrote {', '.join(others[:5])}" if others else f" ({option}), and nothing else"
     return f"the program wrote no {relative}{wrote}"
+
+
+def _without_folder(one: Estimator, folder: Path) -> Estimator:
+    """An estimator whose notes name the files of a run as any run has them."""
+    notes, causes = ([text.replace(f"{folder}/", "") for text in texts] for texts in (one.notes, one.causes))
+    return replace(one, notes=notes, causes=causes)
 
 
 def _require_whole(records: Sequence[Record]) -> None:

@@ -14,18 +14,21 @@ from typing import Any, cast
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
-from consistency.referee.parsing import require_name
 from consistency.referee.readers.formats.file_kinds import (
-    ARCHIVES,
     TRAJECTORIES,
     is_bag,
     is_drive,
-    is_foreign,
     trajectory_files,
-    unknown_kind,
 )
 from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.pipeline.kinds import OF_BAGS, OF_TRAJECTORIES, Found, is_program_runs, kind_of
+from consistency.referee.readers.pipeline.kinds import (
+    OF_BAGS,
+    OF_TRAJECTORIES,
+    Found,
+    found_in,
+    is_program_runs,
+    refuse_options,
+)
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 from consistency.referee.readers.runs_to_record import with_failed_runs
 from consistency.referee.readers.truth_matching import Estimator
@@ -86,7 +89,7 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
 
     sheet, true = rows(estimates, "estimates"), rows(truth, "truth")
     r = checked_options(replace(reading, truth=cast(Any, true)))
-    _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
+    refuse_options(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
     return _read("tables", r, lambda options: _records(read_tables(sheet, options), options))
 
 
@@ -168,22 +171,6 @@ def _records(found: Found, r: Reading) -> list[Record]:
     return records
 
 
-def found_in(estimates: Path, r: Reading) -> Found:
-    """What the reader of a file gives; raises InputError for a file of no kind, and options that do not go with it."""
-    if not estimates.exists():
-        raise InputError(f"{estimates}: no such file")
-    require_name(estimates.name, "file")
-    if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
-        raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
-    kind = kind_of(estimates, r)
-    _refuse(estimates, r, *(OF_BAGS if kind is None else kind.refused))
-    if kind is None:
-        raise unknown_kind(estimates)
-    if r.truth is not None and is_foreign(r.truth):
-        raise unknown_kind(r.truth)
-    return kind.read(estimates, r, False)
-
-
 def _by_kind(estimates: Path, r: Reading) -> list[Record]:
     records = _records(found_in(estimates, r), r)
     if r.truth is None or not is_drive(r.truth):
@@ -243,11 +230,3 @@ def checked_options(r: Reading) -> Reading:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     pieces_asked(r)  # refused before anything is read
     return replace(r, time_offset=offset, align=align)
-
-
-def _refuse(path: Path, r: Reading, *names: str) -> None:
-    if names and (given := r.given(names)):
-        keys = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}
-        kept = path.suffix.lower() in ARCHIVES and given[0] in keys
-        instead = f", an archive; it has a key '{keys[given[0]]}' in its place" if kept else ""
-        raise InputError(f"{flag_of(given[0])}: does not go with {path}{instead}")

@@ -48,6 +48,11 @@ def test_the_page_leads_from_one_file_to_a_gate(tmp_path: Path) -> None:
         assert done.returncode == status, done.stderr
         assert line in done.stdout
 
+    (block,) = blocks(PAGE, "python", part=PART)
+    (folder / "test_kalman.py").write_text(block.text)
+    done = shell("python -m pytest -q -p no:cacheprovider test_kalman.py", folder)
+    assert "1 passed" in done.stdout
+
     configure, build, test = ctest
     done = shell(f"{configure} && {build} && {test} --verbose", folder)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -72,7 +77,10 @@ def test_what_the_page_shows_is_in_the_files() -> None:
 def test_a_node_that_died_is_seen(tmp_path: Path) -> None:
     """The wrapper of ROS 2, with a stand-in for ``ros2``."""
     (script,) = (block.text for block in blocks(PAGE, "text", part="ROS 2") if block.text.startswith("#!/bin/bash"))
-    for name, text in (("run.sh", script), ("ros2", '#!/bin/sh\necho "$@ in $ROS_DOMAIN_ID"\ncat said\nexit $(cat status)\n')):
+    for name, text in (
+        ("run.sh", script),
+        ("ros2", '#!/bin/sh\necho "$@ in $ROS_DOMAIN_ID"\ncat said\nexit $(cat status)\n'),
+    ):
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o755)
     died, well = "[ERROR] [ekf-1]: process has died", "[INFO] [ekf-1]: process has finished cleanly"

@@ -689,12 +689,6 @@ def test_a_lower_triangle_is_a_covariance(heading: str, inside: Path) -> None:
         ),
         ("o.txt.gz", "", "", r"o\.txt\.gz: unknown kind of file; .*; unpack it$"),
         ("f.ulg", "", "", r"f\.ulg: unknown kind of file; .*; flight logs are for 'consistency monitor'$"),
-        (
-            "d/0.csv",
-            "t,x,y,heading",
-            "0,1,2,3\n",
-            r"d: holds no \.txt .*; tables of several runs go into one file with a",
-        ),
     ],
 )
 def test_a_refusal_names_the_remedy(name: str, header: str, rows: str, said: str, inside: Path) -> None:

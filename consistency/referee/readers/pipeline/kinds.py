@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import read_json, require_name
+from consistency.referee.parsing import is_file, read_json, require_name
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
@@ -38,7 +38,7 @@ PROGRAM_RUNS = "monte-carlo"  # kind of the manifest of a folder with runs of a 
 def is_program_runs(path: Path) -> bool:
     """Whether a path is a folder that ``consistency monte-carlo`` wrote."""
     manifest = path / "manifest.json"
-    if not manifest.is_file():
+    if not is_file(manifest):
         return False
     data = read_json(manifest)
     return isinstance(data, dict) and data.get("kind") == PROGRAM_RUNS

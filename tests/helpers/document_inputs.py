@@ -45,6 +45,7 @@ NOT_RUN = [
     ("docs/fit-covariance.md", "consistency", "needs real drives; unit/referee/test_fit_command.py simulates"),
     ("docs/front-end.md", "from consistency.vision import fit_shared", "tests/unit/stereo/test_vision_shared.py"),
     ("docs/front-end.md", "python experiments/e11", REAL),
+    ("docs/gates.md", "from consistency.testing import assert_program", "tests/smoke/test_cpp_example.py has one"),
     ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/bench/test_guards.py runs such"),
     ("docs/kitti07.md", "", REAL),
     ("docs/planar.md", "", f"{STUDY}; e15: {REAL}"),

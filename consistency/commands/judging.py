@@ -83,8 +83,7 @@ def analyse_command(
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.command_settings import settings_of, skip_asked
-    from consistency.referee.verdicts.sources import analyse as judge
-    from consistency.referee.verdicts.sources import files_source
+    from consistency.referee.verdicts.sources import files_source, judge_all
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -99,7 +98,7 @@ def analyse_command(
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
         source = files_source(path, recordings)
-        verdicts = judge(source, filters, settings=settings, optimal_gain=innovations is not None)
+        verdicts = judge_all(source, filters, settings=settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         _refuse_unfinished(path, source, "monte-carlo", fail_on)
         if report is not None and not is_file:
@@ -125,7 +124,7 @@ def analyse_command(
             raise InputError(
                 "--innovations is for files of another estimator; filters of the bench declare it themselves"
             )
-        verdicts = judge(results, filters, settings=settings, skip=first)
+        verdicts = judge_all(results, filters, settings=settings, skip=first)
         _refuse_unfinished(path, results, "run", fail_on)
     shown = document(verdicts, path.name)
     if report is not None and is_file:
@@ -170,8 +169,7 @@ def report_command(
 ) -> None:
     """Write a report of results as one offline HTML file and a PDF."""
     from consistency.referee.pages.write_pages import require_pages, write_file_pages
-    from consistency.referee.verdicts.sources import analyse as judge
-    from consistency.referee.verdicts.sources import files_source
+    from consistency.referee.verdicts.sources import files_source, judge_all
 
     estimates = are_files(path, files)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
@@ -180,7 +178,7 @@ def report_command(
     if estimates:
         require_pages(*targets, overwrite)
         recordings = read_files(path, files)
-        write_file_pages(recordings, judge(files_source(path, recordings)), *targets, path.name)
+        write_file_pages(recordings, judge_all(files_source(path, recordings)), *targets, path.name)
         tell_notes(recordings)
     else:
         from consistency.bench.pages import write_reports

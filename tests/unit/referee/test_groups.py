@@ -411,6 +411,36 @@ def test_a_trajectory_with_a_table(tmp_path: Path) -> None:
         cs.read(tmp_path / "est.txt", **files, by="n_matches")
 
 
+def test_windows_take_the_value_at_their_beginning(tmp_path: Path) -> None:
+    rng, rows, true = np.random.default_rng(10), [], []
+    for step in range(41):
+        small, P = 0.01 * rng.standard_normal(3), "0.0001,0,0,0.0001,0,0.0001"
+        rows.append(f"{step},{small[0]},{small[1]},{small[2]},{P},{step % 4}")
+        true.append(f"{step},0,0,0")
+    (tmp_path / "est.csv").write_text("t,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh,mode\n" + "\n".join(rows) + "\n")
+    (tmp_path / "truth.csv").write_text("t,x,y,heading\n" + "\n".join(true) + "\n")
+    record = cs.read(
+        tmp_path / "est.csv", tmp_path / "truth.csv", relative=2, motions=True, windows="independent", by="mode"
+    )
+    assert record.by[0, :4].tolist() == [0.0, 2.0, 0.0, 2.0]
+    assert record.as_runs.groups.index[:4, 0].tolist() == [0, 1, 0, 1]
+
+
+def test_innovations_have_no_groups(tmp_path: Path) -> None:
+    (tmp_path / "nis.csv").write_text("t,nis,nis_dof,mode\n0,1,1,1\n1,1,1,2\n")
+    with pytest.raises(cs.InputError, match=r"--by mode: .*nis.csv has no truth"):
+        cs.read(tmp_path / "nis.csv", by="mode")
+
+
+def test_a_component_that_is_not_judged_is_environment(tmp_path: Path) -> None:
+    rng = np.random.default_rng(11)
+    rows = [f"{k},{a},0,{a + b},{c},1,{a}" for k, (a, b, c) in enumerate(rng.standard_normal((60, 3)))]
+    (tmp_path / "est.csv").write_text("t,a,P_a_b,true_a,b,P_a_a,mine\n" + "\n".join(rows) + "\n")
+    assert cs.read(tmp_path / "est.csv", state=["a"], by="b").groups.outcome == ""
+    assert cs.read(tmp_path / "est.csv", state=["a"], by="a").groups.outcome == "is a component of the estimate"
+    assert cs.read(tmp_path / "est.csv", state=["a"], by="mine").groups.outcome == "is a component of the estimate"
+
+
 def test_a_key_of_an_archive(tmp_path: Path) -> None:
     error, covariance, column = wrong_in_the_first()
     np.savez(tmp_path / "mine.npz", errors=error, covariances=covariance, mode=column, lab=np.arange(40) % 2)

@@ -16,7 +16,15 @@ from consistency.diagnostics import Answer, Equivalence, Interval, Record, Setti
 from consistency.diagnostics import judge as judge_evidence
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped
 from consistency.referee.diagnostics.verdict import parts
-from consistency.referee.diagnostics.verdict.answers import ABOUT, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, answers
+from consistency.referee.diagnostics.verdict.answers import (
+    ABOUT,
+    GROUP,
+    JOINT,
+    JOINT_DISTRIBUTION,
+    MAIN,
+    SHARES,
+    answers,
+)
 from consistency.referee.diagnostics.verdict.parts import Innovations
 from consistency.referee.types import Array, Failure
 
@@ -305,7 +313,9 @@ def test_every_status_has_a_meaning_and_every_question_a_share() -> None:
         "consistent", "overconfident", "conservative", "biased", "heavy-tailed", "inconsistent", "undecided", "failed",
     ]  # fmt: skip
     assert set(SHARES) == set(ABOUT)
-    two_sided = {q: s for q, s in SHARES.items() if q not in ("scale in some direction", JOINT, JOINT_DISTRIBUTION)}
+    two_sided = {
+        q: s for q, s in SHARES.items() if q not in ("scale in some direction", JOINT, JOINT_DISTRIBUTION, GROUP)
+    }
     assert SHARES[MAIN] == 0.5
     assert sum(two_sided.values()) == pytest.approx(1.0)
 

@@ -1,7 +1,5 @@
 """What a report of several studies opens with: one picture and one table of all verdicts."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +11,6 @@ from painted import lines, panels
 import consistency as cs
 from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.sections import overview
-from consistency.bench.pages.sections.report_input import Report
 from consistency.referee.document.blocks import Figure, Name, Status, Table
 from consistency.referee.document.wording import written
 from consistency.referee.show import pdf
@@ -23,7 +20,7 @@ FILTERS = ("ekf-uvd", "ekf-xyz")
 
 
 @pytest.fixture(scope="module")
-def report(uvd, tmp_path_factory) -> Report:
+def report(uvd, tmp_path_factory):
     """Two worlds with two filters, the second of them judged in the first world alone."""
     folder = tmp_path_factory.mktemp("overview") / "run"
     cs.run_trials(uvd, FILTERS, runs=4, seed=61, jobs=1).write(folder)
@@ -33,14 +30,14 @@ def report(uvd, tmp_path_factory) -> Report:
     return replace(one, manifest={"studies": ["first", "second"]}, studies=(replace(study, name="first"), second))
 
 
-def opening(report: Report) -> tuple[Figure, Table]:
+def opening(report):
     picture, verdicts = overview.opening(report)
     assert isinstance(picture, Figure)
     assert isinstance(verdicts, Table)
     return picture, verdicts
 
 
-def test_every_verdict_is_in_the_table(report: Report) -> None:
+def test_every_verdict_is_in_the_table(report):
     [(_, rows)] = opening(report)[1].groups
     expected = [
         (study.name, track.name, track.verdict.status, f"{track.verdict.scale.mean_anees:.3g}")
@@ -53,7 +50,7 @@ def test_every_verdict_is_in_the_table(report: Report) -> None:
     assert all(isinstance(row[1], Name) and isinstance(row[2], Status) for row in rows)
 
 
-def test_the_picture_has_every_ratio_in_the_row_of_its_world(report: Report) -> None:
+def test_the_picture_has_every_ratio_in_the_row_of_its_world(report):
     (axes,) = panels(opening(report)[0])
     worlds = [label.get_text() for label in axes.get_yticklabels()]
     assert worlds == ["first", "second"]
@@ -72,14 +69,14 @@ def test_the_picture_has_every_ratio_in_the_row_of_its_world(report: Report) -> 
     assert all(low < ratio.value < high for ratio in ratios.values())
 
 
-def test_what_is_tolerated_is_shaded(report: Report) -> None:
+def test_what_is_tolerated_is_shaded(report):
     (axes,) = panels(opening(report)[0])
     factor = report.studies[0].tracks[0].verdict.settings.factor
     (shade,) = [patch for patch in axes.patches if str(patch.get_label()).startswith("tolerated")]
     assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx((1.0 / factor, factor))
 
 
-def test_a_filter_without_a_ratio_stays_in_the_table(report: Report) -> None:
+def test_a_filter_without_a_ratio_stays_in_the_table(report):
     study = report.studies[1]
     blind = replace(study.tracks[0], verdict=replace(study.tracks[0].verdict, scale=None))
     changed = replace(report, studies=(report.studies[0], replace(study, tracks=(blind,))))
@@ -89,13 +86,13 @@ def test_a_filter_without_a_ratio_stays_in_the_table(report: Report) -> None:
     assert tuple(map(written, verdicts.groups[0][1][-1][3:])) == ("–", "–")
 
 
-def test_one_study_opens_with_its_answer_alone(report: Report) -> None:
+def test_one_study_opens_with_its_answer_alone(report):
     single = replace(report, studies=report.studies[:1])
     assert overview.opening(single) == ()
     assert compose(single).opening == ()
 
 
-def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> None:
+def test_the_opening_stands_before_the_contents_of_the_page(report):
     document = compose(report)
     assert document.figures[0].title == overview.TITLE
     page = render(document)
@@ -106,21 +103,21 @@ def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> N
     assert page[:first].count('class="chart') == 1
 
 
-def test_the_opening_is_printed(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_opening_is_printed(report, monkeypatch):
     monkeypatch.setattr(pdf.typst, "compile", lambda path, **_: Path(path).with_name("data.json").read_bytes())
     data = json.loads(pdf.render_pdf(compose(report)))
     assert [block["kind"] for block in data["opening"]] == ["Figure", "Table"]
     assert pdf.soft(overview.TITLE) == data["opening"][0]["title"]
 
 
-def test_the_answer_counts_where_the_table_names(report: Report) -> None:
+def test_the_answer_counts_where_the_table_names(report):
     text = answer(report.studies, ())
     assert "2 studies put 3 pairs of filter and scenario to the test" in text
     assert "ekf-uvd" not in text
     assert "ekf-uvd" in answer(report.studies[:1], ())
 
 
-def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report: Report) -> None:
+def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report):
     track = report.studies[0].tracks[0]
     scale = track.verdict.scale
     wide = replace(scale, inflation=scale.inflation._replace(value=2.0, low=0.5, high=np.inf))

@@ -1,7 +1,5 @@
 """What is said of long work where standard error is no terminal."""
 
-from __future__ import annotations
-
 import io
 import sys
 import time
@@ -12,7 +10,7 @@ from consistency.referee.system import progress as module
 from consistency.referee.system.progress import each, foreseen, progress, quiet, say
 
 
-def test_what_is_foreseen_to_take_long_is_said_at_once_and_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_foreseen_to_take_long_is_said_at_once_and_once(capsys):
     with quiet(), foreseen("compiling the kernel of ekf-uvd", 14.6):
         assert capsys.readouterr().err == "compiling the kernel of ekf-uvd: about 15 s, once\n"
     assert capsys.readouterr().err == ""
@@ -20,7 +18,7 @@ def test_what_is_foreseen_to_take_long_is_said_at_once_and_once(capsys: pytest.C
         assert capsys.readouterr().err == "compiling 40 kernels: about 5 min, once\n"
 
 
-def test_a_terminal_has_a_bar_by_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_has_a_bar_by_the_clock(monkeypatch):
     """It is full when the work is done, not when the seconds are over."""
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
@@ -36,24 +34,24 @@ def test_a_terminal_has_a_bar_by_the_clock(monkeypatch: pytest.MonkeyPatch) -> N
     assert "╸" not in bar(terminal)
 
 
-def bar(terminal: Terminal) -> str:
+def bar(terminal):
     """What it shows now."""
     return terminal.getvalue().rpartition("compiling: about 1 s, once")[2]
 
 
 class Terminal(io.StringIO):
-    def isatty(self) -> bool:
+    def isatty(self):
         return True
 
 
-def test_runs_are_said_when_some_are_done(capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_are_said_when_some_are_done(capsys):
     with progress("runs", 2) as advance:
         assert capsys.readouterr().err == ""
         advance(2)
         assert capsys.readouterr().err.startswith("runs: 2 of 2 runs")
 
 
-def test_work_on_each_is_quiet_and_the_whole_is_not(capsys: pytest.CaptureFixture[str]) -> None:
+def test_work_on_each_is_quiet_and_the_whole_is_not(capsys):
     done = []
     for item in each("abc", 3, "worlds", "worlds"):
         say(f"inside {item}")
@@ -69,8 +67,8 @@ def test_work_on_each_is_quiet_and_the_whole_is_not(capsys: pytest.CaptureFixtur
     assert capsys.readouterr().err == "outside\n"
 
 
-def test_an_item_that_breaks_leaves_nobody_quiet(capsys: pytest.CaptureFixture[str]) -> None:
-    def breaks() -> None:
+def test_an_item_that_breaks_leaves_nobody_quiet(capsys):
+    def breaks():
         for _ in each("abc", 3, "worlds", "worlds"):
             raise ValueError
 
@@ -80,9 +78,7 @@ def test_an_item_that_breaks_leaves_nobody_quiet(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().err == "again\n"
 
 
-def test_brief_work_is_said_when_it_takes_long(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_brief_work_is_said_when_it_takes_long(capsys, monkeypatch):
     with progress("report", 2, "parts", brief=True) as advance:
         advance(2)
     assert capsys.readouterr().err == ""

@@ -4,12 +4,9 @@ Right filters are judged at a false-alarm rate of 1e-6 each, 2e-5 in this file; 
 with a power of 1 - 1e-6.
 """
 
-from __future__ import annotations
-
 import pickle
 import re
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +16,6 @@ from draws import autoregression
 import consistency as cs
 from consistency.diagnostics import gate_runs
 from consistency.referee.gating.checked_arrays import planned_dof, record_of_checked
-from consistency.referee.types import Array
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 RARE = 1e-6  # false-alarm rate of a gate here
@@ -27,9 +23,7 @@ RUNS = gate_runs(3, 1.5, RARE, 0.95)
 OPTIMAL = {"optimal_gain": True}
 
 
-def sample(
-    rng: np.random.Generator, runs: int = RUNS, steps: int = 12, n: int = 3, true: float = 1.0
-) -> tuple[Array, Array]:
+def sample(rng, runs=RUNS, steps=12, n=3, true=1.0):
     """Errors that follow each other (AR(1), 0.8), and covariances that are theirs over ``true``; of mixed units."""
     A = rng.normal(size=(n, n)) + 2.0 * np.eye(n)
     A[0] *= 1e-3
@@ -41,15 +35,15 @@ def sample(
 # --- what passes and what does not -----------------------------------------------------------------
 
 
-def test_a_right_filter_passes(rng: np.random.Generator) -> None:
+def test_a_right_filter_passes(rng):
     verdict = assert_consistent(*sample(rng), false_alarm=RARE, axes=["x", "y", "heading"])
     assert verdict.status == "consistent"
     assert verdict.faults == ()
     assert verdict.statistics["runs"] == RUNS
 
 
-@pytest.mark.parametrize(("true", "status"), [(3.0, "overconfident"), (1 / 3, "conservative")])
-def test_a_wrong_scale_does_not(rng: np.random.Generator, true: float, status: str) -> None:
+@pytest.mark.parametrize("true, status", [(3.0, "overconfident"), (1 / 3, "conservative")])
+def test_a_wrong_scale_does_not(rng, true, status):
     with pytest.raises(ConsistencyError) as caught:
         assert_consistent(*sample(rng, true=true), false_alarm=RARE, name="mine")
     verdict = caught.value.verdict
@@ -64,14 +58,14 @@ def test_a_wrong_scale_does_not(rng: np.random.Generator, true: float, status: s
     assert lines[1:] == [f"  - {reason}" for reason in verdict.reasons[1:]]
 
 
-def test_a_covariance_too_large_can_be_allowed(rng: np.random.Generator) -> None:
+def test_a_covariance_too_large_can_be_allowed(rng):
     errors, covariances = sample(rng, true=1 / 3)
     assert assert_consistent(errors, covariances, allow="conservative", false_alarm=RARE).consistent
     with pytest.raises(ConsistencyError):
         assert_consistent(errors, covariances / 9.0, allow="conservative", false_alarm=RARE)
 
 
-def test_a_subset_is_looked_at(rng: np.random.Generator) -> None:
+def test_a_subset_is_looked_at(rng):
     verdict = assert_consistent(*sample(rng), false_alarm=RARE, subsets={"first two": [0, 1]}, method="bonferroni")
     assert "first two" in verdict.statistics["groups"]
 
@@ -79,7 +73,7 @@ def test_a_subset_is_looked_at(rng: np.random.Generator) -> None:
 # --- innovations -----------------------------------------------------------------------------------
 
 
-def test_innovations_alone(rng: np.random.Generator) -> None:
+def test_innovations_alone(rng):
     S = np.broadcast_to(np.diag([4.0, 0.25]), (40, 50, 2, 2))
     v = rng.normal(size=(40, 50, 2)) * [2.0, 0.5]
     v[:, 7] = np.nan  # no measurement in step 8
@@ -94,7 +88,7 @@ def test_innovations_alone(rng: np.random.Generator) -> None:
         assert_consistent(innovations=slow, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
 
 
-def test_innovations_beside_errors(rng: np.random.Generator) -> None:
+def test_innovations_beside_errors(rng):
     """Right errors, innovations twice as wide as stated."""
     S, v = np.ones((RUNS, 12, 1, 1)), 2.0 * rng.normal(size=(RUNS, 12, 1))
     with pytest.raises(ConsistencyError) as caught:
@@ -105,7 +99,7 @@ def test_innovations_beside_errors(rng: np.random.Generator) -> None:
     assert verdict.innovations.ratio > 3.0
 
 
-def test_innovations_of_any_gain_decide_nothing(rng: np.random.Generator) -> None:
+def test_innovations_of_any_gain_decide_nothing(rng):
     with pytest.raises(ValueError, match="only with optimal_gain=True"):
         assert_consistent(nis=rng.chisquare(2, (40, 50)), nis_dof=2)
 
@@ -113,7 +107,7 @@ def test_innovations_of_any_gain_decide_nothing(rng: np.random.Generator) -> Non
 # --- enough runs -----------------------------------------------------------------------------------
 
 
-def test_too_few_runs_do_not_pass(rng: np.random.Generator) -> None:
+def test_too_few_runs_do_not_pass(rng):
     """Five runs have 15 degrees of freedom: no ratio shows that 1.5 and 1 / 1.5 are both too far off."""
     errors, covariances = sample(rng, runs=5)
     with pytest.raises(InsufficientTrials) as caught:
@@ -126,7 +120,7 @@ def test_too_few_runs_do_not_pass(rng: np.random.Generator) -> None:
         assert_consistent(errors, covariances, false_alarm=RARE, detect=1.01, allow="conservative")
 
 
-def test_a_small_fault_can_be_tolerated(rng: np.random.Generator) -> None:
+def test_a_small_fault_can_be_tolerated(rng):
     """x1.2 in 2,000 runs is found beyond all doubt, and shown to be below 1.5."""
     errors, covariances = sample(rng, runs=2000, true=1.2)
     with pytest.raises(ConsistencyError, match=r"covariance too small by x1\.2"):
@@ -139,14 +133,14 @@ def test_a_small_fault_can_be_tolerated(rng: np.random.Generator) -> None:
         assert_consistent(errors, covariances, tolerance=-1.0)
 
 
-def test_the_defaults_are_those_of_the_documentation(rng: np.random.Generator) -> None:
+def test_the_defaults_are_those_of_the_documentation(rng):
     with pytest.raises(InsufficientTrials) as caught:  # fixed values: no chance in it
         assert_consistent(nees=[[3.0], [2.0]], dof=3)
     assert caught.value.needed == gate_runs(3, 1.5, 1e-3, 0.95)
 
 
 @pytest.mark.parametrize("error", [ConsistencyError("text"), InsufficientTrials("text", 7, 3)])
-def test_errors_travel_between_processes(error: Any) -> None:
+def test_errors_travel_between_processes(error):
     again = pickle.loads(pickle.dumps(error))
     assert (str(again), vars(again)) == (str(error), vars(error))
 
@@ -154,7 +148,7 @@ def test_errors_travel_between_processes(error: Any) -> None:
 # --- failed runs, and input that cannot be judged -------------------------------------------------------
 
 
-def spoilt(what: str, rng: np.random.Generator, runs: int = 6) -> tuple[Array, Array]:
+def spoilt(what, rng, runs=6):
     """Right errors; run 4 is broken in step 7."""
     errors = rng.normal(size=(runs, 8, 3))
     covariances = np.broadcast_to(np.eye(3), (runs, 8, 3, 3)).copy()
@@ -181,8 +175,8 @@ FAILURES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("what", "reason"), FAILURES.items())
-def test_a_run_that_is_no_estimate_has_failed(what: str, reason: str, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("what, reason", FAILURES.items())
+def test_a_run_that_is_no_estimate_has_failed(what, reason, rng):
     """It is counted, fails the gate, and the others are judged beside it; no number of runs makes up for it."""
     errors, covariances = spoilt(what, rng, RUNS)
     match = rf"mine is failed: 1 of {RUNS} runs failed, first run 4 in step 7: {reason}"
@@ -198,14 +192,14 @@ def test_a_run_that_is_no_estimate_has_failed(what: str, reason: str, rng: np.ra
     assert not assert_not_worse(*right, *(part.copy() for part in spoilt(what, rng, RUNS)), detect=9.0).worse
 
 
-def test_nees_of_a_failed_run(rng: np.random.Generator) -> None:
+def test_nees_of_a_failed_run(rng):
     nees = rng.chisquare(3, (RUNS, 8))
     nees[4, 6:] = np.nan
     with pytest.raises(ConsistencyError, match="first run 4 in step 7: NEES is not finite"):
         assert_consistent(nees=nees, dof=3, false_alarm=RARE)
 
 
-def test_innovations_end_with_a_failed_run(rng: np.random.Generator) -> None:
+def test_innovations_end_with_a_failed_run(rng):
     """Whatever a run says after its failure does not count, nor is it refused."""
     errors, covariances = spoilt("error", rng, RUNS)
     nis = rng.chisquare(2, (RUNS, 8))
@@ -222,7 +216,7 @@ def test_innovations_end_with_a_failed_run(rng: np.random.Generator) -> None:
             assert_consistent(np.nan_to_num(errors), covariances, **arrays, false_alarm=RARE)
 
 
-def test_innovations_of_a_start_without_rank(rng: np.random.Generator) -> None:
+def test_innovations_of_a_start_without_rank(rng):
     """Left out where every run begins so; a run that alone does has failed."""
     v, S = rng.normal(size=(40, 8, 2)), np.broadcast_to(np.eye(2), (40, 8, 2, 2)).copy()
     S[:, 0] = 0.0
@@ -235,7 +229,7 @@ def test_innovations_of_a_start_without_rank(rng: np.random.Generator) -> None:
     assert [(failure.run, failure.step) for failure in failures] == [(6, 1)]
 
 
-def broken_innovations(what: str, rng: np.random.Generator) -> tuple[Array, Array]:
+def broken_innovations(what, rng):
     """Right innovations but for runs 4 and 9, which break down in step 7."""
     v, S = rng.normal(size=(40, 50, 2)), np.broadcast_to(np.eye(2), (40, 50, 2, 2)).copy()
     broken = np.isin(np.arange(40), (4, 9))[:, None] & (np.arange(50) >= 6)
@@ -249,14 +243,14 @@ def broken_innovations(what: str, rng: np.random.Generator) -> tuple[Array, Arra
     return v, S
 
 
-@pytest.mark.parametrize(("what", "reason"), [
+@pytest.mark.parametrize("what, reason", [
     ("indefinite", "innovation covariance is not positive definite"),
     ("singular", "innovation covariance is not positive definite"),
     ("NaN", "innovation covariance is not finite"),
     ("innovation", "innovation is not finite"),
     ("masked", "innovation is not finite"),
 ])  # fmt: skip
-def test_runs_fail_by_their_innovations(what: str, reason: str, rng: np.random.Generator) -> None:
+def test_runs_fail_by_their_innovations(what, reason, rng):
     v, S = broken_innovations(what, rng)
     with pytest.raises(ConsistencyError, match=f"2 of 40 runs failed, first run 4 in step 7: {reason}") as caught:
         assert_consistent(innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
@@ -270,7 +264,7 @@ def test_runs_fail_by_their_innovations(what: str, reason: str, rng: np.random.G
     assert [(each.run, each.step) for each in own.failures] == [(4, 7), (9, 7)]
 
 
-def test_nis_count_nothing_from_the_failure_of_their_run_on(rng: np.random.Generator) -> None:
+def test_nis_count_nothing_from_the_failure_of_their_run_on(rng):
     nis = rng.chisquare(2, (20, 8))
     nis[4, 6] = np.nan
     record = record_of_checked("f", nis=nis, nis_dof=2, optimal_gain=True)
@@ -279,7 +273,7 @@ def test_nis_count_nothing_from_the_failure_of_their_run_on(rng: np.random.Gener
     assert (np.delete(record.nis_dof, 4, axis=0) == 2).all()
 
 
-def test_a_run_fails_where_anything_of_it_failed_first(rng: np.random.Generator) -> None:
+def test_a_run_fails_where_anything_of_it_failed_first(rng):
     errors, covariances = spoilt("error", rng, 20)  # run 4 in step 7
     v, S = rng.normal(size=(20, 8, 1)), np.ones((20, 8, 1, 1))
     S[4, 2], S[3, 7] = -1.0, np.nan
@@ -292,10 +286,10 @@ def test_a_run_fails_where_anything_of_it_failed_first(rng: np.random.Generator)
     assert record.nis_dof[[3, 4]].tolist() == [[1] * 7 + [0], [1] * 2 + [0] * 6]
 
 
-def test_misuse_of_innovations_is_no_failed_run(rng: np.random.Generator) -> None:
+def test_misuse_of_innovations_is_no_failed_run(rng):
     v, S = rng.normal(size=(6, 8, 2)), np.broadcast_to(np.eye(2), (6, 8, 2, 2))
 
-    def refused(match: str, v: Array, S: Array) -> None:
+    def refused(match, v, S):
         with pytest.raises(ValueError, match=match):
             assert_consistent(innovations=v, innovation_covariances=S, **OPTIMAL)
 
@@ -311,7 +305,7 @@ def test_misuse_of_innovations_is_no_failed_run(rng: np.random.Generator) -> Non
     assert record.nis_dof[0].tolist() == [0] + [2] * 7
 
 
-def test_misuse_is_no_failed_run(rng: np.random.Generator) -> None:
+def test_misuse_is_no_failed_run(rng):
     errors, covariances = spoilt("", rng)
     P = covariances.copy()
     P[4, 6, 0, 1] = 1e-5
@@ -333,7 +327,7 @@ E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    "arguments, said",
     [
         ({}, "nothing to judge"),
         ({"errors": E}, "errors without covariances"),
@@ -371,7 +365,7 @@ E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3
         ({"errors": E, "covariances": P, "filter": "kf"}, "results"),
     ],
 )
-def test_unusable_arguments_say_what_is_wrong(arguments: dict[str, Any], said: str) -> None:
+def test_unusable_arguments_say_what_is_wrong(arguments, said):
     with pytest.raises(ValueError, match=re.escape(said)):
         assert_consistent(**arguments)
 
@@ -380,7 +374,7 @@ def test_unusable_arguments_say_what_is_wrong(arguments: dict[str, Any], said: s
 
 
 @pytest.mark.parametrize("true", [2.0, 0.5])
-def test_a_less_consistent_filter_is_worse(rng: np.random.Generator, true: float) -> None:
+def test_a_less_consistent_filter_is_worse(rng, true):
     errors, covariances = sample(rng)
     with pytest.raises(ConsistencyError, match="worse than the reference: mean NEES") as caught:
         assert_not_worse(errors, covariances / true, errors, covariances, false_alarm=RARE, name="new")
@@ -394,7 +388,7 @@ def test_a_less_consistent_filter_is_worse(rng: np.random.Generator, true: float
     ).worse  # the better one
 
 
-def test_a_comparison_needs_runs(rng: np.random.Generator) -> None:
+def test_a_comparison_needs_runs(rng):
     a, b = sample(rng, runs=9), sample(rng, runs=9)
     with pytest.raises(InsufficientTrials, match="at the spread between these runs") as caught:
         assert_not_worse(*a, *b, false_alarm=RARE, detect=1.01)
@@ -403,7 +397,7 @@ def test_a_comparison_needs_runs(rng: np.random.Generator) -> None:
         assert_not_worse(a[0][:4], a[1][:4], b[0][:4], b[1][:4])
 
 
-def test_rows_of_a_comparison_are_the_same_trials(rng: np.random.Generator) -> None:
+def test_rows_of_a_comparison_are_the_same_trials(rng):
     e, P = sample(rng, runs=20)
     with pytest.raises(ValueError, match="20 runs and the reference 19"):
         assert_not_worse(e, P, e[1:], P[1:])
@@ -419,19 +413,19 @@ def test_rows_of_a_comparison_are_the_same_trials(rng: np.random.Generator) -> N
 
 
 @pytest.fixture(scope="module")
-def stereo() -> cs.Results:
+def stereo():
     scenario = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=80)
     return cs.run_trials(scenario, filters=["ekf-xyz", "ekf-uvd"], runs=12, seed=0)
 
 
-def test_results_are_judged_as_by_analyse(stereo: cs.Results) -> None:
+def test_results_are_judged_as_by_analyse(stereo):
     with pytest.raises(ConsistencyError) as caught:
         assert_consistent(stereo, filter="ekf-xyz", false_alarm=0.05)
     assert caught.value.verdict.reasons == cs.analyse(stereo)["ekf-xyz"].reasons
     assert caught.value.verdict.status == "overconfident"
 
 
-def test_a_failed_run_is_a_fault(stereo: cs.Results) -> None:
+def test_a_failed_run_is_a_fault(stereo):
     row = {"filter": ["ekf-uvd"], "run": [3], "step": [40], "reason": ["NaN"]}
     failures = pd.DataFrame(row).astype(stereo.failures.dtypes)
     broken = replace(stereo, failures=failures, estimates=stereo.estimates[stereo.estimates["run"] != 3])
@@ -439,7 +433,7 @@ def test_a_failed_run_is_a_fault(stereo: cs.Results) -> None:
         assert_consistent(broken, filter="ekf-uvd", detect=20.0, false_alarm=RARE)
 
 
-def test_results_compared(stereo: cs.Results) -> None:
+def test_results_compared(stereo):
     with pytest.raises(ConsistencyError, match="worse than ekf-uvd"):
         assert_not_worse(stereo, filter="ekf-xyz", than="ekf-uvd", false_alarm=0.01)
     assert not assert_not_worse(stereo, filter="ekf-xyz", reference=stereo, false_alarm=RARE).worse
@@ -449,7 +443,7 @@ def test_results_compared(stereo: cs.Results) -> None:
         assert_not_worse(stereo, filter="ekf-xyz", than="kf")
 
 
-def test_results_need_a_filter_and_bring_the_rest(stereo: cs.Results) -> None:
+def test_results_need_a_filter_and_bring_the_rest(stereo):
     with pytest.raises(ValueError, match="filter: name one of ekf-xyz, ekf-uvd"):
         assert_consistent(stereo)
     with pytest.raises(ValueError, match="'kf' is not in these results"):
@@ -458,7 +452,7 @@ def test_results_need_a_filter_and_bring_the_rest(stereo: cs.Results) -> None:
         assert_consistent(stereo, filter="ekf-xyz", dof=3)
 
 
-def test_a_run_is_planned_for_the_fewest_degrees_of_freedom() -> None:
+def test_a_run_is_planned_for_the_fewest_degrees_of_freedom():
     nis_dof = np.array([[2, 2, 0], [2, 2, 2]])
     record = record_of_checked("f", nis=np.where(nis_dof, 2.0, np.nan), nis_dof=nis_dof, optimal_gain=True)
     assert planned_dof(record) == 4

@@ -1,7 +1,5 @@
 """Wrong options and wrong files of ``analyse``: status 2, and one line that says it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable
@@ -15,7 +13,7 @@ from command import refused
 from drives import write_drive, write_states
 from test_bags import Drive
 from test_bags import write as write_bag
-from test_recording import POSE_COLUMNS, Edit, archive, poses, set_cell, write
+from test_recording import POSE_COLUMNS, archive, poses, set_cell, write
 
 Make = Callable[[Path], Any]
 TUM = "0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n0.2 2 0 0 0 0 0 1\n"
@@ -24,37 +22,37 @@ EST = ("est.csv", "--truth", "truth.csv")
 LINE = ("t.txt", "--truth", "truth.txt", "--covariance", "P.txt")
 
 
-def csv(edit: Edit | None = None, edit_truth: Edit | None = None) -> Make:
+def csv(edit=None, edit_truth=None):
     return lambda at: write(at, edit, edit_truth)
 
 
-def text(**files: str) -> Make:
+def text(**files):
     whole = {"t": TUM, "truth": TUM, "P": P36} | files
 
-    def make(at: Path) -> None:
+    def make(at):
         for name, content in whole.items():
             (at / f"{name}.txt").write_text(content)
 
     return make
 
 
-def raw(content: str) -> Make:
-    def make(at: Path) -> None:
+def raw(content):
+    def make(at):
         write(at)
         (at / "est.csv").write_text(content)
 
     return make
 
 
-def npz(**arrays: Any) -> Make:
+def npz(**arrays):
     return lambda at: archive(at, **arrays)
 
 
-def columns(*names: str) -> Edit:
+def columns(*names):
     return lambda table: table.drop(columns=list(names))
 
 
-def twice(table: pd.DataFrame) -> pd.DataFrame:
+def twice(table):
     return pd.concat([table, table.iloc[[3]]])
 
 
@@ -67,7 +65,7 @@ P21 = "".join(f"{line.split()[0]} {' '.join(['1.0'] * 21)}\n" for line in P36.sp
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     """Right files that take time to write, each in a folder of its own."""
     folder = tmp_path_factory.mktemp("made")
     for name in ("bag", "drive"):
@@ -77,10 +75,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def runs(**names: int) -> Make:
+def runs(**names):
     """Folders of so many runs each."""
 
-    def make(at: Path) -> None:
+    def make(at):
         rng = np.random.default_rng(331)
         for name, number in names.items():
             (at / name).mkdir()
@@ -93,56 +91,56 @@ def runs(**names: int) -> Make:
     return make
 
 
-def doubled(at: Path) -> None:
+def doubled(at):
     runs(est=2, truth=2, P=2)(at)
     shutil.copy(at / "est/0.txt", at / "est/1.txt")
 
 
-def both_suffixes(at: Path) -> None:
+def both_suffixes(at):
     runs(est=1, truth=1, P=1)(at)
     shutil.copy(at / "est/0.txt", at / "est/0.tum")
 
 
-def pipe(at: Path) -> None:
+def pipe(at):
     text()(at)
     (at / "t.txt").unlink()
     os.mkfifo(at / "t.txt")
 
 
-def folder_named(name: str) -> Make:
-    def make(at: Path) -> None:
+def folder_named(name):
+    def make(at):
         text()(at)
         (at / name).mkdir()
 
     return make
 
 
-def bytes_of(name: str, content: bytes, first: Make) -> Make:
-    def make(at: Path) -> None:
+def bytes_of(name, content, first):
+    def make(at):
         first(at)
         (at / name).write_bytes(content)
 
     return make
 
 
-def of(name: str) -> Make:
+def of(name):
     """What the fixture made."""
     return lambda at: shutil.copytree(at.parent / "made" / name, at, dirs_exist_ok=True)
 
 
-def cut(at: Path) -> None:
+def cut(at):
     of("bag")(at)
     data = (at / "one.bag").read_bytes()
     (at / "one.bag").write_bytes(data[: len(data) // 3])
 
 
-def with_estimate(at: Path) -> None:
+def with_estimate(at):
     of("drive")(at)
     (at / "t.txt").write_text("".join(f"0.{k} 0 0 0 0 0 0 1\n" for k in range(3)))
     (at / "P.txt").write_text(P36)
 
 
-def late_estimate(at: Path) -> None:
+def late_estimate(at):
     with_estimate(at)
     for path, content in ((at / "t.txt", TUM), (at / "P.txt", P36)):
         lines = [f"{1317042145.0 + k / 10} {line.split(' ', 1)[1]}" for k, line in enumerate(content.splitlines())]
@@ -152,7 +150,7 @@ def late_estimate(at: Path) -> None:
 DRIVE = ("t.txt", "--covariance", "P.txt", "--truth", "one")
 RUNS = ("est", "--truth", "truth", "--covariance", "P")
 NAN = TUM.replace("0 0 0 1\n", "nan nan nan nan\n")
-WRONG: dict[str, tuple[Make, tuple[str, ...], str]] = {
+WRONG = {
     "no such file": (csv(), ("nowhere.csv", *EST[1:]), "nowhere.csv: no such file"),
     "no such truth": (csv(), ("est.csv", "--truth", "other.csv"), "other.csv: no such file"),
     "unknown kind": (
@@ -455,9 +453,7 @@ WRONG: dict[str, tuple[Make, tuple[str, ...], str]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_input_is_refused_in_one_line(
-    case: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_input_is_refused_in_one_line(case, made, tmp_path, monkeypatch, capsys):
     make, arguments, expected = WRONG[case]
     (tmp_path / "made").symlink_to(made)
     work = tmp_path / "work"

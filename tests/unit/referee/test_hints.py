@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from recorded import read_recordings
-from scipy.linalg import expm
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
@@ -52,54 +51,24 @@ def rng():
     return np.random.default_rng(22)
 
 
-def covariance(rng, sigma, plain):
-    root = np.eye(len(sigma)) + (0.0 if plain else 0.3) * rng.normal(size=(len(sigma),) * 2)
-    P = root @ root.T
-    scale = np.array(sigma) * np.exp(0.2 * rng.normal()) / np.sqrt(np.diag(P))
-    return np.asarray(P * np.outer(scale, scale))
-
-
-def hat(xi):
-    x, y, z, a, b, c = xi
-    return np.array([[0, -c, b, x], [c, 0, -a, y], [-b, a, 0, z], [0, 0, 0, 0]])
-
-
 def spatial(rng, convention="so3", plain=False):
-    """Drives whose errors have the stated covariance in ``convention``: so3 or left."""
-    runs = []
-    for _ in range(RUNS):
-        t, heading = 0.1 * np.arange(STEPS), rng.uniform(-3, 3) + np.cumsum(rng.normal(0, 0.1, STEPS))
-        steps = 0.5 * np.column_stack([np.cos(heading), np.sin(heading), 0.1 * np.sin(t)])
-        at = rng.uniform(-5, 5, 3) + np.cumsum(steps, axis=0)
-        turn = Rotation.from_euler("ZYX", np.column_stack([heading, 0.1 * np.sin(t), 0.1 * np.cos(2 * t)]))
-        P = covariance(rng, (0.05, 0.08, 0.12, 0.004, 0.006, 0.01), plain)
-        xi = rng.normal(size=(STEPS, 6)) @ np.linalg.cholesky(P).T
-        true = np.hstack([at + xi[:, :3], (Rotation.from_rotvec(xi[:, 3:]) * turn).as_quat()])
-        if convention == "left":
-            T = np.tile(np.eye(4), (STEPS, 1, 1))
-            T[:, :3, :3], T[:, :3, 3] = turn.as_matrix(), at
-            T = T @ np.array([expm(hat(each)) for each in xi])
-            true = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()])
-        runs.append(poses(t, np.hstack([at, turn.as_quat()]), P, true, "spatial", convention))
-    return runs
+    """Drives whose errors have the stated covariance in ``convention``."""
+    sigma = np.array([0.05, 0.08, 0.12, 0.004, 0.006, 0.01])
+    return world.log(rng, "spatial", RUNS, STEPS, 0.0, sigma=sigma, convention=convention, correlated=not plain)
 
 
 def planar(rng, plain=False):
-    runs = []
-    for _ in range(RUNS):
-        t, heading = 0.1 * np.arange(STEPS), rng.uniform(-3, 3) + np.cumsum(rng.normal(0, 0.1, STEPS))
-        at = rng.uniform(-5, 5, 2) + np.cumsum(0.5 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
-        P = covariance(rng, (0.05, 0.08, 0.01), plain)
-        own = np.column_stack([at, wrap(heading)])
-        true = own + rng.normal(size=(STEPS, 3)) @ np.linalg.cholesky(P).T
-        true[:, 2] = wrap(true[:, 2])
-        runs.append(poses(t, own, P, true, "planar", "so2"))
-    return runs
+    return world.log(rng, "planar", RUNS, STEPS, 0.0, sigma=np.array([0.05, 0.08, 0.01]), correlated=not plain)
 
 
 def poses(t, own, P, true, manifold, convention):
     place, stated = Places("line {}".format, np.arange(len(t))), np.ones(len(t), bool)
     return Poses(place, t, own, np.tile(P, (len(t), 1, 1)), stated, t, true, manifold, convention, 0.01)  # type: ignore[arg-type]
+
+
+def states(e, P):
+    """A log of a state that is no pose, with errors (k, n) and one covariance (n, n)."""
+    return poses(np.arange(float(len(e))), np.zeros_like(e), P, e, "vector", "vector")
 
 
 def weighed(p, part, factor):
@@ -116,12 +85,12 @@ Make = Callable[[np.random.Generator], list[Poses]]
 Mess = Callable[[Poses], Poses]
 MIXED = {
     "blocks": (
-        spatial, lambda p: replace(p, covariance=p.covariance[:, SWAP][:, :, SWAP]),
+        spatial, world.reordered(SWAP),
         "the covariance has its two blocks in the other order (--covariance-order)",
     ),
     "gtsam": (
         lambda rng: spatial(rng, "left"),
-        lambda p: replace(p, convention="so3", covariance=p.covariance[:, SWAP][:, :, SWAP]),
+        lambda p: replace(world.reordered(SWAP)(p), convention="so3"),
         "the error is 'left' (--error left) and the covariance has its two blocks in the other order",
     ),
     "quaternions": (
@@ -134,7 +103,7 @@ MIXED = {
     "world to body": (
         spatial, lambda p: replace(p, estimate=p.estimate * [1, 1, 1, -1, -1, -1, 1]), "turn world into body",
     ),
-    "variances in degrees": (spatial, lambda p: weighed(p, slice(3, 6), DEGREES), "its angles are in degrees"),
+    "variances in degrees": (spatial, world.degrees, "its angles are in degrees"),
     "variances in mm": (spatial, lambda p: weighed(p, slice(0, 3), 1e3), "its positions are in millimetres"),
     "estimates in mm": (
         spatial, lambda p: weighed(replace(p, estimate=p.estimate * ([1e3] * 3 + [1] * 4)), slice(0, 3), 1e3),
@@ -144,7 +113,8 @@ MIXED = {
         spatial, lambda p: replace(p, truth=p.truth * ([1e3] * 3 + [1] * 4)), "positions of the truth are in millim",
     ),
     "deviations": (lambda rng: spatial(rng, plain=True), world.deviations, "its diagonal holds standard deviations"),
-    "information": (spatial, lambda p: replace(p, covariance=np.linalg.inv(p.covariance)), "information matrix"),
+    "information": (spatial, world.information, "information matrix"),
+    "inverse": (spatial, world.inverse, "the poses of the estimates are inverse"),
     "y before x": (
         spatial, lambda p: replace(p, estimate=p.estimate[:, [1, 0, 2, 3, 4, 5, 6]]),
         "the positions of the estimates are in the order y, x, z; write them as x, y, z",
@@ -161,7 +131,7 @@ MIXED = {
     ),
     "turned world": (spatial, lambda p: moved(p, WorldTransform.about_z(-np.pi / 4.5, FAR)), "turned by 40."),
     "headings in degrees": (
-        planar, lambda p: replace(p, estimate=p.estimate * ANGLES), "the headings of the estimates are in degrees",
+        planar, world.heading_degrees, "the headings of the estimates are in degrees",
     ),
     "true headings in degrees": (
         planar, lambda p: replace(p, truth=p.truth * ANGLES), "the headings of the truth are in degrees",
@@ -187,15 +157,22 @@ MIXED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", MIXED)
-def test_a_mix_up_is_named(name, rng):
+BESIDE = ["quaternions", "blocks", "gtsam", "turned world", "information", "headings in degrees"]
+
+
+@pytest.mark.parametrize(
+    "name, scale", [*((name, 1.0) for name in MIXED), *((name, scale) for name in BESIDE for scale in (0.25, 4.0))]
+)
+def test_a_mix_up_is_named_also_beside_a_wrong_scale(name, scale, rng):
     make, mess, words = MIXED[name]
-    runs = make(rng)
+    runs = [replace(p, covariance=p.covariance * scale) for p in make(rng)]
     axes = SIX if runs[0].manifold == "spatial" else THREE
     assert hints("est", axes, runs) == []
     (said,) = hints("est", axes, [mess(p) for p in runs])
     assert said.startswith("est: the NEES")
     assert words in said
+    rest = {0.25: "too large in all components", 4.0: "too small in all components"}.get(scale)
+    assert rest is None or said.endswith(rest)
 
 
 def decades(runs):
@@ -238,10 +215,9 @@ def test_honest_logs_get_no_hint(kind, wrong, rng):
 
 def test_both_worlds_of_north_and_east_are_named(rng):
     """In the plane and in space, there with bodies that have z down too or not."""
-    north = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     down = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     for both in (False, True):
-        turned = [moved(p, WorldTransform(north, np.zeros(3))) for p in spatial(rng, plain=True)]
+        turned = [world.north(p) for p in spatial(rng, plain=True)]
         for p in turned:
             if both:
                 p.estimate[:, 3:] = (Rotation.from_quat(p.estimate[:, 3:]) * down).as_quat()
@@ -260,9 +236,8 @@ def test_both_worlds_of_north_and_east_are_named(rng):
 @pytest.mark.parametrize("convention", ["so3-body", "left"])
 def test_a_body_that_is_turned_over_takes_its_covariance_along(convention, rng):
     """NEES of a log whose estimates are undone is what it was before."""
-    north = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     p = replace(spatial(rng)[0], convention=convention)
-    there = moved(p, WorldTransform(north, np.zeros(3)))
+    there = world.north(p)
     there.estimate[:, 3:] = (
         Rotation.from_quat(there.estimate[:, 3:]) * Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     ).as_quat()
@@ -386,34 +361,10 @@ def test_a_variance_in_the_row_of_another_component_is_no_reason_to_judge_that_o
     assert "--axes x,y,yaw" in _singular("est", [right], SIX)
 
 
-@pytest.mark.parametrize("scale", [0.25, 1.0, 4.0])
-@pytest.mark.parametrize(
-    "name", ["quaternions", "blocks", "gtsam", "turned world", "information", "headings in degrees"]
-)
-def test_a_mix_up_is_named_beside_a_wrong_scale(name, scale, rng):
-    make, mess, words = MIXED[name]
-    runs = [replace(p, covariance=p.covariance * scale) for p in make(rng)]
-    axes = SIX if runs[0].manifold == "spatial" else THREE
-    assert hints("est", axes, runs) == []
-    (said,) = hints("est", axes, [mess(p) for p in runs])
-    assert words in said
-    rest = {0.25: "too large in all components", 4.0: "too small in all components"}.get(scale)
-    assert rest is None or said.endswith(rest)
-
-
-def test_inverse_poses_are_named(rng):
-    inverted = []
-    for p in spatial(rng):
-        turn = Rotation.from_quat(p.estimate[:, 3:]).inv()
-        inverted.append(replace(p, estimate=np.hstack([-turn.apply(p.estimate[:, :3]), turn.as_quat()])))
-    (said,) = hints("est", SIX, inverted)
-    assert "the poses of the estimates are inverse" in said
-
-
 def test_one_slow_log_with_a_constant_covariance_gets_no_hint(rng):
     """A drift of meters beside 0.001 I: the inverse, 1000 I, is as far off on the other side."""
     drift = np.cumsum(rng.normal(0.0, 0.3, (300, 3)), axis=0)
-    run = poses(np.arange(300.0), np.zeros((300, 3)), 1e-3 * np.eye(3), drift, "vector", "vector")
+    run = states(drift, 1e-3 * np.eye(3))
     assert hints("est", ("x", "y", "z"), [run]) == []
 
 
@@ -421,7 +372,7 @@ def test_components_that_are_judged_alone_get_hints(rng):
     """Blocks in the other order beside components without a variance, which would make the whole singular."""
     runs = []
     for p in spatial(rng, plain=True):
-        P = p.covariance[:, SWAP][:, :, SWAP]
+        P = world.reordered(SWAP)(p).covariance
         P[:, 2], P[:, :, 2] = 0.0, 0.0
         runs.append(replace(p, covariance=P))
     assert hints("est", SIX, runs) == []
@@ -434,7 +385,7 @@ def test_cross_terms_that_are_nearly_singular_are_named_with_their_direction(rng
     R = np.eye(3)
     R[0, 1] = R[1, 0] = 1.0 - 1e-7
     P = R * np.outer([0.1, 0.2, 0.05], [0.1, 0.2, 0.05])
-    (said,) = hints("est", ("x", "y", "z"), [poses(np.arange(400.0), np.zeros_like(e), P, e, "vector", "vector")])
+    (said,) = hints("est", ("x", "y", "z"), [states(e, P)])
     assert "nearly singular in the direction +1.00 x -1.00 y" in said or "direction -1.00 x +1.00 y" in said
 
 
@@ -489,7 +440,7 @@ def test_one_error_that_is_constant_over_a_log_is_no_reason_against_a_cause(rng)
     """One effective estimate, whose components differ by chance; with as many runs they would not."""
     sigma, w = np.repeat([1.0, 1e-3], 3), np.array([1.0, 0.05, 2.0, -0.1, 0.5, 1.5])
     right = world.run_of(rng, "spatial", "so3", np.tile(w * sigma, (60, 1)), np.tile(np.diag(sigma**2), (60, 1, 1)))
-    swapped = replace(right, covariance=right.covariance[:, SWAP][:, :, SWAP])
+    swapped = world.reordered(SWAP)(right)
     (said,) = hints("est", SIX, [swapped])
     assert "other order (--covariance-order)" in said
     assert not fit(*[np.tile(w, (60, 1)) * sign for sign in rng.choice([-1.0, 1.0], 60)]).right(True)
@@ -534,7 +485,7 @@ def test_a_bias_of_few_standard_deviations_explains_a_large_nees(rng):
     grown = np.exp(0.5 * np.sin(np.linspace(0.0, 6.0, 400)))[:, None]
     e = (rng.normal(size=(400, 2)) @ np.linalg.cholesky(R).T + [3.0, 0.0]) * grown
     P = R * np.square(grown)[:, :, None]
-    run = replace(poses(np.arange(400.0), np.zeros_like(e), R, e, "vector", "vector"), covariance=P)
+    run = replace(states(e, R), covariance=P)
     assert decades([run])[0] > 5.0
     assert hints("est", ("a", "b"), [run]) == []
     found, unbiased = fit_of([(e, P)]), fit_of([(e - [3.0, 0.0] * grown, P)])
@@ -546,12 +497,12 @@ def test_a_bias_of_few_standard_deviations_explains_a_large_nees(rng):
 def test_one_number_for_all_variances_is_no_covariance_of_an_estimator(rng):
     sigma = np.repeat([0.3, 0.3 * np.pi / 180.0], 3)
     right = world.log(rng, "spatial", 20, 50, 0.0, sigma=sigma, correlated=False)
-    runs = [weighed(p, slice(3, 6), DEGREES) for p in right]
+    runs = [world.degrees(p) for p in right]
     dummy = [replace(p, covariance=np.broadcast_to(0.09 * np.eye(6), p.covariance.shape)) for p in runs]
     assert hints("est", SIX, dummy) == []
     sigma[0] *= 3.0
     right = world.log(rng, "spatial", 20, 50, 0.0, sigma=sigma, correlated=False)
-    (said,) = hints("est", SIX, [weighed(p, slice(3, 6), DEGREES) for p in right])
+    (said,) = hints("est", SIX, [world.degrees(p) for p in right])
     assert "its angles are in degrees" in said
 
 
@@ -568,7 +519,7 @@ def test_many_components_are_fitted_like_few(rng):
     assert_allclose(np.square(found.w).sum(axis=1), nees, rtol=1e-6)
     log_det = np.mean([np.linalg.slogdet(P[k])[1] for k in (0, 2, 3)])
     assert found.likelihood == pytest.approx(-0.5 * (np.mean(nees) + log_det), rel=1e-9)
-    many = [poses(np.arange(1.0), np.zeros((1, 400)), np.eye(400), np.ones((1, 400)), "vector", "vector")] * 40
+    many = [states(np.ones((1, 400)), np.eye(400))] * 40
     assert len(readers_hints._thinned(many, 0.0)) == 20
 
 
@@ -713,7 +664,7 @@ def changes_in_space(convention, change, step=1e-6):
     T, found = np.eye(4), np.zeros((6, 6))
     T[:3, :3], T[:3, 3] = Rotation.from_quat(IN_SPACE[0, 3:]).as_matrix(), IN_SPACE[0, :3]
     for i, xi in enumerate(step * np.eye(6)):
-        E = expm(hat(xi))
+        E = world.motions(xi[None])[0]
         G = {"left": T @ E, "right": E @ T}.get(convention, T.copy())
         if convention.startswith("so3"):
             G[:3, 3] += xi[:3]

@@ -1,5 +1,7 @@
 """What the key of a kernel covers, and who compiles: a small kernel in modules of a user's own."""
 
+from __future__ import annotations
+
 import json
 import os
 import shutil
@@ -14,6 +16,7 @@ import forks
 import kernel_keys
 import numba
 import pytest
+from forks import Program
 from numba.core import config
 from numba.core.registry import cpu_target
 
@@ -102,7 +105,7 @@ def shift(x: float) -> float:
 
 
 @pytest.fixture
-def script(tmp_path):
+def script(tmp_path: Path) -> Path:
     folder = tmp_path / "scripts"
     folder.mkdir()
     for name, text in (("kinds", KINDS), ("rules", RULES), ("numbers_of_mine", NUMBERS), ("uses_rules", SCRIPT)):
@@ -118,14 +121,14 @@ numba.njit(lambda x: x + 1.0)(1.0)  # the first of a process takes long
 """
 
 
-def started(script, order, imports=IMPORTS):
+def started(script: Path, order: str, imports: str = IMPORTS) -> Program:
     """The script in a fork."""
     cache = str(script.parents[1] / "cache")
     code = f"import runpy; os.environ['NUMBA_CACHE_DIR'] = {cache!r}; runpy.run_path(sys.argv[0], None, '__main__')"
     return forks.begun(imports, code, str(script), order, cwd=script.parent)
 
 
-def ended(process):
+def ended(process: Program) -> tuple[str, str]:
     try:
         out, err = process.communicate()
         assert process.returncode == 0, err
@@ -134,13 +137,13 @@ def ended(process):
         process.end()
 
 
-def finished(process):
+def finished(process: Program) -> tuple[list[float], int, int]:
     """Values of the kernels, how many were read from disk, and how many were ready beforehand."""
     *values, loaded, ready = ended(process)[0].split()
     return [float(value) for value in values], int(loaded), int(ready)
 
 
-def hits(script, order, imports=IMPORTS):
+def hits(script: Path, order: str, imports: str = IMPORTS) -> int:
     """Kernels read from disk, which are just those that were ready."""
     values, loaded, ready = finished(started(script, order, imports))
     assert values == [{"Single": 10.0, "Triple": 30.0}[name] for name in order.split()]
@@ -148,7 +151,7 @@ def hits(script, order, imports=IMPORTS):
     return loaded
 
 
-def test_place_and_time_are_no_content(script):
+def test_place_and_time_are_no_content(script: Path) -> None:
     """And another order in another process has the same keys."""
     assert hits(script, "Single Triple") == 0
     (script.parent / "rules.py").touch()
@@ -163,12 +166,12 @@ Keys = Callable[..., str]
 
 
 @pytest.fixture
-def key(monkeypatch):
+def key(monkeypatch: pytest.MonkeyPatch) -> Keys:
     """Key of the kernel of a kind, with one text in a module replaced by another."""
 
-    def of(module="rules", old="", new="", kind="Single"):
+    def of(module: str = "rules", old: str = "", new: str = "", kind: str = "Single") -> str:
         assert not old or TEXTS[module].count(old) == 1
-        parts = {}
+        parts: dict[str, type] = {}
         for owner, name in ((dispatch, "PARTS"), (content_key, "PARTS"), (dispatch, "_named_bodies")):
             monkeypatch.setattr(owner, name, parts if name == "PARTS" else {})
         for name, text in TEXTS.items():
@@ -181,7 +184,7 @@ def key(monkeypatch):
     return of
 
 
-def test_comments_and_docstrings_are_no_content(key):
+def test_comments_and_docstrings_are_no_content(key: Keys) -> None:
     assert key() == key()
     assert key() == key("rules", '"""Twice a half."""', '"""Half of it, twice."""')
     assert key() == key("numbers_of_mine", '"""x, where it was."""', '"""x."""\n    # as it was')
@@ -199,23 +202,23 @@ EDITS = {
 
 
 @pytest.mark.parametrize("name", EDITS)
-def test_what_the_kernel_reads_is_content(key, name):
+def test_what_the_kernel_reads_is_content(key: Keys, name: str) -> None:
     assert key(*EDITS[name]) != key()
 
 
-def test_constants_in_tuples_and_functions_of_numba_are_content(key):
+def test_constants_in_tuples_and_functions_of_numba_are_content(key: Keys) -> None:
     triple = key(kind="Triple")
     assert key("numbers_of_mine", "(2.0,)", "(3.0,)", kind="Triple") != triple
     assert key("rules", "return x + 1.0", "return 1.0 + x", kind="Triple") != triple
 
 
-def test_what_other_kernels_are_made_of_is_no_content(key):
+def test_what_other_kernels_are_made_of_is_no_content(key: Keys) -> None:
     assert key("numbers_of_mine", "(2.0,)", "(3.0,)") == key()
     assert key(kind="Triple") != key()
 
 
 @pytest.mark.parametrize("setting", ["OPT", "LOOP_VECTORIZE", "BOUNDSCHECK"])
-def test_settings_are_content(key, monkeypatch, setting):
+def test_settings_are_content(key: Keys, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
     before = key()
     monkeypatch.setattr(config, setting, 17)
     content_key._versions.cache_clear()
@@ -224,7 +227,7 @@ def test_settings_are_content(key, monkeypatch, setting):
     content_key._versions.cache_clear()
 
 
-def test_the_processor_is_content(key, monkeypatch):
+def test_the_processor_is_content(key: Keys, monkeypatch: pytest.MonkeyPatch) -> None:
     before, codegen = key(), cpu_target.target_context.codegen()
     monkeypatch.setattr(codegen, "magic_tuple", lambda: ("x86_64", "another", ""))
     content_key._versions.cache_clear()
@@ -233,7 +236,7 @@ def test_the_processor_is_content(key, monkeypatch):
     content_key._versions.cache_clear()
 
 
-def test_what_cannot_be_compared_is_not_kept(monkeypatch, tmp_path):
+def test_what_cannot_be_compared_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     kernel = Kernel(with_something)
     assert not kernel.is_ready(1j)
@@ -249,7 +252,7 @@ class Something:
 real = Something()
 
 
-def with_something(x):
+def with_something(x: complex) -> float:
     """Reads an attribute; to a key it might be the global of that name."""
     return x.real
 
@@ -257,15 +260,15 @@ def with_something(x):
 # --- textbook -----------------------------------------------------------------------------------------------
 
 
-def keys_with_other_numbers(folder):
+def keys_with_other_numbers(folder: str) -> dict[str, str]:
     """Keys of the kernels of built-in filters, with every number in a folder of the filters doubled."""
     code = "import runpy; runpy.run_path(sys.argv[0], None, '__main__')"
     out, _ = ended(forks.begun(IMPORTS, code, kernel_keys.__file__, folder, cwd=Path.cwd()))
-    keys = json.loads(out)
+    keys: dict[str, str] = json.loads(out)
     return keys
 
 
-def test_the_textbook_is_no_content():
+def test_the_textbook_is_no_content() -> None:
     before, after = kernel_keys.keys(), keys_with_other_numbers("update")
     assert len(before) > 30
     assert keys_with_other_numbers("textbook") == before
@@ -275,13 +278,13 @@ def test_the_textbook_is_no_content():
 # --- processes --------------------------------------------------------------------------------------------
 
 
-def test_of_four_processes_that_start_at_once_one_compiles(script):
+def test_of_four_processes_that_start_at_once_one_compiles(script: Path) -> None:
     found = [finished(process)[1] for process in [started(script, "Single Triple") for _ in range(4)]]
     assert sorted(found)[-1] == 2
     assert sum(found) == 6, "each of the two kernels is compiled once, and loaded by the other three"
 
 
-def test_a_killed_compiler_leaves_nothing_that_is_loaded(script):
+def test_a_killed_compiler_leaves_nothing_that_is_loaded(script: Path) -> None:
     """Wherever it is killed: before, while or after it writes."""
     for wait in (0.05, 0.2, 0.5):
         process = started(script, "Single Triple")
@@ -294,7 +297,7 @@ def test_a_killed_compiler_leaves_nothing_that_is_loaded(script):
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="there are no modes on this system")
-def test_a_folder_that_others_may_write_is_not_trusted(script):
+def test_a_folder_that_others_may_write_is_not_trusted(script: Path) -> None:
     assert hits(script, "Single") == 0
     folder = script.parents[1] / "cache" / "filter-consistency"
     assert folder.stat().st_mode & 0o777 == 0o700

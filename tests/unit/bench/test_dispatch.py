@@ -1,6 +1,8 @@
 """Parts and the functions chosen by their types: what is refused, what is cached, who compiles."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import consistency as cs
 from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.compiler.dispatch import fits, generic, implement, part, require_fitting
 from consistency.bench.filters.covariance_update.local import Local
+from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.methods.riekf import RightInvariant
 from consistency.bench.filters.update.unscented import Unscented
 
@@ -28,31 +31,31 @@ class Stranger(NamedTuple):
 
 
 @generic()
-def times(rule, x):
+def times(rule: NamedTuple, x: float) -> float:
     """x, multiplied."""
     raise NotImplementedError
 
 
 @implement(times, Doubling)
-def doubled(rule, x):
+def doubled(rule: Doubling, x: float) -> float:
     return 2.0 * x
 
 
-def another_doubling():
-    namespace = {"__name__": __name__, "NamedTuple": NamedTuple}
+def another_doubling() -> type:
+    namespace: dict[str, object] = {"__name__": __name__, "NamedTuple": NamedTuple}
     exec("class Doubling(NamedTuple):\n    pass\n", namespace)
     cls = namespace["Doubling"]
     assert isinstance(cls, type)
     return cls
 
 
-def test_two_parts_of_one_name_are_refused():
+def test_two_parts_of_one_name_are_refused() -> None:
     """They would run each other's compiled code, silently."""
     with pytest.raises(TypeError, match=r"a part named 'Doubling' is there already, in .*test_dispatch"):
         part()(another_doubling())
 
 
-def test_a_part_must_be_a_named_tuple_at_module_level():
+def test_a_part_must_be_a_named_tuple_at_module_level() -> None:
     class Inside(NamedTuple):
         pass
 
@@ -61,8 +64,8 @@ def test_a_part_must_be_a_named_tuple_at_module_level():
             part()(cls)
 
 
-def test_bodies_must_stand_at_module_level_and_alone():
-    def body(rule, x):
+def test_bodies_must_stand_at_module_level_and_alone() -> None:
+    def body(rule: Doubling, x: float) -> float:
         return x
 
     with pytest.raises(TypeError, match="module level"):
@@ -71,28 +74,28 @@ def test_bodies_must_stand_at_module_level_and_alone():
         implement(times, Doubling)(doubled)
 
 
-def test_two_bodies_of_one_name_are_refused():
-    namespace = {"__name__": __name__}
+def test_two_bodies_of_one_name_are_refused() -> None:
+    namespace: dict[str, Any] = {"__name__": __name__}
     exec("def doubled(rule, x):\n    return x\n", namespace)
     with pytest.raises(TypeError, match=r"'.*test_dispatch.doubled' must .* under a name of its own"):
         implement(times, Stranger)(namespace["doubled"])
 
 
-def test_one_body_may_serve_two_parts():
+def test_one_body_may_serve_two_parts() -> None:
     assert implement(times, Twofold)(doubled) is doubled
     assert times(Twofold(), 3.0) == 6.0
 
 
-def test_a_function_without_a_body_says_what_there_is():
+def test_a_function_without_a_body_says_what_there_is() -> None:
     assert times(Doubling(), 3.0) == 6.0
     with pytest.raises(TypeError, match="'times' has no body for Stranger; there are Doubling"):
         times(Stranger(), 3.0)
 
 
-def parts(name, world):
+def parts(name: str, world: str) -> Slam:
     scenario = cs.load_scenario(world)
     trial = cs.simulate(scenario.variant("short", truth__steps=3))
-    slam = cs.get_filter(name).parts(problem_of(trial, scenario.belief), np.array(trial.controls))
+    slam: Slam = cs.get_filter(name).parts(problem_of(trial, scenario.belief), np.array(trial.controls))
     return slam
 
 
@@ -110,8 +113,10 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize("name, world, changes, message", REFUSED, ids=lambda value: str(value)[:20])
-def test_combinations_that_mean_nothing_are_refused(name, world, changes, message):
+@pytest.mark.parametrize(("name", "world", "changes", "message"), REFUSED, ids=lambda value: str(value)[:20])
+def test_combinations_that_mean_nothing_are_refused(
+    name: str, world: str, changes: dict[str, NamedTuple], message: str
+) -> None:
     slam = parts(name, world)
     require_fitting(slam)
     with pytest.raises(TypeError, match=message):

@@ -1,11 +1,13 @@
 """The worked example "Add a report section" of docs/extending.md works as it is printed."""
 
+from __future__ import annotations
+
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 from documents import blocks
-from numpy.testing import assert_allclose
 from painted import by_title, lines, panels
 
 import consistency as cs
@@ -15,7 +17,7 @@ from consistency.bench.pages.sections import study_sections
 
 
 @pytest.fixture
-def example(monkeypatch):
+def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The module of sections with the example and its place, as the guide says."""
     place = "consistency/bench/pages/sections/study_sections.py"
     (code,) = (block.text for block in blocks("docs/extending.md", "python") if place in block.before)
@@ -27,19 +29,19 @@ def example(monkeypatch):
     return module
 
 
-def test_the_section_with_one_plot_is_in_both_reports(uvd, tmp_path, example):
+def test_the_section_with_one_plot_is_in_both_reports(uvd, tmp_path: Path, example: ModuleType) -> None:
     cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=3, seed=0, jobs=1).write(tmp_path / "run")
     report = build_report(tmp_path / "run")
     (study,) = report.studies
     error = study.tracks[0].record().in_world.error
     expected = np.sqrt((error[..., :2] ** 2).sum(-1).mean(axis=0))
-    assert_allclose(example.rmse(study.tracks[0]), expected)
+    np.testing.assert_allclose(example.rmse(study.tracks[0]), expected)
 
     document = build.compose(report)
     titles = [figure.title for figure in document.figures]
     assert titles.index("Error of the position") == titles.index("Pose errors, run 0") + 1
     (axes,) = panels(by_title(document)["Error of the position"])
-    assert_allclose(lines(axes, "ekf-uvd")[0].get_ydata(), expected)
+    np.testing.assert_allclose(lines(axes, "ekf-uvd")[0].get_ydata(), expected)
     targets = tmp_path / "r.html", tmp_path / "r.pdf"
     write_reports(tmp_path / "run", *targets, overwrite=False)
     page = targets[0].read_text(encoding="utf-8")
@@ -49,7 +51,7 @@ def test_the_section_with_one_plot_is_in_both_reports(uvd, tmp_path, example):
     assert targets[1].read_bytes().startswith(b"%PDF")
 
 
-def test_the_section_does_not_apply_without_truth(example):
+def test_the_section_does_not_apply_without_truth(example: ModuleType) -> None:
     class Blind:
         has_truth = False
 

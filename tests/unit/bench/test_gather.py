@@ -68,11 +68,21 @@ def few_rows(monkeypatch):
     monkeypatch.setattr(parquet, "ROWS", 97)
 
 
+@pytest.fixture(scope="session")
+def run(uvd):
+    """Nine runs of the same study, unless told otherwise."""
+
+    def work(filters=FILTERS, **options):
+        return cs.run_trials(uvd, filters, **{"runs": 9, "seed": 3, "jobs": 1, **options})
+
+    return work
+
+
 @pytest.fixture(scope="module")
-def written(uvd, tmp_path_factory):
+def written(run, tmp_path_factory):
     """Nine runs from memory."""
     folder = tmp_path_factory.mktemp("gather") / "memory"
-    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1).write(folder)
+    run().write(folder)
     return folder
 
 
@@ -80,19 +90,19 @@ def written(uvd, tmp_path_factory):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_streamed_is_what_is_written_from_memory(uvd, written, tmp_path, jobs):
-    stored = cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, out=tmp_path / "deep" / "out")
+def test_streamed_is_what_is_written_from_memory(run, written, tmp_path, jobs):
+    stored = run(jobs=jobs, out=tmp_path / "deep" / "out")
     assert isinstance(stored, StoredResults)
     assert content(tmp_path / "deep" / "out") == content(written)
     assert stored.manifest == open_results(tmp_path / "deep" / "out").manifest
-    other = cs.run_trials(uvd, FILTERS, runs=9, seed=4, jobs=jobs, out=tmp_path / "other")
+    other = run(seed=4, jobs=jobs, out=tmp_path / "other")
     assert content(other.folder) != content(written), "negative control"
 
 
 @pytest.mark.usefixtures("few_rows")
-def test_row_groups_do_not_depend_on_the_pieces(uvd, tmp_path):
-    stored = cs.run_trials(uvd, [*FILTERS, Halts()], runs=9, seed=3, jobs=1, out=tmp_path / "streamed")
-    memory = cs.run_trials(uvd, [*FILTERS, Halts()], runs=9, seed=3, jobs=1)
+def test_row_groups_do_not_depend_on_the_pieces(run, tmp_path):
+    stored = run([*FILTERS, Halts()], out=tmp_path / "streamed")
+    memory = run([*FILTERS, Halts()])
     assert 0 < len(memory.failures) < 9
     memory.write(tmp_path / "memory")
     assert content(tmp_path / "streamed") == content(tmp_path / "memory")
@@ -233,13 +243,13 @@ def test_a_row_of_no_filter_is_refused(written, tmp_path):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_stopped_and_resumed_gives_the_same_bytes(uvd, written, tmp_path, stop_at, monkeypatch, jobs):
+def test_stopped_and_resumed_gives_the_same_bytes(run, written, tmp_path, stop_at, monkeypatch, jobs):
     out = tmp_path / "out"
     stop_at(4, KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
-        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, out=out)
+        run(jobs=jobs, out=out)
     monkeypatch.undo()
-    part = cs.run_trials(uvd, FILTERS, runs=1, seed=3, jobs=jobs, out=out, resume=True)  # writes what is finished
+    part = run(runs=1, jobs=jobs, out=out, resume=True)  # writes what is finished
     finished = part.finished_runs(FILTERS)
     assert finished == {0, 1, 2, 3} or (jobs > 1 and 4 not in finished)  # another worker may be before or behind
     is_whole = finished == set(range(len(finished)))
@@ -248,16 +258,16 @@ def test_stopped_and_resumed_gives_the_same_bytes(uvd, written, tmp_path, stop_a
     assert part.manifest["runs"] == max(finished) + 1
     assert open_results(out).manifest == part.manifest
     (out / "notes.txt").write_text("mine")
-    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, previous=part, out=out)
+    run(jobs=jobs, previous=part, out=out)
     assert content(out) == content(written)
     assert (out / "notes.txt").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 @pytest.mark.usefixtures("few_rows")
-def test_resuming_keeps_failures_and_fills_gaps(uvd, tmp_path):
+def test_resuming_keeps_failures_and_fills_gaps(run, uvd, tmp_path):
     filters = [Halts(), "ekf-uvd"]
-    whole = cs.run_trials(uvd, filters, runs=9, seed=3, jobs=1)
+    whole = run(filters)
     whole.write(tmp_path / "whole")
     tables = (("estimates", whole.estimates), ("truth", whole.truth), ("map", whole.map))
     gaps = {n: t[~t["run"].isin([1, 4, 8])] for n, t in tables}
@@ -265,7 +275,7 @@ def test_resuming_keeps_failures_and_fills_gaps(uvd, tmp_path):
     manifest = whole.manifest | {"complete": False, "finished_runs": 6, "failures": len(failures)}
     part = cs.Results(gaps["estimates"], failures, gaps["truth"], whole.landmarks, manifest, gaps["map"])
     part.write(tmp_path / "out")
-    cs.run_trials(uvd, filters, runs=9, seed=3, jobs=1, previous=open_results(tmp_path / "out"), out=tmp_path / "out")
+    run(filters, previous=open_results(tmp_path / "out"), out=tmp_path / "out")
     assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
@@ -284,7 +294,7 @@ def test_a_filter_without_any_row_is_resumed(uvd, tmp_path):
         assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
-def test_a_run_that_takes_long_keeps_no_other_from_the_journal(uvd, written, tmp_path, monkeypatch):
+def test_a_run_that_takes_long_keeps_no_other_from_the_journal(run, written, tmp_path, monkeypatch):
     trial, kept = World.trial, threading.Event()
     add = gather.Gathered.add
 
@@ -301,7 +311,7 @@ def test_a_run_that_takes_long_keeps_no_other_from_the_journal(uvd, written, tmp
     monkeypatch.setattr(World, "trial", last)
     monkeypatch.setattr(TrialWork, "compile", lambda self, run, jobs: None)
     monkeypatch.setattr(gather.Gathered, "add", counted)
-    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=2, out=tmp_path / "out")
+    run(jobs=2, out=tmp_path / "out")
     assert content(tmp_path / "out") == content(written)
 
 
@@ -341,26 +351,26 @@ def test_what_ends_together_leaves_room_for_as_many(monkeypatch):
     assert sorted(map(int, outcomes)) == list(range(8))  # type: ignore[call-overload]
 
 
-def test_rows_out_of_order_are_not_resumed(uvd, written):
+def test_rows_out_of_order_are_not_resumed(run, written):
     memory = cs.read_results(written)
     upside_down = cs.Results(memory.estimates[::-1], memory.failures, memory.truth, memory.landmarks, memory.manifest)
     with pytest.raises(cs.InputError, match="estimates to resume must be in order of the runs"):
-        cs.run_trials(uvd, FILTERS, runs=10, seed=3, jobs=1, previous=upside_down)
+        run(runs=10, previous=upside_down)
 
 
 @pytest.mark.parametrize("name", ["estimates", "truth"])
-def test_what_cannot_be_resumed_is_refused_before_any_work(uvd, written, tmp_path, stop_at, name):
+def test_what_cannot_be_resumed_is_refused_before_any_work(run, written, tmp_path, stop_at, name):
     out = tmp_path / "out"
     cs.read_results(written).write(out)
     damage(out / f"{name}.parquet")
     accept_changes(out)
     stop_at(9, RuntimeError("work"))
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
-        cs.run_trials(uvd, FILTERS, runs=10, seed=3, jobs=1, previous=open_results(out), out=out)
+        run(runs=10, previous=open_results(out), out=out)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
-def test_ctrl_c_waits_while_the_folder_is_written(uvd, tmp_path, monkeypatch):
+def test_ctrl_c_waits_while_the_folder_is_written(run, tmp_path, monkeypatch):
     pressed = []
 
     class Pressed(gather.Writer):
@@ -373,7 +383,7 @@ def test_ctrl_c_waits_while_the_folder_is_written(uvd, tmp_path, monkeypatch):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(gather, "Writer", Pressed)
     with pytest.raises(KeyboardInterrupt):
-        cs.run_trials(uvd, FILTERS, runs=3, seed=3, jobs=1, out=tmp_path / "out")
+        run(runs=3, out=tmp_path / "out")
     signal.signal(signal.SIGINT, before)
     assert open_results(tmp_path / "out").finished_runs(FILTERS) == {0, 1, 2}
 
@@ -382,17 +392,17 @@ def test_ctrl_c_waits_while_the_folder_is_written(uvd, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_in_the_middle_leaves_the_finished_runs(uvd, written, tmp_path, stop_at, monkeypatch, jobs):
+def test_an_error_in_the_middle_leaves_the_finished_runs(run, written, tmp_path, stop_at, monkeypatch, jobs):
     out = tmp_path / "deep" / "out"
     stop_at(5, RuntimeError("out of ideas"))
     with pytest.raises(RuntimeError, match="out of ideas"):
-        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, out=out)
+        run(jobs=jobs, out=out)
     monkeypatch.undo()
     assert [path.name for path in out.parent.iterdir()] == [".out.unfinished"]
     done = []
     trial = World.trial
     monkeypatch.setattr(World, "trial", lambda self, run, seed: (done.append(run), trial(self, run, seed))[1])
-    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=out, resume=True)
+    run(out=out, resume=True)
     assert 5 in done
     # a thread may be ahead, or behind with what is then given up; the system decides
     assert set(done) <= {5, 6, 7, 8} if jobs == 1 else len(set(done)) < 8
@@ -401,15 +411,15 @@ def test_an_error_in_the_middle_leaves_the_finished_runs(uvd, written, tmp_path,
 
 
 @pytest.mark.parametrize("error", [RuntimeError("out of ideas"), KeyboardInterrupt()], ids=["error", "ctrl-c"])
-def test_what_ends_in_the_first_run_leaves_nothing(uvd, tmp_path, stop_at, error):
+def test_what_ends_in_the_first_run_leaves_nothing(run, tmp_path, stop_at, error):
     stop_at(0, error)
     with pytest.raises(type(error)):
-        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=tmp_path / "deep" / "out")
+        run(out=tmp_path / "deep" / "out")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("where", ["Journal.append", "Writer.add"])
-def test_a_full_disk_keeps_what_was_there(uvd, written, tmp_path, monkeypatch, where):
+def test_a_full_disk_keeps_what_was_there(run, written, tmp_path, monkeypatch, where):
     cs.read_results(written).write(tmp_path / "out")
     before = content(tmp_path / "out")
 
@@ -420,15 +430,15 @@ def test_a_full_disk_keeps_what_was_there(uvd, written, tmp_path, monkeypatch, w
     kept = "; 3 finished runs are kept, and the same command with --resume goes on" if where == "Writer.add" else ""
     said = rf"--out .*out: cannot be written \(No space left on device\){kept}$"
     with pytest.raises(cs.InputError, match=said):
-        cs.run_trials(uvd, FILTERS, runs=3, seed=4, jobs=2, out=tmp_path / "out", overwrite=True)
+        run(runs=3, seed=4, jobs=2, out=tmp_path / "out", overwrite=True)
     assert content(tmp_path / "out") == before
     assert {path.name for path in tmp_path.iterdir()} == {"out", *[".out.unfinished"] * bool(kept)}
     monkeypatch.undo()
     if kept:  # the disk was freed: what was there is replaced, as was asked for at the beginning
         monkeypatch.setattr(World, "trial", None)
-        cs.run_trials(uvd, FILTERS, runs=3, seed=4, jobs=1, out=tmp_path / "out", resume=True)
+        run(runs=3, seed=4, jobs=1, out=tmp_path / "out", resume=True)
         monkeypatch.undo()
-        cs.run_trials(uvd, FILTERS, runs=3, seed=4, jobs=1, out=tmp_path / "whole")
+        run(runs=3, seed=4, jobs=1, out=tmp_path / "whole")
         assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 

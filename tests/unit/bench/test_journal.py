@@ -41,6 +41,14 @@ def fill(journal, *runs):
         journal.append(run, {"estimates f": columns(run), "truth": columns(100 + run, 3)}, notes)
 
 
+def reopened(path):
+    """What a journal holds when it is opened again."""
+    journal = Journal(path)
+    pieces = held(journal)
+    journal.close()
+    return pieces
+
+
 def held(journal, part="estimates f"):
     pieces = {run: b"".join(each.tobytes() for each in piece.values()) for run, piece in journal.pieces(part)}
     assert list(pieces) == sorted(pieces)
@@ -56,11 +64,21 @@ def path(tmp_path):
     return tmp_path / "journal"
 
 
+@pytest.fixture(scope="session")
+def run(uvd):
+    """Six runs of the same study, unless told otherwise."""
+
+    def work(filters=FILTER, **options):
+        return cs.run_trials(uvd, filters, **{"runs": RUNS, "seed": 3, "jobs": 1, **options})
+
+    return work
+
+
 @pytest.fixture(scope="module")
-def whole(uvd, tmp_path_factory):
+def whole(run, tmp_path_factory):
     """Results of one go."""
     folder = tmp_path_factory.mktemp("journal") / "whole"
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=folder)
+    run(out=folder)
     return folder
 
 
@@ -131,9 +149,7 @@ def test_an_append_that_fails_leaves_nothing(path):
     assert journal.runs == {0}
     fill(journal, 2)
     journal.close()
-    again = Journal(path)
-    assert held(again) == expected(0, 2)
-    again.close()
+    assert reopened(path) == expected(0, 2)
 
 
 def test_a_full_disk_leaves_whole_runs_and_may_be_freed(path):
@@ -147,9 +163,7 @@ def test_a_full_disk_leaves_whole_runs_and_may_be_freed(path):
     journal._database.execute("PRAGMA max_page_count = 100000")
     fill(journal, 2)
     journal.close()
-    again = Journal(path)
-    assert held(again) == expected(0, 2)
-    again.close()
+    assert reopened(path) == expected(0, 2)
 
 
 def test_a_damaged_number_is_refused(path):
@@ -216,14 +230,14 @@ def test_unfinished_work_is_neither_ignored_nor_dropped_unasked(tmp_path):
     assert list((tmp_path / "deep").iterdir()) == [], "nothing is finished, nothing stays"
 
 
-def test_resume_where_nothing_is(uvd, tmp_path):
+def test_resume_where_nothing_is(run, tmp_path):
     """Nothing at all is refused; a journal that a process was killed in before its first run is begun."""
     with pytest.raises(cs.InputError, match=r"out: there is nothing to resume; leave --resume out"):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=True)
+        run(out=tmp_path / "out", resume=True)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / ".out.unfinished").mkdir()
     Journal(tmp_path / ".out.unfinished" / DATABASE).close()
-    assert cs.run_trials(uvd, FILTER, 1, seed=3, jobs=1, out=tmp_path / "out", resume=True).manifest["complete"]
+    assert run(runs=1, out=tmp_path / "out", resume=True).manifest["complete"]
 
 
 def test_folders_that_were_made_go_with_what_was_for_nothing(tmp_path):
@@ -235,14 +249,14 @@ def test_folders_that_were_made_go_with_what_was_for_nothing(tmp_path):
 # --- whatever ends the process -----------------------------------------------------------------------
 
 
-def test_what_a_killed_process_leaves_is_resumed(uvd, whole, tmp_path, at_run):
+def test_what_a_killed_process_leaves_is_resumed(run, whole, tmp_path, at_run):
     """What is on disk in the middle of a run is what SIGKILL would leave."""
     out, left = tmp_path / "first" / "out", tmp_path / "second"
     at_run(4, lambda: shutil.copytree(out.parent, left))
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out)
+    run(out=out)
     begun = set()
     at_run(..., begun.add)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=left / "out", resume=True)
+    run(out=left / "out", resume=True)
     assert content(left / "out") == content(whole)
     assert [path.name for path in left.iterdir()] == ["out"]
     assert {4, 5} <= begun <= {3, 4, 5}, "run 3 was finished, but may not have been written yet"
@@ -258,27 +272,27 @@ def test_unfinished_work_of_an_earlier_version_is_refused(tmp_path):
         assert fresh.journal.runs == set()
 
 
-def test_only_what_is_missing_is_done_again(uvd, whole, tmp_path, monkeypatch):
+def test_only_what_is_missing_is_done_again(run, uvd, whole, tmp_path, monkeypatch):
     with Unfinished(tmp_path / "out") as unfinished:  # another filter's journal
         unfinished.journal.begin({"scenario_hash": uvd.hash, "filters": FILTER, "error": {}, "seed": 4})
         fill(unfinished.journal, 0)
     with pytest.raises(cs.InputError, match="the results to resume have another seed"):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=True)
+        run(out=tmp_path / "out", resume=True)
     with Unfinished(tmp_path / "out", resume=True) as unfinished:
         assert unfinished.journal.runs == {0}, "it is still there"
     monkeypatch.setattr(gather, "Writer", None)
     with pytest.raises(TypeError):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "other")
+        run(out=tmp_path / "other")
     monkeypatch.undo()
     monkeypatch.setattr(World, "trial", None)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "other", resume=True)
+    run(out=tmp_path / "other", resume=True)
     assert content(tmp_path / "other") == content(whole)
 
 
-def test_killed_while_results_were_replaced(uvd, whole, tmp_path, monkeypatch):
+def test_killed_while_results_were_replaced(run, whole, tmp_path, monkeypatch):
     """The old folder is away and the new one not there: both are found again."""
     out, replace = tmp_path / "out", os.replace
-    cs.run_trials(uvd, FILTER, 3, seed=3, jobs=1, out=out)
+    run(runs=3, out=out)
 
     def dies(source, target):
         if Path(target) == out:
@@ -287,27 +301,27 @@ def test_killed_while_results_were_replaced(uvd, whole, tmp_path, monkeypatch):
 
     monkeypatch.setattr(folders.os, "replace", dies)
     with pytest.raises(SystemExit):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
+        run(out=out, resume=True)
     monkeypatch.undo()
     assert not out.exists()
     monkeypatch.setattr(World, "trial", None)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
+    run(out=out, resume=True)
     assert content(out) == content(whole)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_killed_before_the_journal_was_removed(uvd, whole, tmp_path, at_run):
+def test_killed_before_the_journal_was_removed(run, whole, tmp_path, at_run):
     """The results are there, and their runs are in the journal, too: they count once."""
     out, unfinished = tmp_path / "out", tmp_path / ".out.unfinished"
     at_run(4, lambda: shutil.copytree(unfinished, tmp_path / "copy"))
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out)
+    run(out=out)
     (tmp_path / "copy").rename(unfinished)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
+    run(out=out, resume=True)
     assert content(out) == content(whole)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_outcomes_in_any_order_give_the_same_bytes(uvd, whole, tmp_path, monkeypatch):
+def test_outcomes_in_any_order_give_the_same_bytes(run, whole, tmp_path, monkeypatch):
     outcomes = []
     add, results = Gathered.add, Gathered.results
 
@@ -318,16 +332,16 @@ def test_outcomes_in_any_order_give_the_same_bytes(uvd, whole, tmp_path, monkeyp
 
     monkeypatch.setattr(Gathered, "add", lambda self, outcome: outcomes.append(outcome))
     monkeypatch.setattr(Gathered, "results", backwards)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out")
+    run(out=tmp_path / "out")
     outcomes.clear()
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1).write(tmp_path / "memory")
+    run().write(tmp_path / "memory")
     assert content(tmp_path / "out") == content(tmp_path / "memory") == content(whole)
 
 
-def test_a_place_that_was_removed_meanwhile_is_made_again(uvd, whole, tmp_path, at_run):
+def test_a_place_that_was_removed_meanwhile_is_made_again(run, whole, tmp_path, at_run):
     """The whole folder above is gone, with the journal in it: the work is not."""
     at_run(4, lambda: shutil.rmtree(tmp_path / "deep"))
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "deep" / "out")
+    run(out=tmp_path / "deep" / "out")
     assert content(tmp_path / "deep" / "out") == content(whole)
 
 
@@ -344,7 +358,7 @@ def handled():
 
 @pytest.mark.usefixtures("handled")
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_ctrl_c_loses_nothing(uvd, whole, tmp_path, at_run, jobs):
+def test_ctrl_c_loses_nothing(run, whole, tmp_path, at_run, jobs):
     """The trial in progress is done to its end; the journal has all that came before."""
     ended = []
 
@@ -355,7 +369,7 @@ def test_ctrl_c_loses_nothing(uvd, whole, tmp_path, at_run, jobs):
 
     at_run(4, pressed)
     with pytest.raises(KeyboardInterrupt) as stop:
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=jobs, out=tmp_path / "out")
+        run(jobs=jobs, out=tmp_path / "out")
     assert not isinstance(stop.value, Interrupted)
     assert ended == [4]
     assert not (tmp_path / "out").exists()
@@ -364,19 +378,19 @@ def test_ctrl_c_loses_nothing(uvd, whole, tmp_path, at_run, jobs):
     assert 4 not in done
     assert jobs == 2 or {0, 1, 2} <= done, "run 3 was finished, but may not have been written yet"
     at_run(4, int)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=bool(done))
+    run(out=tmp_path / "out", resume=bool(done))
     assert content(tmp_path / "out") == content(whole)
 
 
 @pytest.mark.usefixtures("handled")
-def test_ctrl_c_without_a_folder_hands_over_what_is_finished(uvd, at_run):
+def test_ctrl_c_without_a_folder_hands_over_what_is_finished(run, at_run):
     def pressed():
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(0.3)
 
     at_run(4, pressed)
     with pytest.raises(Interrupted) as stop:
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1)
+        run()
     done = stop.value.results.finished_runs(FILTER)
     assert {0, 1, 2} <= done <= {0, 1, 2, 3}, "run 3 was finished, but may not have been handed over yet"
     assert stop.value.results.manifest["finished_runs"] == len(done)
@@ -445,7 +459,7 @@ def test_a_folder_of_before_has_no_digests(whole, tmp_path):
     assert open_results(tmp_path / "out").finished_runs(FILTER) == set(range(RUNS))
 
 
-def test_another_processor_is_named(uvd, whole, tmp_path, capsys):
+def test_another_processor_is_named(run, whole, tmp_path, capsys):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
     manifest = json.loads((out / "manifest.json").read_text())
@@ -454,9 +468,9 @@ def test_another_processor_is_named(uvd, whole, tmp_path, capsys):
     assert here["blas"]
     old = {"cpu": "Z80", "blas": "Prescott"}
     capsys.readouterr()
-    cs.run_trials(uvd, FILTER, RUNS + 1, seed=3, jobs=1, out=out, resume=True)
+    run(runs=RUNS + 1, out=out, resume=True)
     assert "last digits" not in capsys.readouterr().err
     change_manifest(out, "contents", machines=[old])
-    cs.run_trials(uvd, FILTER, RUNS + 2, seed=3, jobs=1, out=out, resume=True)
+    run(runs=RUNS + 2, out=out, resume=True)
     assert "Z80 (BLAS: Prescott) computed the runs that are there" in capsys.readouterr().err
     assert open_results(out).manifest["machines"] == [old, here]

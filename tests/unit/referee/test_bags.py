@@ -111,6 +111,7 @@ def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path):
             r"--topic /tf: is not there with poses and cov.*there are: /odom",
         ),
         ({"truth_topic": "map:body", "state": ["x"]}, r"--state: does not go with"),
+        ({"truth_topic": "map:body", "truth": "drive.bag"}, r"--truth: does not go with .*drive\.bag"),
         ({"truth_topic": "map:body", "error": "so2"}, r"--error so2: for a trajectory in space it is one of"),
         ({"truth_topic": "map:body", "axes": ["w"]}, r"--axes w: 'w' is not one of"),
         ({"truth_topic": "map:body", "time_offset": 900.0}, r"no estimate has a truth within 0.01 s"),

@@ -7,11 +7,12 @@ with a power of 1 - 1e-6.
 import pickle
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
-from draws import autoregression
+from draws import autoregression, identities
 
 import consistency as cs
 from consistency.diagnostics import gate_runs
@@ -21,6 +22,7 @@ from consistency.testing import ConsistencyError, InsufficientTrials, assert_con
 RARE = 1e-6  # false-alarm rate of a gate here
 RUNS = gate_runs(3, 1.5, RARE, 0.95)
 OPTIMAL = {"optimal_gain": True}
+gate, no_worse = (partial(function, false_alarm=RARE) for function in (assert_consistent, assert_not_worse))
 
 
 def sample(rng, runs=RUNS, steps=12, n=3, true=1.0):
@@ -32,11 +34,21 @@ def sample(rng, runs=RUNS, steps=12, n=3, true=1.0):
     return z @ A.T, 0.5 * (P + np.swapaxes(P, -1, -2))
 
 
+def innovations(rng, runs=40, steps=50):
+    """Right innovations of two components, and their covariances."""
+    v = rng.normal(size=(runs, steps, 2))
+    return v, identities(v).copy()
+
+
+def places(failures):
+    return [(failure.run, failure.step) for failure in failures]
+
+
 # --- what passes and what does not -----------------------------------------------------------------
 
 
 def test_a_right_filter_passes(rng):
-    verdict = assert_consistent(*sample(rng), false_alarm=RARE, axes=["x", "y", "heading"])
+    verdict = gate(*sample(rng), axes=["x", "y", "heading"])
     assert verdict.status == "consistent"
     assert verdict.faults == ()
     assert verdict.statistics["runs"] == RUNS
@@ -45,7 +57,7 @@ def test_a_right_filter_passes(rng):
 @pytest.mark.parametrize("true, status", [(3.0, "overconfident"), (1 / 3, "conservative")])
 def test_a_wrong_scale_does_not(rng, true, status):
     with pytest.raises(ConsistencyError) as caught:
-        assert_consistent(*sample(rng, true=true), false_alarm=RARE, name="mine")
+        gate(*sample(rng, true=true), name="mine")
     verdict = caught.value.verdict
     assert (verdict.status, verdict.filter) == (status, "mine")
     assert verdict.p_value <= RARE
@@ -60,13 +72,13 @@ def test_a_wrong_scale_does_not(rng, true, status):
 
 def test_a_covariance_too_large_can_be_allowed(rng):
     errors, covariances = sample(rng, true=1 / 3)
-    assert assert_consistent(errors, covariances, allow="conservative", false_alarm=RARE).consistent
+    assert gate(errors, covariances, allow="conservative").consistent
     with pytest.raises(ConsistencyError):
-        assert_consistent(errors, covariances / 9.0, allow="conservative", false_alarm=RARE)
+        gate(errors, covariances / 9.0, allow="conservative")
 
 
 def test_a_subset_is_looked_at(rng):
-    verdict = assert_consistent(*sample(rng), false_alarm=RARE, subsets={"first two": [0, 1]}, method="bonferroni")
+    verdict = gate(*sample(rng), subsets={"first two": [0, 1]}, method="bonferroni")
     assert "first two" in verdict.statistics["groups"]
 
 
@@ -77,24 +89,24 @@ def test_innovations_alone(rng):
     S = np.broadcast_to(np.diag([4.0, 0.25]), (40, 50, 2, 2))
     v = rng.normal(size=(40, 50, 2)) * [2.0, 0.5]
     v[:, 7] = np.nan  # no measurement in step 8
-    assert assert_consistent(innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL).consistent
+    assert gate(innovations=v, innovation_covariances=S, **OPTIMAL).consistent
     nis, dof = np.where(np.isnan(v[..., 0]), np.nan, np.square(v / [2.0, 0.5]).sum(-1)), np.full((40, 50), 2)
     dof[:, 7] = 0
-    assert assert_consistent(nis=nis, nis_dof=dof, false_alarm=RARE, **OPTIMAL).consistent
+    assert gate(nis=nis, nis_dof=dof, **OPTIMAL).consistent
     with pytest.raises(ConsistencyError, match="larger than stated"):
-        assert_consistent(innovations=v, innovation_covariances=S / 2.0, false_alarm=RARE, **OPTIMAL)
+        gate(innovations=v, innovation_covariances=S / 2.0, **OPTIMAL)
     slow = np.repeat(rng.normal(size=(40, 25, 2)), 2, axis=1) * [2.0, 0.5]
     with pytest.raises(ConsistencyError, match="correlated over steps"):
-        assert_consistent(innovations=slow, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
+        gate(innovations=slow, innovation_covariances=S, **OPTIMAL)
 
 
 def test_innovations_beside_errors(rng):
     """Right errors, innovations twice as wide as stated."""
     S, v = np.ones((RUNS, 12, 1, 1)), 2.0 * rng.normal(size=(RUNS, 12, 1))
     with pytest.raises(ConsistencyError) as caught:
-        assert_consistent(*sample(rng), innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
+        gate(*sample(rng), innovations=v, innovation_covariances=S, **OPTIMAL)
     assert caught.value.verdict.faults == ("innovation scale",)
-    verdict = assert_consistent(*sample(rng), innovations=v, innovation_covariances=S, false_alarm=RARE)
+    verdict = gate(*sample(rng), innovations=v, innovation_covariances=S)
     assert not verdict.innovations.judged
     assert verdict.innovations.ratio > 3.0
 
@@ -111,24 +123,24 @@ def test_too_few_runs_do_not_pass(rng):
     """Five runs have 15 degrees of freedom: no ratio shows that 1.5 and 1 / 1.5 are both too far off."""
     errors, covariances = sample(rng, runs=5)
     with pytest.raises(InsufficientTrials) as caught:
-        assert_consistent(errors, covariances, false_alarm=RARE)
+        gate(errors, covariances)
     assert (caught.value.needed, caught.value.runs) == (RUNS, 5)
     assert caught.value.verdict.status == "undecided"
     assert f"consistency plan --dof 3 --detect 1.5 --false-alarm {RARE} --power 0.95" in str(caught.value)
     assert "5 runs do not show the covariance ratio" in str(caught.value)
     with pytest.raises(InsufficientTrials, match="--allow conservative"):
-        assert_consistent(errors, covariances, false_alarm=RARE, detect=1.01, allow="conservative")
+        gate(errors, covariances, detect=1.01, allow="conservative")
 
 
 def test_a_small_fault_can_be_tolerated(rng):
     """x1.2 in 2,000 runs is found beyond all doubt, and shown to be below 1.5."""
     errors, covariances = sample(rng, runs=2000, true=1.2)
     with pytest.raises(ConsistencyError, match=r"covariance too small by x1\.2"):
-        assert_consistent(errors, covariances, false_alarm=RARE)
-    verdict = assert_consistent(errors, covariances, false_alarm=RARE, tolerance=1.4)
+        gate(errors, covariances)
+    verdict = gate(errors, covariances, tolerance=1.4)
     assert "within the tolerance of x1.4" in "".join(verdict.reasons)
     with pytest.raises(ConsistencyError):
-        assert_consistent(errors, covariances, false_alarm=RARE, tolerance=1.1)
+        gate(errors, covariances, tolerance=1.1)
     with pytest.raises(ValueError, match="tolerance must be"):
         assert_consistent(errors, covariances, tolerance=-1.0)
 
@@ -151,7 +163,7 @@ def test_errors_travel_between_processes(error):
 def spoilt(what, rng, runs=6):
     """Right errors; run 4 is broken in step 7."""
     errors = rng.normal(size=(runs, 8, 3))
-    covariances = np.broadcast_to(np.eye(3), (runs, 8, 3, 3)).copy()
+    covariances = identities(errors).copy()
     bad = covariances[4, 6]
     if what == "error":
         errors[4, 6, 1] = np.nan
@@ -181,13 +193,13 @@ def test_a_run_that_is_no_estimate_has_failed(what, reason, rng):
     errors, covariances = spoilt(what, rng, RUNS)
     match = rf"mine is failed: 1 of {RUNS} runs failed, first run 4 in step 7: {reason}"
     with pytest.raises(ConsistencyError, match=match) as caught:
-        assert_consistent(errors, covariances, false_alarm=RARE, name="mine")
+        gate(errors, covariances, name="mine")
     verdict = caught.value.verdict
     assert [(f.filter, f.run, f.step) for f in verdict.failures] == [("mine", 4, 7)]
     assert verdict.scale.alive.tolist() == [RUNS] * 6 + [RUNS - 1] * 2
     assert (verdict.lost.count, verdict.lost.runs) == (1, RUNS)
     with pytest.raises(ConsistencyError, match=r"1 runs failed, of the reference 0"):
-        assert_not_worse(errors, covariances, *spoilt("", rng, RUNS), false_alarm=RARE)
+        no_worse(errors, covariances, *spoilt("", rng, RUNS))
     right = spoilt("", rng, RUNS)
     assert not assert_not_worse(*right, *(part.copy() for part in spoilt(what, rng, RUNS)), detect=9.0).worse
 
@@ -196,7 +208,7 @@ def test_nees_of_a_failed_run(rng):
     nees = rng.chisquare(3, (RUNS, 8))
     nees[4, 6:] = np.nan
     with pytest.raises(ConsistencyError, match="first run 4 in step 7: NEES is not finite"):
-        assert_consistent(nees=nees, dof=3, false_alarm=RARE)
+        gate(nees=nees, dof=3)
 
 
 def test_innovations_end_with_a_failed_run(rng):
@@ -204,21 +216,21 @@ def test_innovations_end_with_a_failed_run(rng):
     errors, covariances = spoilt("error", rng, RUNS)
     nis = rng.chisquare(2, (RUNS, 8))
     nis[4, 6:] = np.nan
-    v, S = rng.normal(size=(RUNS, 8, 2)), np.broadcast_to(np.eye(2), (RUNS, 8, 2, 2)).copy()
+    v, S = innovations(rng, RUNS, 8)
     S[4, 7], v[4, 7, 0] = -1.0, np.nan
     for step, arrays in ((7, {"nis": nis, "nis_dof": 2}), (8, {"innovations": v, "innovation_covariances": S})):
         record = record_of_checked("f", errors, covariances, **arrays)
         assert np.isnan(record.nis[4]).tolist() == [False] * 6 + [True] * 2
         assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
         with pytest.raises(ConsistencyError, match="1 of"):
-            assert_consistent(errors, covariances, **arrays, false_alarm=RARE)
+            gate(errors, covariances, **arrays)
         with pytest.raises(ConsistencyError, match=rf"first run 4 in step {step}: (NIS|innovation) is not finite"):
-            assert_consistent(np.nan_to_num(errors), covariances, **arrays, false_alarm=RARE)
+            gate(np.nan_to_num(errors), covariances, **arrays)
 
 
 def test_innovations_of_a_start_without_rank(rng):
     """Left out where every run begins so; a run that alone does has failed."""
-    v, S = rng.normal(size=(40, 8, 2)), np.broadcast_to(np.eye(2), (40, 8, 2, 2)).copy()
+    v, S = innovations(rng, steps=8)
     S[:, 0] = 0.0
     record = record_of_checked("f", innovations=v, innovation_covariances=S, **OPTIMAL)
     assert record.failures == ()
@@ -226,12 +238,12 @@ def test_innovations_of_a_start_without_rank(rng):
     assert np.isfinite(record.innovations[:, 1:]).all()
     S[:, 0], S[6, 0] = np.eye(2), 0.0
     failures = record_of_checked("f", innovations=v, innovation_covariances=S, **OPTIMAL).failures
-    assert [(failure.run, failure.step) for failure in failures] == [(6, 1)]
+    assert places(failures) == [(6, 1)]
 
 
 def broken_innovations(what, rng):
     """Right innovations but for runs 4 and 9, which break down in step 7."""
-    v, S = rng.normal(size=(40, 50, 2)), np.broadcast_to(np.eye(2), (40, 50, 2, 2)).copy()
+    v, S = innovations(rng)
     broken = np.isin(np.arange(40), (4, 9))[:, None] & (np.arange(50) >= 6)
     if what == "masked":
         v[broken] = np.nan
@@ -253,7 +265,7 @@ def broken_innovations(what, rng):
 def test_runs_fail_by_their_innovations(what, reason, rng):
     v, S = broken_innovations(what, rng)
     with pytest.raises(ConsistencyError, match=f"2 of 40 runs failed, first run 4 in step 7: {reason}") as caught:
-        assert_consistent(innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
+        gate(innovations=v, innovation_covariances=S, **OPTIMAL)
     verdict = caught.value.verdict
     assert verdict.status == "failed"
     assert verdict.innovations.dof == 2 * (40 * 50 - 2 * 44) - 80 * (what == "masked")
@@ -261,14 +273,14 @@ def test_runs_fail_by_their_innovations(what, reason, rng):
     errors, covariances = spoilt("", rng, 40)
     own = record_of_checked("f", errors, covariances, innovations=v[:, :8], innovation_covariances=S[:, :8])
     assert np.isnan(own.nees).sum(axis=1).tolist() == [2 * (run in (4, 9)) for run in range(40)]
-    assert [(each.run, each.step) for each in own.failures] == [(4, 7), (9, 7)]
+    assert places(own.failures) == [(4, 7), (9, 7)]
 
 
 def test_nis_count_nothing_from_the_failure_of_their_run_on(rng):
     nis = rng.chisquare(2, (20, 8))
     nis[4, 6] = np.nan
     record = record_of_checked("f", nis=nis, nis_dof=2, optimal_gain=True)
-    assert [(each.run, each.step) for each in record.failures] == [(4, 7)]
+    assert places(record.failures) == [(4, 7)]
     assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
     assert (np.delete(record.nis_dof, 4, axis=0) == 2).all()
 
@@ -287,7 +299,7 @@ def test_a_run_fails_where_anything_of_it_failed_first(rng):
 
 
 def test_misuse_of_innovations_is_no_failed_run(rng):
-    v, S = rng.normal(size=(6, 8, 2)), np.broadcast_to(np.eye(2), (6, 8, 2, 2))
+    v, S = innovations(rng, 6, 8)
 
     def refused(match, v, S):
         with pytest.raises(ValueError, match=match):
@@ -323,7 +335,9 @@ def test_misuse_is_no_failed_run(rng):
         cs.nees(errors[0, 0], -covariances[0, 0])
 
 
-E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3), (4, 2, 3, 3))
+E = np.random.default_rng(0).normal(size=(4, 2, 3))
+P = identities(E)
+BOTH = {"errors": E, "covariances": P}
 
 
 @pytest.mark.parametrize(
@@ -336,8 +350,8 @@ E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3
         ({"errors": E, "covariances": P[..., :2]}, "key 'covariances' has shape (4, 2, 3, 2), needs (4, 2, 3, 3)"),
         ({"errors": E[:0], "covariances": P[:0]}, "errors has shape (0, 2, 3), needs (runs, steps, n)"),
         ({"errors": [[[1.0], [2.0]], [[1.0]]], "covariances": P}, "errors: not an array of numbers"),
-        ({"errors": E, "covariances": P, "dof": 2}, "dof is 2, but the errors have 3 components"),
-        ({"errors": E, "covariances": P, "nees": E[..., 0]}, "not both"),
+        (BOTH | {"dof": 2}, "dof is 2, but the errors have 3 components"),
+        (BOTH | {"nees": E[..., 0]}, "not both"),
         ({"nees": E[..., 0]}, "nees without dof"),
         ({"nees": E[..., 0], "dof": 0}, "key 'dof' must be one whole number of 1 or more"),
         ({"nees": E[0, :, 0], "dof": 3}, "nees has shape (2,), needs (runs, steps): nees[None] is one run"),
@@ -348,21 +362,21 @@ E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3
         ({"nis": E[..., 0] ** 2, "nis_dof": 1.5}, "whole numbers"),
         ({"nis": E[..., 0] * np.nan, "nis_dof": 1}, "nis, step 1: not finite in any run"),
         ({"nis": -(E[..., 0] ** 2), "nis_dof": 1}, "nis: negative in run 0, step 1"),
-        ({"errors": E, "covariances": P, "deviations": E}, "covariances or deviations, not both"),
+        (BOTH | {"deviations": E}, "covariances or deviations, not both"),
         ({"deviations": E}, "deviations without errors"),
         ({"errors": E, "deviations": E[:2]}, "deviations has shape (2, 2, 3), needs that of errors"),
         ({"errors": E, "deviations": np.ones(E.shape), "subsets": {"a": [0]}}, "subsets needs covariances"),
         ({"innovations": E}, "give innovations and innovation_covariances together"),
         ({"innovations": E, "innovation_covariances": E}, "(runs, steps, m) and (runs, steps, m, m)"),
-        ({"errors": E, "covariances": P, "nis": E[:2, :, 0] ** 2, "nis_dof": 1}, "nis has (2, 2) runs and steps"),
-        ({"errors": E, "covariances": P, "allow": "optimistic"}, "allow must be 'conservative' or None"),
-        ({"errors": E, "covariances": P, "method": "pointwise"}, "method must be 'max' or 'bonferroni'"),
-        ({"errors": E, "covariances": P, "false_alarm": 0.0}, "false_alarm must lie between 0 and 1"),
-        ({"errors": E, "covariances": P, "power": 1.0}, "power must lie between 0 and 1"),
-        ({"errors": E, "covariances": P, "detect": 1.0}, "detect must be a positive ratio"),
-        ({"errors": E, "covariances": P, "detect": 0.5, "allow": "conservative"}, "which allow='conservative' accepts"),
-        ({"errors": E, "covariances": P, "axes": ["x"]}, "key 'axes' names 1 components, the error has 3"),
-        ({"errors": E, "covariances": P, "filter": "kf"}, "results"),
+        (BOTH | {"nis": E[:2, :, 0] ** 2, "nis_dof": 1}, "nis has (2, 2) runs and steps"),
+        (BOTH | {"allow": "optimistic"}, "allow must be 'conservative' or None"),
+        (BOTH | {"method": "pointwise"}, "method must be 'max' or 'bonferroni'"),
+        (BOTH | {"false_alarm": 0.0}, "false_alarm must lie between 0 and 1"),
+        (BOTH | {"power": 1.0}, "power must lie between 0 and 1"),
+        (BOTH | {"detect": 1.0}, "detect must be a positive ratio"),
+        (BOTH | {"detect": 0.5, "allow": "conservative"}, "which allow='conservative' accepts"),
+        (BOTH | {"axes": ["x"]}, "key 'axes' names 1 components, the error has 3"),
+        (BOTH | {"filter": "kf"}, "results"),
     ],
 )
 def test_unusable_arguments_say_what_is_wrong(arguments, said):
@@ -377,21 +391,19 @@ def test_unusable_arguments_say_what_is_wrong(arguments, said):
 def test_a_less_consistent_filter_is_worse(rng, true):
     errors, covariances = sample(rng)
     with pytest.raises(ConsistencyError, match="worse than the reference: mean NEES") as caught:
-        assert_not_worse(errors, covariances / true, errors, covariances, false_alarm=RARE, name="new")
+        no_worse(errors, covariances / true, errors, covariances, name="new")
     assert caught.value.comparison.worse
     assert caught.value.verdict.filter == "new"
     nees = cs.nees(errors, covariances)
     with pytest.raises(ConsistencyError):
-        assert_not_worse(nees_a=true * nees, nees_b=nees, dof=3, false_alarm=RARE)
-    assert not assert_not_worse(
-        nees_a=nees, nees_b=true * nees, dof=3, false_alarm=RARE, detect=3.0
-    ).worse  # the better one
+        no_worse(nees_a=true * nees, nees_b=nees, dof=3)
+    assert not no_worse(nees_a=nees, nees_b=true * nees, dof=3, detect=3.0).worse  # the better one
 
 
 def test_a_comparison_needs_runs(rng):
     a, b = sample(rng, runs=9), sample(rng, runs=9)
     with pytest.raises(InsufficientTrials, match="at the spread between these runs") as caught:
-        assert_not_worse(*a, *b, false_alarm=RARE, detect=1.01)
+        no_worse(*a, *b, detect=1.01)
     assert caught.value.needed > 9
     with pytest.raises(InsufficientTrials, match="4 runs are too few for a standard error"):
         assert_not_worse(a[0][:4], a[1][:4], b[0][:4], b[1][:4])
@@ -430,13 +442,13 @@ def test_a_failed_run_is_a_fault(stereo):
     failures = pd.DataFrame(row).astype(stereo.failures.dtypes)
     broken = replace(stereo, failures=failures, estimates=stereo.estimates[stereo.estimates["run"] != 3])
     with pytest.raises(ConsistencyError, match="1 of 12 runs failed"):
-        assert_consistent(broken, filter="ekf-uvd", detect=20.0, false_alarm=RARE)
+        gate(broken, filter="ekf-uvd", detect=20.0)
 
 
 def test_results_compared(stereo):
     with pytest.raises(ConsistencyError, match="worse than ekf-uvd"):
         assert_not_worse(stereo, filter="ekf-xyz", than="ekf-uvd", false_alarm=0.01)
-    assert not assert_not_worse(stereo, filter="ekf-xyz", reference=stereo, false_alarm=RARE).worse
+    assert not no_worse(stereo, filter="ekf-xyz", reference=stereo).worse
     with pytest.raises(ValueError, match="name the filter to compare with"):
         assert_not_worse(stereo, filter="ekf-xyz")
     with pytest.raises(ValueError, match="'kf' is not in the reference"):

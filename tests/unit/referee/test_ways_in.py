@@ -33,12 +33,13 @@ class Data:
         rng, n = np.random.default_rng(), len(axes)
         self.axes, self.P = axes, matrices(n)
         self.error, self.truth = 0.1 * rng.normal(size=(STEPS, n)), rng.normal(size=(STEPS, n))
-        self.t = 1.0 + 0.1 * np.arange(STEPS)
+        self.t, self.step = 1.0 + 0.1 * np.arange(STEPS), np.arange(1, STEPS + 1)
+        self.state = None if axes == POSE else list(axes)
 
-    def table(self, names=None, own="{}"):
+    def table(self, names=(), own="{}"):
         values = self.truth - self.error
         columns = {own.format(axis): values[:, i] for i, axis in enumerate(self.axes)}
-        return pd.DataFrame(columns | (names or {}))
+        return pd.DataFrame(columns | dict(names))
 
     def true(self, spelling="{}"):
         return pd.DataFrame({spelling.format(axis): self.truth[:, i] for i, axis in enumerate(self.axes)})
@@ -47,6 +48,11 @@ class Data:
         n = len(words)
         pairs = itertools.combinations_with_replacement(range(n), 2)
         return {spelling.format(words[i], words[j]): self.P[:, i, j] for i, j in pairs}
+
+    def read(self, columns):
+        """The record of est.csv, with these columns among the others in any order, and truth.csv, both by step."""
+        est = write("est.csv", self.table(columns).sample(frac=1, axis=1), step=self.step)
+        return cs.read(est, truth=write("truth.csv", self.true(), step=self.step), state=self.state)
 
 
 def write(path, table, **columns):
@@ -74,31 +80,31 @@ CLOCKS = {
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("axes", [POSE, ("a", "b")])
 def test_a_time_by_another_name_is_t(clock, axes, inside):
-    data, state = Data(axes), None if axes == POSE else list(axes)
+    data = Data(axes)
     names = CLOCKS[clock](data.t)
     est = write("est.csv", data.table(data.stated("P_{}_{}", axes)), **names)
-    record = cs.read(est, truth=write("truth.csv", data.true(), **names), state=state)
+    record = cs.read(est, truth=write("truth.csv", data.true(), **names), state=data.state)
     check(record, data)
     start = 1.7e9 if clock == "since 1970" else 0.0
     assert_allclose(record.t, start + data.t, atol=1e-6)
     if clock == "time":  # beside t in the other file, and in memory
-        check(cs.read(est, truth=write("truth.csv", data.true(), t=data.t), state=state), data)
-        check(cs.read(pd.read_csv(est), truth=pd.read_csv("truth.csv"), state=state), data)
+        check(cs.read(est, truth=write("truth.csv", data.true(), t=data.t), state=data.state), data)
+        check(cs.read(pd.read_csv(est), truth=pd.read_csv("truth.csv"), state=data.state), data)
     assert len(list(inside.iterdir())) == 2
 
 
 def test_beside_steps_a_time_is_not_looked_at(inside):
-    data, step = Data(("a", "b")), np.arange(STEPS)
-    est = write("est.csv", data.table(data.stated("P_{}_{}", data.axes)), step=step, time="at noon")
-    truth = write("truth.csv", data.true(), step=step, time=data.t + 5.0)
-    record = cs.read(est, truth=truth, state=["a", "b"])
+    data = Data(("a", "b"))
+    table = data.table(data.stated("P_{}_{}", data.axes)).assign(step=data.step)
+    est = write("est.csv", table, time="at noon")
+    truth = write("truth.csv", data.true(), step=data.step, time=data.t + 5)
+    record = cs.read(est, truth=truth, state=data.state)
     check(record, data)
     assert np.isnan(record.t).all()
     with pytest.raises(cs.InputError, match=r"est\.csv, line 2: column 'time': not a number \(at noon\)"):
-        cs.read(est, truth=truth, state=["a", "b"], max_dt=0.1)
-    write("est.csv", data.table(data.stated("P_{}_{}", data.axes)), step=step, time=data.t)
-    moved = cs.read(est, truth=write("truth.csv", data.true(), time=data.t + 5.0), state=["a", "b"], time_offset=5.0)
-    check(moved, data)
+        cs.read(est, truth=truth, state=data.state, max_dt=0.1)
+    write("est.csv", table, time=data.t)
+    check(cs.read(est, truth=write("truth.csv", data.true(), time=data.t + 5), state=data.state, time_offset=5.0), data)
 
 
 def test_the_monitor_knows_a_time(inside):
@@ -119,12 +125,8 @@ NAMES = [
 @pytest.mark.parametrize("spelling, words", NAMES)
 @pytest.mark.parametrize("axes", [POSE, ("a", "b", "c")])
 def test_a_covariance_by_other_names(spelling, words, axes, inside):
-    data, step = Data(axes), np.arange(1, STEPS + 1)
-    labels = axes if words == "own" else tuple(words)
-    table = data.table(data.stated(spelling, labels))
-    order = np.random.default_rng().permutation(table.columns)
-    truth = write("truth.csv", data.true(), step=step)
-    record = cs.read(write("est.csv", table[order], step=step), truth=truth, state=None if axes == POSE else list(axes))
+    data = Data(axes)
+    record = data.read(data.stated(spelling, axes if words == "own" else tuple(words)))
     check(record, data)
     assert any(note.startswith("est.csv: read ") and " as P_" in note for note in record.notes)
 
@@ -141,23 +143,18 @@ def test_words_for_the_heading(spelling, word, inside):
 
 
 def test_a_lower_triangle_by_another_name_has_to_agree(inside):
-    data, step = Data(("a", "b")), np.arange(1, STEPS + 1)
-    lower = {"P21": data.P[:, 1, 0]}
-    truth = write("truth.csv", data.true(), step=step)
-    table = data.table(data.stated("P{}{}", ("1", "2")) | lower)
-    check(cs.read(write("est.csv", table, step=step), truth=truth, state=["a", "b"]), data)
+    data = Data(("a", "b"))
+    upper = data.stated("P{}{}", ("1", "2"))
+    check(data.read(upper | {"P21": data.P[:, 1, 0]}), data)
     with pytest.raises(cs.InputError, match="line 2: the covariance is not symmetric"):
-        cs.read(write("est.csv", table, step=step, P21=data.P[:, 1, 0] + 1), truth=truth, state=["a", "b"])
+        data.read(upper | {"P21": data.P[:, 1, 0] + 1})
 
 
 def test_of_eleven_components_the_numbers_are_apart(inside):
-    axes = tuple("abcdefghijk")
-    data, step, words = Data(axes), np.arange(1, STEPS + 1), tuple(map(str, range(1, 12)))
-    truth = write("truth.csv", data.true(), step=step)
-    check(cs.read(write("est.csv", data.table(data.stated("P_{}_{}", words)), step=step), truth, state=axes), data)
-    ambiguous = data.table(data.stated("P{}{}", words))  # P111 is that of 1 and 11
+    data, words = Data(tuple("abcdefghijk")), tuple(map(str, range(1, 12)))
+    check(data.read(data.stated("P_{}_{}", words)), data)
     with pytest.raises(cs.InputError, match="column 'P_a_a' is missing"):
-        cs.read(write("est.csv", ambiguous, step=step), truth, state=axes)
+        data.read(data.stated("P{}{}", words))  # P111 is that of 1 and 11
 
 
 @pytest.mark.parametrize(
@@ -165,38 +162,30 @@ def test_of_eleven_components_the_numbers_are_apart(inside):
 )
 @pytest.mark.parametrize("axes", [POSE, ("a", "b")])
 def test_variances_and_deviations_by_other_names(spelling, axes, inside):
-    data, step = Data(axes), np.arange(1, STEPS + 1)
+    data = Data(axes)
     variance = np.diagonal(data.P, axis1=1, axis2=2)
     words = ("x", "y", "theta") if axes == POSE else axes
     values = variance if "var" in spelling else np.sqrt(variance)
-    table = data.table({spelling.format(word): values[:, i] for i, word in enumerate(words)})
-    truth = write("truth.csv", data.true(), step=step)
-    record = cs.read(write("est.csv", table, step=step), truth, state=None if axes == POSE else list(axes))
+    record = data.read({spelling.format(word): values[:, i] for i, word in enumerate(words)})
     assert record.parts == tuple((i,) for i in range(len(axes)))
     assert_allclose(record.nees[0], (data.error**2 / variance).sum(axis=1), rtol=1e-9)
 
 
 def test_variances_beside_cross_terms(inside):
-    data, step = Data(("a", "b")), np.arange(1, STEPS + 1)
-    names = {"var_a": data.P[:, 0, 0], "var_b": data.P[:, 1, 1], "cov_ab": data.P[:, 0, 1]}
-    truth = write("truth.csv", data.true(), step=step)
-    check(cs.read(write("est.csv", data.table(names), step=step), truth, state=["a", "b"]), data)
+    data = Data(("a", "b"))
+    check(data.read({"var_a": data.P[:, 0, 0], "var_b": data.P[:, 1, 1], "cov_ab": data.P[:, 0, 1]}), data)
 
 
 def test_names_that_were_read_before_are_read_so(inside):
-    data, step = Data(POSE), np.arange(1, STEPS + 1)
-    other = {f"P{i}{j}": np.ones(STEPS) for i, j in itertools.product("123", repeat=2)}
-    truth = write("truth.csv", data.true(), step=step)
+    data = Data(POSE)
     canonical = data.stated("P_{}{}", ("x", "y", "h"))
-    check(cs.read(write("est.csv", data.table(canonical | other), step=step), truth), data)
-    deviations = {f"sigma_{axis}": np.ones(STEPS) for axis in POSE}
-    record = cs.read(write("est.csv", data.table(deviations | {f"var_{axis}": np.full(STEPS, 9.0) for axis in POSE}),
-                           step=step), truth)  # fmt: skip
-    assert_allclose(record.nees[0], (data.error**2).sum(axis=1), rtol=1e-9)
-    both = data.table(canonical).assign(x_est=9.0, theta=9.0, step=step)
-    check(cs.read(write("est.csv", both), truth), data)
+    check(data.read(canonical | {f"P{i}{j}": 1.0 for i, j in itertools.product("123", repeat=2)}), data)
+    deviations = {f"sigma_{axis}": 1.0 for axis in POSE} | {f"var_{axis}": 9.0 for axis in POSE}
+    assert_allclose(data.read(deviations).nees[0], (data.error**2).sum(axis=1), rtol=1e-9)
+    check(data.read(canonical | {"x_est": 9.0, "theta": 9.0}), data)
+    canonical.pop("P_xh")
     with pytest.raises(cs.InputError, match=r"column 'P_xh' is missing; .*--state a,b judges fewer"):
-        cs.read(write("est.csv", data.table(canonical).drop(columns="P_xh"), step=step), truth)
+        data.read(canonical)
 
 
 @pytest.mark.parametrize("spelling", ["P{}{}", "P_{}_{}"])
@@ -227,7 +216,7 @@ def test_truth_and_estimate_in_one_table(true, own, inside):
     check(cs.read(pd.read_csv(est)), data)
     state = Data(("a", "b"))
     table = state.table(state.stated("P{}{}", ("1", "2")), own).join(state.true(true))
-    record = cs.read(write("est.csv", table, step=np.arange(1, STEPS + 1)), state=["a", "b"], error="vector")
+    record = cs.read(write("est.csv", table, step=state.step), state=state.state, error="vector")
     check(record, state)
     assert "est.csv: the truth stands in columns beside the estimates" in record.notes
 
@@ -252,11 +241,11 @@ def test_truth_beside_poses_in_space(true, own, folder, inside):
     Path("est").mkdir()
     est = write("est/one.csv", table)
     record = cs.read("est" if folder else est)
-    assert_allclose(record.error[0, :, :3], np.delete(data.error[:, :3], 2, axis=0), atol=1e-9)  # type: ignore[index]
+    assert_allclose(record.error[0, :, :3], np.delete(data.error[:, :3], 2, axis=0), atol=1e-9)
     assert any("1 of 7 estimates have no truth" in note for note in record.notes)
     assert any(note.endswith("the truth stands in columns beside the estimates") for note in record.notes)
     other = write("truth.csv", data.true().iloc[:, :3], t=data.t, qx=0.0, qy=0.0, qz=0.0, qw=1.0)
-    assert_allclose(cs.read(est, truth=other).error[0, :, :3], data.error[:, :3], atol=1e-9)  # type: ignore[index]
+    assert_allclose(cs.read(est, truth=other).error[0, :, :3], data.error[:, :3], atol=1e-9)
 
 
 @pytest.mark.parametrize("spelling", ["var_{}", "{}_var", "sd_{}", "{}_sd"])
@@ -267,28 +256,24 @@ def test_variances_and_deviations_of_poses_in_space(spelling, inside):
     variance = 4.0 if "var" in spelling else 16.0
     assert_allclose(np.asarray(record.covariance)[0, 3], variance * np.eye(6))
     assert record.parts == tuple((i,) for i in range(6))
-    other = {f"var_{word}": np.full(STEPS, 9.0) for word in words} | {
-        f"sd_{word}": np.full(STEPS, 2.0) for word in words
-    }
-    both = cs.read(
-        write("est.csv", in_space(data, other, "true_{}"), t=data.t), axes=words
-    )  # deviations count, as in the plane
+    other = {f"var_{word}": 9.0 for word in words} | {f"sd_{word}": np.full(STEPS, 2.0) for word in words}
+    both = cs.read(write("est.csv", in_space(data, other, "true_{}"), t=data.t), axes=words)  # as in the plane
     assert_allclose(np.asarray(both.covariance)[0, 3], 4.0 * np.eye(6))
 
 
 def test_rows_without_a_truth_beside_them_do_not_count(inside):
-    data, step = Data(("a", "b")), np.arange(1, STEPS + 1)
-    table = data.table(data.stated("P_{}_{}", data.axes)).join(data.true("true_{}")).assign(step=step)
+    data = Data(("a", "b"))
+    table = data.table(data.stated("P_{}_{}", data.axes)).join(data.true("true_{}")).assign(step=data.step)
     table.loc[3, "true_b"] = np.nan
     two = pd.concat([table.assign(filter="one"), table.assign(filter="two", true_a=table["true_a"] + 1.0)])
-    one, two_ = read_recordings(write("est.csv", two), state=["a", "b"])
+    one, two_ = read_recordings(write("est.csv", two), state=data.state)
     expected = np.delete(data.error, 3, axis=0)
-    assert_allclose(one.error[0], expected, atol=1e-9)  # type: ignore[index]
-    assert_allclose(two_.error[0], expected + np.array([1.0, 0.0]), atol=1e-9)  # type: ignore[index]
-    other = write("truth.csv", data.true() + 2.0, step=step)  # a truth that is named counts
-    assert_allclose(cs.read("est.csv", other, state=["a", "b"], filter="one").error[0], data.error + 2.0)
+    assert_allclose(one.error[0], expected, atol=1e-9)
+    assert_allclose(two_.error[0], expected + np.array([1.0, 0.0]), atol=1e-9)
+    other = write("truth.csv", data.true() + 2.0, step=data.step)  # a truth that is named counts
+    assert_allclose(cs.read("est.csv", other, state=data.state, filter="one").error[0], data.error + 2.0)
     with pytest.raises(cs.InputError, match=r"needs --truth FILE, .* or columns true_a, … beside the state"):
-        cs.read(write("est.csv", table.drop(columns="true_b")), state=["a", "b"])
+        cs.read(write("est.csv", table.drop(columns="true_b")), state=data.state)
 
 
 def test_motions_beside_their_truth_are_drives(inside):
@@ -357,7 +342,7 @@ def test_files_of_matlab_are_archives(n, inside):
     flat["covariances"] = given["covariances"][..., 0, 0] if n == 1 else given["covariances"]  # as MATLAB has it
     names = np.array([f"axis {i}" for i in range(n)], object)
     savemat("est.mat", flat | {"axes": names, "lengths": np.array([5, 4, 5, 3])})
-    np.savez("est.npz", **given, axes=[*names], lengths=[5, 4, 5, 3])  # type: ignore[arg-type]
+    np.savez("est.npz", **given, axes=[*names], lengths=[5, 4, 5, 3])
     own, npz = cs.read("est.mat"), cs.read("est.npz")
     for key in ("error", "covariance", "nees", "nis", "nis_dof", "t"):
         assert_array_equal(getattr(own, key), getattr(npz, key))
@@ -378,7 +363,7 @@ def test_what_a_file_of_matlab_may_hold(inside):
     with pytest.raises(cs.InputError, match=r"'covariances' has shape \(6, 1\): one run of one component has \(1, st"):
         cs.read("one.mat")
     savemat("one.mat", {"errors": np.ones((1, 6)), "covariances": np.ones((1, 6))})
-    assert cs.read("one.mat").error.shape == (1, 6, 1)  # type: ignore[union-attr]
+    assert cs.read("one.mat").error.shape == (1, 6, 1)
     Path("new.mat").write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(600))
     with pytest.raises(cs.InputError, match=r"new\.mat: is of MATLAB 7\.3; write it with save\(\.\.\., '-v7'\)"):
         cs.read("new.mat")
@@ -481,7 +466,7 @@ def test_motions_of_stretches_of_other_lengths_are_no_broken_filters(inside):
             Path(folder).mkdir(exist_ok=True)
             np.savetxt(f"{folder}/{name}.tum", values, fmt="%.17g")
     record = cs.read("est", truth="truth", relative=1, motions=True)
-    assert np.isfinite(record.error).all(axis=-1).sum() == 8 + 4  # type: ignore[arg-type]
+    assert np.isfinite(record.error).all(axis=-1).sum() == 8 + 4
     assert not any("broke down" in note for note in record.notes)
 
 
@@ -512,10 +497,10 @@ def test_a_chain_of_frames_is_composed(tmp_path):
     total = turned * base * mast
     expected, total = expected[both], total[both]
     [record] = read_recordings(bag, truth_topic="map:mast")  # the estimates are at the origin
-    assert_allclose(record.error[0, :, :3], expected, atol=1e-6)  # type: ignore[index]
-    assert_allclose(Rotation.from_rotvec(record.error[0, :, 3:]).as_matrix(), total.as_matrix(), atol=1e-9)  # type: ignore[index]
+    assert_allclose(record.error[0, :, :3], expected, atol=1e-6)
+    assert_allclose(Rotation.from_rotvec(record.error[0, :, 3:]).as_matrix(), total.as_matrix(), atol=1e-9)
     [back] = read_recordings(bag, truth_topic="mast:map")
-    assert_allclose(back.error[0, :, :3], -total.inv().apply(expected), atol=1e-6)  # type: ignore[index]
+    assert_allclose(back.error[0, :, :3], -total.inv().apply(expected), atol=1e-6)
     with pytest.raises(
         cs.InputError, match=r"map:arm: is no transform of /tf; .*base:mast, map:odom, odom:base, world"
     ):

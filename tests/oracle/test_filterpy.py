@@ -1,7 +1,5 @@
 """filterpy's filters, put behind the same interface, say what ours say."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,7 +8,6 @@ from estimates import apart
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter
 
-Small = Callable[..., cs.Scenario]
 MERWE = {"belief__sigma_points": {"alpha": 0.5, "beta": 2.0, "kappa": 1.0}}
 CASES = [
     ("ekf-xyz", "herath2007-xyz", {}),
@@ -23,7 +20,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("name, world, changes", CASES)
+@pytest.mark.parametrize(("name", "world", "changes"), CASES)
 def test_filterpy_agrees(small, name, world, changes):
     scenario = small(world, **changes)
     trial = cs.simulate(scenario, run=2)

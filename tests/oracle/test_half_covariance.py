@@ -1,7 +1,5 @@
 """Whole trials where a kernel could go wrong and small worlds would not tell: many landmarks, singular starts."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ import consistency as cs
 from consistency.bench.filters.kernel.linalg import ROUNDING
 from consistency.bench.filters.stepping import step_through
 
-Small = Callable[..., cs.Scenario]
 MANY = {"truth__landmarks__count": 600, "truth__steps": 25}
 
 
@@ -33,7 +30,7 @@ def both(name, scenario):
 
 
 @pytest.mark.parametrize(
-    "name, world",
+    ("name", "world"),
     [
         ("kf", "linear-gaussian"),
         ("ekf-xyz", "herath2007-xyz"),

@@ -5,7 +5,6 @@ map together can be shifted in the plane and turned, and no observation tells; h
 the robot is known. So three singular values of M are zero unless the filter gains information that is not there.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,6 @@ from consistency.bench.filters.compiled import problem_for
 from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.types import Observation
 
-Small = Callable[..., cs.Scenario]
 WORLDS = {"xyz": "herath2007-xyz", "uvd": "herath2007-wide-baseline"}
 ZERO, CLEAR = 1e-13, 1e-6  # singular values, relative to the largest
 
@@ -83,7 +81,7 @@ def unobserved(name, scenario):
     return int(zero.sum())
 
 
-@pytest.mark.parametrize("method, directions", [("ekf", 2), ("fej-ekf", 3), ("oc-ekf", 3), ("ideal-ekf", 3)])
+@pytest.mark.parametrize(("method", "directions"), [("ekf", 2), ("fej-ekf", 3), ("oc-ekf", 3), ("ideal-ekf", 3)])
 @pytest.mark.parametrize("sensor", ["xyz", "uvd"])
 def test_unobserved_directions(small, tilted, method, sensor, directions):
     """Three where the filter is a remedy; the EKF believes that it sees the heading."""

@@ -1,7 +1,5 @@
 """Sub-maps: one large filter to first order after each join, and less certain between them."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -10,7 +8,6 @@ from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook.submaps import SubmapKalman, joined_map
 from consistency.bench.protocols import Problem
 
-Small = Callable[..., cs.Scenario]
 STEPS = 20
 WORLDS = {True: "herath2007-wide-baseline", False: "herath2007-xyz"}
 

@@ -1,6 +1,5 @@
 """Compiled filters against their textbook twins, and the Kalman filter against batch least squares."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,6 @@ from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook.ukf import CUBATURE, sigma_points
 from consistency.bench.simulation import planned_path
 
-Small = Callable[..., cs.Scenario]
 MERWE = {"belief__sigma_points": {"alpha": 0.5, "beta": 2.0, "kappa": 1.0}}
 EIGHT = {"shape": "figure-of-eight", "radius": 2.0, "start": (0.0, 0.0), "heading": 0.3, "speed": 0.8}
 
@@ -53,7 +51,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("name, world, steps, changes", CASES)
+@pytest.mark.parametrize(("name", "world", "steps", "changes"), CASES)
 def test_kernel_equals_its_twin(small, name, world, steps, changes):
     scenario = small(world, truth__steps=steps, **changes)
     trial = cs.simulate(scenario, run=1)

@@ -1,7 +1,5 @@
 """Closed-form derivatives of every cost of the front-end against automatic differentiation, to 1e-8."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hyperdual import HyperDual, derivatives
@@ -17,7 +15,6 @@ from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches, Poin
 from consistency.stereo.visual_odometry.two_frame_cost import cost_derivatives as two_frame_derivatives
 from consistency.vision import RelativePose, StereoRig, register_svd, triangulate
 
-Array = np.ndarray[Any, Any]
 TOLERANCE = 1e-8  # of the largest entry
 K = np.array([[500.0, 1.5, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 RIG = StereoRig(K, K + np.diag([9.0, -7.0, 0.0]), rotation(0.04, 0.016, 0.014), [0.385, 0.007, 0.02], (640, 480))

@@ -1,7 +1,5 @@
 """Registrations and refinement against SciPy's."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from rigs import MOTION, RIG
@@ -18,8 +16,6 @@ from consistency.vision import (
     triangulate,
     triangulation_covariance,
 )
-
-Array = np.ndarray[Any, Any]
 
 
 def frames(rng, n, noise):

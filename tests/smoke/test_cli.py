@@ -4,7 +4,6 @@ import json
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -17,7 +16,6 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.scenario import data_folder
 
-ROOT = Path(__file__).parents[2]
 RUNS = 6
 
 

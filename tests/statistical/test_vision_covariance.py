@@ -4,8 +4,6 @@ The pixel noise is so small that second-order terms stay far below the sampling 
 unweighted registration needs less of it: at 0.05 px it already fails this test, in the directions that it fixes best.
 """
 
-from typing import Any
-
 import numpy as np
 import pytest
 from rigs import RIG
@@ -24,7 +22,6 @@ from consistency.vision import (
 
 pytestmark = pytest.mark.slow
 
-Array = np.ndarray[Any, Any]
 SAMPLES, CHUNK = 100_000, 10_000
 FALSE_ALARM = 1e-5  # of each test
 NOISE, LESS = 0.05, 0.01  # px

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numba
 import numpy as np
@@ -11,7 +11,6 @@ import pytest
 from numba import types
 from numba.core import compiler, ir, targetconfig
 from numba.core.registry import cpu_target
-from numba.core.runtime import context as runtime
 from numba.core.types import functions
 
 import consistency as cs
@@ -21,11 +20,9 @@ from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.trial_work import Simulated, TrialWork
 from consistency.bench.simulation.world import World
 
-Counts = list[Any]
 stack = targetconfig.ConfigStack
 Flags = compiler.Flags
 numba_ir = ir
-Runtime = runtime.NRTContext
 
 
 class Small(NamedTuple):

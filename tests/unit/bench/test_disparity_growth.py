@@ -1,7 +1,5 @@
 """Noise of a disparity that grows with it: the curve, what the world does, what a file may say, and old hashes."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scenario_files import load, put
@@ -11,7 +9,6 @@ from consistency.bench.scenario import DisparityGrowth
 from consistency.bench.simulation import World
 from consistency.scenario import scenario_text
 
-Small = Callable[..., cs.Scenario]
 GROWTH = {"disparity": [3.0, 5.0, 12.0], "ratio": [0.5, 1.0, 2.4]}
 WIDE = {"truth__sensor__disparity": (1e-6, 1e6)}
 HASHES = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -21,7 +20,6 @@ from consistency.bench.simulation.sensing import purpose_of
 from consistency.bench.store.log import read_log
 from consistency.bench.store.trial_rows import observations_table
 
-Small = Callable[..., cs.Scenario]
 CALLS = []  # labels of effects in the order in which they were applied
 DRAWN = {}  # first numbers of each effect, by label
 FIRST = {"kind": "draw", "name": "first"}
@@ -226,7 +224,7 @@ def test_effects_are_applied_in_order_and_before_the_search_range(small):
     assert np.array_equal(found.landmark, plain.landmark[(expected >= 10.0) & (expected <= 20.0)])
 
 
-@pytest.mark.parametrize("noise_on, times", [("odometry", 0), ("motion", 3)])
+@pytest.mark.parametrize(("noise_on", "times"), [("odometry", 0), ("motion", 3)])
 def test_what_is_the_same_in_every_run_is_done_once(small, noise_on, times):
     scale = {"kind": "scale", "factor": 2.0}
     world = World(with_effects(small, scale, truth__motion__noise_on=noise_on).truth)

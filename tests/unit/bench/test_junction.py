@@ -1,7 +1,5 @@
 """Occlusion junctions: where they are seen, and that they are on the two edges and on no rigid point."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from consistency.bench.scenario.effects.junction import Crossings
 from consistency.bench.simulation import World
 from consistency.referee.geometry import rotation
 
-Small = Callable[..., cs.Scenario]
 EFFECT = {"kind": "junction", "count": 12, "seed": 5, "behind_m": [1.0, 3.0], "edge_m": 2.0, "far_share": 0.5}
 STEPS = 250
 
@@ -97,7 +94,7 @@ def test_the_matcher_takes_one_edge_or_the_other(share):
     assert np.all(edges.by_far == (share == 1.0))
 
 
-@pytest.mark.parametrize("x, seen", [(3.0, True), (1.0, False)])
+@pytest.mark.parametrize(("x", "seen"), [(3.0, True), (1.0, False)])
 def test_the_far_edge_must_be_behind_the_near_one(x, seen):
     _, effect, context = world_of()
     edges = Crossings(np.array([[2.0, 0.0, 0.2]]), np.array([[x, 0.0, 0.3]]), np.array([[0.0, 1.0]]), np.zeros(1, bool))

@@ -1,7 +1,5 @@
 """Bias maps and what makes them: a table over the image, an effect, a belief, and the distortion of two cameras."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scenario_files import load, put
@@ -15,7 +13,6 @@ from consistency.bench.simulation import World
 from consistency.bench.store.log import read_log
 from consistency.scenario import scenario_text
 
-Small = Callable[..., cs.Scenario]
 U, V = [-150.0, -40.0, 30.0, 160.0], [-100.0, 10.0, 90.0]
 D = [[0.5, -1.0, 0.2, 2.0], [0.0, 0.3, -0.4, 1.0], [-2.0, 0.7, 0.1, -0.6]]
 W = [[0.1, 0.0, 0.0, -0.3], [0.2, 0.4, 0.0, 0.0], [0.0, 0.0, -0.5, 0.0]]

@@ -2,7 +2,6 @@
 
 import shutil
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,6 @@ import tomli_w
 import consistency as cs
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.log import read_log
-
-Edit = Callable[[pd.DataFrame], pd.DataFrame]
-Small = Callable[..., cs.Scenario]
 
 
 @pytest.fixture(scope="module")
@@ -233,7 +229,9 @@ def test_an_error_while_writing_leaves_nothing(uvd, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("runs, seed, complaint", [(0, 0, "runs must be at least 1"), (1, -1, "seed must not be")])
+@pytest.mark.parametrize(
+    ("runs", "seed", "complaint"), [(0, 0, "runs must be at least 1"), (1, -1, "seed must not be")]
+)
 def test_counts_are_checked(uvd, tmp_path, runs, seed, complaint):
     with pytest.raises(cs.InputError, match=complaint):
         simulate_log(uvd, runs, seed, tmp_path / "log")

@@ -1,6 +1,5 @@
 """Runs are a function of (scenario, filter, seed, run) alone, and whatever a filter does is a result."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +12,6 @@ from consistency.bench.filters.stepping import run_filter
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.store.results import joined
 from consistency.bench.types import Trial
-
-Small = Callable[..., cs.Scenario]
 
 
 class Mine:
@@ -155,7 +152,7 @@ class Same(Mine):
 
 
 @pytest.mark.parametrize(
-    "options, complaint",
+    ("options", "complaint"),
     [
         ({"filters": ["ekf-xyz", "ekf-xyz"]}, "a filter is given twice: ekf-xyz"),
         ({"filters": ["ekf-xyz", Same()]}, "given twice: ekf-xyz"),
@@ -230,7 +227,7 @@ def test_resuming_with_fewer_runs_than_there_are_is_refused(uvd, ten):
 
 
 @pytest.mark.parametrize(
-    "change, key",
+    ("change", "key"),
     [({"seed": 4}, "seed"), ({"filters": ["ekf-uvd"]}, "filter"), ({"truth__steps": 61}, "scenario")],
 )
 def test_resuming_something_else_is_refused(small, ten, tmp_path, change, key):

@@ -1,12 +1,9 @@
 """Named trajectories: what they are called for is what is driven."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.scenario import Truth
 from consistency.bench.simulation import planned_controls, planned_path
 
 V, DT = 0.7, 0.1  # no lap below is a whole number of steps of 0.1 s
@@ -28,8 +25,6 @@ LENGTH = {
     "waypoints": float(np.hypot(*np.diff(CORNERS, axis=0).T).sum()),
 }
 TURNED = {"circle": 1, "figure-of-eight": 0, "rounded-rectangle": 1, "corridor": 1, "waypoints": 1}  # turns a lap
-
-Drive = Callable[..., Truth]
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,5 @@
 """Sensors of landmarks in the plane: models, scenarios, logs, maps."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +26,6 @@ from consistency.bench.store.trial_rows import is_flat
 from consistency.diagnostics import map_score
 from consistency.referee.system.provenance import manifest_of
 
-Small = Callable[..., cs.Scenario]
 STEP = 1e-6
 POINTS = np.array([[2.0, 0.5], [-1.5, 0.8], [-1.2, -2.0], [0.3, -0.4]])
 

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +26,6 @@ from consistency.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import short
 
-Small = Callable[..., cs.Scenario]
 RUNS, SEED = 8, 60_321
 
 
@@ -61,7 +59,7 @@ def test_all_of_q_leaves_out_a_noise_that_is_zero(uvd):
 
 
 @pytest.mark.parametrize(
-    "text, said",
+    ("text", "said"),
     [
         ("Q,P0", "unknown noise 'P0'; there are Q, Q.v, Q.omega, R, R.u, R.v, R.d"),
         ("Q,Q.v", "'Q.v' is named twice"),
@@ -260,7 +258,7 @@ def test_the_words_say_what_came_of_it(tuned):
 
 
 @pytest.mark.parametrize(
-    "status, is_said",
+    ("status", "is_said"),
     [("overconfident", True), ("biased", True), ("failed", True), ("undecided", False), ("consistent", False)],
 )
 def test_a_fault_that_is_left_is_not_blamed_on_the_noises(tuned, status, is_said):
@@ -277,7 +275,7 @@ def with_interval(tuned, low, high, edge=0):
 
 
 @pytest.mark.parametrize(
-    "low, high, edge, said",
+    ("low", "high", "edge", "said"),
     [
         (0.0, 0.004, 0, ", at most x0.004 with 95 %"),
         (3.0, np.inf, 0, ", at least x3.00 with 95 %"),
@@ -332,7 +330,7 @@ SCENARIO = "linear-gaussian"
 
 
 @pytest.mark.parametrize(
-    "arguments, said",
+    ("arguments", "said"),
     [
         ((), "give either a SCENARIO or --log DIR"),
         ((SCENARIO, "--log", "x"), "give either a SCENARIO or --log DIR"),

@@ -4,7 +4,6 @@ import json
 import re
 import runpy
 import secrets
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +94,6 @@ def test_the_table_declares_what_the_examples_do():
 
 STEPS = 80
 SIGMA = np.array([0.2, 0.1, 0.05, 0.01, 0.02, 0.01])
-Make = Callable[[pytest.MonkeyPatch], list[str]]
 
 
 def poses(rng):

@@ -2,9 +2,6 @@
 
 import json
 import runpy
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,7 +25,6 @@ from consistency.referee.geometry.groups import se3_log, spatial_error
 from consistency.referee.readers.truth_matching import associate, common_times
 from consistency.referee.verdicts.sources import analyse
 
-ROOT = Path(__file__).parents[3]
 POSE_COLUMNS = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]
 coordinate = st.floats(-50, 50).map(lambda value: round(value, 9))  # logm itself fails on subnormal numbers
 angle = st.floats(-3.1, 3.1).map(lambda value: round(value, 9))
@@ -277,7 +273,7 @@ def test_a_failing_trajectory_and_warnings(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "spatial_kind, planar_kind", [("so3", "so2"), ("so3-body", "so2"), ("left", "left"), ("right", "right")]
+    ("spatial_kind", "planar_kind"), [("so3", "so2"), ("so3-body", "so2"), ("left", "left"), ("right", "right")]
 )
 def test_a_planar_robot_in_messages_of_six(spatial_kind, planar_kind, tmp_path):
     """Zeros for z, roll and pitch: with three axes the errors are those of the planar poses."""
@@ -356,9 +352,6 @@ def poses(runs=3, steps=5):
     return est, true
 
 
-Edit = Callable[[pd.DataFrame], Any]
-
-
 def write(at, edit=None, edit_truth=None):
     for name, table, change in zip(("est.csv", "truth.csv"), poses(), (edit, edit_truth), strict=True):
         changed = change(table) if change else None
@@ -419,7 +412,7 @@ def set_cell(row, column, value):
 
 
 @pytest.mark.parametrize(
-    "row, column, value, reason",
+    ("row", "column", "value", "reason"),
     [
         (7, "x", np.nan, "estimate is not finite"),
         (7, "heading", np.inf, "estimate is not finite"),
@@ -578,7 +571,7 @@ def example(word):
 
 
 @pytest.mark.parametrize(
-    "change, status",
+    ("change", "status"),
     [
         (None, "consistent"),
         (("believed = 1.0", "believed = 0.5"), "overconfident"),

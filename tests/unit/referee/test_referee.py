@@ -6,7 +6,6 @@ would be missed: together under 1 false failure in 1,000 runs of this file.
 """
 
 import re
-from collections.abc import Callable
 from itertools import combinations
 from typing import Any
 
@@ -60,7 +59,7 @@ def within(count, total, rate, sigmas=5.0):
 # --- planning ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ratio, runs", [(1.2, 260), (1.5, 53), (2.0, 18)])
+@pytest.mark.parametrize(("ratio", "runs"), [(1.2, 260), (1.5, 53), (2.0, 18)])
 def test_required_runs_are_the_planned_ones(ratio, runs):
     """Worked out outside this project: 3 degrees of freedom, two-sided 5 %, power 0.95."""
     assert required_runs(3, ratio) == runs
@@ -478,9 +477,6 @@ def wrong_for_a_moment(case, rng):
     quantiles = stats.chi2(DOF).ppf((np.arange(RUNS) + 0.5) / RUNS)
     case["w"][:, 17] = np.sqrt(3.0 * quantiles)[:, None] * directions / np.linalg.norm(directions, axis=1)[:, None]
     return case
-
-
-Fault = Callable[[Case, np.random.Generator], Case]
 
 
 def changed(where=..., factor=1.0, shift=0.0):

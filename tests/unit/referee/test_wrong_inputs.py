@@ -2,9 +2,6 @@
 
 import os
 import shutil
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,7 +10,6 @@ from command import refused
 from drives import write_states
 from test_recording import POSE_COLUMNS, archive, poses, set_cell, write
 
-Make = Callable[[Path], Any]
 TUM = "0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n0.2 2 0 0 0 0 0 1\n"
 P36 = "".join(f"{t} {' '.join(str(float(v)) for v in np.eye(6).ravel())}\n" for t in (0.0, 0.1, 0.2))
 EST = ("est.csv", "--truth", "truth.csv")

@@ -1,7 +1,5 @@
 """The parts of the experiment on real images that need no images, and its figures."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scripts
@@ -11,7 +9,6 @@ from consistency.vision import RelativePose
 
 figures = scripts.experiment("front_end_figures")
 
-ROOT = Path(__file__).parents[3]
 META = """
 	.pose_fixedFrame_robotFrame.data:
 		.orientation: -0.50.5-0.50.5

@@ -1,7 +1,5 @@
 """Relative poses, their angles, and covariances through composition."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,7 +10,6 @@ from consistency.referee.errors import InputError
 from consistency.stereo.visual_odometry.relative_pose import rotation_derivatives
 from consistency.vision import GimbalLockError, RelativePose, compose, invert, register_svd, registration_covariance
 
-Array = np.ndarray[Any, Any]
 A = np.array([0.3, -0.2, 0.9, 0.5, -0.7, 2.0])
 B = np.array([-1.0, 0.4, 2.0, -1.2, 0.3, -2.8])
 LOCKED = RelativePose(Rotation.from_euler("ZYX", [0.3, np.pi / 2, 0.1]).as_matrix(), np.zeros(3))
@@ -81,7 +78,7 @@ def test_gimbal_lock_is_named(rng):
 
 
 @pytest.mark.parametrize(
-    "R, t, message",
+    ("R", "t", "message"),
     [
         (np.eye(2), np.zeros(3), "R: shape"),
         (np.eye(3), np.zeros(2), "t: shape"),

@@ -1,7 +1,5 @@
 """Maximum-likelihood poses: what they gain, robust losses, and refusals."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from rigs import MOTION, RIG
@@ -22,7 +20,6 @@ from consistency.vision import (
     triangulation_covariance,
 )
 
-Array = np.ndarray[Any, Any]
 S = 0.25 * np.eye(4)
 
 

@@ -1,7 +1,5 @@
 """Registrations: exact recovery, the misprints of Horn's method, consensus among outliers, refusals."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -25,7 +23,6 @@ from consistency.vision import (
     registration_covariance,
 )
 
-Array = np.ndarray[Any, Any]
 BOTH = pytest.mark.parametrize("register", [register_svd, register_horn])
 
 
@@ -77,7 +74,7 @@ DEGENERATE = {
 }
 
 
-@pytest.mark.parametrize("points, message", DEGENERATE.values(), ids=DEGENERATE.keys())
+@pytest.mark.parametrize(("points", "message"), DEGENERATE.values(), ids=DEGENERATE.keys())
 def test_points_that_fix_no_motion(points, message, rng):
     moved = MOTION.apply(points)
     calls = [

@@ -1,7 +1,5 @@
 """The stereo rig: projection, triangulation, and what they refuse."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +9,6 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.vision import PointError, StereoRig, triangulable, triangulate, triangulation_covariance
 
-Array = np.ndarray[Any, Any]
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 SIZE = (640, 480)
 TURN, BASE = rotation(0.04, 0.016, 0.014), np.array([0.385, 0.007, 0.0])
@@ -46,7 +43,7 @@ def test_no_points_are_no_error():
 
 
 @pytest.mark.parametrize(
-    "uv, why",
+    ("uv", "why"),
     [
         ([400.0, 240.0, 400.0, 240.0], "zero disparity: at infinity"),
         ([380.0, 240.0, 400.0, 240.0], "negative disparity: behind"),
@@ -107,7 +104,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize("change, message", BAD)
+@pytest.mark.parametrize(("change", "message"), BAD)
 def test_a_rig_that_is_none(change, message):
     good = {"K_left": K, "K_right": K, "R": TURN, "t": BASE, "image_size": SIZE}
     with pytest.raises(InputError, match=message):
@@ -122,7 +119,7 @@ def test_a_rig_cannot_be_changed():
 
 
 @pytest.mark.parametrize(
-    "S, message",
+    ("S", "message"),
     [
         (np.eye(3), r"S_uv: shape \(3, 3\)"),
         (np.diag([1.0, 1.0, 1.0, -0.1]), "not positive semidefinite"),

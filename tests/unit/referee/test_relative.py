@@ -22,7 +22,7 @@ from consistency.referee.readers.pipeline.relative_motions import windows_of
 from consistency.referee.readers.windows import Relative
 from consistency.referee.verdicts.baselines import baseline
 from consistency.referee.verdicts.compare_sources import compare_with
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.sources import judge_all
 
 GROUPS = tuple(world.SIGMA)
 SURE = 1e-5  # false-alarm rate of a verdict in a test
@@ -37,7 +37,7 @@ def statistics(stretches, size, motions):
 
 
 def verdict_of(stretches, size, motions):
-    return analyse([recorded(stretches, size, motions)])["log"]
+    return judge_all([recorded(stretches, size, motions)])["log"]
 
 
 def same(a, b):
@@ -112,7 +112,7 @@ def test_declared_windows_are_runs(rng):
     runs = [pose_stretch(rng, "SE(2)", 11, 5, 1.0, run) for run in range(3)]
     relative = replace(Relative(1, "step"), independent=True)
     record = world.relative_recording("log", "log", runs, AXES["SE(2)"], range(3), relative)
-    verdict = analyse([record])["log"]
+    verdict = judge_all([record])["log"]
     assert (verdict.runs, verdict.steps, verdict.unit) == (30, 1, "window")
     assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
 
@@ -127,17 +127,17 @@ def declared(rng, windows, steps=10):
 
 def test_few_windows_do_not_show_independence(rng):
     """Errors x9: found by 150 windows, and neither a fault nor an all-clear is said with 140."""
-    few = analyse([declared(rng, ENOUGH - 10)])["log"]
+    few = judge_all([declared(rng, ENOUGH - 10)])["log"]
     assert few.status == "undecided"
     assert few.faults == ()
     assert few.answers == ()
     assert few.reasons[0].startswith("undecided: 140 windows are too few windows to show independence, which takes 150")
     assert "the covariance ratio would be" in few.reasons[0]
     assert not few.equivalence.shown
-    enough = analyse([declared(rng, ENOUGH)])["log"]
+    enough = judge_all([declared(rng, ENOUGH)])["log"]
     assert enough.status == "overconfident"
     right = replace(declared(rng, 30), unshown="")
-    assert analyse([right])["log"].runs == 30
+    assert judge_all([right])["log"].runs == 30
     base = baseline([declared(rng, 50)], "log")
     with pytest.raises(cs.InputError, match="at least 8 runs"):
         compare_with(base, base, [])
@@ -148,7 +148,7 @@ def test_a_failed_window_stays_failed(rng):
     stretch.estimate[20] = np.nan
     relative = replace(Relative(1, "step"), independent=True)
     record = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), relative)
-    assert analyse([record])["log"].status == "failed"
+    assert judge_all([record])["log"].status == "failed"
 
 
 # --- files -----------------------------------------------------------------------------------------------
@@ -333,7 +333,7 @@ def test_motions_of_the_front_end_are_read_and_right(tmp_path, rng):
 
 
 @pytest.mark.parametrize(
-    "name, truth, size, count",
+    ("name", "truth", "size", "count"),
     [("kitti06_f0-50", "poses.txt", "0.5s", 10), ("euroc_static", "groundtruth_first97.csv", "1", 5)],
 )
 @pytest.mark.slow

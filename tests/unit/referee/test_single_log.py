@@ -26,7 +26,7 @@ from consistency.referee.diagnostics.questions.independence import ALIKE, ENOUGH
 from consistency.referee.diagnostics.questions.lost_runs import early_ends
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.sources import judge_all
 
 SETTINGS = Settings()
 SURE = 1e-5
@@ -121,12 +121,12 @@ def poses(path, e):
 def test_relative_poses_are_named_where_they_would_help(tmp_path, rng):
     file = poses(tmp_path / "one.csv", errors(rng, 0.8, 300, 3))
     recordings = read_recordings(file, tmp_path / "truth.csv")
-    verdict = analyse(recordings, settings=Settings(SURE))["one"]
+    verdict = judge_all(recordings, settings=Settings(SURE))["one"]
     assert "--relative 10s" in verdict.reasons[-1]
     vector = read_recordings(file, tmp_path / "truth.csv", state=["x", "y"])
-    assert "--relative" not in str(analyse(vector, settings=Settings(SURE))["one"].reasons)
+    assert "--relative" not in str(judge_all(vector, settings=Settings(SURE))["one"].reasons)
     gross = poses(tmp_path / "gross.csv", 100.0 * errors(rng, 0.0, 300, 3))
-    found = analyse(read_recordings(gross, tmp_path / "truth.csv"))["gross"]
+    found = judge_all(read_recordings(gross, tmp_path / "truth.csv"))["gross"]
     assert found.status == "overconfident"
     assert "--relative" not in str(found.reasons)
     assert any("the covariance ratio is" in reason for reason in found.reasons)
@@ -271,7 +271,7 @@ def test_the_rows_of_the_calibration(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "options, message",
+    ("options", "message"),
     [
         ({"split": "x"}, "--split x: must be a number of pieces, or 'auto'"),
         ({"split": "0"}, "--split 0: must be a number of pieces, or 'auto'"),
@@ -328,7 +328,7 @@ def test_independent_pieces_are_doubted_at_the_stated_rate(count, rng):
     assert doubted <= stats.binom.isf(SURE, 400, 0.005)
 
 
-@pytest.mark.parametrize("memory, count", [(0.5, 400), (0.8, 150), (0.95, 150)])
+@pytest.mark.parametrize(("memory", "count"), [(0.5, 400), (0.8, 150), (0.95, 150)])
 def test_sizes_that_go_on_are_doubted(memory, count, rng):
     """Missed in fewer than 1e-5: signs are independent, sizes AR."""
     found = independence(calibration_windows.windows_of(rng, count, memory))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from draws import autoregression
+from draws import autoregression, identities
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import linalg
 from scipy.spatial.transform import Rotation
@@ -379,9 +379,12 @@ def test_a_frame_of_all_runs_leaves_no_bias_of_errors_that_cancel(rng):
 
 def test_what_a_frame_may_have_taken_is_added_before_consistent_is_said(rng):
     """60 runs of 20 steps know their ratio to 3 %: within 1.5 with a tenth added, and not with 0.4 added."""
-    error, P = rng.normal(size=(60, 20, 3)), np.broadcast_to(np.eye(3), (60, 20, 3, 3))
+    error = rng.normal(size=(60, 20, 3))
     for unseen, status in ((0.0, "consistent"), (0.1, "consistent"), (0.4, "undecided"), (1.0, "undecided")):
-        v = judge(Record("f", error, P, reduced=True, unavailable=ALL_BUT_SCALE, unseen=unseen), Settings(1e-6))
+        v = judge(
+            Record("f", error, identities(error), reduced=True, unavailable=ALL_BUT_SCALE, unseen=unseen),
+            Settings(1e-6),
+        )
         assert v.status == status
         assert "would probably decide" not in v.reasons[0]
     means = np.square(error).mean(axis=(1, 2))
@@ -460,20 +463,24 @@ def tables(folder, rng, runs, ratio, world, steps=20):
     return [str(folder / "est.csv"), "--truth", str(folder / "truth.csv")]
 
 
+def read(folder, align):
+    return cs.read(folder / "est.csv", truth=folder / "truth.csv", align=align)
+
+
 @pytest.mark.parametrize("step", [True, False])
 def test_files_are_aligned_whatever_numbers_them(step, tmp_path, rng):
     tables(tmp_path, rng, 24, 1.0, "each")
     if not step:
         for name in ("est.csv", "truth.csv"):
             pd.read_csv(tmp_path / name).drop(columns="step").to_csv(tmp_path / name, index=False)
-    record = cs.read(tmp_path / "est.csv", truth=tmp_path / "truth.csv", align="posyaw")
+    record = read(tmp_path, "posyaw")
     verdict = cs.judge(record, false_alarm=1e-6)
     assert verdict.status == "consistent"  # 480 steps: their ratio is 1 to 4 %, and shown to lie within 50 %
     assert verdict.align == record.align == "posyaw"
     assert "aligned by posyaw, a frame of 3 degrees of freedom for each run: what is constant" in verdict.reasons[0]
     assert {a.question for a in verdict.answers} == {"scale"}
     assert np.nanmean(record.nees) == pytest.approx(3.0, abs=0.6)  # 1,440 squares: 5 of its spread of 0.11
-    plain = cs.judge(cs.read(tmp_path / "est.csv", truth=tmp_path / "truth.csv", align="none"))
+    plain = cs.judge(read(tmp_path, "none"))
     assert plain.status == "overconfident"
     assert plain.align == "none"
 
@@ -482,18 +489,18 @@ def test_a_frame_of_each_run_hides_no_covariance_that_is_too_small(tmp_path, rng
     """White errors of twice the variance: found always; of a quarter: neither a fault nor consistent."""
     for ratio, status in ((2.0, "overconfident"), (0.25, "undecided")):
         tables(tmp_path, rng, 24, ratio, "each")
-        verdict = cs.judge(cs.read(tmp_path / "est.csv", truth=tmp_path / "truth.csv", align="posyaw"))
+        verdict = cs.judge(read(tmp_path, "posyaw"))
         assert verdict.status == status
         assert "such runs would probably decide" not in verdict.reasons[0]
     tables(tmp_path, rng, 24, 0.25, "all")
-    verdict = cs.judge(cs.read(tmp_path / "est.csv", truth=tmp_path / "truth.csv", align="posyaw-all"))
+    verdict = cs.judge(read(tmp_path, "posyaw-all"))
     assert verdict.status == "conservative"
     assert "a frame of 3 degrees of freedom for all runs" in verdict.reasons[0]
 
 
 def test_few_runs_are_said_to_be_few(tmp_path, rng):
     tables(tmp_path, rng, 5, 1.0, "all")
-    record = cs.read(tmp_path / "est.csv", truth=tmp_path / "truth.csv", align="posyaw-all")
+    record = read(tmp_path, "posyaw-all")
     assert record.reduced
     assert any("fewer than 20 runs do not show what the frame takes" in note for note in record.notes)
 
@@ -501,7 +508,7 @@ def test_few_runs_are_said_to_be_few(tmp_path, rng):
 def test_questions_without_an_answer_are_not_asked(rng):
     error = rng.normal(size=(30, 20, 3))
     error[:, 3] += 5.0
-    P = np.broadcast_to(np.eye(3), (30, 20, 3, 3))
+    P = identities(error)
     every = judge(Record("f", error, P))
     assert "bias in some step" in every.faults
     some = judge(Record("f", error, P, reduced=True, unavailable=ALL_BUT_SCALE))
@@ -514,8 +521,8 @@ def test_questions_without_an_answer_are_not_asked(rng):
 
 def test_where_the_scale_is_asked_alone_it_has_the_whole_rate(rng):
     """Its p value between half of the rate and the rate is a fault of the scale and not of a few runs."""
-    P = np.broadcast_to(np.eye(3), (40, 10, 3, 3))
     w = rng.normal(size=(40, 10, 3))
+    P = identities(w)
     for ratio in np.linspace(0.9, 1.5, 120):
         v = judge(Record("f", np.sqrt(ratio) * w, P, reduced=True, unavailable=ALL_BUT_SCALE), Settings())
         (answer,) = v.answers

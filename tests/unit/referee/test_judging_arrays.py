@@ -88,7 +88,7 @@ def test_a_masked_step_has_no_truth(error, tmp_path):
 
 def test_rows_are_runs_only_where_that_is_said(rng):
     error = independent(rng, 300, 1, 2)[:, 0]
-    P = np.broadcast_to(np.eye(2), (300, 2, 2))
+    P = identities(error)
     verdict = cs.judge(error, P, independent=True, false_alarm=SURE)
     assert (verdict.status, verdict.runs, verdict.steps) == ("consistent", 300, 1)
     with pytest.raises(cs.InputError, match=r"errors\[None\] and covariances\[None\] are one run of many"):

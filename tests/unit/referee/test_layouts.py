@@ -119,8 +119,8 @@ def matrices(pose, rows=3):
     return list(M[:, :rows].reshape(len(pose), -1).T)
 
 
-def tum(d, path="est.tum"):
-    return lines(path, "", [d.t, *d.own.T, *d.P.reshape(STEPS, 36).T], " ")
+def tum(d, path="est.tum", end="\n"):
+    return lines(path, "", [d.t, *d.own.T, *d.P.reshape(STEPS, 36).T], " ", end)
 
 
 # --- truth -------------------------------------------------------------------------------------------
@@ -571,7 +571,7 @@ def test_a_last_row_of_a_table_that_is_cut_short_is_left_out(case, inside):
 def test_whole_files_without_a_final_newline_are_read_whole(inside):
     d = drive()
     lines("truth.csv", NAMES, [d.t, *d.true.T], end="")
-    Path("est.tum").write_text(Path(tum(d)).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8")
+    tum(d, end="")
     record = cs.read("est.tum", truth="truth.csv")
     assert record.nees.shape == (1, STEPS)
     assert not any("has no end" in note for note in record.notes)
@@ -583,12 +583,10 @@ def test_a_last_line_of_nan_is_a_failure(inside):
     truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
     own, P = d.own.copy(), d.P.copy()
     own[-1] = np.nan
-    Path("est.tum").write_text(
-        Path(tum(d._replace(own=own))).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8"
-    )
+    tum(d._replace(own=own), end="")
     assert [failure.step for failure in cs.read("est.tum", truth=truth).failures] == [STEPS]
     P[-1, 5, 5] = 0.0
-    Path("est.tum").write_text(Path(tum(d._replace(P=P))).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8")
+    tum(d._replace(P=P), end="")
     assert not cs.read("est.tum", truth=truth).failures
     tum(d._replace(P=P))
     assert [failure.step for failure in cs.read("est.tum", truth=truth).failures] == [STEPS]

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from command import consistency
+from draws import identities
 from numpy.testing import assert_allclose
 from recorded import read_recordings
 
@@ -74,7 +75,7 @@ def test_names_on_the_command_line_may_have_spaces(tables, capsys):
 
 def test_a_step_without_a_measurement_has_no_covariance_to_check(rng):
     v = rng.normal(size=(400, 10, 2))
-    S = np.broadcast_to(np.eye(2), (400, 10, 2, 2)).copy()
+    S = identities(v).copy()
     v[:, 3] = S[:, 3] = np.nan
     assert assert_consistent(innovations=v, innovation_covariances=S, optimal_gain=True).status == "consistent"
 
@@ -169,7 +170,7 @@ def test_a_truth_the_wrong_way_round_is_named(tmp_path):
         tmp_path / "a.npz",
         estimates=own,
         truth=np.swapaxes(own, 0, 1),
-        covariances=np.broadcast_to(np.eye(2), (4, 9, 2, 2)),
+        covariances=identities(own),
     )
     with pytest.raises(cs.InputError, match=r"'estimates' \(4, 9, 2\); runs and steps are swapped in one"):
         cs.read(tmp_path / "a.npz")

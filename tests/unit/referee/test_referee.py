@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from draws import autoregression
+from draws import autoregression, identities
 from hypothesis import given
 from hypothesis import strategies as st
 from referee import judge
@@ -353,7 +353,7 @@ def test_coverage_interval_in_closed_form():
     """All or none within: ends at (alpha / 2)^(1 / N); else quantiles of Beta."""
     error = np.zeros((30, 1, 3))
     error[:, 0, 1], error[:9, 0, 2] = 5.0, 5.0
-    share, interval = coverage_interval(error, np.broadcast_to(np.eye(3), (30, 1, 3, 3)), confidence=0.9)
+    share, interval = coverage_interval(error, identities(error), confidence=0.9)
     end = 0.05 ** (1 / 30)
     assert share.tolist() == [1.0, 0.0, 0.7]
     assert interval[0] == pytest.approx([end, 1.0])
@@ -417,7 +417,7 @@ def verdict_of(case, **options):
     return judge(
         "f", error, np.broadcast_to(P * case.get("units", 1.0) ** 2, (runs, steps, 3, 3)).copy(), optimal_gain=True,
         nis=np.square(u).sum(axis=-1), nis_dof=np.full((runs, steps), 2), innovations=u,
-        innovation_covariances=np.broadcast_to(np.eye(2), (runs, steps, 2, 2)), axes=AXES,
+        innovation_covariances=identities(u), axes=AXES,
         **{"false_alarm": FALSE_ALARM, **options},
     )  # fmt: skip
 
@@ -569,7 +569,7 @@ def test_a_step_found_only_by_what_holm_leaves_is_still_named(fresh):
         w[..., 0] = np.sqrt(nees) * signs  # all on one axis
         w[:, 4, 0] *= np.sqrt(factor)
         w += 1e-3 * fresh.standard_normal(w.shape)
-        verdict = judge("f", w, np.broadcast_to(np.eye(3), (30, 10, 3, 3)))
+        verdict = judge("f", w, identities(w))
         if "scale in some step" in verdict.faults:
             break
     assert "scale in some step" in verdict.faults
@@ -581,10 +581,6 @@ def test_a_step_found_only_by_what_holm_leaves_is_still_named(fresh):
 # --- degenerate input ------------------------------------------------------------------------------------
 
 
-def stated(shape):
-    return np.broadcast_to(np.eye(shape[-1]), (*shape, shape[-1])).copy()
-
-
 @pytest.mark.parametrize("runs", [1, 2, 3, 4, 9, 10])
 @pytest.mark.parametrize("steps", [1, 2, 10])
 @pytest.mark.parametrize("n", [1, 3, 9])
@@ -592,7 +588,7 @@ def test_any_shape_is_judged(fresh, runs, steps, n):
     """54 shapes at 1e-7 each; a warning would be an error. Ten runs show no ratio of 1.5, unless steps are many."""
     e = fresh.standard_normal((runs, steps, n))
     for options in ({}, {"allow": "conservative"}, {"method": "bonferroni"}):
-        verdict = judge("f", e, stated(e.shape), false_alarm=1e-7, **options)
+        verdict = judge("f", e, identities(e), false_alarm=1e-7, **options)
         assert verdict.status in ("consistent", "undecided"), verdict.reasons
         assert verdict.p_value <= 1.0
 
@@ -600,21 +596,21 @@ def test_any_shape_is_judged(fresh, runs, steps, n):
 @pytest.mark.parametrize("runs", [5, 20])
 def test_no_error_at_all_is_conservative(runs):
     e = np.zeros((runs, 30, 3))
-    assert judge("f", e, stated(e.shape)).status == "conservative"
+    assert judge("f", e, identities(e)).status == "conservative"
     assert judge("f", nees=np.zeros((runs, 30)), dof=3).status == "conservative"
 
 
 @pytest.mark.parametrize("value", [0.1, 1.0, 10.0])
 def test_one_and_the_same_error_is_not_consistent(value):
     e = np.full((20, 30, 3), value)
-    assert judge("f", e, stated(e.shape)).status != "consistent"
+    assert judge("f", e, identities(e)).status != "consistent"
     assert judge("f", nees=np.full((20, 30), 3 * value), dof=3).status != "consistent"
 
 
 def test_a_perfect_axis_is_judged(fresh):
     e = fresh.standard_normal((30, 30, 3))
     e[..., 2] = 0.0
-    verdict = judge("f", e, stated(e.shape), axes=AXES)
+    verdict = judge("f", e, identities(e), axes=AXES)
     assert not verdict.consistent
     assert "scale of an axis" in verdict.faults
 
@@ -622,7 +618,7 @@ def test_a_perfect_axis_is_judged(fresh):
 @pytest.mark.parametrize("ratio", [1e-36, 1e-18, 1e18, 1e36])
 def test_a_covariance_out_of_all_proportion(fresh, ratio):
     e = fresh.standard_normal((20, 30, 3))
-    verdict = judge("f", e, stated(e.shape) / ratio)
+    verdict = judge("f", e, identities(e) / ratio)
     assert verdict.status == ("overconfident" if ratio > 1 else "conservative")
     assert max(len(number) for number in re.findall(r"[\d.e+-]+", verdict.reasons[0])) <= len("+1.0e+18")
 
@@ -630,7 +626,7 @@ def test_a_covariance_out_of_all_proportion(fresh, ratio):
 @pytest.mark.parametrize("what", ["error", "covariance", "nees"])
 def test_nothing_but_nan_is_failed(fresh, what):
     e = fresh.standard_normal((20, 30, 3))
-    arrays = {"error": e, "covariance": stated(e.shape), "nees": np.square(e).sum(axis=-1)}
+    arrays = {"error": e, "covariance": identities(e), "nees": np.square(e).sum(axis=-1)}
     arrays[what] = np.full_like(arrays[what], np.nan)
     verdict = judge("f", **arrays)
     assert verdict.status == "failed"

@@ -16,6 +16,7 @@ from consistency.referee.readers.windows import Relative, relative_of, windows
 from consistency.referee.verdicts.sources import judge_all
 
 GROUPS = tuple(world.SIGMA)
+NEXT = Relative(1, "step")
 
 
 def random_poses(rng, group, number):
@@ -82,7 +83,7 @@ def test_motions_make_up_the_covariance_of_a_window(group, rng):
 @pytest.mark.parametrize("group", GROUPS)
 def test_joint_covariance_of_two_poses_makes_up_that_of_a_window(group, rng):
     stretch, n, kind = pose_stretch(rng, group, 3, 5, 1.0, 0), len(AXES[group]), DECLARED[group]
-    found = windows_of(stretch, Relative(1, "step"))
+    found = windows_of(stretch, NEXT)
     T = matrices(stretch.estimate)
     for k in (1, 2):
 
@@ -193,7 +194,7 @@ def test_a_log_that_is_broken_from_the_start(rng):
         record = recorded([stretch], "1", False)
         assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
         assert not any("first order" in note for note in record.notes)
-        assert windows_of(stretch, Relative(1, "step")).track.t.tolist() == [stretch.t[0]]
+        assert windows_of(stretch, NEXT).track.t.tolist() == [stretch.t[0]]
         assert judge_all([record])["log"].status == "failed"
 
 
@@ -241,9 +242,9 @@ def test_windows_too_wide_for_first_order_are_named(rng):
 
 def test_a_cross_covariance_that_is_not_finite_breaks_the_window_that_ends_there(rng):
     stretch = pose_stretch(rng, "SE(2)", 8, 5, 1.0, 0)
-    whole = windows_of(stretch, Relative(1, "step"))
+    whole = windows_of(stretch, NEXT)
     stretch.cross[4, 2, 0] = np.inf
-    found = windows_of(stretch, Relative(1, "step"))
+    found = windows_of(stretch, NEXT)
     assert_array_equal(found.t, stretch.t[1:5])
     assert_array_equal(found.covariance[:3], whole.covariance[:3])
     assert np.isnan(found.covariance[3]).all()
@@ -267,7 +268,7 @@ def test_poses_need_a_cross_covariance_of_the_very_next_row(rng):
     with pytest.raises(cs.InputError, match=r"^row 2: --relative 2: the window spans 2 rows, .* reaches one row back"):
         windows_of(stretch, Relative(2, "step"))
     with pytest.raises(cs.InputError, match="poses: --relative: covariances of two poses do not tell"):
-        windows_of(replace(stretch, cross=None), Relative(1, "step"))
+        windows_of(replace(stretch, cross=None), NEXT)
 
 
 def test_runs_have_windows_by_their_times_where_those_are_known(rng):

@@ -50,6 +50,12 @@ def covariance_of_left_out(a, b):
     return (N - 1) ** 2 / N * float(np.cov(a, b, ddof=1)[0, 1])
 
 
+def doubt(means):
+    """Variance of log nu by the jackknife, which is at least 2 / N."""
+    left_out = [log_nu_of_spread(np.delete(means, i)) for i in range(len(means))]
+    return max(covariance_of_left_out(left_out, left_out), 2.0 / len(means))
+
+
 def gamma_shape(means):
     """log of the most likely shape and its standard error, from the curvature of the likelihood by differences."""
 
@@ -111,7 +117,7 @@ def tails(ratio, k, spread):
     return float(above), float(stats.t.cdf(stats.norm.ppf(stats.chi2.cdf(k * ratio, k)), spread))
 
 
-def gamma_means(rng, runs, nu, ratio=1.0):
+def gamma_means(rng, runs, nu=3.0, ratio=1.0):
     return ratio * rng.chisquare(nu, runs) / nu
 
 
@@ -275,10 +281,8 @@ def test_ratio_interval_from_twenty_runs_on(confidence):
     rng = np.random.default_rng(7)
     means = gamma_means(rng, 30, 6.0, 1.8)
     N = len(means)
-    left_out = [log_nu_of_spread(np.delete(means, i)) for i in range(N)]
-    variance = max(covariance_of_left_out(left_out, left_out), 2.0 / N)
     nu = np.exp(log_nu_of_spread(means)) / (1.0 + means.var(ddof=1) / means.mean() ** 2 / N)
-    tail = stats.norm.sf(stats.t.isf((1 - confidence) / 2, 2.0 / variance))
+    tail = stats.norm.sf(stats.t.isf((1 - confidence) / 2, 2.0 / doubt(means)))
     value, low, high = ratio_interval(means, 3, confidence)
     assert value == pytest.approx(means.mean())
     assert low == pytest.approx(value * N * nu / stats.chi2.isf(tail, N * nu), rel=1e-6)
@@ -290,8 +294,7 @@ def test_upper_end_is_by_the_spread_of_means_whose_ratio_it_is(size):
     """High enough that the test of Y / high, without its standard errors, just finds it; the same in any unit."""
     means = size * gamma_means(np.random.default_rng(3), 40, 60.0)
     N, (value, _, high) = 40, ratio_interval(means, 3)
-    left_out = [log_nu_of_spread(np.delete(means, i)) for i in range(N)]
-    tail = stats.norm.sf(stats.t.isf(0.025, 2.0 / max(covariance_of_left_out(left_out, left_out), 2.0 / N)))
+    tail = stats.norm.sf(stats.t.isf(0.025, 2.0 / doubt(means)))
     log_nu = log_nu_of_spread(means) - np.log1p(means.var(ddof=1) / value**2 / N)
     k = N * max(3.0, np.exp(at_most_skewness(log_nu, value / high, 3)))
     assert high == pytest.approx(value * k / stats.chi2.ppf(tail, k), rel=2e-3)
@@ -368,13 +371,6 @@ def test_means_of_any_size_have_an_interval(size):
     assert ratio_interval(all_, 3).low == pytest.approx(size * ratio_interval(np.ones(30), 3).low)
 
 
-# --- is a right scale shown, and only a right one -------------------------------------------------------------
-
-
-def means_of(rng, runs, nu=3.0, ratio=1.0):
-    return ratio * rng.chisquare(nu, runs) / nu
-
-
 # --- two one-sided tests --------------------------------------------------------------------------------
 
 
@@ -382,7 +378,7 @@ def means_of(rng, runs, nu=3.0, ratio=1.0):
 @pytest.mark.parametrize("ratio", [0.6, 1.0, 1.4])
 def test_by_hand_below_twenty_runs(detect, ratio):
     """Chi-square of N n degrees of freedom at both ends of the interval."""
-    n, means = 3, means_of(np.random.default_rng(21), 19, ratio=ratio)
+    n, means = 3, gamma_means(np.random.default_rng(21), 19, ratio=ratio)
     k, total, d = 19 * n, n * means.sum(), max(detect, 1 / detect)
     too_large, too_small = stats.chi2.cdf(total / d, k), stats.chi2.sf(total * d, k)
     both = equivalence(means, n, 50, Settings(detect=detect))
@@ -396,7 +392,7 @@ def test_by_hand_below_twenty_runs(detect, ratio):
 @pytest.mark.parametrize("allow", [None, "conservative"])
 @pytest.mark.parametrize("ratio", [0.72, 1.0, 1.35])
 def test_by_the_test_of_means_from_twenty_runs_on(ratio, allow):
-    means = means_of(np.random.default_rng(22), 40, 8.0, ratio)
+    means = gamma_means(np.random.default_rng(22), 40, 8.0, ratio)
     result = equivalence(means, 2, 50, Settings(detect=1.4, allow=allow))
     below, above = scale_test(means / 1.4, 2, 50).below, scale_test(means * 1.4, 2, 50).above
     assert result.p_value == pytest.approx(below if allow else max(below, above))
@@ -419,7 +415,7 @@ def test_level_is_one_less_the_power():
 def test_a_ratio_at_the_end_is_seldom_called_equivalent(ratio, runs):
     """Fully dependent, 500 draws at 5 % (Student's t leaves up to .7 % more from 20 runs on)."""
     rng = np.random.default_rng(24)
-    shown = sum(equivalence(means_of(rng, runs, 3.0, ratio), 3, 50, Settings()).shown for _ in range(500))
+    shown = sum(equivalence(gamma_means(rng, runs, 3.0, ratio), 3, 50, Settings()).shown for _ in range(500))
     assert shown <= stats.binom.isf(SURE, 500, 0.057)
 
 
@@ -446,7 +442,7 @@ def test_nothing_is_shown_of_nothing():
 def test_runs_that_would_decide_by_hand():
     """2 / nu ((z + z') / distance)^2, to the nearer of 'shown' and 'at fault'."""
     z = stats.norm.ppf
-    means = means_of(np.random.default_rng(27), 40)
+    means = gamma_means(np.random.default_rng(27), 40)
     for ratio, allow, expected in (
         (1.0, None, 2 / 3 * (2 * z(0.9) / np.log(1.5)) ** 2),
         (1.2, None, 2 / 3 * (2 * z(0.9) / np.log(1.5 / 1.2)) ** 2),
@@ -475,7 +471,7 @@ def test_no_advice_where_there_is_none():
 
 def test_what_may_be_conservative_is_far_from_the_end():
     """One-sided, a ratio of .7 is farther from 1.5 than one of 1; it is no fault, and takes fewer runs to show."""
-    z, means = stats.norm.ppf, means_of(np.random.default_rng(28), 40)
+    z, means = stats.norm.ppf, gamma_means(np.random.default_rng(28), 40)
     nu = scale_test(0.7 * means / means.mean(), 3, 1, gaussian=False).effective_dof
     result = equivalence(0.7 * means / means.mean(), 3, 1, Settings(allow="conservative", power=0.999))
     assert result.runs == int(np.ceil(2 / nu * (2 * z(0.999) / np.log(1.5 / 0.7)) ** 2))
@@ -488,7 +484,7 @@ def test_what_may_be_conservative_is_far_from_the_end():
 @pytest.mark.parametrize("allow", [None, "conservative"])
 def test_by_betting(allow, ratio):
     """The e-process of Y / d against 'none is too large', that of Y d against 'none is too small'."""
-    means, d = means_of(np.random.default_rng(29), 60, 20.0, ratio), 1.6
+    means, d = gamma_means(np.random.default_rng(29), 60, 20.0, ratio), 1.6
     result = equivalence_by_betting(means, 3, Settings(detect=d, allow=allow))
     too_large, too_small = ever(e_process(means / d, 3).down), ever(e_process(means * d, 3).up)
     assert (too_large < too_small) == (ratio < 1)
@@ -557,7 +553,7 @@ def test_innovations_of_nearly_the_stated_size_are_tolerated():
 
 
 def pilot(runs=40, nu=20.0, seed=91):
-    return np.random.default_rng(seed).chisquare(nu, runs) / nu
+    return gamma_means(np.random.default_rng(seed), runs, nu)
 
 
 def chi_square_power(k, ratio, tail):

@@ -7,6 +7,7 @@ import calibration_windows
 import numpy as np
 import pandas as pd
 import pytest
+from draws import identities
 from numpy.testing import assert_array_equal
 from recorded import read_recordings
 from scipy import signal, stats
@@ -34,7 +35,7 @@ SURE = 1e-5
 
 def log_of(rng, rho, steps, n=3, ratio=1.0):
     e = np.sqrt(ratio) * errors(rng, rho, steps, n)[None]
-    return judge(Record("log", e, np.broadcast_to(np.eye(n), (*e.shape, n))), Settings(SURE))
+    return judge(of(e), Settings(SURE))
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
@@ -97,12 +98,12 @@ def test_a_long_log_is_to_be_cut(rng):
     assert found.pieces == 50
     assert any("cut into 50 runs, this log would then probably decide" in reason for reason in verdict.reasons)
     cut = errors(rng, 0.5, 20_000, 3).reshape(50, 400, 3)
-    assert judge(Record("cut", cut, np.broadcast_to(np.eye(3), (50, 400, 3, 3))), Settings(SURE)).consistent
+    assert judge(of(cut), Settings(SURE)).consistent
 
 
 def test_several_runs_have_no_such_line(rng):
     e = errors(rng, 0.5, 400, 3).reshape(2, 200, 3)
-    verdict = judge(Record("two", e, np.broadcast_to(np.eye(3), (2, 200, 3, 3))), Settings(SURE))
+    verdict = judge(of(e), Settings(SURE))
     assert verdict.scale.within is None
     assert not any("decorrelate" in reason for reason in verdict.reasons)
 
@@ -145,12 +146,11 @@ def log(rng, steps, rho=0.0, constant=0.0, ratio=1.0):
     w[1:] *= np.sqrt(1.0 - rho**2)
     e = np.sqrt(1.0 - constant) * signal.lfilter([1.0], [1.0, -rho], w, axis=0)
     e += np.sqrt(constant) * rng.standard_normal((1, N))
-    P = np.broadcast_to(np.eye(N), (1, steps, N, N))
-    return Record("log", np.sqrt(ratio) * e[None], P, axes=("x", "y"), t=np.arange(float(steps)))
+    return Record("log", np.sqrt(ratio) * e[None], identities(e[None]), axes=("x", "y"), t=np.arange(float(steps)))
 
 
 def of(array, name="log"):
-    return Record(name, array, np.broadcast_to(np.eye(array.shape[-1]), (*array.shape, array.shape[-1])))
+    return Record(name, array, identities(array))
 
 
 def test_pieces_are_rows_of_the_log():

@@ -127,6 +127,11 @@ WRONG = {
     ),
     "NaN step": (csv(set_cell(4, "step", np.nan)), EST, "est.csv, line 6: column 'step': not a finite number"),
     "NaN truth": (csv(None, set_cell(4, "y", np.nan)), EST, "truth.csv, line 6: column 'y': not a finite number"),
+    "asymmetric": (
+        csv(lambda e: e.assign(P_y_x=e["P_xy"] + 0.01)),
+        EST,
+        "est.csv, line 2: the covariance is not symmetric",
+    ),
     "row twice": (csv(twice), EST, "est.csv, line 17: step 4 of run 0 is there twice"),
     "runs without run": (csv(columns("run")), EST, "is there twice; several runs need a column 'run'"),
     "time runs back": (

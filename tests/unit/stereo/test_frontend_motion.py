@@ -104,7 +104,7 @@ def test_unusable_images(wall, rng):
 
 
 @pytest.mark.parametrize(
-    "settings, said",
+    ("settings", "said"),
     [({"estimator": "icp"}, "one of reprojection"), ({"ratio": 0.0}, "ratio: 0.0"), ({"features": 1}, "at least 8")],
 )
 def test_unusable_settings(settings, said):
@@ -122,13 +122,13 @@ def test_without_opencv(monkeypatch, wall, rng):
 def test_a_dark_frame_is_bridged(wall, tmp_path):
     """Counted, with its reason, in the manifest and on the terminal; what follows is measured again."""
     cv2, folder = pytest.importorskip("cv2"), tmp_path / "seq"
-    scene.write_kitti(folder, scene.drive(9), wall)
-    dark = sorted((folder / "image_0").iterdir())[4]
+    scene.write_kitti(folder, scene.drive(14), wall)
+    dark = sorted((folder / "image_0").iterdir())[6]
     cv2.imwrite(str(dark), np.zeros(scene.SIZE[::-1], np.uint8))
     summary = write_frontend_log(folder, tmp_path / "log", FrontendOptions(max_landmarks=30))
     assert sum(bool(motion.fault) for motion in summary.motions) == 2
-    assert "2 of 8 motions could not be measured and are bridged" in "\n".join(summary.lines(tmp_path / "log"))
-    assert list(read_manifest(tmp_path / "log")["bridged"]) == ["3", "4"]
+    assert "2 of 13 motions could not be measured and are bridged" in "\n".join(summary.lines(tmp_path / "log"))
+    assert list(read_manifest(tmp_path / "log")["bridged"]) == ["5", "6"]
     (recording,) = read_recordings(
         tmp_path / "log/trajectory.tum", tmp_path / "log/truth.tum", tmp_path / "log/covariance.txt", "so3"
     )
@@ -237,7 +237,7 @@ def data(name):
 
 
 @pytest.mark.parametrize(
-    "name, truth, metres, degrees",
+    ("name", "truth", "metres", "degrees"),
     [("kitti06_f0-50", "poses.txt", 0.020, 0.03), ("euroc_static", "groundtruth_first97.csv", 0.001, 0.1)],
 )
 def test_real_images(name, truth, metres, degrees, rng):

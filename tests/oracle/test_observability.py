@@ -5,7 +5,11 @@ map together can be shifted in the plane and turned, and no observation tells; h
 the robot is known. So three singular values of M are zero unless the filter gains information that is not there.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,30 +17,32 @@ import pytest
 import consistency as cs
 from consistency.bench.filters.compiled import problem_for
 from consistency.bench.filters.textbook.basics import SlamState
-from consistency.bench.types import Observation
+from consistency.bench.types import Control, Observation, Trial
+from consistency.referee.types import Array
 
+Small = Callable[..., cs.Scenario]
 WORLDS = {"xyz": "herath2007-xyz", "uvd": "herath2007-wide-baseline"}
 ZERO, CLEAR = 1e-13, 1e-6  # singular values, relative to the largest
 
 
-def slam_of(state):
-    slam = state if isinstance(state, SlamState) else state.slam
+def slam_of(state: Any) -> SlamState:
+    slam: SlamState = state if isinstance(state, SlamState) else state.slam
     return slam
 
 
-def with_covariance(state, P):
+def with_covariance(state: Any, P: Array) -> Any:
     slam = replace(slam_of(state), P=P)
     return slam if isinstance(state, SlamState) else replace(state, slam=slam)
 
 
-def of_the_robot(state, block):
+def of_the_robot(state: Any, block: Array) -> Any:
     """The state with a covariance of the robot and none of the map."""
     P = np.zeros_like(slam_of(state).P)
     P[:3, :3] = block
     return with_covariance(state, P)
 
 
-def motion_jacobian(twin, state, control):
+def motion_jacobian(twin: Any, state: Any, control: Control) -> Array:
     """F (3, 3), from what it makes of two covariances."""
     noise, all_ = (slam_of(twin.predict(of_the_robot(state, P), control)).P for P in (np.zeros((3, 3)), np.eye(3)))
     square, F = (all_ - noise)[:3, :3], np.eye(3)
@@ -45,14 +51,14 @@ def motion_jacobian(twin, state, control):
     return F
 
 
-def split(state, observation):
+def split(state: Any, observation: Observation) -> tuple[Observation, Observation]:
     """What is seen of landmarks in the state, and of new ones."""
     known = np.isin(observation.landmarks, slam_of(state).landmarks)
     old, new = (Observation(observation.landmarks[rows], observation.z[rows]) for rows in (known, ~known))
     return old, new
 
 
-def observability_matrix(twin, trial, belief):
+def observability_matrix(twin: Any, trial: Trial, belief: Any) -> Array:
     """M over all landmarks of the trial, a row for each number that was observed."""
     state, Phi, blocks = twin.init(problem_for(twin, trial, belief)), np.eye(3), []
     for k in range(1, trial.steps + 1):
@@ -71,7 +77,7 @@ def observability_matrix(twin, trial, belief):
     return np.vstack([np.pad(block, ((0, 0), (0, width - block.shape[1]))) for block in blocks])
 
 
-def unobserved(name, scenario):
+def unobserved(name: str, scenario: cs.Scenario) -> int:
     """How many directions of robot and map M leaves at zero; all others are clearly not."""
     M = observability_matrix(cs.get_filter(name).textbook, cs.simulate(scenario, run=3), scenario.belief)
     assert M.shape[0] > M.shape[1] > 30
@@ -83,7 +89,7 @@ def unobserved(name, scenario):
 
 @pytest.mark.parametrize(("method", "directions"), [("ekf", 2), ("fej-ekf", 3), ("oc-ekf", 3), ("ideal-ekf", 3)])
 @pytest.mark.parametrize("sensor", ["xyz", "uvd"])
-def test_unobserved_directions(small, tilted, method, sensor, directions):
+def test_unobserved_directions(small: Small, tilted: dict[str, Any], method: str, sensor: str, directions: int) -> None:
     """Three where the filter is a remedy; the EKF believes that it sees the heading."""
     scenario = small(WORLDS[sensor], truth__sensor__mount=tilted, belief__sensor__mount=tilted)
     assert unobserved(f"{method}-{sensor}", scenario) == directions

@@ -1,5 +1,7 @@
 """What a report of several studies opens with: one picture and one table of all verdicts."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,7 @@ from painted import lines, panels
 import consistency as cs
 from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.sections import overview
+from consistency.bench.pages.sections.report_input import STEREO, Report
 from consistency.referee.document.blocks import Figure, Name, Status, Table
 from consistency.referee.document.wording import written
 from consistency.referee.show import pdf
@@ -20,7 +23,7 @@ FILTERS = ("ekf-uvd", "ekf-xyz")
 
 
 @pytest.fixture(scope="module")
-def report(uvd, tmp_path_factory):
+def report(uvd, tmp_path_factory) -> Report:
     """Two worlds with two filters, the second of them judged in the first world alone."""
     folder = tmp_path_factory.mktemp("overview") / "run"
     cs.run_trials(uvd, FILTERS, runs=4, seed=61, jobs=1).write(folder)
@@ -30,14 +33,14 @@ def report(uvd, tmp_path_factory):
     return replace(one, manifest={"studies": ["first", "second"]}, studies=(replace(study, name="first"), second))
 
 
-def opening(report):
-    picture, verdicts = overview.opening(report)
+def opening(report: Report) -> tuple[Figure, Table]:
+    _, picture, verdicts = overview.opening(report)
     assert isinstance(picture, Figure)
     assert isinstance(verdicts, Table)
     return picture, verdicts
 
 
-def test_every_verdict_is_in_the_table(report):
+def test_every_verdict_is_in_the_table(report: Report) -> None:
     [(_, rows)] = opening(report)[1].groups
     expected = [
         (study.name, track.name, track.verdict.status, f"{track.verdict.scale.mean_anees:.3g}")
@@ -50,7 +53,7 @@ def test_every_verdict_is_in_the_table(report):
     assert all(isinstance(row[1], Name) and isinstance(row[2], Status) for row in rows)
 
 
-def test_the_picture_has_every_ratio_in_the_row_of_its_world(report):
+def test_the_picture_has_every_ratio_in_the_row_of_its_world(report: Report) -> None:
     (axes,) = panels(opening(report)[0])
     worlds = [label.get_text() for label in axes.get_yticklabels()]
     assert worlds == ["first", "second"]
@@ -69,14 +72,14 @@ def test_the_picture_has_every_ratio_in_the_row_of_its_world(report):
     assert all(low < ratio.value < high for ratio in ratios.values())
 
 
-def test_what_is_tolerated_is_shaded(report):
+def test_what_is_tolerated_is_shaded(report: Report) -> None:
     (axes,) = panels(opening(report)[0])
     factor = report.studies[0].tracks[0].verdict.settings.factor
     (shade,) = [patch for patch in axes.patches if str(patch.get_label()).startswith("tolerated")]
     assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx((1.0 / factor, factor))
 
 
-def test_a_filter_without_a_ratio_stays_in_the_table(report):
+def test_a_filter_without_a_ratio_stays_in_the_table(report: Report) -> None:
     study = report.studies[1]
     blind = replace(study.tracks[0], verdict=replace(study.tracks[0].verdict, scale=None))
     changed = replace(report, studies=(report.studies[0], replace(study, tracks=(blind,))))
@@ -86,13 +89,13 @@ def test_a_filter_without_a_ratio_stays_in_the_table(report):
     assert tuple(map(written, verdicts.groups[0][1][-1][3:])) == ("–", "–")
 
 
-def test_one_study_opens_with_its_answer_alone(report):
+def test_one_study_opens_with_its_answer_alone(report: Report) -> None:
     single = replace(report, studies=report.studies[:1])
     assert overview.opening(single) == ()
     assert compose(single).opening == ()
 
 
-def test_the_opening_stands_before_the_contents_of_the_page(report):
+def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> None:
     document = compose(report)
     assert document.figures[0].title == overview.TITLE
     page = render(document)
@@ -103,21 +106,57 @@ def test_the_opening_stands_before_the_contents_of_the_page(report):
     assert page[:first].count('class="chart') == 1
 
 
-def test_the_opening_is_printed(report, monkeypatch):
+def test_the_opening_is_printed(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pdf.typst, "compile", lambda path, **_: Path(path).with_name("data.json").read_bytes())
     data = json.loads(pdf.render_pdf(compose(report)))
-    assert [block["kind"] for block in data["opening"]] == ["Figure", "Table"]
-    assert pdf.soft(overview.TITLE) == data["opening"][0]["title"]
+    assert [block["kind"] for block in data["opening"]] == ["Text", "Figure", "Table"]
+    assert pdf.soft(overview.TITLE) == data["opening"][1]["title"]
 
 
-def test_the_answer_counts_where_the_table_names(report):
+@pytest.fixture
+def of_paper(report: Report) -> Report:
+    """The same with the sensor of the paper as its first world."""
+    first, second = report.studies
+    manifest = report.manifest | {"date": "2026-01-02", "command": "consistency reproduce", "git_commit": "abc"}
+    return replace(report, manifest=manifest, studies=(replace(first, name=STEREO), second))
+
+
+def test_the_first_page_has_question_answer_curves_and_origin(of_paper: Report) -> None:
+    made = compose(of_paper)
+    question, curves, origin, picture, _ = made.opening
+    assert "Herath, Kodagoda and Dissanayake (2007)" in question.text
+    assert curves.title == "NEES over time at a baseline of 9 cm"
+    assert origin.text == "command: consistency reproduce; date: 2026-01-02; git commit: abc."
+    assert picture.title == overview.TITLE
+    statuses = {track.name: track.verdict.status for track in of_paper.studies[0].tracks}
+    assert made.answer.startswith("At a baseline of 9 cm, ")
+    assert all(name in made.answer and status in made.answer for name, status in statuses.items())
+
+
+def test_of_several_studies_the_paper_has_verdicts_and_their_first_figure(of_paper: Report) -> None:
+    made = compose(of_paper)
+    on_paper = {chapter.anchor: chapter.blocks for chapter in made.paper}
+    assert list(on_paper) == ["study-0", "study-1"]
+    assert [type(block).__name__ for block in on_paper["study-0"]] == ["Table", "Reasons", "Figure"]
+    assert not any(entry.others for entry in on_paper["study-0"][1].entries)
+    whole = {chapter.anchor: chapter.blocks for chapter in made.chapters}
+    assert {"verdicts", "calibration", "provenance"} < set(whole)
+    assert on_paper["study-0"][2] in whole["study-0"]
+
+
+def test_one_study_is_printed_whole_but_for_the_rates_of_the_referee(report: Report) -> None:
+    made = compose(replace(report, studies=report.studies[:1]))
+    assert {chapter.anchor for chapter in made.chapters} - {chapter.anchor for chapter in made.paper} == {"calibration"}
+
+
+def test_the_answer_counts_where_the_table_names(report: Report) -> None:
     text = answer(report.studies, ())
-    assert "2 studies put 3 pairs of filter and scenario to the test" in text
+    assert "In 2 worlds, of 3 verdicts on a filter " in text
     assert "ekf-uvd" not in text
     assert "ekf-uvd" in answer(report.studies[:1], ())
 
 
-def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report):
+def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report: Report) -> None:
     track = report.studies[0].tracks[0]
     scale = track.verdict.scale
     wide = replace(scale, inflation=scale.inflation._replace(value=2.0, low=0.5, high=np.inf))

@@ -127,7 +127,7 @@ def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path, rng):
     assert legend_of(panels(found[2])[0].figure) == ["2-sigma bounds", "run 0"]
 
 
-def test_the_worst_run_is_named_and_drawn(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_the_worst_run_is_named_and_drawn(tmp_path, rng):
     data = errors_of(rng)
     data["errors"][7] *= 5.0
     np.savez(tmp_path / "e.npz", **data)
@@ -135,11 +135,11 @@ def test_the_worst_run_is_named_and_drawn(tmp_path: Path, rng: np.random.Generat
     worst = next(of for of in record_figures(record, cs.judge(record)) if of.title == "Which run, and when")
     of_runs, of_steps = panels(worst)
     assert of_steps.get_ylabel() == "NEES of run 7"
-    np.testing.assert_allclose(places(of_runs)[0][:, 1], record.nees.mean(axis=1))
-    np.testing.assert_allclose(places(of_runs)[1], [[7.0, record.nees[7].mean()]])
+    assert_allclose(places(of_runs)[0][:, 1], record.nees.mean(axis=1))
+    assert_allclose(places(of_runs)[1], [[7.0, record.nees[7].mean()]])
 
 
-def test_the_first_steps_set_no_axis(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_the_first_steps_set_no_axis(tmp_path, rng):
     """A filter that starts with a large error and says so."""
     data = errors_of(rng)
     usual = np.abs(data["errors"]).max()

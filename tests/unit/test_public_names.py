@@ -17,7 +17,8 @@ NAMES = {  # module -> its public names; also those of CONTRACT.md, of docs/api,
     "consistency": """
         Alarm Control Drive Finding Gaussian Info InputError Log Monitor NoiseModel Observation Record Results Scenario
         Study Trial Tuning Verdict analyse anees anees_interval drive_of filter_names fit_covariance get_filter guarded
-        judge load_scenario nees read read_drives read_log read_results run_trials scenario_names simulate tune""",
+        judge load_scenario monte_carlo nees read read_drives read_log read_results run_trials scenario_names simulate
+        tune""",
     "consistency.challenging": "Challenge Plan challenge",
     "consistency.diagnostics": """
         Alarm Answer Band Comparison Design Difference EProcess EarlyEnds Equivalence Evidence Hotelling Independence
@@ -41,7 +42,8 @@ NAMES = {  # module -> its public names; also those of CONTRACT.md, of docs/api,
         SigmaPoints TrueSensor Truth UvdSensor load_scenario scenario_names scenario_text""",
     "consistency.store": "Log Results StoredResults open_results read_log read_results write_log",
     "consistency.sweeps": "CellResult Regime read_regime",
-    "consistency.testing": "ConsistencyError InsufficientTrials assert_consistent assert_not_worse",
+    "consistency.testing": """
+        ConsistencyError InsufficientTrials assert_consistent assert_not_worse assert_program_consistent""",
     "consistency.tuning": "Factor Setting Tuning tune",
     "consistency.types": "Control Estimates Failure Finding Gaussian Info Map Observation Ratio Trial",
     "consistency.vision": """

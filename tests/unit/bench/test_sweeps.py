@@ -281,7 +281,7 @@ def test_more_values_and_filters_go_into_the_same_folder(at, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "old, new, what",
+    ("old", "new", "what"),
     [("max_runs = 12", "max_runs = 13", "max_runs"), ("seed = 3", "seed = 4", "seed"), ("seed", "seed", "source code")],
 )
 def test_changed_inputs_are_refused_or_run_again(at, monkeypatch, old, new, what):
@@ -436,6 +436,23 @@ def test_a_report_shows_every_filter_and_cell(at):
     assert render_pdf(document).startswith(b"%PDF")
     unfinished = compose_regime(Regime(sweep, dict(list(results.items())[:3]), {"kind": "map"}))
     assert "not finished: 5 of 8" in unfinished.answer
+
+
+def test_a_sweep_of_one_axis_has_one_figure_of_all_filters(at):
+    from painted import panels
+
+    from consistency.bench.pages.maps_of_worlds import LOOKS, compose_regime
+
+    sweep = load_sweep(edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "odometry = [1.0, 2.0]"))
+    found = {(0, "kf"): result(rmse=0.1), (1, "kf"): result("overconfident", rmse=0.3)}
+    document = compose_regime(Regime(sweep, found, {}))
+    along, _ = document.figures
+    ratios, errors = panels(along)
+    assert along.title == "Along odometry"
+    line, *markers = errors.get_lines()
+    assert line.get_xydata().tolist() == [[1.0, 0.1], [2.0, 0.3]]
+    assert [marker.get_marker() for marker in markers] == [LOOKS[s].marker for s in ("consistent", "overconfident")]
+    assert ratios.get_ylabel() == "true / stated covariance"
 
 
 def test_a_map_without_numbers_on_its_axes_has_heat_maps_alone(at):

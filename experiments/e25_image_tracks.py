@@ -1,6 +1,6 @@
 """What do tracking, junctions and each stage of the chain do to u, v and d in rendered images of a moving camera?
 
-Experiment 1 and figures 3, 6 and 9 of Herath et al. (2007): docs/sensor.md.
+Experiment 1 and figures 3, 6 and 9 of Herath et al. (2007): docs/reference/sensor.md.
 """
 
 from __future__ import annotations

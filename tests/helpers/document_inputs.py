@@ -30,6 +30,7 @@ STUDY = "takes from half a minute to hours even with two runs; tests of its expe
 REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
 CLUSTER = "needs a cluster; tests/smoke/test_dask_cli.py and unit/bench/test_slurm.py stand in"
 NOT_RUN = [
+    ("docs/any-program.md", "", "needs MATLAB, Julia and ROS; tests/smoke/test_cpp_example.py runs what is in C++"),
     ("docs/case-studies.md", "python docs/case-studies", "needs the libraries; tests/oracle/test_case_studies_live.py"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
     ("docs/long-runs.md", "openssl", CLUSTER),
@@ -51,10 +52,11 @@ NOT_RUN = [
     ("docs/fit-covariance.md", "consistency", "needs real drives; unit/referee/test_fit_command.py simulates"),
     ("docs/front-end.md", "from consistency.vision import fit_shared", "tests/unit/stereo/test_vision_shared.py"),
     ("docs/front-end.md", "python experiments/e11", REAL),
+    ("docs/gates.md", "from consistency.testing import assert_program", "tests/smoke/test_cpp_example.py has one"),
     ("docs/filters.md", "consistency run", "compiles two guarded filters; tests/unit/bench/test_guards.py runs such"),
     ("docs/reference/recorded.md", "", f"{STUDY}; e15: {REAL}"),
     ("docs/regime.md", "consistency sweep regime --out regime --filter", "compiles two more filters for one cell"),
-    ("docs/sensor.md", "consistency reproduce", STUDY),
+    ("docs/reference/sensor.md", "consistency reproduce", STUDY),
     ("docs/tuning.md", "consistency tune --log OUT", REAL),
     ("docs/tuning.md", "python experiments/e15", REAL),
 ]  # fmt: skip

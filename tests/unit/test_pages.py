@@ -30,7 +30,10 @@ def test_pages_are_few_and_short() -> None:
         text = page.read_text("utf-8")
         assert text.count("\n") <= 250, page
         assert len(text.split()) <= 3000, page
-    assert sum(len(page.read_text("utf-8").split()) for page in ALL) <= 70_000
+    written = [
+        re.sub(r"<!-- (\w+): begin -->.*<!-- \1: end -->", "", p.read_text("utf-8"), flags=re.DOTALL) for p in ALL
+    ]
+    assert sum(len(text.split()) for text in written) <= 70_000  # beside the tables that benchmarks write
 
 
 @pytest.mark.parametrize("fix", ["0.3", "0.2"], ids=["as it is", "trusts its fixes too much"])

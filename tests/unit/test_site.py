@@ -103,7 +103,7 @@ def test_an_empty_folder_is_no_site(tmp_path):
             "scenarios/README.md",
             "docs/generated/scenarios",
             "[a](../docs/reference/sensor.md#b)",
-            "[a](../sensor.md#b)",
+            "[a](../reference/sensor.md#b)",
         ),
         ("scenarios/README.md", "docs/generated/scenarios", "[a](../experiments/README.md)", "[a](experiments.md)"),
         ("CONTRIBUTING.md", "docs/generated/contributing", "[a](LICENSE)", "a"),

@@ -205,11 +205,10 @@ def _along(regime: Regime, side: grid.Axis) -> Figure:
             for axes, values in quantities:
                 axes.plot(x, values, label=name, **stroke(look))
                 for place, value, (_, result) in zip(x, values, found, strict=True):
-                    marker = replace(LOOKS[result.status], colour=look.colour, size=4.5)
-                    axes.plot(place, value, gid=TITLE + words_of(result), **dots(marker))
+                    axes.plot(place, value, gid=TITLE + words_of(result), **dots(_marker(result.status, look.colour)))
         statuses = dict.fromkeys(result.status for result in regime.results.values())
         for status in statuses:
-            ratios.plot([], [], label=status, **dots(replace(LOOKS[status], colour="#555555", size=4.5)))
+            ratios.plot([], [], label=status, **dots(_marker(status, "#555555")))
         ratios.axhline(1.0, **stroke(EXPECTED))
         ratios.set_ylabel("true / stated covariance")
         errors.set_ylabel("RMSE (m)")
@@ -223,6 +222,14 @@ def _along(regime: Regime, side: grid.Axis) -> Figure:
         "of a marker is the verdict."
     )
     return Figure(f"Along {_short(side.key)}", caption, (draw,))
+
+
+def _marker(status: str, colour: str) -> Look:
+    """The shape of a verdict in the colour of a filter; hollow where its own is."""
+    look = LOOKS[status]
+    if look.edge:
+        return replace(look, edge=colour, size=4.5)
+    return replace(look, colour=colour, size=4.5)
 
 
 def _draw(regime: Regime, name: str, shown: Sequence[View]) -> Drawing:

@@ -17,7 +17,7 @@ import consistency as cs
 from consistency.bench.filters.compiled import Compiled, problem_of
 from consistency.bench.filters.compiler.jit import Kernel
 from consistency.bench.filters.guard import kernel_rules, plain_rules
-from consistency.bench.filters.guard.guard_part import guard_part, keep_agreeing
+from consistency.bench.filters.guard.kernel_guard import guard_part, keep_agreeing
 from consistency.bench.filters.guard.plain_rules import KINDS, kept_observations, limits_of
 from consistency.bench.filters.kernel import loop
 from consistency.bench.filters.kernel.part_functions import make_watch

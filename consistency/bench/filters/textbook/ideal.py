@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.basics import SlamState
-from consistency.bench.filters.textbook.sensors import view
+from consistency.bench.filters.textbook.basics import SlamState, view
 from consistency.bench.protocols import Problem, TrialTruth
 from consistency.bench.types import Control, Info, Observation
 from consistency.referee.errors import InputError

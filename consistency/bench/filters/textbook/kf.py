@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.basics import SlamState
-from consistency.bench.filters.textbook.sensors import PointSensor
+from consistency.bench.filters.textbook.basics import PointSensor, SlamState
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Info, Observation
 from consistency.referee.types import Array

@@ -10,6 +10,7 @@ import numpy as np
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.parts import reactivation  # noqa: F401, registers the update
 from consistency.bench.filters.parts.converting import Converted, Converting
 from consistency.bench.filters.parts.invariant_pose import InvariantPose
 from consistency.bench.filters.parts.inverse_range import InverseRange, Pixels
@@ -29,7 +30,6 @@ from consistency.bench.filters.textbook.robocentric import (
     RobotCentredKalman,
     rounds,
 )
-from consistency.bench.filters.update import reactivation  # noqa: F401, registers the update
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 

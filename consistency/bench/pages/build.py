@@ -9,15 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.bench.pages.sections import exhibits, images, overview, sensor_issues
+from consistency.bench.pages.sections import exhibits, overview
 from consistency.bench.pages.sections.calibration_rates import calibration_rates
 from consistency.bench.pages.sections.filters_table import filters_table
-from consistency.bench.pages.sections.front_end import front_end
 from consistency.bench.pages.sections.report_input import Report, Study, Track
-from consistency.bench.pages.sections.stereo_noise import stereo_noise
 from consistency.bench.pages.sections.study_origin import provenance
 from consistency.bench.pages.sections.study_sections import SECTIONS
-from consistency.bench.runs.findings import read_findings
+from consistency.bench.runs.findings import figure_scripts, read_findings
 from consistency.bench.runs.results_to_records import design_of, longest_run, record_of
 from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
@@ -117,16 +115,11 @@ def compose(report: Report) -> Document:
         Part("filters", "Filters side by side", "Filters", filters_table(report)),
         Part("verdicts", "Verdicts", "Verdicts", overview.verdicts(report)),
     )
-    noise, sensor = "What eq. 21 does to Gaussian pixels (fig. 12)", "The stereo sensor: biases and practical issues"
     after = (
-        Part("distributions", noise, "Stereo noise", stereo_noise(report)),
-        Part("front-end", "Stereo front-end", "Stereo front-end", front_end(report)),
-        Part("sensor-issues", sensor, "Sensor issues", exhibits.shown(report, sensor_issues.EXHIBITS)),
-        Part("images", "The stereo sensor in rendered images", "Rendered images",
-             exhibits.shown(report, images.EXHIBITS)),
+        *(Part(*module.CHAPTER, module.blocks(report)) for module in figure_scripts().values()),
         Part("calibration", "How far the referee can be trusted", "The referee", calibration_rates()),
         Part("provenance", "Provenance", "Provenance", provenance(report)),
-    )  # fmt: skip
+    )
     chapters = (*_chapters(before), *map(_study_chapter, range(len(report.studies)), report.studies), *_chapters(after))
     return Document(report.title, answer(report.studies, report.findings), chapters, overview.opening(report))
 

@@ -17,6 +17,7 @@ import pytest
 from edited import change_manifest
 from painted import by_title, lines, panels, places, shaded, titles
 from scipy import stats
+from scripts import figures
 
 import consistency as cs
 from consistency.bench.pages import write_reports
@@ -24,12 +25,10 @@ from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.sections import (
     anees,
     calibration_rates,
-    front_end,
     nees_distribution,
     nis,
     paths_and_landmarks,
     pose_errors,
-    stereo_noise,
 )
 from consistency.bench.pages.sections.report_input import Report, Study, Track
 from consistency.bench.pages.sections.study_sections import without_truth
@@ -48,6 +47,7 @@ from consistency.referee.pages.judged import clock_of
 from consistency.referee.show import as_html, pdf
 from consistency.referee.types import Failure
 
+front_end, stereo_noise = figures("front_end"), figures("stereo_noise")
 ODD = {
     "ekf-xyz": "<script>alert(1)</script><img src=x onerror=alert(2)>",
     "ekf-uvd": "#set *b* $x^2$ $$y$$ \\frac `c` @ref {{ 7*7 }} </script>",
@@ -808,7 +808,7 @@ def test_findings_and_distributions(reproduced):
     # first order: sigma_x = x^2 sigma_d / (f B)
     np.testing.assert_allclose(np.sqrt(narrow.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.09))
     np.testing.assert_allclose(np.sqrt(wide.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.5))
-    cloud, histogram = panels(stereo_noise.stereo_noise(report)[0])
+    cloud, histogram = panels(stereo_noise.blocks(report)[0])
     linear, fitted = lines(cloud)
     np.testing.assert_array_equal(linear.get_xydata(), stereo_noise.ellipse(narrow.linear))
     np.testing.assert_array_equal(fitted.get_xydata(), stereo_noise.ellipse(narrow.fitted))
@@ -876,7 +876,7 @@ def test_the_front_end_is_what_its_tables_hold(reproduced):
     assert "probability 0.1 % at most" in text
     assert "$x$ <b>: 0 of 1 accepted" in text
     assert printed(report).startswith(b"%PDF")
-    by_depth, by_scene, first_order = (panels(figure) for figure in front_end.front_end(report))
+    by_depth, by_scene, first_order = (panels(figure) for figure in front_end.blocks(report))
     (curve,) = lines(by_depth[0], "measured")
     np.testing.assert_allclose(curve.get_ydata(), [95.0, 80.0])
     (accepted,) = by_depth[0].patches

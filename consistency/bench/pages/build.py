@@ -12,8 +12,8 @@ import numpy as np
 from consistency.bench.pages.sections import exhibits, overview
 from consistency.bench.pages.sections.calibration_rates import calibration_rates
 from consistency.bench.pages.sections.filters_table import filters_table
+from consistency.bench.pages.sections.overview import provenance
 from consistency.bench.pages.sections.report_input import Report, Study, Track
-from consistency.bench.pages.sections.study_origin import provenance
 from consistency.bench.pages.sections.study_sections import SECTIONS
 from consistency.bench.runs.findings import figure_scripts, read_findings
 from consistency.bench.runs.results_to_records import design_of, longest_run, record_of

@@ -116,12 +116,21 @@ def compose(report: Report) -> Document:
         Part("verdicts", "Verdicts", "Verdicts", overview.verdicts(report)),
     )
     after = (
-        *(Part(*module.CHAPTER, module.blocks(report)) for module in figure_scripts().values()),
+        *_of_experiments(report),
         Part("calibration", "How far the referee can be trusted", "The referee", calibration_rates()),
         Part("provenance", "Provenance", "Provenance", provenance(report)),
     )
     chapters = (*_chapters(before), *map(_study_chapter, range(len(report.studies)), report.studies), *_chapters(after))
     return Document(report.title, answer(report.studies, report.findings), chapters, overview.opening(report))
+
+
+def _of_experiments(report: Report) -> list[Part]:
+    """Chapters that the scripts in ``experiments/figures`` make of the tables in the folder."""
+    parts = []
+    for script in figure_scripts().values():
+        anchor, title, link = script.CHAPTER
+        parts.append(Part(anchor, title, link, script.blocks(report)))
+    return parts
 
 
 def _chapters(parts: Sequence[Part]) -> list[Chapter]:

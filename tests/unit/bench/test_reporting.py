@@ -27,8 +27,7 @@ from consistency.bench.pages.sections import (
     calibration_rates,
     nees_distribution,
     nis,
-    paths_and_landmarks,
-    pose_errors,
+    one_run,
 )
 from consistency.bench.pages.sections.report_input import Report, Study, Track
 from consistency.bench.pages.sections.study_sections import without_truth
@@ -176,8 +175,8 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(pose_errors.pose_error_series, study.tracks),
-        paths_and_landmarks.read(study).paths, strict=True,
+        anees.read(study).curves, map(one_run.pose_error_series, study.tracks),
+        one_run.read(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
         verdict = by_filter[track.name]
@@ -197,9 +196,9 @@ def test_the_model_is_what_analyse_says(folder):
 def test_the_odometry_is_that_of_the_trial(report, uvd):
     (study,) = report.studies
     trial = cs.simulate(uvd, run=0, seed=1)
-    np.testing.assert_array_equal(paths_and_landmarks.read(study).truth, trial.truth[:, :2])
+    np.testing.assert_array_equal(one_run.read(study).truth, trial.truth[:, :2])
     step = trial.controls[0, 0] * trial.controls[0, 1]
-    odometry = paths_and_landmarks.read(study).odometry
+    odometry = one_run.read(study).odometry
     np.testing.assert_allclose(np.linalg.norm(odometry[1] - odometry[0]), abs(step))
 
 
@@ -724,7 +723,7 @@ def test_odd_names_are_shown_literally_and_failed_runs_are_listed(results, tmp_p
     (study,) = report.studies
     assert len(study.failures) == 6
     assert study.tracks[1].verdict.status == "failed"
-    assert not np.isfinite(paths_and_landmarks.read(study).paths[1][1]).any()
+    assert not np.isfinite(one_run.read(study).paths[1][1]).any()
     assert "6 of 8 runs" in compose(report).answer
 
 
@@ -926,7 +925,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
     for number, track in enumerate(study.tracks):
         drawn_panels = panels(figure, number)
         assert titles(drawn_panels)[0] == track.name
-        of = pose_errors.pose_error_series(track)
+        of = one_run.pose_error_series(track)
         for axes, error, sigma in zip(drawn_panels, of.error.T, of.sigma.T, strict=True):
             _, low, high, curve = axes.lines
             np.testing.assert_array_equal(curve.get_ydata(), error)
@@ -935,7 +934,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
 
 def test_the_map_shows_truth_and_estimates(report):
     (study,) = report.studies
-    found = paths_and_landmarks.read(study)
+    found = one_run.read(study)
     (axes,) = panels(by_title(compose(report))["Scenario and estimates, run 0"])
     (truth,), (odometry,) = lines(axes, "true path"), lines(axes, "odometry alone")
     np.testing.assert_array_equal(truth.get_xydata(), found.truth)
@@ -1012,7 +1011,7 @@ def test_a_log_without_truth_says_so(uvd, tmp_path):
     report = build_report(tmp_path / "run")
     (study,) = report.studies
     assert not study.has_truth
-    assert paths_and_landmarks.read(study).odometry is None
+    assert one_run.read(study).odometry is None
     assert str(tmp_path) not in study.name
     source = shown(report)
     assert "The truth of log is not known" in source

@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.csv as pa_csv
-import tomli_w
 
 from consistency.bench.scenario import (
     Belief,
     BelievedMotion,
+    BelievedSensor,
     Finite,
     GuardSettings,
     PicturedSensor,
@@ -203,7 +203,7 @@ def write_log(
         tables["truth"] = stacked_table("truth", parts)
     if landmarks is not None:
         tables["landmarks"] = landmarks
-    texts = {"sensor.toml": tomli_w.dumps(_sensor_file(belief, trials[0].start, view)), **files}
+    texts = {"sensor.toml": _sensor_file(belief, trials[0].start, view), **files}
 
     def contents(at: Path) -> None:
         for name, text in texts.items():
@@ -228,22 +228,21 @@ def sensor_text(folder: Path, belief: Belief) -> str:
     return toml_text(changed.model_dump(mode="json", exclude_none=True))
 
 
-def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, object]:
-    sensor = belief.sensor.model_dump(exclude_none=True)
-    unit = f"sigma{SIGMA_UNITS[belief.sensor.model]}"
-    return {
-        "model": sensor["model"],
-        unit: list(sensor["sigma"]),
-        **{key: sensor[key] for key in ("f", "B") if key in sensor},
-        **({"disparity": list(sensor["disparity"])} if "disparity" in sensor else {}),
-        **{key: sensor[key] for key in ("disparity_growth", "bias") if key in sensor},
-        **({"image": list(view[0]), "principal_point": list(view[1])} if view else {}),
-        "mount": {key: list(value) for key, value in sensor["mount"].items()},
-        "motion": belief.motion.model_dump(),
-        "start": dict(zip(POSE, map(float, start), strict=True)),
-        "sigma_points": belief.sigma_points.model_dump(),
-        **({} if belief.guard is None else {"guard": belief.guard.model_dump(exclude_none=True)}),
-    }
+def sensor_keys(sensor: BelievedSensor) -> dict[str, Any]:
+    """Keys of ``sensor.toml`` that say what a sensor is believed to be."""
+    keys = sensor.model_dump(mode="json", exclude_none=True)
+    return {"model": keys.pop("model"), f"sigma{SIGMA_UNITS[sensor.model]}": keys.pop("sigma"), **keys}
+
+
+def _sensor_file(belief: Belief, start: Array, view: View | None) -> str:
+    keys = sensor_keys(belief.sensor)
+    if view is not None:
+        keys |= {"image": view[0], "principal_point": view[1]}
+    keys |= {"motion": belief.motion.model_dump(), "start": dict(zip(POSE, map(float, start), strict=True))}
+    keys["sigma_points"] = belief.sigma_points.model_dump()
+    if belief.guard is not None:
+        keys["guard"] = belief.guard.model_dump(exclude_none=True)
+    return toml_text(keys)
 
 
 def _observations(folder: Path, sensor: SensorFile) -> pd.DataFrame:

@@ -28,7 +28,7 @@ from consistency.referee.readers.pipeline.relative_motions import Stretch, relat
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.windows import relative_of
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.sources import judge_all
 
 DT, SPEED = 0.1, 1.5  # s, m/s
 TURN = 0.03  # rad a step, and its spread
@@ -124,7 +124,7 @@ def recorded(stretches: list[Stretch], size: str, motions: bool) -> Record:
 
 
 def verdict_on(record: Record) -> Verdict:
-    return analyse([record])["log"]
+    return judge_all([record])["log"]
 
 
 @dataclass(frozen=True)

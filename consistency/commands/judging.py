@@ -79,7 +79,7 @@ def analyse_command(
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.command_settings import settings_of, skip_asked
-    from consistency.referee.verdicts.sources import analyse as judge
+    from consistency.referee.verdicts.sources import judge_all
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -93,7 +93,7 @@ def analyse_command(
     require_written(overwrite, report, "--report")
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
-        verdicts = judge(recordings, filters, settings=settings, optimal_gain=innovations is not None)
+        verdicts = judge_all(recordings, filters, settings=settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         if report is not None and not is_file:
             from consistency.referee.pages.write_pages import write_file_reports
@@ -118,7 +118,7 @@ def analyse_command(
             raise InputError(
                 "--innovations is for files of another estimator; filters of the bench declare it themselves"
             )
-        verdicts = judge(results, filters, settings=settings, skip=first)
+        verdicts = judge_all(results, filters, settings=settings, skip=first)
         if results.unfinished:
             text = f"{path}: {results.unfinished}; the same 'consistency run' with --resume goes on"
             if fail_on:
@@ -157,7 +157,7 @@ def report_command(
 ) -> None:
     """Write a report of results as one offline HTML file and a PDF."""
     from consistency.referee.pages.write_pages import require_pages, write_file_pages
-    from consistency.referee.verdicts.sources import analyse as judge
+    from consistency.referee.verdicts.sources import judge_all
 
     estimates = are_files(path, files)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
@@ -166,7 +166,7 @@ def report_command(
     if estimates:
         require_pages(*targets, overwrite)
         recordings = read_files(path, files)
-        write_file_pages(recordings, judge(recordings), *targets, path.name)
+        write_file_pages(recordings, judge_all(recordings), *targets, path.name)
         tell_notes(recordings)
     else:
         from consistency.bench.pages import write_reports

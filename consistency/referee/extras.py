@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from importlib import import_module
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from consistency.referee.errors import InputError
 
@@ -173,10 +172,3 @@ def _from_origin(extras: tuple[str, ...]) -> list[str]:
     if vcs := record.get("vcs_info"):
         url = f"{vcs['vcs']}+{url}@{vcs.get('requested_revision') or vcs['commit_id']}"
     return [f"{DISTRIBUTION}{added} @ {url}"] if url else []
-
-
-def function_at(target: str) -> Callable[..., Any]:
-    """Return the function that ``module:function`` names, of a module below ``consistency``."""
-    module, name = target.split(":")
-    function: Callable[..., Any] = getattr(import_module(f"consistency.{module}"), name)
-    return function

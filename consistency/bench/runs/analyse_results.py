@@ -10,8 +10,7 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.skipping import Skip
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.verdicts.sources import Source
-from consistency.referee.verdicts.sources import analyse as analyse_records
+from consistency.referee.verdicts.sources import Source, judge_all
 
 if TYPE_CHECKING:
     from consistency.bench.store.results import Tables
@@ -49,4 +48,4 @@ def analyse(
         from consistency.bench.runs.results_to_records import results_source
 
         source = results_source(cast("Tables | str | Path", results))
-    return analyse_records(source, filters, confidence, settings, skip, optimal_gain)
+    return judge_all(source, filters, confidence, settings, skip, optimal_gain)

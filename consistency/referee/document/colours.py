@@ -36,7 +36,6 @@ class Look:
 
 EXPECTED = Look("#555555", width=0.8)
 LIMIT = Look("#333333", (4.0, 3.0), width=0.9)
-SHADE = Look(BAND)
 ZERO = Look("#555555", width=0.5)
 SIGMAS = 2.0  # stated standard deviations from 0 to the bounds of an error that are drawn
 ACCEPTED, REJECTED = Look(COLOURS[0], (), "o"), Look(COLOURS[1], (), "X")

@@ -45,7 +45,7 @@ def source_of(of: Source | Sequence[Record]) -> Source:
     return Source(list(named), record)
 
 
-def analyse(
+def judge_all(
     results: Source | Sequence[Record],
     filters: Sequence[str] | None = None,
     confidence: float | None = None,
@@ -53,22 +53,7 @@ def analyse(
     skip: str | float | Skip | None = None,
     optimal_gain: bool = False,
 ) -> dict[str, Verdict]:
-    """A verdict for every filter of the results, or for those named.
-
-    Parameters
-    ----------
-    results : records, or a source of them; :func:`consistency.analyse` also takes results of the bench
-    confidence : 1 less the false-alarm rate of a verdict, in place of ``settings``
-    settings : what to ask; the defaults of :class:`Settings` where None. Results of a run until decided are then
-        judged as that run was.
-    skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
-    optimal_gain : the filters declare one, so that their innovations are judged; results say it themselves
-
-    Raises
-    ------
-    InputError
-        Unknown filter, a confidence outside (0, 1), or nothing is left.
-    """
+    """Judge every filter of the records, or those named; :func:`consistency.analyse` has the parameters."""
     source, design = source_of(results), None
     if settings is None:
         settings = settings_of(confidence)

@@ -52,7 +52,9 @@ class Sum(Compiled):
             if what == "die":
                 os.kill(os.getpid(), signal.SIGKILL)
             if what in ("hang", "abandon"):
-                os.kill(here, signal.SIGINT)
+                if not os.path.exists(f"{folder}/signalled"):
+                    Path(folder, "signalled").touch()
+                    os.kill(here, signal.SIGINT)
                 time.sleep(600.0)
         self.kernel.compile(self.values)
 

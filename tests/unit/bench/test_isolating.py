@@ -293,8 +293,8 @@ def no_supervisors() -> Iterator[None]:
 
 @pytest.mark.usefixtures("no_supervisors")
 def test_blas_has_one_thread(world: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in filter_process.ONE_THREAD:
-        monkeypatch.setenv(name, "2")
+    for library in ("OPENBLAS_NUM", "MKL_NUM", "OMP_NUM", "BLIS_NUM", "VECLIB_MAXIMUM"):
+        monkeypatch.setenv(f"{library}_THREADS", "2")
     results = cs.run_trials(world, [Threads("threads")], runs=1, jobs=1)
     assert (results.estimates["x"] == 1.0).all()
 
@@ -388,13 +388,15 @@ def test_limits_are_positive(world: cs.Scenario, option: str, value: float) -> N
         cs.run_trials(world, ["ekf-xyz"], runs=1, jobs=1, **{option: value})  # type: ignore[call-overload]
 
 
-def takes_half(*_: Any) -> None:
-    np.ones(int(0.5 * MEMORY * 2**27))
+def takes_most(*_: Any) -> None:
+    np.ones(int(0.75 * MEMORY * 2**27))
 
 
-def test_a_filter_within_its_limits_has_the_same_bits(world: cs.Scenario, doomed: Control, calm: pd.DataFrame) -> None:
-    filters = [Still("calm", takes_half, doomed), "ekf-xyz"]
-    limited = cs.run_trials(world, filters, runs=RUNS, jobs=2, timeout=LONG, memory=4 * MEMORY).estimates
-    both = calm.merge(limited[["filter", "run", "step"]])  # memory may lack for a run
-    assert len(both) >= len(calm) - len(calm) // 6
-    pd.testing.assert_frame_equal(limited, both, check_exact=True, check_dtype=False)
+@pytest.mark.parametrize("run", [0, DOOMED])
+def test_a_filter_within_its_limits_has_the_same_bits(world: cs.Scenario, calm: pd.DataFrame, run: int) -> None:
+    """Also in the first trial of a new process, where libraries take memory that is not the filter's."""
+    filter_process.dismiss()
+    filters = [Still("calm", takes_most, cs.simulate(world, run).control(1)), "ekf-xyz"]
+    limited = cs.run_trials(world, filters, runs=RUNS, jobs=2, timeout=LONG, memory=MEMORY)
+    assert not len(limited.failures), limited.failures
+    pd.testing.assert_frame_equal(limited.estimates, calm, check_exact=True)

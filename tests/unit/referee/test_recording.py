@@ -28,7 +28,7 @@ from consistency.referee.geometry.conventions import planar_error, se2_log
 from consistency.referee.geometry.groups import se3_log, spatial_error
 from consistency.referee.readers.truth_matching import associate, common_times
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.sources import judge_all
 
 ROOT = Path(__file__).parents[3]
 POSE_COLUMNS = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]
@@ -407,9 +407,9 @@ def test_without_run_and_step(tmp_path: Path) -> None:
 def test_filters_are_recordings(tmp_path: Path) -> None:
     est, truth = write(tmp_path, lambda e: pd.concat([e.assign(filter="a"), e.assign(filter="b", x=e["x"] + 9)]))
     assert [r.name for r in read_recordings(est, truth)] == ["a", "b"]
-    assert list(analyse(read_recordings(est, truth), ["b"])) == ["b"]
+    assert list(judge_all(read_recordings(est, truth), ["b"])) == ["b"]
     with pytest.raises(InputError, match="--filter c: is not in these files; there are: a, b"):
-        analyse(read_recordings(est, truth), ["c"])
+        judge_all(read_recordings(est, truth), ["c"])
 
 
 def set_cell(row: int, column: str, value: float) -> Edit:
@@ -442,7 +442,7 @@ def test_a_broken_row_is_a_failed_run(row: int, column: str, value: float, reaso
     assert np.isnan(r.covariance[1, step:]).all()
     assert np.isfinite(r.error[1, :step]).all()
     assert np.isfinite(r.error[[0, 2]]).all()
-    verdict = analyse([r])["est"]
+    verdict = judge_all([r])["est"]
     assert not verdict.consistent
     assert verdict.statistics["failures"] == [[1, step + 1, r.failures[0].reason]]
 
@@ -459,7 +459,7 @@ def test_a_start_known_exactly_is_left_out(tmp_path: Path) -> None:
     np.testing.assert_allclose(r.nees[:, 2:], nees(r.error[:, 2:], r.covariance[:, 2:]))
     assert np.isfinite(r.error).all()
     assert any("6 estimates before the covariance has full rank" in note for note in r.notes)
-    assert analyse([r])["est"].statistics["left_out_steps"] == [1, 2]
+    assert judge_all([r])["est"].statistics["left_out_steps"] == [1, 2]
 
 
 def test_step_0_is_the_start_only_where_nothing_is_uncertain(tmp_path: Path) -> None:
@@ -495,18 +495,18 @@ def test_nis_alone(tmp_path: Path) -> None:
     table.to_csv(tmp_path / "nis.csv", index=False)
     r = one(tmp_path / "nis.csv", None)
     assert (r.error, r.covariance, r.nees, r.dof) == (None, None, None, 0)
-    undeclared = analyse([r])["nis"]
+    undeclared = judge_all([r])["nis"]
     assert (undeclared.status, undeclared.faults) == ("undecided", ())
     assert "declares an optimal gain" in undeclared.reasons[0]
     assert "reported and not judged" in undeclared.reasons[1]
-    assert analyse([r], optimal_gain=True)["nis"].status == "overconfident"
+    assert judge_all([r], optimal_gain=True)["nis"].status == "overconfident"
 
 
 def test_our_own_files_get_our_own_verdict(uvd: cs.Scenario, tmp_path: Path) -> None:
     results = cs.run_trials(uvd, ["ekf-uvd"], runs=3, jobs=1)
     results.write(tmp_path / "out")
     r = one(tmp_path / "out/estimates.parquet", tmp_path / "out/truth.parquet")
-    ours, theirs = cs.analyse(results)["ekf-uvd"], analyse([r])["ekf-uvd"]
+    ours, theirs = cs.analyse(results)["ekf-uvd"], judge_all([r])["ekf-uvd"]
     assert (theirs.status, theirs.statistics["left_out_steps"]) == (ours.status, ours.statistics["left_out_steps"])
     np.testing.assert_allclose(theirs.statistics["anees"], ours.statistics["anees"], rtol=1e-9)
 
@@ -539,11 +539,11 @@ def test_three_kinds_of_archives_agree(tmp_path: Path) -> None:
     by_nees = one(archive(tmp_path, nees=values, dof=2), None)
     assert by_nees.error is None
     for r in (by_error, by_truth, by_nees):
-        verdict = analyse([r], settings=Settings(false_alarm=1e-4))["a"]
+        verdict = judge_all([r], settings=Settings(false_alarm=1e-4))["a"]
         assert verdict.status == "consistent"
         np.testing.assert_allclose(verdict.statistics["mean_anees"], values.mean())
     for bad in (gaussian(2.0), {"nees": 2 * values, "dof": 2}):
-        assert analyse([one(archive(tmp_path, **bad), None)])["a"].status == "overconfident"
+        assert judge_all([one(archive(tmp_path, **bad), None)])["a"].status == "overconfident"
 
 
 def test_lengths_failures_and_starts_of_archives(tmp_path: Path) -> None:

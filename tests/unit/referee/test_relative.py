@@ -25,7 +25,7 @@ from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline
 from consistency.referee.verdicts.compare_sources import compare_with
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.sources import judge_all
 
 GROUPS = tuple(world.SIGMA)
 SURE = 1e-5  # false-alarm rate of a verdict in a test
@@ -40,7 +40,7 @@ def statistics(stretches: list[Stretch], size: str, motions: bool) -> dict[str, 
 
 
 def verdict_of(stretches: list[Stretch], size: str, motions: bool) -> Verdict:
-    return analyse([recorded(stretches, size, motions)])["log"]
+    return judge_all([recorded(stretches, size, motions)])["log"]
 
 
 def same(a: object, b: object) -> None:
@@ -117,7 +117,7 @@ def test_declared_windows_are_runs(rng: np.random.Generator) -> None:
     runs = [pose_stretch(rng, "SE(2)", 11, 5, 1.0, run) for run in range(3)]
     relative = replace(Relative(1, "step"), independent=True)
     record = world.relative_recording("log", "log", runs, AXES["SE(2)"], range(3), relative)
-    verdict = analyse([record])["log"]
+    verdict = judge_all([record])["log"]
     assert (verdict.runs, verdict.steps, verdict.unit) == (30, 1, "window")
     np.testing.assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
 
@@ -132,17 +132,17 @@ def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Record:
 
 def test_few_windows_do_not_show_independence(rng: np.random.Generator) -> None:
     """Errors x9: found by 150 windows, and neither a fault nor an all-clear is said with 140."""
-    few = analyse([declared(rng, ENOUGH - 10)])["log"]
+    few = judge_all([declared(rng, ENOUGH - 10)])["log"]
     assert few.status == "undecided"
     assert few.faults == ()
     assert few.answers == ()
     assert few.reasons[0].startswith("undecided: 140 windows are too few windows to show independence, which takes 150")
     assert "the covariance ratio would be" in few.reasons[0]
     assert not few.equivalence.shown
-    enough = analyse([declared(rng, ENOUGH)])["log"]
+    enough = judge_all([declared(rng, ENOUGH)])["log"]
     assert enough.status == "overconfident"
     right = replace(declared(rng, 30), unshown="")
-    assert analyse([right])["log"].runs == 30
+    assert judge_all([right])["log"].runs == 30
     base = baseline([declared(rng, 50)], "log")
     with pytest.raises(cs.InputError, match="at least 8 runs"):
         compare_with(base, base, [])
@@ -153,7 +153,7 @@ def test_a_failed_window_stays_failed(rng: np.random.Generator) -> None:
     stretch.estimate[20] = np.nan
     relative = replace(Relative(1, "step"), independent=True)
     record = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), relative)
-    assert analyse([record])["log"].status == "failed"
+    assert judge_all([record])["log"].status == "failed"
 
 
 # --- files -----------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from consistency.referee.geometry.groups import adjoint, composed, inverse, log,
 from consistency.referee.readers.pipeline.relative_motions import windows_of
 from consistency.referee.readers.windows import Relative, relative_of, windows
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.sources import judge_all
 
 GROUPS = tuple(world.SIGMA)
 
@@ -174,7 +174,7 @@ def test_a_broken_row_is_a_failed_window(row: int, rng: np.random.Generator) -> 
     assert [f.reason for f in record.failures] == [f"estimate is not finite (row {row})"]
     found = windows_of(stretch, Relative(5, "step", True))
     assert (found.track.t[-1], found.t[-1]) == (stretch.t[row - 1], stretch.t[row])
-    verdict = analyse([record])["log"]
+    verdict = judge_all([record])["log"]
     assert verdict.runs == (row - 1) // 5 + 1
     assert verdict.status != "consistent"
     assert any(f"1 of {verdict.runs} windows failed, first window {verdict.runs}: " in r for r in verdict.reasons)
@@ -197,7 +197,7 @@ def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
         assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
         assert not any("first order" in note for note in record.notes)
         assert windows_of(stretch, Relative(1, "step")).track.t.tolist() == [stretch.t[0]]
-        assert analyse([record])["log"].status == "failed"
+        assert judge_all([record])["log"].status == "failed"
 
 
 def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None:
@@ -230,7 +230,7 @@ def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng: np.random.Ge
     truth = composed(np.concatenate([np.eye(3)[None], moved]))
     record = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True)
     assert any("errors of neighbouring windows are of like size" in note for note in record.notes)
-    verdict = analyse([record])["log"]
+    verdict = judge_all([record])["log"]
     assert verdict.reasons[0].endswith("the motions do not seem to be independent, on which this rests")
     plain_one = recorded([motion_stretch(drive(rng, "SE(2)", 19))], "1", True)
     assert (plain_one.caption, plain_one.unshown) == ("", "")

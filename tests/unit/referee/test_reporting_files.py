@@ -22,7 +22,7 @@ from consistency.referee.pages.files_report import compose_files
 from consistency.referee.pages.judged import clock_of
 from consistency.referee.pages.record_figures import observed_coverage, record_figures, unit_of
 from consistency.referee.pages.trajectory import shown_run
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.sources import judge_all
 
 RUNS, STEPS = 30, 25
 
@@ -46,7 +46,7 @@ def rng() -> np.random.Generator:
 
 def document(path: Path) -> Any:
     records = read_recordings(path)
-    return compose_files(records, analyse(records), path.name, {"command": "consistency analyse"})
+    return compose_files(records, judge_all(records), path.name, {"command": "consistency analyse"})
 
 
 def test_the_verdict_stands_on_top_and_the_pictures_first(archive: Path) -> None:
@@ -176,7 +176,7 @@ def test_each_of_several_estimators_has_its_sentence(tmp_path: Path, rng: np.ran
     (tmp_path / "e.csv").write_text("\n".join(lines))
     (tmp_path / "t.csv").write_text("step,a\n" + "".join(f"{k},0\n" for k in range(1, STEPS + 1)))
     records = read_recordings(tmp_path / "e.csv", tmp_path / "t.csv", state=["a"])
-    made = compose_files(records, analyse(records), "e.csv", {})
+    made = compose_files(records, judge_all(records), "e.csv", {})
     assert [chapter.title for chapter in made.chapters[:2]] == ["good", "bad"]
     assert isinstance(made.chapters[1].blocks[0], Text)
     assert made.chapters[1].blocks[0].text.startswith("bad is overconfident")

@@ -29,7 +29,7 @@ from consistency.referee.diagnostics.questions.lost_runs import early_ends
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import analyse
+from consistency.referee.verdicts.sources import judge_all
 
 SETTINGS = Settings()
 SURE = 1e-5
@@ -124,12 +124,12 @@ def poses(path: Path, e: Array) -> Path:
 def test_relative_poses_are_named_where_they_would_help(tmp_path: Path, rng: np.random.Generator) -> None:
     file = poses(tmp_path / "one.csv", errors(rng, 0.8, 300, 3))
     recordings = read_recordings(file, tmp_path / "truth.csv")
-    verdict = analyse(recordings, settings=Settings(SURE))["one"]
+    verdict = judge_all(recordings, settings=Settings(SURE))["one"]
     assert "--relative 10s" in verdict.reasons[-1]
     vector = read_recordings(file, tmp_path / "truth.csv", state=["x", "y"])
-    assert "--relative" not in str(analyse(vector, settings=Settings(SURE))["one"].reasons)
+    assert "--relative" not in str(judge_all(vector, settings=Settings(SURE))["one"].reasons)
     gross = poses(tmp_path / "gross.csv", 100.0 * errors(rng, 0.0, 300, 3))
-    found = analyse(read_recordings(gross, tmp_path / "truth.csv"))["gross"]
+    found = judge_all(read_recordings(gross, tmp_path / "truth.csv"))["gross"]
     assert found.status == "overconfident"
     assert "--relative" not in str(found.reasons)
     assert any("the covariance ratio is" in reason for reason in found.reasons)

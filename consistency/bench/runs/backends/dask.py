@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NoReturn, TypeVar
 
+import dask
 from distributed import Client, LocalCluster, Security
 
 from consistency.bench.runs.backends.threads import worker_count
@@ -112,6 +113,8 @@ class DaskExecutor(Executor):
 
     @cached_property
     def _cluster(self) -> LocalCluster:
+        # dask gives a worker up for good that dies again within this time, and the last one too
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"})
         return LocalCluster(
             n_workers=worker_count(self.jobs), threads_per_worker=1, memory_limit=None, host="127.0.0.1",
             dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,

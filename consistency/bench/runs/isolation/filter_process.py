@@ -34,9 +34,6 @@ KILLED = (-signal.SIGTERM, -getattr(signal, "SIGKILL", signal.SIGTERM))  # exit 
 GLANCE = 0.5  # s between looks at whether a process still lives
 LOADING = 60.0  # s that loading a filter may take where there is a time-out
 SHOWN = 2**14  # bytes of what the filters in a process print that are shown
-ONE_THREAD = dict.fromkeys(  # of BLAS in a process of a filter: the last bits depend on it
-    ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
-)
 _lock = threading.Lock()
 _idle: list[_Worker] = []  # of earlier studies, as starting one takes seconds
 

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 try:
@@ -49,6 +50,7 @@ def load(pickled: bytes, path: Sequence[str], folder: str) -> int:
     with contextlib.suppress(Exception):
         pickle.loads(pickled)
     threadpool_limits(1)  # of the libraries of BLAS that are loaded now
+    np.linalg.cholesky(np.eye(2))  # OpenBLAS takes its buffer, tens of MiB, in its first call: none of the filter's
     return os.getpid()
 
 

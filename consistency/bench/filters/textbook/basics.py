@@ -133,6 +133,7 @@ class SlamState:
     landmarks: tuple[int, ...]
     problem: Problem
     width: int = 3  # variables of a landmark
+    points: Any = None  # what a method keeps of the points at which its Jacobians are taken
 
     def at(self, landmark: int) -> int:
         """Offset of a landmark in x."""
@@ -296,25 +297,6 @@ def joint_of(state: SlamState) -> Gaussian:
     spatial = np.eye(3)[:, : state.width]  # one in the plane is known to be at height zero
     T = block_diag(np.eye(3), *[spatial] * count)
     return Gaussian(T @ state.x, T @ state.P @ T.T)
-
-
-class WrappedFilter:
-    """A filter whose state is a dataclass with a ``SlamState`` of world points as its ``slam``, and more."""
-
-    def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
-
-    def forget(self, state: Any, landmark: int) -> Any:
-        return replace(state, slam=without(state.slam, landmark))
-
-    def pose(self, state: Any) -> Gaussian:
-        return pose_of(state.slam)
-
-    def map(self, state: Any) -> dict[int, Gaussian]:
-        return map_of_state(state.slam)
-
-    def joint(self, state: Any) -> Gaussian:
-        return joint_of(state.slam)
 
 
 def require_landmarks(problem: Problem, name: str) -> Array:

@@ -162,8 +162,10 @@ def measured_sensor_toml(of: Characterisation, others: Mapping[str, Any] = Mappi
 
 def _half_widths(of: Characterisation) -> list[str]:
     """Half widths of the intervals at the nodes of the bias map, a line for each row of the image."""
+    if of.bias is None:
+        return []
     lines = []
-    for k in np.flatnonzero(of.bias.shown) if of.bias is not None else ():
+    for k in np.flatnonzero(of.bias.shown):
         lines.append(f"Half widths of bias_{NAMES[k]}, px; rows are v, columns are u; nan: not known, taken as zero:")
         rows = of.bias.half[k].reshape(len(of.bias.grid.v), -1)
         lines += ["  " + " ".join(f"±{width:.2g}" for width in row) for row in rows]

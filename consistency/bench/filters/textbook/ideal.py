@@ -48,7 +48,7 @@ class IdealKalman(ExtendedKalman):
 
 def _pose(state: SlamState) -> Array:
     """The true pose (3,)."""
-    return truth_of(state.problem).path[state.points]
+    return np.asarray(truth_of(state.problem).path[state.points])
 
 
 def _landmark(state: SlamState, label: int) -> Array:

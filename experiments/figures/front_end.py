@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
 CHAPTER = ("front-end", "Stereo front-end", "Stereo front-end")
+ON_PAPER = True  # of a report of several studies
 PERCENT = 100.0
 
 

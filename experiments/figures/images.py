@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CHAPTER = ("images", "The stereo sensor in rendered images", "Rendered images")
+ON_PAPER = False  # of a report of several studies
 SAMPLES, GAUSS = Look("#c4c4c4"), replace(style(0), width=1.4)
 STOPS = ("disparity", "selected", "features", "within", "pooled", "residual", "sigma", "needed")
 KINDS = ((0.0, "points"), (1.0, "junctions"))

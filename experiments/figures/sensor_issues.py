@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CHAPTER = ("sensor-issues", "The stereo sensor: biases and practical issues", "Sensor issues")
+ON_PAPER = False  # of a report of several studies
 DOF = 3.0
 ROWS = 4  # of a map that are drawn at most
 MAP = ("u", "v", "bias_d")

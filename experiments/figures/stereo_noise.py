@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
 CHAPTER = ("distributions", "What eq. 21 does to Gaussian pixels (fig. 12)", "Stereo noise")
+ON_PAPER = True  # of a report of several studies
 FILE = "fig12.parquet"
 POINT, FOCAL = (10.0, 1.0), 150.0  # m, px: Herath et al. (2007) sec. 4.5
 SIGMA_U, SIGMA_D = 1.34, 0.65  # px, ibid.

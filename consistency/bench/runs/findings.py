@@ -140,7 +140,8 @@ def experiments() -> dict[str, ModuleType]:
 def figure_scripts() -> dict[str, ModuleType]:
     """Scripts of ``experiments/figures/`` by name, each a chapter of a report on the tables that experiments leave.
 
-    A script has CHAPTER (anchor, title, entry in the contents) and ``blocks(report)``, empty without its tables.
+    A script has CHAPTER (anchor, title, entry in the contents), ``blocks(report)``, empty without its tables, and
+    ON_PAPER: whether the PDF of several studies has it, too.
 
     Raises
     ------

@@ -53,7 +53,9 @@ def test_the_verdict_stands_on_top_and_the_pictures_first(archive: Path) -> None
     made = document(archive)
     sentence = cs.judge(cs.read(archive)).reasons[0]
     assert made.answer == f"mine is {sentence}."
-    assert [block.title for block in made.chapters[0].blocks] == ["Errors and stated bounds", "NEES", "Coverage"]
+    assert [block.title for block in made.chapters[0].blocks] == [
+        "NEES", "Errors over their stated sigma", "Which run, and when", "Errors and stated bounds", "Coverage",
+    ]  # fmt: skip
     assert [chapter.anchor for chapter in made.chapters] == ["estimator-0", "verdicts", "provenance"]
 
 
@@ -119,8 +121,40 @@ def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path: Path, rng: np.rando
     np.savez(tmp_path / "e.npz", **{key: value[0] for key, value in errors_of(rng).items()})
     record = read_recordings(tmp_path / "e.npz")[0]
     found = record_figures(record, cs.judge(cs.read(tmp_path / "e.npz")))
-    assert legend_of(panels(found[0])[0].figure) == ["2-sigma bounds", "run 0"]
-    assert found[1].caption.startswith("NEES; 2 is expected")
+    assert found[0].caption.startswith("NEES; 2 is expected")
+    assert legend_of(panels(found[1])[0].figure) == ["2 sigma", "run 0"]
+    assert [of.title for of in found] == [
+        "NEES",
+        "Errors over their stated sigma",
+        "Errors and stated bounds",
+        "Coverage",
+    ]
+    assert legend_of(panels(found[2])[0].figure) == ["2-sigma bounds", "run 0"]
+
+
+def test_the_worst_run_is_named_and_drawn(tmp_path: Path, rng: np.random.Generator) -> None:
+    data = errors_of(rng)
+    data["errors"][7] *= 5.0
+    np.savez(tmp_path / "e.npz", **data)
+    record = cs.read(tmp_path / "e.npz")
+    worst = next(of for of in record_figures(record, cs.judge(record)) if of.title == "Which run, and when")
+    of_runs, of_steps = panels(worst)
+    assert of_steps.get_ylabel() == "NEES of run 7"
+    np.testing.assert_allclose(places(of_runs)[0][:, 1], record.nees.mean(axis=1))
+    np.testing.assert_allclose(places(of_runs)[1], [[7.0, record.nees[7].mean()]])
+
+
+def test_the_first_steps_set_no_axis(tmp_path: Path, rng: np.random.Generator) -> None:
+    """A filter that starts with a large error and says so."""
+    data = errors_of(rng)
+    usual = np.abs(data["errors"]).max()
+    data["errors"][:, :2] *= 1000.0
+    data["covariances"] = data["covariances"] * np.where(np.arange(STEPS) < 2, 1e6, 1.0)[:, None, None]
+    np.savez(tmp_path / "e.npz", **data)
+    record = cs.read(tmp_path / "e.npz")
+    found = {of.title: of for of in record_figures(record, cs.judge(record))}
+    assert panels(found["Errors and stated bounds"])[0].get_ylim()[1] < 10.0 * usual
+    assert panels(found["Errors over their stated sigma"])[0].get_ylim()[1] < 10.0
 
 
 def test_runs_of_one_step_stand_side_by_side(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -129,7 +163,7 @@ def test_runs_of_one_step_stand_side_by_side(tmp_path: Path, rng: np.random.Gene
     covariances = np.broadcast_to(np.diag([0.25, 4.0]), (RUNS, 1, 2, 2))
     np.savez(tmp_path / "e.npz", errors=errors, covariances=covariances, axes=["x", "yaw"])
     record = cs.read(tmp_path / "e.npz")
-    of_errors, of_nees, _ = record_figures(record, cs.judge(record))
+    of_nees, of_errors, _ = record_figures(record, cs.judge(record))
     for axes, factor, sigma, error in zip(
         panels(of_errors), (1.0, 180 / np.pi), (0.5, 2.0), errors[:, 0].T, strict=True
     ):

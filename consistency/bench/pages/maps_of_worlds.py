@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -32,15 +33,26 @@ from consistency.referee.document.blocks import (
     Text,
     table,
 )
-from consistency.referee.document.colours import COLOURS
+from consistency.referee.document.colours import COLOURS, EXPECTED, Look, solid, style
 from consistency.referee.document.wording import brief, listed, number
 from consistency.referee.pages.origin import facts
-from consistency.referee.show.painting import TITLE, add_legend, canvas, say, wrapped
+from consistency.referee.show.painting import TITLE, add_legend, canvas, dots, log_axis, say, stroke, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
+# colour and marker of a verdict: each has a shape of its own, so that a grey print still reads
+LOOKS = {
+    "consistent": Look(COLOURS[0], marker="o", size=8.0),
+    "overconfident": Look(COLOURS[1], marker="^", size=6.5),
+    "conservative": Look(COLOURS[5], marker="v", size=6.5),
+    "biased": Look(COLOURS[3], marker="D", size=5.5),
+    "heavy-tailed": Look(COLOURS[4], marker="s", size=6.0),
+    "inconsistent": Look(COLOURS[1], marker="P", size=6.0),
+    "undecided": Look("#ffffff", marker="o", size=6.5, edge="#6e6e6e"),
+    "failed": Look("#111111", marker="X", size=6.0),
+}
 # heads of columns on paper
 HYPHENATED = {
     "consistent": "Con-\nsistent", "overconfident": "Over-\nconfident", "conservative": "Conser-\nvative",
@@ -58,6 +70,7 @@ WORDS = {
 }  # fmt: skip
 ROW, MARGIN = 0.34, 0.75  # inches: height of a row of tiles, and of title and axis
 ROOM = 15  # rows of tiles in one drawing, about, titles and axes counted as two
+BEYOND = 1.25  # of a log axis is left beyond the first and the last value, as a factor
 WIDEST = 6  # tiles beside each other where two panels stand side by side
 View = tuple[list[GridAxis], list[tuple[GridAxis, int]]]  # axes for the sides of a panel, and a place on each other one
 
@@ -68,11 +81,20 @@ def compose_regime(regime: Regime) -> Document:
     heat = tuple(heat_figure(regime, name) for name in sweep.filters)
     chapters = [
         Chapter("filters", "Filters", "Filters", (_summary(regime), about), sweep.summary),
+        *_regions(regime),
         Chapter("ratios", "How wrong the covariance is", "Covariance ratios", heat),
         Chapter("rigs", "Rig, and the filters to trust", "Rigs", (_rigs(regime),)),
         Chapter("provenance", "Provenance", "Provenance", _provenance(regime)),
     ]
     return Document(f"Regime map: {sweep.name}", answer(regime), tuple(chapters))
+
+
+def _regions(regime: Regime) -> list[Chapter]:
+    """The chapter of a sweep along one axis of numbers; none for others, whose heat maps show as much."""
+    sides = _sides(regime)
+    if not len(regime.sweep.axes) == len(sides) == 1:
+        return []
+    return [Chapter("regions", "Where each filter is consistent", "Regions", (_along(regime, sides[0]),))]
 
 
 def answer(regime: Regime) -> str:
@@ -169,6 +191,62 @@ def _provenance(regime: Regime) -> tuple[Block, ...]:
 
 def _short(key: str) -> str:
     return key.rpartition(".")[2]
+
+
+# --- along one axis ---------------------------------------------------------------------------------
+
+
+def _along(regime: Regime, side: GridAxis) -> Figure:
+    """Covariance ratio and RMSE of all filters along the one axis of a sweep."""
+
+    def draw() -> Drawing:
+        figure, (ratios, errors) = canvas(2.2, 2, 2)
+        for number_of, name in enumerate(regime.sweep.filters):
+            found = results_at(regime, name, [])
+            x = np.array([float(side.values[cell.indices[0]]) for cell, _ in found])
+            look = solid(style(number_of))
+            quantities = ((ratios, [r.ratio for _, r in found]), (errors, [r.rmse_position for _, r in found]))
+            for axes, values in quantities:
+                axes.plot(x, values, label=name, **stroke(look))
+                for place, value, (_, result) in zip(x, values, found, strict=True):
+                    axes.plot(place, value, gid=TITLE + words_of(result), **dots(_marker(result.status, look.colour)))
+        statuses = dict.fromkeys(result.status for result in regime.results.values())
+        for status in statuses:
+            ratios.plot([], [], label=status, **dots(_marker(status, "#555555")))
+        ratios.axhline(1.0, **stroke(EXPECTED))
+        ratios.set_ylabel("true / stated covariance")
+        errors.set_ylabel("RMSE (m)")
+        for axes in (ratios, errors):
+            _draw_side(axes, "x", side)
+            log_axis(axes, "y")
+        return add_legend(figure)
+
+    caption = (
+        f"True over stated covariance, 1 is right (line), and RMSE of the position along {_short(side.key)}. The shape "
+        "of a marker is the verdict."
+    )
+    return Figure(f"Along {_short(side.key)}", caption, (draw,))
+
+
+def _marker(status: str, colour: str) -> Look:
+    """The shape of a verdict in the colour of a filter; hollow where its own is."""
+    look = LOOKS[status]
+    if look.edge:
+        return replace(look, edge=colour, size=4.5)
+    return replace(look, colour=colour, size=4.5)
+
+
+def _draw_side(axes: Axes, side: str, axis: GridAxis) -> None:
+    """Ticks and range of one axis of numbers."""
+    first, last = float(axis.values[0]), float(axis.values[-1])
+    unit = f" ({axis.unit})" if axis.unit else ""
+    axes.set(**{f"{side}label": _short(axis.key) + unit})
+    if axis.log:
+        axes.set(**{f"{side}lim": (first / BEYOND, last * BEYOND)})
+        log_axis(axes, side)
+    else:
+        room = 0.08 * (last - first)
+        axes.set(**{f"{side}lim": (first - room, last + room), f"{side}ticks": [float(value) for value in axis.values]})
 
 
 # --- heat maps ------------------------------------------------------------------------------------

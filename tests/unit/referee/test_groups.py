@@ -266,6 +266,9 @@ def test_standard_deviations_are_judged_by_group_one_by_one() -> None:
     assert f"{GROUP} of x" in verdict.faults
     assert any(line.startswith("x: mode <= 0: covariance ratio") for line in verdict.reasons)
     assert verdict.statistics["by_part"]["y"]["groups"][0]["status"] == "overconfident"
+    error[column == 0] /= 2.0
+    right = cs.judge(error, deviations=sigma, axes=("x", "y"), by={"mode": column})
+    assert "; x: consistent in each of 4 groups by mode; y: consistent in each of 4 groups by mode" in right.reasons[0]
 
 
 def test_groups_go_with_runs_windows_and_pieces() -> None:

@@ -333,9 +333,14 @@ def test_honest_columns_are_not_refused() -> None:
     assert selects_on_outcome(Column("n_matches", number), ("x", "y"), flat, flat, covariance) == ""
 
 
-@pytest.mark.parametrize("name", ["x", "true_x", "x_gt", "est_y", "sigma", "P_xx", "std_heading"])
+@pytest.mark.parametrize("name", ["x", "true_x", "x_gt", "est_y", "sigma", "P_xx", "std_y"])
 def test_names_that_select_on_the_outcome(name: str) -> None:
     assert selects_on_outcome(Column(name, np.arange(40.0)), ("x", "y")) != ""
+
+
+@pytest.mark.parametrize("name", ["p_hpa", "gnss_std", "speed", "true_speed", "t", "var_of_matches"])
+def test_names_that_do_not(name: str) -> None:
+    assert selects_on_outcome(Column(name, np.arange(40.0)), ("x", "y")) == ""
 
 
 def test_groups_of_the_outcome_show_and_do_not_convict() -> None:

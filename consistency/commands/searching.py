@@ -182,14 +182,14 @@ def challenge_command(
     ] = None,
 ) -> None:
     """Find the world where a filter is most overconfident. Confirm it on new runs."""
-    from consistency.bench.challenging.challenge import Plan
-    from consistency.bench.challenging.challenge import challenge as challenge_filter
-    from consistency.bench.challenging.challenge_text import (
+    from consistency.bench.challenging.challenge import (
+        Plan,
         challenge_data,
         challenge_lines,
         require_writable,
         write_scenario,
     )
+    from consistency.bench.challenging.challenge import challenge as challenge_filter
 
     require_word("--fail-on", fail_on, "found")
     if minutes is None and trials is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -28,10 +28,14 @@ from consistency.commands.shared_options import (
     require_written,
     tell_notes,
 )
+from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy
 from consistency.referee.readers.options import Reading
+
+if TYPE_CHECKING:
+    from consistency.referee.verdicts.sources import Source
 
 
 @reads_files
@@ -43,43 +47,50 @@ def analyse_command(
     ] = None,
     false_alarm: Annotated[
         float | None,
-        typer.Option("--false-alarm", help=f"Chance to find a fault in a filter that has none [{FALSE_ALARM}]."),
+        typer.Option("--false-alarm", help=f"Probability of finding a fault in a correct filter [{FALSE_ALARM}]."),
     ] = None,
     detect: Annotated[
         float | None,
         typer.Option(
-            "--detect", help=f"Consistent is a covariance ratio shown inside [1/R, R] [{DETECT}].", metavar="R"
+            "--detect", help=f"Say 'consistent' only if the ratio is shown to lie in [1/R, R] [{DETECT}].", metavar="R"
         ),
     ] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option("--tolerance", help="A covariance ratio shown inside [1/R, R] is no fault.", metavar="R"),
+        typer.Option("--tolerance", help="Accept a ratio that is shown to lie in [1/R, R].", metavar="R"),
     ] = None,
     lost: Annotated[
         float | None,
-        typer.Option("--lost", help="Consistent is also a share of lost runs shown to be this at most.", metavar="P"),
+        typer.Option(
+            "--lost", help="Say 'consistent' only if the share of lost runs is shown to be at most P.", metavar="P"
+        ),
     ] = None,
     innovations: Annotated[
         str | None,
-        typer.Option("--innovations", help="'optimal': of an optimal gain without a gate, so that they are judged."),
+        typer.Option(
+            "--innovations", help="'optimal': declare an optimal, ungated gain; innovations are then tested too."
+        ),
     ] = None,
     confidence: Annotated[
-        float | None, typer.Option("--confidence", help="1 less the --false-alarm, in its place.")
+        float | None,
+        typer.Option("--confidence", help="Confidence level; alternative to --false-alarm (1 - false alarm)."),
     ] = None,
     skip: Skip = None,
     report: Annotated[
         Path | None,
-        typer.Option("--report", help="Folder for an HTML and a PDF page on files, or FILE.xml (JUnit) or FILE.md."),
+        typer.Option("--report", help="Folder for an HTML and a PDF page, or FILE.xml (JUnit), or FILE.md."),
     ] = None,
     as_json: AsJson = False,
-    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
+    fail_on: Annotated[
+        str | None, typer.Option("--fail-on", help="'inconsistent': exit with status 1 unless all are consistent.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing report files.")] = False,
 ) -> None:
-    """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
+    """Check whether stated covariances match the errors. Explain the verdict."""
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.command_settings import settings_of, skip_asked
-    from consistency.referee.verdicts.sources import judge_all
+    from consistency.referee.verdicts.sources import files_source, judge_all
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -93,8 +104,10 @@ def analyse_command(
     require_written(overwrite, report, "--report")
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
-        verdicts = judge_all(recordings, filters, settings=settings, optimal_gain=innovations is not None)
+        source = files_source(path, recordings)
+        verdicts = judge_all(source, filters, settings=settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
+        _refuse_unfinished(path, source, "monte-carlo", fail_on)
         if report is not None and not is_file:
             from consistency.referee.pages.write_pages import write_file_reports
             from consistency.referee.show.as_json import render
@@ -119,11 +132,7 @@ def analyse_command(
                 "--innovations is for files of another estimator; filters of the bench declare it themselves"
             )
         verdicts = judge_all(results, filters, settings=settings, skip=first)
-        if results.unfinished:
-            text = f"{path}: {results.unfinished}; the same 'consistency run' with --resume goes on"
-            if fail_on:
-                raise InputError(f"--fail-on: {text}")
-            print(f"consistency: {text}", file=sys.stderr)
+        _refuse_unfinished(path, results, "run", fail_on)
     shown = document(verdicts, path.name)
     if report is not None and is_file:
         from consistency.referee.pages.write_pages import write_text_file
@@ -142,6 +151,16 @@ def analyse_command(
         raise typer.Exit(1)
 
 
+def _refuse_unfinished(path: Path, source: Source, command: str, fail_on: str | None) -> None:
+    """Say that runs are missing; refuse them with ``--fail-on``."""
+    if not source.unfinished:
+        return
+    text = f"{path}: {source.unfinished}; the same 'consistency {command}' with --resume continues"
+    if fail_on:
+        raise InputError(f"--fail-on: {text}")
+    print(f"consistency: {text}", file=sys.stderr)
+
+
 @reads_files
 def report_command(
     path: Annotated[
@@ -150,14 +169,14 @@ def report_command(
     files: Reading,
     html: Annotated[
         Path | None,
-        typer.Option("--html", help="HTML file [default: PATH/report.html; of estimates PATH-report.html]."),
+        typer.Option("--html", help="HTML file [default: PATH/report.html; for estimates PATH-report.html]."),
     ] = None,
-    pdf: Annotated[Path | None, typer.Option("--pdf", help="PDF file [beside the default HTML file].")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    pdf: Annotated[Path | None, typer.Option("--pdf", help="PDF file [default: beside the HTML file].")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")] = False,
 ) -> None:
-    """Write a report of results as one offline HTML file and a PDF."""
+    """Write a report as one offline HTML file and a PDF."""
     from consistency.referee.pages.write_pages import require_pages, write_file_pages
-    from consistency.referee.verdicts.sources import judge_all
+    from consistency.referee.verdicts.sources import files_source, judge_all
 
     estimates = are_files(path, files)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
@@ -166,7 +185,7 @@ def report_command(
     if estimates:
         require_pages(*targets, overwrite)
         recordings = read_files(path, files)
-        write_file_pages(recordings, judge_all(recordings), *targets, path.name)
+        write_file_pages(recordings, judge_all(files_source(path, recordings)), *targets, path.name)
         tell_notes(recordings)
     else:
         from consistency.bench.pages import write_reports
@@ -179,22 +198,25 @@ def report_command(
 
 def plan_command(
     scenario: Annotated[
-        str | None, typer.Argument(metavar="[SCENARIO]", help="Run a short pilot of it to learn how steps depend.")
+        str | None,
+        typer.Argument(
+            metavar="[SCENARIO]", help="Scenario of a short pilot, which shows how steps depend on each other."
+        ),
     ] = None,
     filters: Annotated[
         list[str] | None, typer.Option("--filter", metavar="NAME", help="Filter of the pilot; may be repeated.")
     ] = None,
     like: Annotated[
-        Path | None, typer.Option("--like", metavar="RESULTS", help="Results to learn from, in place of a pilot.")
+        Path | None, typer.Option("--like", metavar="RESULTS", help="Results to use instead of a pilot.")
     ] = None,
-    pilot_runs: Annotated[int, typer.Option("--pilot-runs", help="Runs of the pilot.")] = 40,
+    pilot_runs: Annotated[int, typer.Option("--pilot-runs", help="Number of runs of the pilot.")] = 40,
     seed: Seed = 0,
     detect: Annotated[float, typer.Option("--detect", help=f"{DETECT_HELP.capitalize()}.")] = DETECT,
     dof: Annotated[int, typer.Option("--dof", help="Dimension of the error; 3 for a planar pose.")] = 3,
     false_alarm: FalseAlarm = FALSE_ALARM,
     power: Power = POWER,
     allow: Annotated[
-        str | None, typer.Option("--allow", help="'conservative': a covariance too large is no fault.")
+        str | None, typer.Option("--allow", help="'conservative': accept a covariance that is too large.")
     ] = None,
     lost: Annotated[float | None, typer.Option("--lost", help=f"{LOST_HELP.capitalize()}.", metavar="P")] = None,
     groups: Annotated[
@@ -202,7 +224,7 @@ def plan_command(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
+    """Compute how many runs a verdict needs. Without a pilot, the number holds however steps depend on each other."""
     from consistency.referee.document.needed_runs import plan_lines
     from consistency.referee.verdicts.command_settings import plan as plan_runs
 
@@ -212,8 +234,13 @@ def plan_command(
         raise InputError("--filter goes with a SCENARIO or --like RESULTS")
     if scenario is not None and not filters:
         raise InputError(f"--filter: name the filter to plan for in {scenario}")
-    pilots = None
-    if like is not None:
+    pilots, pilot_dof = None, len(POSE)
+    if like is not None and are_files(like, Reading()):
+        from consistency.referee.verdicts.command_settings import pilots_of_records
+
+        pilots, pilot_dof = pilots_of_records(read_files(like, Reading()), filters)
+        dof = pilot_dof
+    elif like is not None:
         from consistency.bench.runs.sequential import pilots_in
 
         pilots = pilots_in(like, filters)
@@ -222,7 +249,7 @@ def plan_command(
         from consistency.bench.runs.sequential import pilots_in_world
 
         pilots = pilots_in_world(scenario, filters, pilot_runs, seed)
-    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, groups)
+    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)
     if as_json:
         print(json.dumps(planned, indent=2))
     else:

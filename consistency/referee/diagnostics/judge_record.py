@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import takewhile
 from typing import TYPE_CHECKING, NamedTuple
@@ -47,9 +47,9 @@ def judge(
     are white. Without truth they are judged alone.
 
     If a fit to the truth absorbed an unknown part of the errors (``Record.reduced``), a covariance that is too large
-    is no fault, as with ``allow="conservative"``. *Consistent* is still shown on both sides, after adding the largest
-    share of the NEES that the fit may have absorbed (``Record.unseen``). Questions that cannot be answered after the
-    fit (``Record.unavailable``) are not asked.
+    is not a fault, as with ``allow="conservative"``. *Consistent* is still shown on both sides, after adding the
+    largest share of the NEES that the fit may have absorbed (``Record.unseen``). Questions that cannot be answered
+    after the fit (``Record.unavailable``) are not asked.
 
     A map is judged likewise, with its landmarks in the place of steps (``Record.landmarks``) and with the NEES of
     pose and map together, where it is given.
@@ -230,7 +230,7 @@ def _judge_conventions(record: Record, settings: Settings, keep_record: bool) ->
 
 
 def look(design: Design, evidence: Record, spent: float | None) -> Verdict:
-    """The verdict at one inspection: `undecided` means that the runs go on.
+    """The verdict at one inspection: `undecided` means that the runs continue.
 
     A filter without truth is judged by its innovations, at looks only.
     """
@@ -259,6 +259,34 @@ def follow(design: Design, evidence_of: Callable[[int], Record], limit: int | No
         if is_last or found.status != "undecided":
             return _of_look(design, evidence, runs, found, first), runs
     raise AssertionError("unreachable: a design without a last look is endless")
+
+
+def looks(
+    design: Design, filters: Sequence[str], read: Callable[[int, str], Record], decided: dict[str, Verdict]
+) -> Iterator[int]:
+    """Yield the number of runs of each inspection, look when they are there, and end when all ``filters`` are decided.
+
+    Parameters
+    ----------
+    read : record of the first runs of a filter, by their number and its name
+    decided : where verdicts go, by filter
+    """
+    for runs, spent in design.inspections():
+        yield runs
+        for name in [name for name in filters if name not in decided]:
+            verdict = _look_at(design, read(runs, name), runs, spent)
+            if verdict is not None and (verdict.status != "undecided" or runs == design.max_runs):
+                decided[name] = verdict
+        if len(decided) == len(filters):
+            return
+
+
+def _look_at(design: Design, record: Record, runs: int, spent: float | None) -> Verdict | None:
+    """What is said after so many runs; None where it is not the time to ask."""
+    some = record.first_runs(runs)
+    if runs != design.max_runs and not speaks(design, some, spent):
+        return None
+    return look(design, some, spent)
 
 
 def _inspections(design: Design, limit: int | None) -> Iterator[tuple[int, float | None, bool]]:
@@ -298,3 +326,8 @@ def _p_of_scale(design: Design, evidence: Record) -> float:
     if sample is None:
         return 1.0
     return ever(e_process(sample.means(), sample.dof).both)
+
+
+def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:
+    parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
+    return ", ".join(parts + [f"{name} open" for name in filters if name not in decided])

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from consistency.referee.diagnostics.records.large_arrays import of_runs
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.record import Record, arrays_of
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, asymmetric, classify
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
@@ -68,7 +68,7 @@ def assemble(
     t : (steps,), s, NaN where a step has no time
     axes : names of the components of the error
     file : where the estimates are from, for messages
-    may_end : a run that ends before the others is no sign of a broken filter
+    may_end : a run that ends before the others is not a sign of a broken filter
 
     Raises
     ------
@@ -115,8 +115,23 @@ def assemble(
     )  # fmt: skip
 
 
+def with_failed_runs(record: Record, failed: Mapping[int, str]) -> Record:
+    """The record with runs that left no estimates: NaN throughout, and failed in step 1 for the reason given by run."""
+    if not failed:
+        return record
+    numbers = np.append(record.run_numbers, list(failed))
+    order = np.argsort(numbers)
+    arrays: dict[str, Any] = {}
+    for name, array in arrays_of(record).items():
+        nothing = np.full((len(failed), *array.shape[1:]), np.nan)
+        arrays[name] = np.concatenate([array, nothing])[order]
+    failures = [*record.failures, *(Failure(record.name, run, 1, reason) for run, reason in failed.items())]
+    failures.sort(key=lambda failure: failure.run)
+    return replace(record, **arrays, runs=numbers[order], failures=tuple(failures))
+
+
 def _require_different(file: str, tracks: Sequence[Track]) -> None:
-    """Refuse a run that is there twice: the verdict counts runs that share no noise."""
+    """Refuse a run that is duplicated: the verdict counts runs that share no noise."""
     seen: dict[bytes, Track] = {}
     for track in tracks:
         if track.error is None or len(track.error) < 2 or not np.nan_to_num(track.error).any():
@@ -124,8 +139,8 @@ def _require_different(file: str, tracks: Sequence[Track]) -> None:
         other = seen.setdefault(hashlib.sha256(np.ascontiguousarray(track.error).tobytes()).digest(), track)
         if other is not track:
             raise InputError(
-                f"{file}: the errors from {track.place[0]} on are those from {other.place[0]} on to the last digit: a "
-                "run that is there twice; leave one of them out"
+                f"{file}: the runs that start at {other.place[0]} and {track.place[0]} are identical; "
+                "remove the duplicate"
             )
 
 

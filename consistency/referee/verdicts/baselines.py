@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -40,6 +40,8 @@ class Baseline:
     failures: dict[str, int]
     axes: dict[str, tuple[str, ...]]  # names of the components of each filter's error
     skip: str | None = None  # first steps that were left out: 20, 2s
+    # of runs of a program: what each was made of, its seed or recorded file and its truth, by run
+    trials: Mapping[int, str] = field(default_factory=dict)
 
     def of_the_trials_of(self, other: Baseline) -> bool:
         """Whether both are of the same trials, so that runs of one number belong together."""
@@ -65,6 +67,7 @@ def baseline(
         A filter has no NEES, or nothing of it is left.
     """
     first, filters, failures, axes = skip_asked(skip), {}, {}, {}
+    of_runs: dict[int, str] = {}
     source = source_of(of)
     if not source.has_truth:
         raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
@@ -72,6 +75,7 @@ def baseline(
         record = source.record(each).without_first(first)
         if record.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
+        of_runs |= record.trials
         failures[each], axes[each] = len(record.failures), tuple(record.axes)
         own = record
         if not record.unshown:
@@ -81,7 +85,7 @@ def baseline(
     trials = source.trials
     if truth is not None:
         trials = (_digest(truth), None)
-    return Baseline(name, source.scenario, trials, filters, failures, axes, _option(first))
+    return Baseline(name, source.scenario, trials, filters, failures, axes, _option(first), of_runs)
 
 
 def _option(skip: Skip | None) -> str | None:
@@ -119,6 +123,7 @@ def write_baseline(base: Baseline, path: Path, overwrite: bool = False) -> None:
         scenario=base.scenario,
         origin=list(base.origin),
         skip=base.skip,
+        trials={str(run): trial for run, trial in base.trials.items()},
         filters={
             name: {key: plain(value) for key, value in vars(s).items()}
             | {"failures": base.failures[name], "axes": list(base.axes[name])}
@@ -147,11 +152,11 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
     Raises
     ------
     InputError
-        It is no baseline, is damaged, or was written with other first steps.
+        It is not a baseline, is damaged, or was written with other first steps.
     """
     data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")
+        raise InputError(f"{path}: is not a baseline; write one with 'consistency baseline DIR --out {path}'")
     with reading(path, "damaged; write it again"):
         for key in ("scenario", "origin", "filters"):
             if key not in data:
@@ -164,11 +169,12 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
             raise ValueError("key 'origin': not a list of two")
         if not isinstance(data["filters"], dict):
             raise ValueError("key 'filters': not a table")
+        trials = _trials_of(data.get("trials", {}))  # files written before lack it
         rows = {name: _filter_of(row, f"filters.{name}") for name, row in data["filters"].items()}
     filters, failures, axes = {}, {}, {}
     for name, row in rows.items():
         filters[name], failures[name], axes[name] = row
-    base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, axes, left_out)
+    base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, axes, left_out, trials)
     return require_skip(base, skip)
 
 
@@ -196,7 +202,7 @@ def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]
     _known(table, place, FILTER_KEYS, optional=("axes",))  # files written before lack it
     runs = [_whole(run, f"{place}.runs.{k}", 0, 2**63) for k, run in enumerate(_list(table["runs"], f"{place}.runs"))]
     if len(set(runs)) < len(runs):
-        raise ValueError(f"key '{place}.runs': a run is there twice")
+        raise ValueError(f"key '{place}.runs': a run is duplicated")
     nees = _numbers(table["nees"], f"{place}.nees")
     squared, covered = (
         [_numbers(row, f"{place}.{key}.{k}", HIGHEST_DOF) for k, row in enumerate(_list(table[key], f"{place}.{key}"))]
@@ -215,8 +221,15 @@ def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]
     return RunSummary(np.array(runs, np.int64), dof, *parts), failures, tuple(axes)
 
 
+def _trials_of(table: Any) -> dict[int, str]:
+    """What each run was made of, by run."""
+    if not isinstance(table, dict) or not all(isinstance(trial, str) for trial in table.values()):
+        raise ValueError("key 'trials': not a table of texts")
+    return {int(run): trial for run, trial in table.items()}
+
+
 def _known(table: Any, place: str, keys: Sequence[str], optional: Sequence[str] = ()) -> None:
-    """Refuse what is no table of these keys and no others."""
+    """Refuse what is not a table of these keys and no others."""
     if not isinstance(table, dict):
         raise ValueError(f"key '{place}': not a table")
     if missing := [key for key in keys if key not in table]:

@@ -295,6 +295,25 @@ def test_bad_input_is_named_and_nothing_is_written(
     assert "exists already" in refused(capsys, "correct", estimates, *good)
 
 
+def test_a_folder_of_tables_comes_back_as_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = write_tables(tmp_path, np.random.default_rng(6), runs=6)
+    for path in paths:
+        head, *lines = path.read_text().splitlines()
+        path.unlink()
+        (tmp_path / path.stem).mkdir()
+        for run in range(1, 7):
+            own = [line for line in lines if line.startswith(f"{run},")]
+            (tmp_path / path.stem / f"drive{run}.csv").write_text("\n".join([head, *own]) + "\n")
+    options = ("--truth", tmp_path / "truth")
+    out, _ = consistency(capsys, "correct", tmp_path / "est", *options, "--out", tmp_path / "c", "--anyway")
+    assert sorted(path.name for path in (tmp_path / "c/held-out").iterdir()) == [
+        f"drive{run}.csv" for run in range(1, 7)
+    ]
+    said, _ = consistency(capsys, "analyse", tmp_path / "c/held-out", *options)
+    assert f"{shown_ratio(said)} after" in out
+    consistency(capsys, "correct", tmp_path / "est", *options, "--held-out", "drive2,drive5")
+
+
 def test_two_estimators_are_told_apart(
     tables: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -266,6 +266,9 @@ def test_standard_deviations_are_judged_by_group_one_by_one() -> None:
     assert f"{GROUP} of x" in verdict.faults
     assert any(line.startswith("x: mode <= 0: covariance ratio") for line in verdict.reasons)
     assert verdict.statistics["by_part"]["y"]["groups"][0]["status"] == "overconfident"
+    error[column == 0] /= 2.0
+    right = cs.judge(error, deviations=sigma, axes=("x", "y"), by={"mode": column})
+    assert "; x: consistent in each of 4 groups by mode; y: consistent in each of 4 groups by mode" in right.reasons[0]
 
 
 def test_groups_go_with_runs_windows_and_pieces() -> None:
@@ -330,9 +333,14 @@ def test_honest_columns_are_not_refused() -> None:
     assert selects_on_outcome(Column("n_matches", number), ("x", "y"), flat, flat, covariance) == ""
 
 
-@pytest.mark.parametrize("name", ["x", "true_x", "x_gt", "est_y", "sigma", "P_xx", "std_heading"])
+@pytest.mark.parametrize("name", ["x", "true_x", "x_gt", "est_y", "sigma", "P_xx", "std_y"])
 def test_names_that_select_on_the_outcome(name: str) -> None:
     assert selects_on_outcome(Column(name, np.arange(40.0)), ("x", "y")) != ""
+
+
+@pytest.mark.parametrize("name", ["p_hpa", "gnss_std", "speed", "true_speed", "t", "var_of_matches"])
+def test_names_that_do_not(name: str) -> None:
+    assert selects_on_outcome(Column(name, np.arange(40.0)), ("x", "y")) == ""
 
 
 def test_groups_of_the_outcome_show_and_do_not_convict() -> None:
@@ -409,6 +417,36 @@ def test_a_trajectory_with_a_table(tmp_path: Path) -> None:
     assert record.by[0, :4].tolist() == [0.0, 0.0, 2.0, 2.0]
     with pytest.raises(cs.InputError, match="has no columns of its own; --by-file FILE names a table"):
         cs.read(tmp_path / "est.txt", **files, by="n_matches")
+
+
+def test_windows_take_the_value_at_their_beginning(tmp_path: Path) -> None:
+    rng, rows, true = np.random.default_rng(10), [], []
+    for step in range(41):
+        small, P = 0.01 * rng.standard_normal(3), "0.0001,0,0,0.0001,0,0.0001"
+        rows.append(f"{step},{small[0]},{small[1]},{small[2]},{P},{step % 4}")
+        true.append(f"{step},0,0,0")
+    (tmp_path / "est.csv").write_text("t,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh,mode\n" + "\n".join(rows) + "\n")
+    (tmp_path / "truth.csv").write_text("t,x,y,heading\n" + "\n".join(true) + "\n")
+    record = cs.read(
+        tmp_path / "est.csv", tmp_path / "truth.csv", relative=2, motions=True, windows="independent", by="mode"
+    )
+    assert record.by[0, :4].tolist() == [0.0, 2.0, 0.0, 2.0]
+    assert record.as_runs.groups.index[:4, 0].tolist() == [0, 1, 0, 1]
+
+
+def test_innovations_have_no_groups(tmp_path: Path) -> None:
+    (tmp_path / "nis.csv").write_text("t,nis,nis_dof,mode\n0,1,1,1\n1,1,1,2\n")
+    with pytest.raises(cs.InputError, match=r"--by mode: .*nis.csv has no truth"):
+        cs.read(tmp_path / "nis.csv", by="mode")
+
+
+def test_a_component_that_is_not_judged_is_environment(tmp_path: Path) -> None:
+    rng = np.random.default_rng(11)
+    rows = [f"{k},{a},0,{a + b},{c},1,{a}" for k, (a, b, c) in enumerate(rng.standard_normal((60, 3)))]
+    (tmp_path / "est.csv").write_text("t,a,P_a_b,true_a,b,P_a_a,mine\n" + "\n".join(rows) + "\n")
+    assert cs.read(tmp_path / "est.csv", state=["a"], by="b").groups.outcome == ""
+    assert cs.read(tmp_path / "est.csv", state=["a"], by="a").groups.outcome == "is a component of the estimate"
+    assert cs.read(tmp_path / "est.csv", state=["a"], by="mine").groups.outcome == "is a component of the estimate"
 
 
 def test_a_key_of_an_archive(tmp_path: Path) -> None:

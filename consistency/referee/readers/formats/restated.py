@@ -12,7 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.referee.readers.formats.file_kinds import ARCHIVES, is_bag, is_plane, is_solution, is_spatial
+from consistency.referee.readers.formats.file_kinds import (
+    ARCHIVES,
+    is_bag,
+    is_plane,
+    is_solution,
+    is_spatial,
+    table_files,
+    trajectory_files,
+)
 from consistency.referee.readers.formats.named_columns import DEVIATIONS, fields_of, head_of, roles_of
 from consistency.referee.readers.formats.other_names import covariance_places
 from consistency.referee.readers.formats.pose_rows import DEVIATED, FULL, TRIANGLE
@@ -97,8 +105,12 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
     """
     if is_bag(estimates) or estimates.suffix.lower() in ARCHIVES or is_solution(estimates):
         return []
-    if estimates.is_file() and estimates.suffix.lower() == ".csv" and (r.state or not is_spatial(estimates)):
-        found = [_table(estimates, tuple(r.state or POSE), name, r.by if r.by_file is None else None)]
+    by = r.by if r.by_file is None else None
+    axes = tuple(r.state or POSE)
+    if estimates.is_dir() and table_files(estimates) and (r.state or not trajectory_files(estimates)):
+        found = [_table(path, axes, name, by, run) for run, path in enumerate(table_files(estimates))]
+    elif estimates.is_file() and estimates.suffix.lower() == ".csv" and (r.state or not is_spatial(estimates)):
+        found = [_table(estimates, axes, name, by)]
     elif is_plane(estimates):
         return []
     elif r.covariance is not None:
@@ -110,16 +122,18 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
     return known if len(known) == len(found) else []
 
 
-def _table(path: Path, axes: tuple[str, ...], name: str, by: str | None) -> TextFile | None:
-    """A table, whose first line names its columns."""
+def _table(path: Path, axes: tuple[str, ...], name: str, by: str | None, run: int | None = None) -> TextFile | None:
+    """A table, whose first line names its columns; of one ``run`` where that is given."""
     head = head_of(path)
     if head is None:
         return None
     names = head.names
     if any(name.startswith("own_P") for name in names):
         return None
-    run, of, value = (names.index(key) if key in names else None for key in ("run", "filter", by))
-    bare = TextFile(path, {}, True, run_column=run, filter_column=of, filter=name, by_column=value)
+    runs, of, value = (names.index(key) if key in names else None for key in ("run", "filter", by))
+    if run is not None:
+        runs = None
+    bare = TextFile(path, {}, True, run=run or 0, run_column=runs, filter_column=of, filter=name, by_column=value)
     places = {name: i for i, name in enumerate(names)} | covariance_places(names, axes)
     entries: dict[int, tuple[str, str]] = {}
     for a, b in itertools.product(axes, repeat=2):

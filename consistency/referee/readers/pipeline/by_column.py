@@ -15,15 +15,18 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Known, Poses
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
     from consistency.referee.readers.formats.sheet import TableRows
 
+ENOUGH = 5000  # rows that show what a column is made from
+ROTATION = range(3, 6)  # components of a pose in space
+NO_TRUTH = "has no truth, so that there are no errors to group"
 NO_COLUMNS = "has no columns of its own; --by-file FILE names a table with the column and t or run"
 
 
-def with_values(e: Estimator, r: Reading) -> tuple[Estimator, Column | None]:
+def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estimator, Column | None]:
     """The estimator with the values of the column in each row, and the column of all rows; None without ``--by``.
 
     Raises
@@ -41,6 +44,7 @@ def with_values(e: Estimator, r: Reading) -> tuple[Estimator, Column | None]:
         raise InputError(f"--by {r.by}: {e.path} {NO_COLUMNS}")
     cells = [p.by for p in runs if p.by is not None]
     column = column_of(r.by, np.concatenate(cells))
+    column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
     ends = np.cumsum([0, *map(len, cells)])
     parts = zip(runs, ends, ends[1:], strict=False)
     return replace(e, runs=[replace(p, by=column.values[start:end]) for p, start, end in parts]), column
@@ -57,22 +61,37 @@ def of_record(record: Record, r: Reading) -> tuple[Record, Column | None]:
     if cells is None:
         raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
     column = column_of(r.by, cells)
+    column = replace(column, outcome=selects_on_outcome(column, record.axes))
     return replace(record, by=column.values), column
 
 
-def beside_states(column: Column, e: Estimator, runs: Sequence[Poses], known: Sequence[Known]) -> Column:
-    """The column, marked where it selects on the outcome by its name, or beside the true and estimated states."""
-    rows = list(zip(runs, known, strict=True))
+def beside_states(
+    column: Column, e: Estimator, judged: Sequence[int], runs: Sequence[Poses], known: Sequence[Known]
+) -> Column:
+    """The column, marked where its values are those of a judged component of the truth or the estimate, or a sigma."""
+    some = [k.of(_some(len(k.rows), len(runs))) for k in known]
+    rows = list(zip(runs, some, strict=True))
     values = np.concatenate([p.by[k.rows] for p, k in rows if p.by is not None])
-    estimate = np.concatenate([p.estimate[k.rows] for p, k in rows])
-    truth, P = np.concatenate([k.truth for _, k in rows]), np.concatenate([p.covariance[k.rows] for p, k in rows])
-    has_states = e.convention != ""  # errors of an archive stand in the place of a truth
-    column_known = replace(column, values=values)
-    if has_states:
-        outcome = selects_on_outcome(column_known, e.axes, truth, estimate, P)
-    else:
-        outcome = selects_on_outcome(column_known, e.axes, covariance=P)
-    return replace(column, outcome=outcome)
+    states = [] if e.convention == "" else _columns_of(e, judged)  # errors of an archive stand in the place of a truth
+    truth, estimate = (
+        np.concatenate([state[:, states] for state in of_runs])
+        for of_runs in ([k.truth for k in some], [p.estimate[k.rows] for p, k in rows])
+    )
+    P = np.concatenate([p.covariance[k.rows] for p, k in rows])[:, judged][:, :, judged]
+    axes = [e.axes[i] for i in judged]
+    return replace(column, outcome=selects_on_outcome(replace(column, values=values), axes, truth, estimate, P))
+
+
+def _columns_of(e: Estimator, judged: Sequence[int]) -> list[int]:
+    """Columns of a state that are judged components; of rotations in space, which are quaternions, none."""
+    if not e.in_space:
+        return list(judged)
+    return [i if i < ROTATION.start else i + 1 for i in judged if i not in ROTATION]
+
+
+def _some(count: int, parts: int = 1) -> Indices:
+    """At most ``ENOUGH`` of so many rows in all, evenly chosen."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, max(ENOUGH // parts, 2))).astype(np.int64))
 
 
 def grouped(record: Record, column: Column | None, r: Reading, option: str = "--by") -> Record:
@@ -86,12 +105,13 @@ def grouped(record: Record, column: Column | None, r: Reading, option: str = "--
     if column is None or record.by is None:
         return record
     if record.nees is None:
-        raise InputError(f"{option} {column.name}: {record.name} has no truth, so that there are no errors to group")
+        raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
     counted = np.isfinite(record.nees)
     if not counted.any():
         return record
-    error = None if record.error is None else record.error[counted]
-    if why := made_from_errors(column.name, record.by[counted], error, record.nees[counted]):
+    run, step = (places[_some(int(counted.sum()))] for places in np.nonzero(counted))
+    error = None if record.error is None else record.error[run, step]
+    if why := made_from_errors(column.name, record.by[run, step], error, record.nees[run, step]):
         raise InputError(
             f"{option} {column.name}: the column is made from the errors ({why}), and groups of small and of large "
             "errors differ in any estimator; take a column that was fixed before the error was, or rename one that is "
@@ -121,7 +141,7 @@ def with_groups(
         raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(named)} names")
     ((name, values),) = named.items()
     if record.nees is None:
-        raise InputError(f"by: {record.name} has no truth, so that there are no errors to group")
+        raise InputError(f"by: {record.name} {NO_TRUTH}")
     try:
         column = column_of(name, on_steps(values, record.nees.shape))
     except ValueError as wrong:

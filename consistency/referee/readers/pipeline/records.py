@@ -17,7 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.pipeline.by_column import beside_states, grouped, with_values
+from consistency.referee.readers.pipeline.by_column import NO_TRUTH, beside_states, grouped, with_values
 from consistency.referee.readers.places import exact, refuse
 from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
 from consistency.referee.readers.truth_matching import (
@@ -41,8 +41,8 @@ OF_WINDOWS = ("relative", "motions", "windows")  # options
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
 FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
 STILL = (
-    "not estimated and left out: their errors are 0 in every row, and their variances one constant each, as of a robot "
-    "in the plane"
+    "not estimated and left out: their errors are 0 in every row, and their variances one constant each, as for a "
+    "robot in the plane"
 )
 
 
@@ -57,11 +57,13 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     InputError
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
+    if e.innovations_alone and r.by is not None:
+        raise InputError(f"--by {r.by}: {e.path} {NO_TRUTH}")
     if e.innovations_alone:
         return [_innovations(e)]
     require_radians(str(e.path), e.runs)
     judged = _named(e, r)
-    e, column = with_values(e, r)
+    e, column = with_values(e, r, judged)
     relative = windows_asked(r)
     if relative is not None:
         return [grouped(_windows(e, judged, r, relative), column, r)]
@@ -87,7 +89,7 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     if e.convention:
         notes.append(f"error convention {e.convention}: {e.definition}")
     if column is not None:
-        column = beside_states(column, e, runs, known)
+        column = beside_states(column, e, judged, runs, known)
     tracks, t, numbering = _in_columns(e, runs, known, tracks)
     notes += numbering
     records = []

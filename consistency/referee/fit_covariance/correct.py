@@ -158,7 +158,8 @@ def correct(
     require_runs(record)
     assert record.nees is not None
     labels = tuple(map(str, record.run_numbers if names is None else names))
-    fitted, judged = fitted_and_judged(labels, np.isfinite(record.nees).any(axis=1), held_out)
+    counted = np.asarray(np.isfinite(record.nees).any(axis=1))
+    fitted, judged = fitted_and_judged(labels, counted, held_out)
     blocks = blocks_of(record.axes, record.dof, per_axis)
     fits = fit_groups(record.of_runs(fitted), blocks)
     place = {run: row for row, run in enumerate(fitted)}

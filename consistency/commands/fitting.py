@@ -20,6 +20,7 @@ from consistency.commands.shared_options import (
     require_written,
     tell_notes,
 )
+from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
 
 KEPT = ("truth", "max_dt", "time_offset", "topic", "truth_topic", "body")
@@ -156,6 +157,8 @@ def correct_command(
     require_written(overwrite, out, "--out")
     if out is not None:
         require_free(out, overwrite, "correction")
+    if per is not None and files.align not in (None, "none", "origin"):
+        raise InputError(f"--per axis: does not go with --align {files.align}, which turns the axes of the covariances")
     records = read_files(path, files)
     record = the_record(records, name).without_first(skip_asked(skip))
     texts = text_files(path, files, record.name)

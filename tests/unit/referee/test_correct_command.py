@@ -288,6 +288,7 @@ def test_bad_input_is_named_and_nothing_is_written(
     estimates, truth = tables
     good = ("--truth", truth, "--out", tmp_path / "c")
     assert "--per must be 'axis'" in refused(capsys, "correct", estimates, *good, "--per", "block")
+    assert "turns the axes" in refused(capsys, "correct", estimates, *good, "--per", "axis", "--align", "se3")
     assert "no run '99'" in refused(capsys, "correct", estimates, *good, "--held-out", "99")
     assert "declare the one" in refused(capsys, "correct", estimates, *good, "--error", "guess")
     assert not (tmp_path / "c").exists()

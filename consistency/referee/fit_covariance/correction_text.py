@@ -24,8 +24,11 @@ def sentence(found: Correction) -> str:
     if found.held_out != IN_TURN:
         how = f"fitted on {plural(len(found.fitted), found.unit)}, judged on {len(found.judged)} others"
     parts = [f"{found.status} after: held-out covariance ratio {shown(before)} before and {shown(after)} after", how]
-    if found.status == "undecided" and found.needed is not None:
-        parts.append(f"about {plural(found.needed, found.unit)} would decide")
+    if found.status == "undecided":
+        decided_by = (
+            f"about {plural(found.needed, found.unit)} would decide" if found.needed else found.verdict.reasons[0]
+        )
+        parts.append(decided_by)
     if found.status == "inconsistent":
         parts.append(f"no factor mends this: {found.verdict.reasons[0]}")
     fits = found.shown.values()

@@ -278,6 +278,8 @@ def test_one_log_is_cut_into_pieces(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "one log has no other to judge its factors by" in refused(capsys, "correct", tmp_path / "log.npz")
     out, _ = consistency(capsys, "correct", tmp_path / "log.npz", "--split", "25", "--out", tmp_path / "c")
     assert "25 pieces, each judged by the factors of the others" in out
+    few, _ = consistency(capsys, "correct", tmp_path / "log.npz", "--split", "10")
+    assert "10 pieces of one log are too few" in few
     said, _ = consistency(capsys, "analyse", tmp_path / "c/held-out/log.npz")
     assert f"{shown_ratio(said)} after" in out
 

@@ -125,7 +125,7 @@ def row_of(world: World, draws: int, rng: np.random.Generator) -> Row:
             held[i, b] = factor.holds(true.factor[b] + true.floor[b] if same else true.factor[b])
             held[i, B + b] = same or floor.holds(true.floor[b])
             logs[i, b] = np.log(whole[b])
-            widths[i, b] = np.log(factor.high / factor.low)
+            widths[i, b] = np.log(factor.high / max(factor.low, 1e-12))
     oracle = 2 * stats.norm.isf(0.025) * logs.std(axis=0, ddof=1)
     ones = held[:, :B].mean(axis=0) if not true.floor.any() and (true.factor == 1.0).all() else np.ones(1)
     return Row(

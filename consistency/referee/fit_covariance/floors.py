@@ -109,11 +109,19 @@ def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
     floors = [Interval(0.0, 0.0, 0.0)] * B
     for i, b in zip(range(B, p), free, strict=True):
         floors[b] = floor_interval(theta[i], open_step[i], open_steps[:, i])
-    positive = np.maximum(open_steps[:, :B], LEAST * alone.factors.factor)
+    intervals = []
+    for b in range(B):
+        value = float(theta[b])
+        if open_steps[:, b].min() > LEAST * start[b]:
+            intervals.append(interval_of_ratio(value, open_steps[:, b]))
+        else:  # a factor that may be 0, so that the floor stands alone
+            at_zero = value <= 2.0 * LEAST * start[b]
+            plain = floor_interval(0.0 if at_zero else value, open_step[b], open_steps[:, b])
+            intervals.append(plain._replace(value=value))
     return Fit(
         factors[0],
         tuple(factors[1:]),
-        tuple(interval_of_ratio(float(theta[b]), positive[:, b]) for b in range(B)),
+        tuple(intervals),
         tuple(floors),
         known_dof(relative_sizes(record, factors[0], factors[1:]), np.array([len(block) for block in blocks])),
     )

@@ -175,7 +175,8 @@ def draw_correction(found: Correction) -> Drawing:
     name_rows(factors, names)
     factors.axvline(1.0, **stroke(EXPECTED))
     values = np.array([factor for fit in found.shown.values() for factor in fit.factor])
-    low, high = values[:, 1].min(), values[:, 2].max()
+    high = values[:, 2].max()
+    low = max(values[:, 1].min(), 1e-3 * high)  # a factor may be 0
     factors.set_xlim(min(0.7, 0.8 * low), max(1.4, 1.25 * high))
     intervals(factors, np.arange(len(names), dtype=float), values, style(1))
     log_axis(factors, "x")

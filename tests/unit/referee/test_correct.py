@@ -299,6 +299,16 @@ def test_no_floor_is_kept_that_data_do_not_ask_for() -> None:
     assert "floors are 0" in fit.notes[0]
 
 
+def test_a_factor_of_0_beside_a_floor_has_a_one_sided_interval() -> None:
+    rng = np.random.default_rng(2)
+    P = covariances(rng, 20, 40, 3)
+    record = record_of(drawn(rng, np.broadcast_to(50.0 * np.eye(3), P.shape).copy()), P)
+    fit = fit_runs(record, blocks_of(record.axes, 3, False))
+    assert fit.factors.floor[0] == pytest.approx(50.0, rel=0.2)
+    assert fit.factor[0].low == 0.0
+    assert 0.0 < fit.factor[0].high < 2.0
+
+
 def test_a_floor_is_not_told_from_a_covariance_of_its_shape(rng: np.random.Generator) -> None:
     P = np.broadcast_to(2.0 * np.eye(3), (6, 20, 3, 3)).copy()
     record = record_of(drawn(rng, 3.0 * P), P)

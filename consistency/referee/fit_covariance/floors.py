@@ -110,14 +110,12 @@ def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
     for i, b in zip(range(B, p), free, strict=True):
         floors[b] = floor_interval(theta[i], open_step[i], open_steps[:, i])
     intervals = []
-    for b in range(B):
-        value = float(theta[b])
+    for b, factor in enumerate(theta[:B].tolist()):
         if open_steps[:, b].min() > LEAST * start[b]:
-            intervals.append(interval_of_ratio(value, open_steps[:, b]))
+            intervals.append(interval_of_ratio(factor, open_steps[:, b]))
         else:  # a factor that may be 0, so that the floor stands alone
-            at_zero = value <= 2.0 * LEAST * start[b]
-            plain = floor_interval(0.0 if at_zero else value, open_step[b], open_steps[:, b])
-            intervals.append(plain._replace(value=value))
+            center = factor if factor > 2.0 * LEAST * start[b] else 0.0
+            intervals.append(floor_interval(center, open_step[b], open_steps[:, b])._replace(value=factor))
     return Fit(
         factors[0],
         tuple(factors[1:]),

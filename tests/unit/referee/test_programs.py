@@ -190,6 +190,9 @@ def test_the_folder_is_read_by_other_commands(place, capsys):
     assert monte_carlo("--runs", "40", "--out", "out", "--", "./filter", "{run}", capsys=capsys)[0] == 0
     before = monte_carlo("--runs", "40", "--json", "--out", "two", "--", "./filter", "{run}", capsys=capsys)[1]
     assert consistency("analyse", "out", "--json", capsys=capsys)[1] == before
+    words = ("--runs", "40", "--skip", "1", "--detect", "3", "--json", "--out", "skipped", "--", "./filter", "{run}")
+    skipped = monte_carlo(*words, capsys=capsys)[1]
+    assert consistency("analyse", "skipped", "--json", capsys=capsys)[1] == skipped != before
     assert consistency("baseline", "out", "--out", "base.json", capsys=capsys)[0] == 0
     status, out, _ = consistency("compare", "two", "base.json", capsys=capsys)
     assert status == 0

@@ -302,6 +302,7 @@ class _Loop:
         self.names = [record.name for record in records]
         planned = gate_runs(dof, settings.detect, rate, settings.power, settings.allow, settings.lost)
         if self.plan.until_decided:
+            _require_looks(records)
             looked: dict[str, Any] = {
                 "dof": dof, "detect": settings.detect, "false_alarm": settings.false_alarm, "power": settings.power,
                 "max_runs": self.plan.max_runs,
@@ -374,6 +375,14 @@ class _Loop:
             say("--check-seed: run 0 done twice gave the same table; the program is reproducible")
         else:
             say("--check-seed: run 0 done twice gave different tables; the program is not reproducible by {seed}")
+
+
+def _require_looks(records: Sequence[Record]) -> None:
+    """Refuse records whose verdict has no form for looks at growing numbers of runs."""
+    for record in records:
+        if record.parts or record.independent or record.unshown or record.truth_covariance is not None:
+            what = "components, windows or a truth that are judged by themselves"
+            raise InputError(f"--until-decided: {record.name} has {what}; give --runs")
 
 
 def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:

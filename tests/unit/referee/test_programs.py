@@ -242,6 +242,14 @@ def test_looks_end_the_runs_and_the_folder_keeps_them(place, capsys):
     assert len(run_files(place / "few", "run.json")) == 5
 
 
+def test_looks_need_whole_covariances(place, capsys):
+    script(place, 'cut -d, -f1-8,11,13 "$CONSISTENCY_HERE/tables/$1.csv" > estimates.csv')  # variances alone
+    words = ("--overwrite", "--out", "out", "--", "./filter", "{run}")
+    status, _, err = monte_carlo("--until-decided", *words, capsys=capsys)
+    assert (status, "--until-decided: estimates has components" in err) == (2, True)
+    assert monte_carlo("--runs", "12", *words, capsys=capsys)[0] == 0
+
+
 def test_one_run_for_each_recorded_file(place, capsys):
     words = ("--each", "tables/1?.csv", "--out", "out", "--", "cp", "{input}", "estimates.csv")
     status, out, _ = monte_carlo(*words, capsys=capsys)

@@ -356,6 +356,8 @@ def test_estimates_that_end_before_their_truth_have_failed(place, capsys):
     words = ("--runs", "8", "--truth", "truth.csv", "--out", "out", "--overwrite", "--", "./filter", "{run}")
     monte_carlo(*words, capsys=capsys)
     assert failures(place / "out", capsys) == {4: "its estimates end at 2, its truth at 4"}
+    table = np.loadtxt(place / "tables/6.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(cs.read(place / "out").error[6], table[:, 4:7] - table[:, 1:4])  # its own truth
     script(place, text + "head -n 3 all.csv > estimates.csv")  # this is how the program works
     monte_carlo(*words, capsys=capsys)
     assert failures(place / "out", capsys) == {}
@@ -414,7 +416,9 @@ def test_missing_runs_are_done_in_new_folders(place, capsys):
     runs = place / "out/runs"
     for run in (2, 9):
         (runs / f"{run:04d}/run.json").unlink()
-    (runs / "0005/run.json").write_text('{"speed": 3}')  # of the program itself
+    (runs / "0005/run.json").write_text(
+        '{"kind": "mine", "run": 5, "values": {}, "failure": "", "seconds": 0}'
+    )  # of the program itself
     kept = (runs / "0003/estimates.csv").stat().st_mtime_ns
     assert "exists already" in monte_carlo(*words, capsys=capsys)[2]
     status, after, _ = monte_carlo("--resume", *words, capsys=capsys)

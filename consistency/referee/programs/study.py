@@ -46,6 +46,7 @@ from consistency.referee.readers.truth_matching import Estimator
 from consistency.referee.system.progress import Advance, progress, say
 
 ALIKE = 3  # first runs that failed alike stop a study
+IS_WINDOWS = os.name == "nt"
 PROOF = 2  # first runs whose tables must differ
 
 
@@ -143,7 +144,7 @@ def _required(plan: Plan, r: Reading) -> Reading:
         raise InputError("--runs and --until-decided do not go with --each, which has a run for each file")
     if r.error == GUESS:
         raise InputError(f"--error {GUESS}: goes with 'consistency analyse DIR' when the runs are there")
-    if os.name == "nt":
+    if IS_WINDOWS:
         raise InputError("monte-carlo needs process groups of POSIX; on Windows run it in WSL")
     return checked_options(r)
 
@@ -318,7 +319,8 @@ class _Loop:
         self.fields |= {"runs": self.total}
         write_manifest(self.study.folder, self.fields)
         self.advance = stack.enter_context(progress("runs", self.total or planned))
-        self.advance(len(self.logs))
+        if self.total is None or len(self.logs) < self.total:
+            self.advance(len(self.logs))
 
     def _look(self) -> None:
         """Look at the first runs, where as many are there as the next look takes."""

@@ -155,6 +155,13 @@ def test_a_recorded_file_needs_its_option(place, capsys):
     assert "named by --state A,B" in capsys.readouterr().err
 
 
+def test_windows_is_refused_in_one_line(place, capsys, monkeypatch):
+    monkeypatch.setattr("consistency.referee.programs.study.IS_WINDOWS", True)
+    status, _, err = monte_carlo("--out", "out", "--", "./filter", "{run}", capsys=capsys)
+    assert (status, err.count("\n"), (place / "out").exists()) == (2, 1, False)
+    assert "on Windows run it in WSL" in err
+
+
 def test_a_relative_path_is_pointed_out(place, capsys):
     (place / "ekf.yaml").touch()
     words = ("--runs", "2", "--out", "out", "--", "./filter", "{run}", "--config=ekf.yaml", "{here}/ekf.yaml")

@@ -209,6 +209,9 @@ def plan_command(
         str | None, typer.Option("--allow", help="'conservative': a covariance too large is no fault.")
     ] = None,
     lost: Annotated[float | None, typer.Option("--lost", help=f"{LOST_HELP.capitalize()}.", metavar="P")] = None,
+    groups: Annotated[
+        int | None, typer.Option("--groups", help="Number of groups of --by, in one of which that ratio must be found.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
@@ -232,11 +235,11 @@ def plan_command(
 
         pilots = pilots_in(like, filters)
     elif scenario is not None and filters:
-        plan_runs(dof, detect, false_alarm, power, allow, lost=lost)  # refuse before the work
+        plan_runs(dof, detect, false_alarm, power, allow, lost=lost, groups=groups)  # refuse before the work
         from consistency.bench.runs.sequential import pilots_in_world
 
         pilots = pilots_in_world(scenario, filters, pilot_runs, seed)
-    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof)
+    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)
     if as_json:
         print(json.dumps(planned, indent=2))
     else:

@@ -1,7 +1,5 @@
 """The C++ example of docs/any-program.md: the page shows what is in the files, and its commands do what it says."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -17,7 +15,7 @@ PAGE, PART = "docs/any-program.md", "A Kalman filter in C++"
 BIN = Path(sys.executable).parent
 
 
-def require(*programs: str) -> None:
+def require(*programs):
     """Skip the test where one is missing, but not in CI."""
     missing = [program for program in programs if not shutil.which(program)]
     if missing and os.environ.get("CONSISTENCY_REQUIRE_CPP") == "1":
@@ -26,23 +24,23 @@ def require(*programs: str) -> None:
         pytest.skip(f"builds C++, and this machine lacks {', '.join(missing)}")
 
 
-def shell(text: str, folder: Path, path: Path = BIN) -> subprocess.CompletedProcess[str]:
+def shell(text, folder, path=BIN):
     environment = os.environ | {"PATH": f"{path}{os.pathsep}{os.environ['PATH']}"}
     return subprocess.run(["sh", "-c", text], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
 
 
-def commands_of_the_page() -> list[str]:
+def commands_of_the_page():
     """To compile, to run with the right and with half of the noise, to configure, to build, to test."""
     return [command.text for block in blocks(PAGE, "indented", part=PART) for command in typed(block)]
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """The example where a new user has copied it."""
     return Path(shutil.copytree(EXAMPLE, tmp_path / "my kalman"))
 
 
-def test_right_and_halved_noise(folder: Path) -> None:
+def test_right_and_halved_noise(folder):
     """False-alarm rate 0: the seed of the runs is fixed."""
     require("c++")
     compile_it, right, halved, *_ = commands_of_the_page()
@@ -56,7 +54,7 @@ def test_right_and_halved_noise(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_gates_of_the_page(folder: Path) -> None:
+def test_the_gates_of_the_page(folder):
     """In pytest, CTest and GoogleTest, the last where it is installed. False-alarm rate 0: the seeds are fixed."""
     require("c++", "cmake", "ctest", "make")
     compile_it, _, _, configure, build, test = commands_of_the_page()
@@ -79,14 +77,14 @@ def test_the_gates_of_the_page(folder: Path) -> None:
     assert failed == set(re.findall(r"Test +#\d+: (\w+)", done.stdout))
 
 
-def test_what_the_page_shows_is_in_the_files() -> None:
+def test_what_the_page_shows_is_in_the_files():
     shown = [block.text for block in blocks(PAGE, "text", part=PART)]
     for name, begin in (("CMakeLists.txt", "add_test("), ("gate_test.cpp", "TEST(")):
         (excerpt,) = (text for text in shown if text.startswith(begin))
         assert excerpt in (EXAMPLE / name).read_text()
 
 
-def test_a_node_that_died_is_seen(tmp_path: Path) -> None:
+def test_a_node_that_died_is_seen(tmp_path):
     """The wrapper of ROS 2, with a stand-in for ``ros2``."""
     (script,) = (block.text for block in blocks(PAGE, "text", part="ROS 2") if block.text.startswith("#!/bin/bash"))
     for name, text in (

@@ -114,8 +114,9 @@ def run_study(
         say(
             f"consistency: no word of the command holds {what}; runs then differ only if the program reads it by itself"
         )
-    with opened(out, _manifest(program, plan, estimates, r), resume) as study:
-        loop = _Loop(program, plan, study, r)
+    about = _manifest(program, plan, estimates, r)
+    with opened(out, about, resume) as study:
+        loop = _Loop(program, plan, study, r, about)
         loop.do_runs()
         records, verdicts = loop.judged()
         write_manifest(out, {**loop.fields, "complete": True})
@@ -176,16 +177,17 @@ def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[
         "words": list(program.words), "files": program.files(), "cwd": program.cwd and str(program.cwd),
         "seed": plan.seed, "inputs": [os.path.relpath(path, here) for path in plan.inputs] or None,
         "estimates": estimates, "reading": reading, "runs": plan.runs, "until_decided": None, "complete": False,
-        "keep": plan.keep,
+        "keep": plan.keep, "settings": {key: value for key, value in vars(plan.settings).items() if value is not None},
+        "skip": plan.skip and plan.skip.option, "optimal_gain": plan.optimal_gain,
     }  # fmt: skip
 
 
 class _Loop:
     """Runs in progress and done, and what is known of them so far."""
 
-    def __init__(self, program: Program, plan: Plan, study: ProgramStudy, r: Reading) -> None:
+    def __init__(self, program: Program, plan: Plan, study: ProgramStudy, r: Reading, fields: dict[str, Any]) -> None:
         self.program, self.plan, self.study, self.options = program, plan, study, r
-        self.fields = {key: value for key, value in study.manifest.items() if key in _KEYS}
+        self.fields = fields  # of the manifest
         self.runs = Runs(study, r, found_in)
         self.logs: dict[int, ProgramRun] = {}
         self.total = len(plan.inputs) or plan.runs
@@ -372,9 +374,6 @@ class _Loop:
             say("--check-seed: run 0 done twice gave the same table; the program is reproducible")
         else:
             say("--check-seed: run 0 done twice gave different tables; the program is not reproducible by {seed}")
-
-
-_KEYS = ("words", "files", "cwd", "seed", "inputs", "estimates", "reading", "runs", "until_decided", "complete", "keep")
 
 
 def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:

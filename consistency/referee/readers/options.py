@@ -13,6 +13,7 @@ from typing import Any
 from consistency.referee.errors import InputError
 
 COLUMNS = "columns"  # covariance of the truth: of its own file
+GROUPED = ("by", "by_file", "bins")  # options
 MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
 
 
@@ -31,6 +32,13 @@ def _lengths(text: str) -> list[float]:
     """Numbers; NaN where one is none, which the readers refuse."""
     numbers = [_seconds(part) for part in text.split(",")]
     return [each if isinstance(each, float) else math.nan for each in numbers]
+
+
+def _bins(text: str) -> int | list[float]:
+    """A number of bins, or edges, of which a single one ends with a comma; NaN where one is none."""
+    if text.strip().isdecimal():
+        return int(text)
+    return _lengths(text.strip().removesuffix(","))
 
 
 def _option(
@@ -86,6 +94,11 @@ class Reading:
         "How errors of the truth depend on each other: independent, per-run or common to all runs."
     )
     truth_shared: bool | None = _option("The estimator has fused the truth.", flag="--truth-shared/")
+    by: str | None = _option("Judge groups by this column, too: bins of numbers, or words.", "COLUMN")
+    by_file: Path | None = _option("Table with that column and t, run or both.")
+    bins: int | Sequence[float] | None = _option(
+        "Quantile bins of --by [5], or edges between them (40, is one edge).", "N|A,B,C", _bins
+    )
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

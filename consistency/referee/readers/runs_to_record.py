@@ -19,7 +19,7 @@ from consistency.referee.readers.places import Places, listed, refuse
 from consistency.referee.types import Array, Failure, Indices
 
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
-ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path")  # of a track, as in a record
+ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path", "by")  # of a track, as in a record
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,7 @@ class Track:
     t: Array | None = None  # (k,), s; of windows, of their beginnings
     truth_covariance: Array | None = None  # (k, n, n), of the truth itself; NaN where it has none
     path: Array | None = None  # (k, 2, 2 or 3), m, true and estimated positions
+    by: Array | None = None  # (k,), values of the column that makes groups
 
     def part(self, index: Sequence[int]) -> Track:
         assert self.error is not None

@@ -172,6 +172,7 @@ class Poses:
     true_clock: Array | None = None  # (M,), s
     nis: Array | None = None  # (N,)
     nis_dof: Array | None = None  # (N,)
+    by: Array | None = None  # (N,), cells of the column that makes groups, or their values
     open_end: str = ""  # the last row stands in a line without an end: what to note if it is cut short
 
     def known(self, shift: float = 0.0) -> Known:
@@ -241,7 +242,7 @@ class Poses:
         return replace(
             self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
             covariance=self.covariance[rows], stated=self.stated[rows], cross=at(self.cross, rows),
-            clock=at(self.clock, rows), nis=at(self.nis, rows), nis_dof=at(self.nis_dof, rows),
+            clock=at(self.clock, rows), nis=at(self.nis, rows), nis_dof=at(self.nis_dof, rows), by=at(self.by, rows),
         )  # fmt: skip
 
     def beside(self, samples: Indices) -> Poses:

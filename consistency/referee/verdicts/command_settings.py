@@ -65,6 +65,7 @@ def plan(
     pilots: Mapping[str, tuple[Array, int]] | None = None,
     lost: float | None = None,
     pilot_dof: int = 3,
+    groups: int | None = None,
 ) -> dict[str, Any]:
     """Runs that a verdict takes (``runs``), those of one chi-square test (``one_step``), and the first looks.
 
@@ -74,6 +75,7 @@ def plan(
         filters take whose steps depend on each other as theirs do
     lost : share of lost runs that is to be excluded
     pilot_dof : dimension of the errors of the pilots
+    groups : number of groups, in one of which the covariance may be wrong; ``runs_in_group`` is then what each takes
 
     Raises
     ------
@@ -82,7 +84,12 @@ def plan(
     """
     from consistency.referee.diagnostics.planning.early_stopping import Design
     from consistency.referee.diagnostics.planning.pilot import pilot_plan
-    from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs, lost_runs, required_runs
+    from consistency.referee.diagnostics.statistics.number_of_runs import (
+        gate_runs,
+        group_runs,
+        lost_runs,
+        required_runs,
+    )
 
     if allow not in (None, "conservative"):
         raise InputError(f"--allow must be 'conservative', got '{allow}'")
@@ -96,6 +103,9 @@ def plan(
             "one_step": required_runs(dof, detect, false_alarm, power, two_sided=allow is None), "looks": looks,
         }  # fmt: skip
         planned |= {} if lost is None else {"lost": lost, "lost_runs": lost_runs(lost, power)}
+        if groups is not None:
+            each = group_runs(dof, detect, groups, false_alarm, power, allow)
+            planned |= {"groups": groups, "runs_in_group": each, "group_runs": groups * each}
         if pilots is not None:
             planned["like"] = {
                 name: vars(pilot_plan(means, dof, steps, detect, false_alarm, power, allow, lost))

@@ -1,7 +1,5 @@
 """``consistency monte-carlo``: runs of a program, in their folders, and the verdict on what they wrote."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os
@@ -11,7 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +27,7 @@ OF_STATE = ("--state", "a,b,c")
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def place(tmp_path, monkeypatch):
     """A folder with a program and its tables, from which the command is called."""
     write_tables(tmp_path, 70)
     script(tmp_path, COPY)
@@ -38,24 +35,24 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def monte_carlo(*words: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+def monte_carlo(*words, capsys):
     """Exit status and output of the command in this process, for states a, b, c."""
     with pytest.raises(SystemExit) as end:
         main(["monte-carlo", *OF_STATE, *words])
     return end.value.code or 0, *capsys.readouterr()  # type: ignore[return-value]
 
 
-def consistency(*words: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+def consistency(*words, capsys):
     with pytest.raises(SystemExit) as end:
         main([*words])
     return end.value.code or 0, *capsys.readouterr()  # type: ignore[return-value]
 
 
-def run_files(out: Path, name: str) -> list[str]:
+def run_files(out, name):
     return sorted(path.parent.name for path in out.glob(f"runs/*/{name}"))
 
 
-def failures(out: Path, capsys: pytest.CaptureFixture[str]) -> dict[int, str]:
+def failures(out, capsys):
     """Reason of each failed run of a folder."""
     record = cs.read(out)
     return {failure.run: failure.reason for failure in record.failures}
@@ -64,7 +61,7 @@ def failures(out: Path, capsys: pytest.CaptureFixture[str]) -> dict[int, str]:
 # --- words and seeds ---------------------------------------------------------------------------------------
 
 
-def test_seeds_are_different_positive_and_stable() -> None:
+def test_seeds_are_different_positive_and_stable():
     seeds = [seed_of(5, run) for run in range(20_000)]
     assert len(set(seeds)) == len(seeds)
     assert min(seeds) >= 1
@@ -74,12 +71,12 @@ def test_seeds_are_different_positive_and_stable() -> None:
     assert len({seed_of(seed, 0) for seed in range(100)}) == 100
 
 
-def test_only_known_braces_are_replaced() -> None:
+def test_only_known_braces_are_replaced():
     values = {"run": "7", "seed": "12", "here": "/a b"}
     assert filled("{run}{seed}-{other} {{run}} {here}/x {input}", values) == "712-{other} {7} /a b/x {input}"
 
 
-def test_words_come_as_they_are(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_words_come_as_they_are(place, capsys):
     script(place, f'{COPY}; shift; printf "%s\\n" "$@" > words', "say")
     odd = ["two words", "{other} {seed", "a\"b'c", "$HOME `ls` *", "ünï→", "", "--flag", "--"]
     status, _, err = monte_carlo("--runs", "2", "--out", "out", "--", "./say", "{run}", *odd, "{seed}", capsys=capsys)
@@ -87,7 +84,7 @@ def test_words_come_as_they_are(place: Path, capsys: pytest.CaptureFixture[str])
     assert (place / "out/runs/0001/words").read_text().split("\n")[:-1] == [*odd, str(seed_of(0, 1))]
 
 
-def test_a_run_has_a_folder_and_an_environment_of_its_own(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_has_a_folder_and_an_environment_of_its_own(place, capsys):
     script(place, f"{COPY}; pwd > at; env > env; cat > input; echo seen; echo err >&2", "look")
     words = ("--runs", "2", "--seed", "9", "--jobs", "1", "--out", "out", "--", "./look", "{run}", "{seed}")
     assert monte_carlo(*words, capsys=capsys)[0] == 0
@@ -113,9 +110,7 @@ def test_a_run_has_a_folder_and_an_environment_of_its_own(place: Path, capsys: p
         (["tables/0.csv"], "cannot be executed; make it so with chmod +x"),
     ],
 )
-def test_a_program_that_is_none_is_refused_before_any_folder(
-    words: list[str], message: str, place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_program_that_is_none_is_refused_before_any_folder(words, message, place, capsys):
     status, out, err = monte_carlo("--out", "out", "--", *words, capsys=capsys)
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert message in err
@@ -144,16 +139,14 @@ def test_a_program_that_is_none_is_refused_before_any_folder(
         (["--report", "tables/0.csv"], "exists already"),
     ],
 )
-def test_options_that_do_not_go_together(
-    options: list[str], message: str, place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_that_do_not_go_together(options, message, place, capsys):
     status, _, err = monte_carlo(*options, "--out", "out", "--", "./filter", "{run}", capsys=capsys)
     assert status == 2
     assert message in err
     assert not (place / "out").exists()
 
 
-def test_a_recorded_file_needs_its_option(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recorded_file_needs_its_option(place, capsys):
     status, _, err = monte_carlo("--out", "out", "--", "./filter", "{input}", capsys=capsys)
     assert (status, "{input} in the command needs --each" in err) == (2, True)
     (place / "out").mkdir()  # an empty folder is taken
@@ -162,7 +155,7 @@ def test_a_recorded_file_needs_its_option(place: Path, capsys: pytest.CaptureFix
     assert "named by --state A,B" in capsys.readouterr().err
 
 
-def test_a_relative_path_is_pointed_out(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_relative_path_is_pointed_out(place, capsys):
     (place / "ekf.yaml").touch()
     words = ("--runs", "2", "--out", "out", "--", "./filter", "{run}", "--config=ekf.yaml", "{here}/ekf.yaml")
     _, _, err = monte_carlo(*words, capsys=capsys)
@@ -172,7 +165,7 @@ def test_a_relative_path_is_pointed_out(place: Path, capsys: pytest.CaptureFixtu
 # --- verdicts ----------------------------------------------------------------------------------------------
 
 
-def test_a_right_program_is_consistent_and_a_bold_one_is_not(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_right_program_is_consistent_and_a_bold_one_is_not(place, capsys):
     """With the number of runs that the plan gives for three components; false alarm 1e-6."""
     judged = ("--false-alarm", "0.000001", "--detect", "2", "--fail-on", "inconsistent", "--json")
     status, out, err = monte_carlo(*judged, "--out", "out", "--", "./filter", "{run}", capsys=capsys)
@@ -193,10 +186,13 @@ def test_a_right_program_is_consistent_and_a_bold_one_is_not(place: Path, capsys
     assert monte_carlo(*judged, *words, capsys=capsys)[0] == 1  # replaces all of them
 
 
-def test_the_folder_is_read_by_other_commands(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_folder_is_read_by_other_commands(place, capsys):
     assert monte_carlo("--runs", "40", "--out", "out", "--", "./filter", "{run}", capsys=capsys)[0] == 0
     before = monte_carlo("--runs", "40", "--json", "--out", "two", "--", "./filter", "{run}", capsys=capsys)[1]
     assert consistency("analyse", "out", "--json", capsys=capsys)[1] == before
+    words = ("--runs", "40", "--skip", "1", "--detect", "3", "--json", "--out", "skipped", "--", "./filter", "{run}")
+    skipped = monte_carlo(*words, capsys=capsys)[1]
+    assert consistency("analyse", "skipped", "--json", capsys=capsys)[1] == skipped != before
     assert consistency("baseline", "out", "--out", "base.json", capsys=capsys)[0] == 0
     status, out, _ = consistency("compare", "two", "base.json", capsys=capsys)
     assert status == 0
@@ -208,7 +204,7 @@ def test_the_folder_is_read_by_other_commands(place: Path, capsys: pytest.Captur
     assert "estimates" in (place / "r.html").read_text()
 
 
-def test_runs_of_other_seeds_are_compared_as_independent(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_of_other_seeds_are_compared_as_independent(place, capsys):
     for seed, out in (("0", "old"), ("1", "other")):
         words = ("--runs", "20", "--seed", seed, "--out", out, "--", "./filter", "{run}")
         assert monte_carlo(*words, capsys=capsys)[0] == 0
@@ -228,7 +224,7 @@ def test_runs_of_other_seeds_are_compared_as_independent(place: Path, capsys: py
     assert "12 of 20 runs have the same seed and truth" in out
 
 
-def test_looks_end_the_runs_and_the_folder_keeps_them(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_looks_end_the_runs_and_the_folder_keeps_them(place, capsys):
     write_tables(place, 70, 9.0, "bold")
     script(place, COPY.replace("tables", "bold"), "brave")
     said = {}
@@ -246,7 +242,7 @@ def test_looks_end_the_runs_and_the_folder_keeps_them(place: Path, capsys: pytes
     assert len(run_files(place / "few", "run.json")) == 5
 
 
-def test_one_run_for_each_recorded_file(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_run_for_each_recorded_file(place, capsys):
     words = ("--each", "tables/1?.csv", "--out", "out", "--", "cp", "{input}", "estimates.csv")
     status, out, _ = monte_carlo(*words, capsys=capsys)
     assert status == 0
@@ -272,7 +268,7 @@ def test_one_run_for_each_recorded_file(place: Path, capsys: pytest.CaptureFixtu
     assert json.loads(folder)["est"]["reasons"] == beside["reasons"]
 
 
-def test_one_truth_for_all_runs_stands_where_the_user_does(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_truth_for_all_runs_stands_where_the_user_does(place, capsys):
     rows = [line.split(",") for line in (place / "tables/0.csv").read_text().splitlines()]
     (place / "truth.csv").write_text("step,a,b,c\n" + "".join(f"{r[0]},0,0,0\n" for r in rows[1:]))
     words = ("--runs", "4", "--out", "out", "--overwrite", "--", "./filter", "{run}")
@@ -299,7 +295,7 @@ esac
 """
 
 
-def test_each_failed_run_is_named_and_counted(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_failed_run_is_named_and_counted(place, capsys):
     script(place, FAULTS + COPY)
     words = ("--runs", "20", "--fail-on", "inconsistent", "--out", "out", "--", "./filter", "{run}")
     status, out, err = monte_carlo(*words, capsys=capsys)
@@ -324,7 +320,7 @@ def test_each_failed_run_is_named_and_counted(place: Path, capsys: pytest.Captur
         _wait_for_the_end(int((place / "child").read_text()))
 
 
-def test_a_run_that_hangs_is_killed_with_its_children(place: Path) -> None:
+def test_a_run_that_hangs_is_killed_with_its_children(place):
     script(place, "trap '' TERM INT HUP; sleep 60 & echo $! > child; wait")
     program, values = program_of(["./filter"], place), {"run": "0", "seed": "1", "out": str(place / "run")}
     done = run_program(program, place / "run", 0, values, 1.0, Processes())
@@ -335,7 +331,7 @@ def test_a_run_that_hangs_is_killed_with_its_children(place: Path) -> None:
             _wait_for_the_end(int(child.read_text()))
 
 
-def _wait_for_the_end(process: int) -> None:
+def _wait_for_the_end(process):
     """Raise ProcessLookupError when a process is gone or nobody has taken its status."""
     for _ in range(200):
         os.kill(process, 0)
@@ -345,7 +341,7 @@ def _wait_for_the_end(process: int) -> None:
         time.sleep(0.05)
 
 
-def test_estimates_that_end_before_their_truth_have_failed(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_estimates_that_end_before_their_truth_have_failed(place, capsys):
     text = 'cut -d, -f1,5-7 "$CONSISTENCY_HERE/tables/$1.csv" | sed "s/true_//g" > truth.csv\n'
     text += 'cut -d, -f1-4,8- "$CONSISTENCY_HERE/tables/$1.csv" > all.csv\n'
     script(place, text + "if [ $1 = 4 ]; then head -n 3 all.csv; else cat all.csv; fi > estimates.csv")
@@ -357,9 +353,7 @@ def test_estimates_that_end_before_their_truth_have_failed(place: Path, capsys: 
     assert failures(place / "out", capsys) == {}
 
 
-def test_a_table_that_ends_before_those_of_most_runs_has_failed(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_that_ends_before_those_of_most_runs_has_failed(place, capsys):
     script(place, COPY + "\n[ $1 = 4 ] && sed -i '$d' estimates.csv; exit 0")
     words = ("--runs", "8", "--out", "out", "--overwrite", "--", "./filter", "{run}")
     monte_carlo("--keep", "failed", *words, capsys=capsys)
@@ -370,7 +364,7 @@ def test_a_table_that_ends_before_those_of_most_runs_has_failed(
     assert failures(place / "out", capsys) == {}
 
 
-def test_first_runs_that_fail_alike_end_the_study(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_first_runs_that_fail_alike_end_the_study(place, capsys):
     script(place, "echo libfoo.so not found; exit 127")
     status, out, err = monte_carlo("--out", "out", "--", "./filter", "{run}", capsys=capsys)
     assert (status, out) == (2, "")
@@ -383,7 +377,7 @@ def test_first_runs_that_fail_alike_end_the_study(place: Path, capsys: pytest.Ca
     assert "the first 6 runs failed: it ended with status 1" in err
 
 
-def test_two_runs_with_the_same_table_end_the_study(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_runs_with_the_same_table_end_the_study(place, capsys):
     status, _, err = monte_carlo("--out", "out", "--", "./filter", "7", capsys=capsys)
     assert status == 2
     assert "no word of the command holds {seed}" in err
@@ -391,7 +385,7 @@ def test_two_runs_with_the_same_table_end_the_study(place: Path, capsys: pytest.
     assert len(run_files(place / "out", "run.json")) <= 3
 
 
-def test_a_program_is_said_to_be_reproducible_or_not(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_program_is_said_to_be_reproducible_or_not(place, capsys):
     words = ("--runs", "3", "--check-seed", "--overwrite", "--out", "out", "--", "./filter", "{run}")
     assert "gave the same table; the program is reproducible" in monte_carlo(*words, capsys=capsys)[2]
     script(
@@ -406,7 +400,7 @@ def test_a_program_is_said_to_be_reproducible_or_not(place: Path, capsys: pytest
 # --- resuming, replacing, two at once ----------------------------------------------------------------------
 
 
-def test_missing_runs_are_done_in_new_folders(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_runs_are_done_in_new_folders(place, capsys):
     words = ("--runs", "14", "--json", "--out", "out", "--", "./filter", "{run}")
     before = monte_carlo(*words, capsys=capsys)[1]
     runs = place / "out/runs"
@@ -425,7 +419,7 @@ def test_missing_runs_are_done_in_new_folders(place: Path, capsys: pytest.Captur
     assert len(cs.read(place / "out").run_numbers) == 16
 
 
-def test_an_unfinished_folder_says_so(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unfinished_folder_says_so(place, capsys):
     monte_carlo("--runs", "14", "--out", "out", "--", "./filter", "{run}", capsys=capsys)
     manifest = place / "out/manifest.json"
     manifest.write_text(manifest.read_text().replace('"complete": true', '"complete": false'))
@@ -446,9 +440,7 @@ def test_an_unfinished_folder_says_so(place: Path, capsys: pytest.CaptureFixture
         (lambda place: ["--", "./filter", "{run}", "x"], "the words of the command have changed"),
     ],
 )
-def test_another_study_is_not_resumed(
-    change: Any, message: str, place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_study_is_not_resumed(change, message, place, capsys):
     (place / "gains.txt").write_text("1")
     words = ["--runs", "3", "--out", "out"]
     command = ["--", "./filter", "{run}", "--gains={here}/gains.txt"]
@@ -464,7 +456,7 @@ def test_another_study_is_not_resumed(
     assert "use --overwrite" in err
 
 
-def test_two_at_once_in_one_folder(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_at_once_in_one_folder(place, capsys):
     words = ("--runs", "3", "--out", "out", "--", "./filter", "{run}")
     monte_carlo(*words, capsys=capsys)
     with (place / "out/.lock").open("w") as other:
@@ -476,7 +468,7 @@ def test_two_at_once_in_one_folder(place: Path, capsys: pytest.CaptureFixture[st
     assert len(run_files(place / "out", "run.json")) == 3
 
 
-def test_only_a_folder_of_this_command_is_replaced(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_a_folder_of_this_command_is_replaced(place, capsys):
     status, _, err = monte_carlo("--overwrite", "--out", "tables", "--", "./filter", "{run}", capsys=capsys)
     assert status == 2
     assert "is not a folder of 'consistency monte-carlo'" in err
@@ -487,7 +479,7 @@ def test_only_a_folder_of_this_command_is_replaced(place: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_stopped_study_loses_no_finished_run(number: int, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stopped_study_loses_no_finished_run(number, place, capsys):
     """Of a command that is told to end no program is left; after SIGKILL one may live on."""
     script(
         place,
@@ -515,7 +507,7 @@ def test_a_stopped_study_loses_no_finished_run(number: int, place: Path, capsys:
     assert "0003-2" in run_files(place / "out", "run.json")
 
 
-def test_files_of_sound_runs_are_deleted(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_of_sound_runs_are_deleted(place, capsys):
     script(place, "[ $1 = 3 ] && { echo a; exit 1; }\n" + COPY)
     words = ("--runs", "20", "--json", "--out", "out", "--", "./filter", "{run}")
     whole = monte_carlo(*words, capsys=capsys)[1]
@@ -533,7 +525,7 @@ def test_files_of_sound_runs_are_deleted(place: Path, capsys: pytest.CaptureFixt
 # --- Python ------------------------------------------------------------------------------------------------
 
 
-def test_from_python(place: Path) -> None:
+def test_from_python(place):
     verdict = cs.monte_carlo(["./filter", "{run}"], 20, state=["a", "b", "c"], out="out")
     assert verdict.record is not None
     assert len(verdict.record.run_numbers) == 20
@@ -545,9 +537,9 @@ def test_from_python(place: Path) -> None:
         cs.monte_carlo(["./filter", "{run}"], states=["a"])
 
 
-def test_the_gate(place: Path) -> None:
+def test_the_gate(place):
     """A right program passes with probability 1 - 1e-6, at a false-alarm rate of 1e-6."""
-    options: dict[str, Any] = {"state": ["a", "b", "c"], "false_alarm": 1e-6, "detect": 2.0, "jobs": 2}
+    options = {"state": ["a", "b", "c"], "false_alarm": 1e-6, "detect": 2.0, "jobs": 2}
     assert assert_program_consistent(["./filter", "{run}"], **options).consistent
     with pytest.raises(InsufficientTrials, match="4 runs do not show"):
         assert_program_consistent(["./filter", "{run}"], runs=4, **options)

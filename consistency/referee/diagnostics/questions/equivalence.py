@@ -26,6 +26,7 @@ def equivalence(
     low_is_fault: bool = True,
     unseen: float = 0.0,
     share: float = 0.0,
+    weights: Array | None = None,
 ) -> Equivalence:
     """Two one-sided tests that the ratio of true to stated covariance lies in [1 / factor, factor].
 
@@ -44,15 +45,16 @@ def equivalence(
     low_is_fault : whether a ratio below 1 is a fault, which more runs may find
     unseen : share of the NEES that ``means`` may lack; the ratio is then as much larger on its upper side
     share : of errors of the truth in the covariances of ``means``; the ratio is of the others
+    weights : (runs,), of the runs in the mean; None where they are equal
     """
     factor = settings.factor if factor is None else factor
     top, bottom = (share + (1.0 - share) * factor) * (1.0 - unseen), share + (1.0 - share) / factor
-    below = scale_test(means / top, dof, steps, gaussian=False).below if top > 0 else 1.0
-    above = scale_test(means / bottom, dof, steps, gaussian=False).above
+    below = scale_test(means / top, dof, steps, False, weights).below if top > 0 else 1.0
+    above = scale_test(means / bottom, dof, steps, False, weights).above
     runs = None
     if top > 1.0:
         nearer = min(top, 1.0 / bottom) if share and not settings.one_sided else top
-        runs = deciding_runs(scale_test(means, dof, steps, gaussian=False), nearer, settings, low_is_fault)
+        runs = deciding_runs(scale_test(means, dof, steps, False, weights), nearer, settings, low_is_fault)
     return equivalent(below, above, factor, settings, runs)
 
 

@@ -10,8 +10,8 @@ from consistency.referee.diagnostics.judging.status import smaller
 from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
-from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, JOINT, SCALE, SHAPE, Settings
-from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Location, Scale, Within
+from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, GROUP, JOINT, SCALE, SHAPE, Settings
+from consistency.referee.diagnostics.verdict.parts import ByGroup, Equivalence, Innovations, Location, Scale, Within
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.words.faults import (
     MOST,
@@ -24,6 +24,7 @@ from consistency.referee.diagnostics.words.faults import (
     shape_text,
     tails_text,
 )
+from consistency.referee.diagnostics.words.groups import faults_of_groups, groups_without_fault, lines_of_groups
 from consistency.referee.diagnostics.words.numbers import is_or_are, p_text, percent, plural, ratio_text, short
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
@@ -136,6 +137,7 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
         return _faults_of_parts(v)
     parts = []
     of_scale, of_bias = _any_of(SCALE, faults), _any_of(BIAS, faults)
+    is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
     if of_bias:
         parts.append(bias_text(v, "bias" not in faults))
     if v.status == "heavy-tailed":
@@ -151,15 +153,24 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
             parts.append(tails_text(v, faults))
         if JOINT in faults and v.joint is not None:
             parts.append(joint_text(v, v.joint))
+    if v.by_group is not None:
+        parts.append(_groups(v.by_group, faults))
     if len(faults) == 1:
         parts += [ALONE[question] for question in faults if question in ALONE]
     if "innovation scale" in faults and v.innovations is not None:
         parts.append(innovations_text(v, v.innovations))
     if "innovation whiteness" in faults:
         parts.append("innovations correlated over steps")
-    if of_scale and not of_bias and v.status != "heavy-tailed" and _any_of(BIAS, [a.question for a in v.answers]):
+    if (of_scale or GROUP in faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
+
+
+def _groups(by: ByGroup, faults: Faults) -> str:
+    """The worst group where one is at fault, otherwise what is shown of the groups."""
+    if GROUP in faults:
+        return faults_of_groups(by)
+    return groups_without_fault(by)
 
 
 def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
@@ -188,6 +199,8 @@ def _no_fault(v: Findings, s: Scale) -> str:
     if v.worst_axis is not None:
         name, ratio = v.worst_axis
         axis = f" (worst axis: {name}, {ratio_text(ratio)})"
+    if v.by_group is not None:
+        axis += f"; {groups_without_fault(v.by_group)}"
     if shown.shown:
         return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
     do = "do"
@@ -273,6 +286,8 @@ def _levels(v: Findings, s: Scale) -> list[str]:
         axis, ratio_of_axis = v.worst_axis
         of_all = ratio_text(s.inflation)
         lines.append(f"covariance ratio of the worst axis: {axis}, {ratio_text(ratio_of_axis)}; of all {of_all}")
+    if v.by_group is not None:
+        lines += lines_of_groups(v.by_group, v.unit)
     if v.lost is not None and (v.lost.count or v.settings.lost is not None):
         lines.append(
             f"lost {v.unit}s: {v.lost.count} of {v.lost.runs} failed or have a mean NEES above {short(v.lost.bound)}; "
@@ -285,6 +300,8 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     for name, part in v.parts.items():
         if part.scale is not None and part.location is not None:
             lines.append(f"{name}: {_level(part, part.scale, part.location)}")
+        if part.by_group is not None:
+            lines += [f"{name}: {line}" for line in lines_of_groups(part.by_group, v.unit)]
     return lines
 
 

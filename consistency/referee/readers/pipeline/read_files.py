@@ -21,6 +21,7 @@ from consistency.referee.readers.formats.file_kinds import (
     trajectory_files,
 )
 from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.pipeline.by_column import grouped, of_record
 from consistency.referee.readers.pipeline.kinds import (
     OF_BAGS,
     OF_TRAJECTORIES,
@@ -167,7 +168,7 @@ def _records(found: Found, r: Reading) -> list[Record]:
                 replace(with_failed_runs(record, one.failed), trials=one.trials) for record in records_of(one, r)
             ]
         else:
-            records.append(one)
+            records.append(grouped(*of_record(one, r), r))
     return records
 
 
@@ -221,6 +222,9 @@ def checked_options(r: Reading) -> Reading:
         from consistency.referee.readers.truth_covariance import require_truth_options
 
         require_truth_options(r)
+    for name in ("by_file", "bins"):
+        if r.given([name]) and r.by is None:
+            raise InputError(f"{flag_of(name)}: goes with --by COLUMN")
     if r.align not in (None, *ALIGNMENTS):
         raise InputError(f"--align {r.align}: must be one of {', '.join(ALIGNMENTS)}")
     align = None if r.align == "none" else r.align

@@ -173,6 +173,16 @@ def _groups(by: ByGroup, faults: Faults) -> str:
     return groups_without_fault(by)
 
 
+def _groups_of_all(v: Findings) -> str:
+    """What is shown of the groups of the whole, or of each part, where none is at fault."""
+    if v.by_group is not None:
+        return f"; {groups_without_fault(v.by_group)}"
+    texts = [f"; {name}: {groups_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
+    if len(texts) > MOST:
+        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
+    return "".join(texts)
+
+
 def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
     return any(question in asked for question in questions)
 
@@ -199,8 +209,7 @@ def _no_fault(v: Findings, s: Scale) -> str:
     if v.worst_axis is not None:
         name, ratio = v.worst_axis
         axis = f" (worst axis: {name}, {ratio_text(ratio)})"
-    if v.by_group is not None:
-        axis += f"; {groups_without_fault(v.by_group)}"
+    axis += _groups_of_all(v)
     if shown.shown:
         return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
     do = "do"

@@ -14,8 +14,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from consistency.bench.pages.sections.exhibits import Exhibit, Source, groups, listing, several, single
-from consistency.referee.document.blocks import Figure, Table
+from consistency.bench.pages.sections.exhibits import Exhibit, Source, groups, listing, several, shown, single
+from consistency.bench.pages.sections.report_input import Report
+from consistency.referee.document.blocks import Block, Figure, Table
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, Look, style
 from consistency.referee.show.painting import curve, dots, log_axis, stroke
 from consistency.referee.types import Array
@@ -23,6 +24,8 @@ from consistency.referee.types import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+CHAPTER = ("images", "The stereo sensor in rendered images", "Rendered images")
+ON_PAPER = False  # of a report of several studies
 SAMPLES, GAUSS = Look("#c4c4c4"), replace(style(0), width=1.4)
 STOPS = ("disparity", "selected", "features", "within", "pooled", "residual", "sigma", "needed")
 KINDS = ((0.0, "points"), (1.0, "junctions"))
@@ -274,3 +277,8 @@ EXHIBITS = (
     Exhibit(("static-vs-dynamic",), "static-vs-dynamic: noise parameters in motion and at rest",
             (Source("images_static_dynamic", ("moving", "at_rest", "ratio", "low", "high"), ("coordinate",), ratios),)),
 )  # fmt: skip
+
+
+def blocks(report: Report) -> tuple[Block, ...]:
+    """The exhibits whose tables the folder holds."""
+    return shown(report, EXHIBITS)

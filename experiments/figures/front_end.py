@@ -28,10 +28,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
+CHAPTER = ("front-end", "Stereo front-end", "Stereo front-end")
+ON_PAPER = True  # of a report of several studies
 PERCENT = 100.0
 
 
-def front_end(report: Report) -> tuple[Figure, ...]:
+def blocks(report: Report) -> tuple[Figure, ...]:
     """The figures whose tables the folder holds."""
     return (*by_depth(report), *by_scene(report), *first_order(report))
 

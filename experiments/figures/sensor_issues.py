@@ -11,14 +11,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.sections.exhibits import P_VALUE, STATUS, Exhibit, Source, groups, listing, several, single
-from consistency.referee.document.blocks import Figure, Table
+from consistency.bench.pages.sections.exhibits import (
+    P_VALUE,
+    STATUS,
+    Exhibit,
+    Source,
+    groups,
+    listing,
+    several,
+    shown,
+    single,
+)
+from consistency.bench.pages.sections.report_input import Report
+from consistency.referee.document.blocks import Block, Figure, Table
 from consistency.referee.document.colours import COLOURS, EXPECTED, Look, style
 from consistency.referee.show.painting import curve, edges, log_axis, stroke
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+CHAPTER = ("sensor-issues", "The stereo sensor: biases and practical issues", "Sensor issues")
+ON_PAPER = False  # of a report of several studies
 DOF = 3.0
 ROWS = 4  # of a map that are drawn at most
 MAP = ("u", "v", "bias_d")
@@ -255,3 +268,8 @@ EXHIBITS = (
     Exhibit(("near-far-mix",), "near-far-mix: near and far features",
             (Source("near_far_mix", NUMBERS, TEXTS, outcomes, NO_GUARD),)),
 )  # fmt: skip
+
+
+def blocks(report: Report) -> tuple[Block, ...]:
+    """The exhibits whose tables the folder holds."""
+    return shown(report, EXHIBITS)

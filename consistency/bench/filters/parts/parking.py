@@ -1,7 +1,7 @@
 """Landmarks that have not been seen for a while stay in the frame of a clone of the pose.
 
 Nothing moves them there, so that they and the clones are the passive part of a state that is updated locally
-(:mod:`consistency.bench.filters.covariance_update.local`): the active part is the robot, the landmarks in use, and what
+(:mod:`consistency.bench.filters.parts.local`): the active part is the robot, the landmarks in use, and what
 was seen again since the split. A clone is Exp(xi) T with the pose T at which it was made and xi in the state, so that
 what a step says of it is a sum.
 """
@@ -12,15 +12,6 @@ from typing import NamedTuple
 
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.covariance_update.local import LOCAL_FROM
-from consistency.bench.filters.covariance_update.splitting import (
-    add_label,
-    append_rows,
-    join,
-    take_out,
-    wake,
-)
-from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, fill, fill_matrix, filled_matrix, integers, matrix
 from consistency.bench.filters.kernel.covariance import gather_rows, replace_rows
 from consistency.bench.filters.kernel.part_functions import (
@@ -37,7 +28,16 @@ from consistency.bench.filters.kernel.part_functions import (
     spare_width,
     withhold,
 )
-from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.kernel.update_steps import Work
+from consistency.bench.filters.parts.invariant_pose import left_jacobian, move_pose
+from consistency.bench.filters.parts.local import (
+    LOCAL_FROM,
+    add_label,
+    append_rows,
+    join,
+    take_out,
+    wake,
+)
 from consistency.referee.types import Array, Indices
 
 WORTH = 1.1  # variables of the whole state for each of active part and base from which updating is local; measured

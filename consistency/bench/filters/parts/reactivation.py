@@ -6,18 +6,14 @@ import numpy as np
 
 from consistency.bench.filters.compiler.dispatch import implement
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.covariance_update.parking import Clones, is_in_doubt, is_new, recentre, unpark
-from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
 from consistency.bench.filters.kernel.covariance import add_gram_to_state, gather_all_rows, replace_rows, state_index
 from consistency.bench.filters.kernel.part_functions import Data, Slam, State, correct, predict_innovation
-from consistency.bench.filters.kernel.update_steps import apply_beyond, divide_by_root
-from consistency.bench.filters.kernel.work_arrays import Work
-from consistency.bench.filters.landmark.inverse_range import carried, observe_range
-from consistency.bench.filters.motion.unicycle import Frame, robot_frame
-from consistency.bench.filters.update.converting import Converting, ConvertingRoom
-from consistency.bench.filters.update.retraction_chain import (
+from consistency.bench.filters.kernel.update_steps import Work, apply_beyond, divide_by_root
+from consistency.bench.filters.parts.converting import (
+    Converting,
+    ConvertingRoom,
     aim_apart,
     aim_chained,
     cast_columns,
@@ -25,6 +21,10 @@ from consistency.bench.filters.update.retraction_chain import (
     move_chain,
     unchain,
 )
+from consistency.bench.filters.parts.invariant_pose import left_jacobian, move_pose
+from consistency.bench.filters.parts.inverse_range import carried, observe_range
+from consistency.bench.filters.parts.parking import Clones, is_in_doubt, is_new, recentre, unpark
+from consistency.bench.filters.parts.unicycle import Frame, robot_frame
 from consistency.referee.types import Array, Indices
 
 SETTLED = 1e-3  # change in standard deviations that ends an iteration

@@ -22,6 +22,8 @@ from consistency.referee.types import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
+CHAPTER = ("distributions", "What eq. 21 does to Gaussian pixels (fig. 12)", "Stereo noise")
+ON_PAPER = True  # of a report of several studies
 FILE = "fig12.parquet"
 POINT, FOCAL = (10.0, 1.0), 150.0  # m, px: Herath et al. (2007) sec. 4.5
 SIGMA_U, SIGMA_D = 1.34, 0.65  # px, ibid.
@@ -104,7 +106,7 @@ def ellipse(gaussian: Gaussian) -> Array:
     return np.asarray(gaussian.mean + 2.0 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
-def stereo_noise(report: Report) -> tuple[Figure, ...]:
+def blocks(report: Report) -> tuple[Figure, ...]:
     """For each baseline samples with two ellipses, and the histogram of x with two densities."""
     return tuple(Figure(f"Baseline {d.baseline:g} m", noise_caption(d), (partial(_draw, d),)) for d in read(report))
 

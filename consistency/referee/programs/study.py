@@ -46,6 +46,7 @@ from consistency.referee.readers.truth_matching import Estimator
 from consistency.referee.system.progress import Advance, progress, say
 
 ALIKE = 3  # first runs that failed alike stop a study
+IS_WINDOWS = os.name == "nt"
 PROOF = 2  # first runs whose tables must differ
 
 
@@ -143,7 +144,7 @@ def _required(plan: Plan, r: Reading) -> Reading:
         raise InputError("--runs and --until-decided do not go with --each, which has a run for each file")
     if r.error == GUESS:
         raise InputError(f"--error {GUESS}: goes with 'consistency analyse DIR' when the runs are there")
-    if os.name == "nt":
+    if IS_WINDOWS:
         raise InputError("monte-carlo needs process groups of POSIX; on Windows run it in WSL")
     return checked_options(r)
 
@@ -302,6 +303,7 @@ class _Loop:
         self.names = [record.name for record in records]
         planned = gate_runs(dof, settings.detect, rate, settings.power, settings.allow, settings.lost)
         if self.plan.until_decided:
+            _require_looks(records)
             looked: dict[str, Any] = {
                 "dof": dof, "detect": settings.detect, "false_alarm": settings.false_alarm, "power": settings.power,
                 "max_runs": self.plan.max_runs,
@@ -317,7 +319,8 @@ class _Loop:
         self.fields |= {"runs": self.total}
         write_manifest(self.study.folder, self.fields)
         self.advance = stack.enter_context(progress("runs", self.total or planned))
-        self.advance(len(self.logs))
+        if self.total is None or len(self.logs) < self.total:
+            self.advance(len(self.logs))
 
     def _look(self) -> None:
         """Look at the first runs, where as many are there as the next look takes."""
@@ -374,6 +377,14 @@ class _Loop:
             say("--check-seed: run 0 done twice gave the same table; the program is reproducible")
         else:
             say("--check-seed: run 0 done twice gave different tables; the program is not reproducible by {seed}")
+
+
+def _require_looks(records: Sequence[Record]) -> None:
+    """Refuse records whose verdict has no form for looks at growing numbers of runs."""
+    for record in records:
+        if record.parts or record.independent or record.unshown or record.truth_covariance is not None:
+            what = "components, windows or a truth that are judged by themselves"
+            raise InputError(f"--until-decided: {record.name} has {what}; give --runs")
 
 
 def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:

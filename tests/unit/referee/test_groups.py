@@ -466,6 +466,7 @@ def test_a_key_of_an_archive(tmp_path: Path) -> None:
     [
         (["--by", "nope"], "--by nope: .*est.csv has no such column; there are: run, step"),
         (["--bins", "4"], "--bins: goes with --by COLUMN"),
+        (["--by", "site", "--bins", "4"], "--bins: site holds words, each of which is a group"),
         (["--by", "site", "--by-file", "one.csv"], "one.csv: column 't' or 'run' is missing"),
         (["--by", "site", "--by-file", "two.csv"], "two.csv: holds no run 0"),
         (["--by", "site", "--by-file", "three.csv"], "three.csv, line 3: run 0 has several rows; they need a column t"),

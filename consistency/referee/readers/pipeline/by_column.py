@@ -106,6 +106,10 @@ def grouped(record: Record, column: Column | None, r: Reading, option: str = "--
         return record
     if record.nees is None:
         raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
+    if column.words and r.bins is not None:
+        raise InputError(
+            f"{option.replace('by', 'bins')}: {column.name} holds words, each of which is a group; leave the option out"
+        )
     counted = np.isfinite(record.nees)
     if not counted.any():
         return record

@@ -48,7 +48,7 @@ class DeadReckoning(Compiled):
         return True
 
     def outlook(self, trial: Any, belief: Any) -> Outlook:
-        return Outlook(self.name, is_ready=True, is_shared=True, seconds=0.0)
+        return Outlook(self.name, is_ready=True, is_shared=True, size=0)
 
     def run(self, trial: Any, belief: Any, halt: Any = None) -> Estimates:
         controls, T = np.asarray(trial.controls, float), trial.steps

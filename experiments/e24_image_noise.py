@@ -21,7 +21,7 @@ from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import MISMATCH, Chain, Tracks
 from consistency.stereo.rendered_images.stages import LeftRightCheck
 from consistency.stereo.rendered_images.stops import Stops, stand
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 drives = sibling(__file__, "image_drives")
 

@@ -29,7 +29,7 @@ from consistency.stereo.rendered_images.stages import (
     TrackResidual,
 )
 from consistency.stereo.rendered_images.stops import Stops, pose_at, stand
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 drives = sibling(__file__, "image_drives")
 

@@ -174,14 +174,14 @@ def challenge_command(
     ] = None,
 ) -> None:
     """Look for the world in which a filter is most overconfident, and confirm it on fresh runs."""
-    from consistency.bench.challenging.challenge import Plan
-    from consistency.bench.challenging.challenge import challenge as challenge_filter
-    from consistency.bench.challenging.challenge_text import (
+    from consistency.bench.challenging.challenge import (
+        Plan,
         challenge_data,
         challenge_lines,
         require_writable,
         write_scenario,
     )
+    from consistency.bench.challenging.challenge import challenge as challenge_filter
 
     require_word("--fail-on", fail_on, "found")
     if minutes is None and trials is None:

@@ -196,7 +196,7 @@ def test_excerpts_of_filters_are_the_code_that_runs() -> None:
 )
 def test_a_filter_is_one_file_and_a_line_for_each_name(method: str, names: set[str]) -> None:
     """Nothing else in the package but its textbook knows the file or what it defines."""
-    registered = {name: module for name, (module, _, _) in consistency.bench.filters.MODULES.items()}
+    registered = {name: module for name, (module, _) in consistency.bench.filters.MODULES.items()}
     mine = {name for name, module in registered.items() if module == f"methods.{method}"}
     assert {name.rpartition("-")[0] for name in mine} == names
     source = (METHODS / f"{method}.py").read_text(encoding="utf-8")

@@ -13,8 +13,7 @@ from typing import NoReturn
 
 from joblib.externals.loky.backend.reduction import dumps
 
-from consistency.bench.filters.recorder import RunRecord
-from consistency.bench.filters.stepping import error_of, name_of, reason_of, rejects
+from consistency.bench.filters.stepping import RunRecord, error_of, name_of, reason_of, rejects
 from consistency.bench.runs.remote_batch import BatchResult, do_batch, require_same_versions
 from consistency.bench.runs.trial_work import Outcomes, TrialWork
 from consistency.bench.store.trial_rows import RunOutcome, outcome_of

@@ -22,7 +22,7 @@ from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.cameras.rig import is_rectified
 from consistency.stereo.visual_odometry.odometry import motion_covariances, trajectory, visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion

@@ -16,7 +16,7 @@ from consistency.referee.readers.formats.kitti_files import NANO, place_of, read
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
 from consistency.stereo.visual_odometry.cameras.camera_pair import PairCalibration, Rectification, rectify
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")
 KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"))

@@ -10,10 +10,10 @@ import pytest
 import consistency as cs
 from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.compiler.dispatch import fits, generic, implement, part, require_fitting
-from consistency.bench.filters.covariance_update.local import Local
 from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.methods.riekf import RightInvariant
-from consistency.bench.filters.update.unscented import Unscented
+from consistency.bench.filters.methods.ukf import Unscented
+from consistency.bench.filters.parts.local import Local
 
 
 @part()

@@ -17,6 +17,7 @@ import pytest
 from edited import change_manifest
 from painted import by_title, lines, panels, places, shaded, titles
 from scipy import stats
+from scripts import figures
 
 import consistency as cs
 from consistency.bench.pages import write_reports
@@ -24,12 +25,9 @@ from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.sections import (
     anees,
     calibration_rates,
-    front_end,
     nees_distribution,
     nis,
-    paths_and_landmarks,
-    pose_errors,
-    stereo_noise,
+    one_run,
 )
 from consistency.bench.pages.sections.report_input import Report, Study, Track
 from consistency.bench.pages.sections.study_sections import without_truth
@@ -48,6 +46,7 @@ from consistency.referee.pages.judged import clock_of
 from consistency.referee.show import as_html, pdf
 from consistency.referee.types import Failure
 
+front_end, stereo_noise = figures("front_end"), figures("stereo_noise")
 ODD = {
     "ekf-xyz": "<script>alert(1)</script><img src=x onerror=alert(2)>",
     "ekf-uvd": "#set *b* $x^2$ $$y$$ \\frac `c` @ref {{ 7*7 }} </script>",
@@ -118,12 +117,22 @@ def printed(report: Report) -> bytes:
     return pdf.render_pdf(compose(report))
 
 
+def without_studies(folder: Path) -> Report:
+    """What a folder holds beside its studies, which take most of the time to draw."""
+    return replace(build_report(folder), studies=())
+
+
 def axis_caption(study: Study) -> str:
     return by_axis.axis_caption(study, by_axis.forests(study))
 
 
 def with_tracks(report, *tracks: Track):
     return replace(report, studies=(replace(report.studies[0], tracks=tracks),))
+
+
+@pytest.fixture(scope="module")
+def page_of_results(report: Report) -> str:
+    return shown(report)
 
 
 @pytest.fixture
@@ -176,8 +185,8 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(pose_errors.pose_error_series, study.tracks),
-        paths_and_landmarks.read(study).paths, strict=True,
+        anees.read(study).curves, map(one_run.pose_error_series, study.tracks),
+        one_run.read(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
         verdict = by_filter[track.name]
@@ -197,9 +206,9 @@ def test_the_model_is_what_analyse_says(folder):
 def test_the_odometry_is_that_of_the_trial(report, uvd):
     (study,) = report.studies
     trial = cs.simulate(uvd, run=0, seed=1)
-    np.testing.assert_array_equal(paths_and_landmarks.read(study).truth, trial.truth[:, :2])
+    np.testing.assert_array_equal(one_run.read(study).truth, trial.truth[:, :2])
     step = trial.controls[0, 0] * trial.controls[0, 1]
-    odometry = paths_and_landmarks.read(study).odometry
+    odometry = one_run.read(study).odometry
     np.testing.assert_allclose(np.linalg.norm(odometry[1] - odometry[0]), abs(step))
 
 
@@ -724,7 +733,7 @@ def test_odd_names_are_shown_literally_and_failed_runs_are_listed(results, tmp_p
     (study,) = report.studies
     assert len(study.failures) == 6
     assert study.tracks[1].verdict.status == "failed"
-    assert not np.isfinite(paths_and_landmarks.read(study).paths[1][1]).any()
+    assert not np.isfinite(one_run.read(study).paths[1][1]).any()
     assert "6 of 8 runs" in compose(report).answer
 
 
@@ -756,18 +765,18 @@ def test_html_loads_nothing_and_is_small(reproduced):
     assert page.tags.count("h1") == 1
 
 
-def test_a_page_allows_its_own_script_and_no_other(report):
+def test_a_page_allows_its_own_script_and_no_other(report, page_of_results):
     """By its hash, as Content Security Policy Level 3 takes it."""
-    source = shown(report)
+    source = page_of_results
     (script,) = re.findall(r"<script>(.*?)</script>", source, re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}';" in source
     assert "script-src 'none'" in as_html.render(replace(compose(report), chapters=()))
 
 
-def test_clips_of_a_page_have_names_of_their_own(report):
+def test_clips_of_a_page_have_names_of_their_own(page_of_results):
     """Equal ones would clip a figure by the panel of another."""
-    clips = re.findall(r'<clipPath id="(\w+)"', shown(report))
+    clips = re.findall(r'<clipPath id="(\w+)"', page_of_results)
     assert len(clips) > 10
     assert len(set(clips)) == len(clips)
 
@@ -775,10 +784,10 @@ def test_clips_of_a_page_have_names_of_their_own(report):
 def test_a_long_study_takes_half_a_megabyte_of_a_page(results, tmp_path):
     results.write(tmp_path / "run")
     report = build_report(tmp_path / "run")
-    steps = 20_000
+    steps = 4_000
     rng = np.random.default_rng(0)
     peak = rng.random(steps)
-    peak[7_777] = 99.0
+    peak[777] = 99.0
 
     def long(track: Track) -> Track:
         scale = replace(track.verdict.scale, anees=peak, band=np.tile([2.0, 4.0], (steps, 1)))
@@ -802,13 +811,13 @@ def test_a_long_study_takes_half_a_megabyte_of_a_page(results, tmp_path):
 
 
 def test_findings_and_distributions(reproduced):
-    report = build_report(reproduced)
+    report = without_studies(reproduced)
     assert "1 reproduced" in compose(report).answer
     narrow, wide = stereo_noise.read(report)
     # first order: sigma_x = x^2 sigma_d / (f B)
     np.testing.assert_allclose(np.sqrt(narrow.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.09))
     np.testing.assert_allclose(np.sqrt(wide.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.5))
-    cloud, histogram = panels(stereo_noise.stereo_noise(report)[0])
+    cloud, histogram = panels(stereo_noise.blocks(report)[0])
     linear, fitted = lines(cloud)
     np.testing.assert_array_equal(linear.get_xydata(), stereo_noise.ellipse(narrow.linear))
     np.testing.assert_array_equal(fitted.get_xydata(), stereo_noise.ellipse(narrow.fitted))
@@ -862,7 +871,7 @@ def front_end_tables(folder: Path) -> dict[str, pd.DataFrame]:
 
 def test_the_front_end_is_what_its_tables_hold(reproduced):
     front_end_tables(reproduced)
-    report = build_report(reproduced)
+    report = without_studies(reproduced)
     depths, registrations, cells = (read(report) for read in (front_end.shares, front_end.scenes, front_end.cells_of))
     np.testing.assert_array_equal(depths.depth, [2.0, 4.0])
     np.testing.assert_array_equal(depths.share, [0.95, 0.8])
@@ -876,7 +885,7 @@ def test_the_front_end_is_what_its_tables_hold(reproduced):
     assert "probability 0.1 % at most" in text
     assert "$x$ <b>: 0 of 1 accepted" in text
     assert printed(report).startswith(b"%PDF")
-    by_depth, by_scene, first_order = (panels(figure) for figure in front_end.front_end(report))
+    by_depth, by_scene, first_order = (panels(figure) for figure in front_end.blocks(report))
     (curve,) = lines(by_depth[0], "measured")
     np.testing.assert_allclose(curve.get_ydata(), [95.0, 80.0])
     (accepted,) = by_depth[0].patches
@@ -926,7 +935,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
     for number, track in enumerate(study.tracks):
         drawn_panels = panels(figure, number)
         assert titles(drawn_panels)[0] == track.name
-        of = pose_errors.pose_error_series(track)
+        of = one_run.pose_error_series(track)
         for axes, error, sigma in zip(drawn_panels, of.error.T, of.sigma.T, strict=True):
             _, low, high, curve = axes.lines
             np.testing.assert_array_equal(curve.get_ydata(), error)
@@ -935,7 +944,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
 
 def test_the_map_shows_truth_and_estimates(report):
     (study,) = report.studies
-    found = paths_and_landmarks.read(study)
+    found = one_run.read(study)
     (axes,) = panels(by_title(compose(report))["Scenario and estimates, run 0"])
     (truth,), (odometry,) = lines(axes, "true path"), lines(axes, "odometry alone")
     np.testing.assert_array_equal(truth.get_xydata(), found.truth)
@@ -948,14 +957,14 @@ def test_the_map_shows_truth_and_estimates(report):
 def test_a_table_of_the_front_end_alone(reproduced, alone):
     for name in set(front_end_tables(reproduced)) - {alone}:
         (reproduced / f"{name}.parquet").unlink()
-    report = build_report(reproduced)
+    report = without_studies(reproduced)
     assert 'id="front-end"' in shown(report)
     (chapter,) = [chapter for chapter in compose(report).chapters if chapter.anchor == "front-end"]
     assert len(chapter.blocks) == 1
 
 
 def test_without_its_tables_there_is_no_front_end(reproduced):
-    report = build_report(reproduced)
+    report = without_studies(reproduced)
     assert "front-end" not in shown(report)
     assert "front-end" not in {chapter.anchor for chapter in compose(report).chapters}
 
@@ -1012,7 +1021,7 @@ def test_a_log_without_truth_says_so(uvd, tmp_path):
     report = build_report(tmp_path / "run")
     (study,) = report.studies
     assert not study.has_truth
-    assert paths_and_landmarks.read(study).odometry is None
+    assert one_run.read(study).odometry is None
     assert str(tmp_path) not in study.name
     source = shown(report)
     assert "The truth of log is not known" in source

@@ -31,8 +31,8 @@ import numpy as np
 
 from consistency.bench.filters.believed_noise import bias_at, disparity_sigma
 from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.basics import heading_matrix, mounted
 from consistency.bench.filters.textbook.inverse_range import rays, untruncated
-from consistency.bench.filters.textbook.sensors import heading_matrix, mounted
 from consistency.bench.models import stereo
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Observation

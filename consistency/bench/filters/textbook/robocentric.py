@@ -46,6 +46,7 @@ from scipy.linalg import block_diag
 
 from consistency.bench.filters.believed_noise import bias_at, variance_at
 from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.basics import heading_matrix
 from consistency.bench.filters.textbook.inverse_range import (
     Corrections,
     carried,
@@ -74,7 +75,6 @@ from consistency.bench.filters.textbook.robocentric_state import (
     without_block,
     without_idle_clones,
 )
-from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Info, Observation
 from consistency.referee.errors import InputError

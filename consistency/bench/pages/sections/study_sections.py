@@ -11,8 +11,7 @@ from collections.abc import Callable
 from consistency.bench.pages.sections.anees import anees_curves
 from consistency.bench.pages.sections.nees_distribution import nees_distribution
 from consistency.bench.pages.sections.nis import innovations
-from consistency.bench.pages.sections.paths_and_landmarks import world_map
-from consistency.bench.pages.sections.pose_errors import pose_errors
+from consistency.bench.pages.sections.one_run import pose_errors, world_map
 from consistency.bench.pages.sections.report_input import Study
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Text, table
 from consistency.referee.document.guard import COLUMNS as GUARD_COLUMNS

@@ -115,6 +115,7 @@ class Record:
     truth_covariance: Array | None = None  # (runs, steps, n, n), of the truth itself; NaN where it has none
     truth_errors: str | None = None  # declared: its errors are "independent", "per-run" or "common" to all runs
     truth_shared: bool = False  # declared: the estimator has fused the truth
+    trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 
     # beside the errors
     world: Record | None = None  # errors of the same runs as differences in the world, where ``error`` is another

@@ -75,6 +75,11 @@ def trajectory_files(folder: Path) -> list[Path]:
     return named or [p for p in files if is_spatial(p) or is_solution(p)]
 
 
+def table_files(folder: Path) -> list[Path]:
+    """Tables in a folder, by name."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in TABLES and p.is_file() and p.name[0] != ".")
+
+
 SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
 ARRAYS = "errors=truth - estimates, covariances=P"
 WAYS_IN = {

@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
 from consistency.referee.readers.clock_units import nothing_near
-from consistency.referee.readers.formats.file_kinds import TABLES, is_drive, trajectory_files
+from consistency.referee.readers.formats.file_kinds import is_drive, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.readers.formats.named_columns import head_of, numbered
@@ -253,10 +253,7 @@ def _runs(estimates: Path, truth: Path | None, covariance: Path | None) -> list[
         return [(estimates, truth or estimates, covariance)]
     files = trajectory_files(estimates)
     if not files:
-        hint = ""
-        if any(path.suffix.lower() in TABLES for path in estimates.iterdir()):
-            hint = "; tables of several runs go into one file with a column 'run'"
-        raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json{hint}")
+        raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json")
     stems = [path.stem for path in files]
     if twice := next((path for path in files if stems.count(path.stem) > 1), None):
         raise InputError(f"{estimates}: holds the run '{twice.stem}' twice, as .txt and .tum; keep one of them")

@@ -13,7 +13,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import HUGE, read_text, reading
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 UNREADABLE = "cannot be read as YAML"
 LARGEST = 2**20  # bytes of a calibration

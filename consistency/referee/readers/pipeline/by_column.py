@@ -74,7 +74,7 @@ def beside_states(
     values = np.concatenate([p.by[k.rows] for p, k in rows if p.by is not None])
     states = [] if e.convention == "" else _columns_of(e, judged)  # errors of an archive stand in the place of a truth
     truth, estimate = (
-        np.concatenate([state[:, states] for state in of_runs])
+        np.concatenate([state[:, [i for i in states if i < state.shape[1]]] for state in of_runs])
         for of_runs in ([k.truth for k in some], [p.estimate[k.rows] for p, k in rows])
     )
     P = np.concatenate([p.covariance[k.rows] for p, k in rows])[:, judged][:, :, judged]

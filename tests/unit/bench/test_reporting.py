@@ -781,7 +781,7 @@ def test_clips_of_a_page_have_names_of_their_own(page_of_results):
     assert len(set(clips)) == len(clips)
 
 
-def test_a_long_study_takes_half_a_megabyte_of_a_page(results, tmp_path):
+def test_a_long_study_takes_a_third_of_a_megabyte_of_a_page(results, tmp_path):
     results.write(tmp_path / "run")
     report = build_report(tmp_path / "run")
     steps = 4_000
@@ -803,11 +803,11 @@ def test_a_long_study_takes_half_a_megabyte_of_a_page(results, tmp_path):
         report.studies[0],
         steps=np.arange(1, steps + 1),
         clock=clock_of(0.1 * np.arange(1, steps + 1)),
-        tracks=tuple(long(t) for t in report.studies[0].tracks * 4),
+        tracks=tuple(long(t) for t in report.studies[0].tracks * 2),
     )
     studies = [shown(replace(report, studies=(study,) * many)) for many in (1, 2)]
     one, two = (len(source.encode()) for source in studies)
-    assert two - one <= 550_000  # of a study with eight filters
+    assert two - one <= 295_000  # of a study with four filters
 
 
 def test_findings_and_distributions(reproduced):

@@ -54,7 +54,7 @@ class Plan:
     trials: int | None = None  # of the search, at most
     seed: int = 0
     jobs: int = -1
-    false_alarm: float = FALSE_ALARM  # chance that a challenge finds a right filter overconfident
+    false_alarm: float = FALSE_ALARM  # probability that a challenge finds a right filter overconfident
     detect: float = DETECT  # ratio of true to stated covariance that the confirmation finds with a power of 95 %
 
     def __post_init__(self) -> None:

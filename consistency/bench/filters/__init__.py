@@ -110,6 +110,9 @@ def get_filter(name: str) -> Any:
     if name not in MODULES:
         if "," in name:
             raise InputError(f"unknown filter '{name}'; give --filter once for each filter")
+        if ".py" in name:
+            example = "cs.run_trials(scenario, [MyFilter()])"
+            raise InputError(f"unknown filter '{name}'; a filter of your own runs from Python: {example}")
         from consistency.bench.scenario.truth_and_belief import unknown
 
         raise InputError(unknown("filter", name, list(MODULES)))

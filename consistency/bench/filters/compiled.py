@@ -211,7 +211,7 @@ def problem_for(filter_: Any, trial: Trial, belief: Belief) -> Problem:
     Raises
     ------
     InputError
-        It needs the truth, and the trial has none, or has observations of what is no landmark.
+        It needs the truth, and the trial has none, or has observations of what is not a landmark.
     """
     problem = problem_of(trial, belief)
     if is_realisable(filter_):
@@ -223,6 +223,6 @@ def problem_for(filter_: Any, trial: Trial, belief: Belief) -> Problem:
         raise InputError(f"{needs}: run {trial.run} has none; a log needs {missing}, or leave the filter out")
     if len(trial.landmark) and trial.landmark.max() >= len(trial.landmarks):
         raise InputError(
-            f"{needs}: run {trial.run} has observations of things that are no landmark; leave the filter out"
+            f"{needs}: run {trial.run} has observations of things that are not landmarks; leave the filter out"
         )
     return replace(problem, truth=TrialTruth(trial.truth, trial.landmarks))

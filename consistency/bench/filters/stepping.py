@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sysconfig
+import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -71,6 +74,7 @@ class RunRecord:
 
 SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands
 LONGEST = 1000  # characters of an exception's message that are kept
+NOT_THE_USERS = [str(Path(__file__).parents[2]), *map(sysconfig.get_path, ("stdlib", "purelib", "platlib"))]
 
 
 def optimal_gain(filter_: Filter) -> bool:
@@ -114,7 +118,7 @@ def run_filter(filter_: Filter, trial: Trial, belief: Belief, record: RunRecord 
     Raises
     ------
     InputError
-        The filter's error is no convention, nothing gives its covariance, or estimates of a whole trial have another.
+        The filter's error is not a convention, nothing gives its covariance, or a whole trial's estimates have another.
     """
     if isinstance(filter_, WholeTrial):
         estimates, error = filter_.run(trial, belief), error_of(filter_)
@@ -138,7 +142,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, record: RunRecor
     Raises
     ------
     InputError
-        The filter's error is no convention, or nothing gives its covariance; it needs the truth and there is none.
+        The filter's error is not a convention, or nothing gives its covariance; it needs the truth and there is none.
     """
     T, name, error = trial.steps, name_of(filter_), error_of(filter_)
     record = record or RunRecord.empty(T, len(trial.landmark))
@@ -190,7 +194,14 @@ def reason_of(exception: BaseException) -> str:
         text = f"its message cannot be read ({type(error).__name__})"
     what = "out of memory" if isinstance(exception, MemoryError) else type(exception).__name__
     text = text if len(text) <= LONGEST else f"{text[:LONGEST]} ..."
-    return f"{what}: {one_line(text.encode(errors='backslashreplace').decode(), 8 * LONGEST)}"
+    return f"{what}: {one_line(text.encode(errors='backslashreplace').decode(), 8 * LONGEST)}{_line_of(exception)}"
+
+
+def _line_of(exception: BaseException) -> str:
+    """File and line where the user's code raised, in brackets; nothing where it did not."""
+    frames = traceback.extract_tb(exception.__traceback__)
+    own = [frame for frame in frames if not frame.filename.startswith(tuple(NOT_THE_USERS))]
+    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
 
 
 def _nis(info: Info) -> float:
@@ -207,6 +218,8 @@ def _nis(info: Info) -> float:
 def _pose_and_covariances(filter_: Filter, state: Any, error: str) -> tuple[Array, list[Array]]:
     """Mean (3,) of the pose and its covariance (3, 3), with that of the filter's own error where it has one."""
     estimate = filter_.pose(state)
+    if not (hasattr(estimate, "mean") and hasattr(estimate, "covariance")):
+        raise TypeError(f"pose must return cs.Gaussian(mean, covariance), not {type(estimate).__name__}")
     mean, P = _array(estimate.mean, (3,)), _array(estimate.covariance, (3, 3))
     if error == ADDITIVE:
         return mean, [P]

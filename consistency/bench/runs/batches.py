@@ -171,7 +171,7 @@ def _result_of(future: Future[BatchResult]) -> BatchResult | str:
 
 
 def _refuse(error: Exception) -> NoReturn:
-    """Say that the executor has ended; like a full disk it is no fault of the runs, which a resume does."""
+    """Say that the executor has ended; like a full disk it is not a fault of the runs, which a resume does."""
     raise InputError(f"the executor has ended ({reason_of(error)})") from ConnectionError(str(error))
 
 

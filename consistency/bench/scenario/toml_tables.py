@@ -45,7 +45,7 @@ class Table(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     units: ClassVar[dict[str, str]] = {}  # of this table's own keys, beside UNITS
-    not_in_file: ClassVar[frozenset[str]] = frozenset()  # fields that are no key of the file
+    not_in_file: ClassVar[frozenset[str]] = frozenset()  # fields that are not key of the file
 
     @model_validator(mode="before")
     @classmethod

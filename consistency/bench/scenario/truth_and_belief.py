@@ -162,7 +162,7 @@ def load_scenario(name: str | Path) -> Scenario:
 
 
 def misbelief(scenario: Scenario) -> str:
-    """What the belief has otherwise than the truth, and the remedy, in one clause; empty where the belief is right.
+    """In what the belief differs from the truth, and the remedy, in one clause; empty where the belief is right.
 
     A bias map must be believed if it is the case. Other effects that make observations err are in no belief.
     """

@@ -112,7 +112,7 @@ def _require_sound(label: str, observations: Observations, context: Context) -> 
         raise ValueError(f"the effect '{label}' must give each landmark once in a step, in order of step and landmark")
     if context.linear and observations.ids > len(context.landmarks):
         raise InputError(
-            f"the effect '{label}' (truth.sensor.effects) observes things that are no landmark, and a linear sensor "
+            f"the effect '{label}' (truth.sensor.effects) observes things that are not landmarks, and a linear sensor "
             "has nothing to be linearised about for them; use the model 'xyz' or 'uvd'"
         )
 

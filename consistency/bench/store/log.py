@@ -74,13 +74,13 @@ def read_table_file(folder: Path, name: str, also: Sequence[str] = ()) -> pd.Dat
         require_table(folder, name, also)
         return read_parquet(folder, name)
     if not is_file(path):
-        raise InputError(f"{path}: is no file")
+        raise InputError(f"{path}: is not a file")
     names = _header(path)
     needed = dict.fromkeys((*COLUMNS[name], *also))
     if missing := [column for column in needed if column not in names]:
         raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(needed)}")
     if twice := [column for column in names if names.count(column) > 1]:
-        raise InputError(f"{path}: column '{twice[0]}' is there twice")
+        raise InputError(f"{path}: column '{twice[0]}' is duplicated")
     kinds = COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in names}
     with reading(path, DAMAGED):
         convert = pa_csv.ConvertOptions(include_columns=list(kinds), column_types=dict.fromkeys(kinds, pa.float64()))
@@ -127,7 +127,7 @@ class Log:
     belief: Belief
     landmarks: pd.DataFrame | None
     sha256: dict[str, str] = field(default_factory=dict)  # of the files, for the manifest of what is made of them
-    screening: dict[str, Any] | None = None  # gate and counts, where landmarks begin anew off the common motion
+    screening: dict[str, Any] | None = None  # gate and counts, where landmarks restart off the common motion
 
 
 def read_log(folder: str | Path) -> Log:
@@ -264,7 +264,7 @@ def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, bel
     if observations.empty:
         raise InputError(f"{path}: holds no observation; no landmark was ever in view")
     twice = observations.duplicated(["run", "step", "landmark"])
-    _refuse(path, twice, "row {}: this landmark is there twice in one step")
+    _refuse(path, twice, "row {}: this landmark is duplicated in one step")
     known = pd.MultiIndex.from_frame(controls[["run", "step"]])
     stray = ~pd.MultiIndex.from_frame(observations[["run", "step"]]).isin(known)
     _refuse(path, stray, f"row {{}}: {table_file(folder, 'controls').name} has no such run and step")
@@ -295,7 +295,7 @@ def _check_pixels(folder: Path, observations: pd.DataFrame, sensor: SensorFile) 
 
 
 class _Names(NamedTuple):
-    """Numbers in the files: those of landmarks, sorted, and those of things that are no landmark, sorted."""
+    """Numbers in the files: those of landmarks, sorted, and those of things that are not landmarks, sorted."""
 
     landmarks: Indices
     things: Indices
@@ -324,8 +324,8 @@ def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | N
 def _positions(folder: Path, landmarks: pd.DataFrame | None, names: _Names, belief: Belief) -> Array | None:
     if belief.sensor.model == "linear" and len(names.things):
         raise InputError(
-            f"{table_file(folder, 'observations')}: column 'landmark': {names.things[0]} is no landmark, and a linear "
-            "world needs one that it is linearised about"
+            f"{table_file(folder, 'observations')}: column 'landmark': {names.things[0]} is not a landmark, and a "
+            "linear world needs one that it is linearised about"
         )
     path, labels = table_file(folder, "landmarks"), names.landmarks
     if landmarks is None:
@@ -334,7 +334,7 @@ def _positions(folder: Path, landmarks: pd.DataFrame | None, names: _Names, beli
         return None
     table = landmarks.set_index("landmark")[["x", "y", "z"]]
     if table.index.has_duplicates:
-        raise InputError(f"{path}: column 'landmark': every landmark may stand there once")
+        raise InputError(f"{path}: column 'landmark': every landmark may be listed once")
     if missing := sorted(set(labels) - set(table.index)):
         raise InputError(f"{path}: landmark {missing[0]} of observations.parquet is not there")
     return table.loc[list(labels)].to_numpy(float)

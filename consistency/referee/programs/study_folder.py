@@ -35,10 +35,10 @@ def require_usable(folder: Path, resume: bool, overwrite: bool) -> None:
     Raises
     ------
     InputError
-        It exists without ``resume`` or ``overwrite``, is no folder of this command, or cannot be written.
+        It exists without ``resume`` or ``overwrite``, is not a folder of this command, or cannot be written.
     """
     if resume and overwrite:
-        raise InputError("--resume goes on with what --overwrite would replace; give one of them")
+        raise InputError("--resume continues with what --overwrite would replace; give one of them")
     try:
         there = folder.exists() or folder.is_symlink()
     except (OSError, ValueError) as error:

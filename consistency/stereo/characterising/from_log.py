@@ -25,7 +25,7 @@ from consistency.stereo.frontend.planar_log import CAMERA
 
 OTHERS = ("motion", "start", "sigma_points")  # tables that a measured sensor keeps from the log
 EXACT = "Poses are taken as exact: their errors are in sigma."
-FREE = "The pose of each step is fitted, six values each: what moves all points together is no noise."
+FREE = "The pose of each step is fitted, six values each: what moves all points together is not noise."
 PLANE = "The truth is on a plane: what the sensor rolls, pitches and heaves is in sigma."
 SPACE = "truth.tum"  # of a log from images: true poses of the left camera in space
 REST = "Only the parts at rest are used: noise while moving may be larger."

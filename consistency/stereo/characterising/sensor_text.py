@@ -105,7 +105,7 @@ def _bias(of: Characterisation) -> list[str]:
 def _gross(of: Characterisation) -> str:
     share = interval(of.gross, 2, 100.0)
     what = "are more than" if of.bias is not None else "are of tracks that are somewhere more than"
-    return f"{share} % of the observations {what} 6 robust sd off, and are no part of sigma."
+    return f"{share} % of the observations {what} 6 robust sd off, and are not part of sigma."
 
 
 def _ratio(of: Characterisation) -> list[str]:
@@ -138,7 +138,7 @@ def _or_dash(estimate: Interval | None) -> Cell:
 
 
 def believed_sensor(of: Characterisation) -> PicturedSensor:
-    """The sensor as a filter should believe it: noise drawn anew, and growth and bias map where they are shown."""
+    """The sensor as a filter should believe it: noise drawn again, and growth and bias map where they are shown."""
     changes: dict[str, Any] = {"sigma": tuple(_rounded(c.sigma.value, 5) for c in of.coordinates)}
     changes["disparity_growth"] = changes["bias"] = None
     if of.growth is not None and of.growth.shown:

@@ -170,7 +170,7 @@ def _searched(image: Array, search: tuple[int, int], block: int) -> int:
 def _at(places: Array, disparities: Array, search: tuple[int, int]) -> Array:
     """Values (N,) of a disparity image (h, w) in sixteenths at the nearest pixels, px.
 
-    NaN outside the search and at its ends, where the best match is no minimum.
+    NaN outside the search and at its ends, where the best match is not a minimum.
     """
     height, width = disparities.shape
     column, row = np.rint(places).astype(int).T

@@ -109,7 +109,7 @@ REFUSED = [
     ("ekf-uvd", "herath2007-stereo", {"point": parts("kf", "linear-gaussian").point}, "sensor 'Uvd'"),
     ("ri-ekf-uvd", "herath2007-stereo", {"covariance": Local(100)}, "covariance 'Local'"),
     ("ekf-uvd", "herath2007-stereo", {"error": RightInvariant(), "covariance": Local(100)}, "'RightInvariant'"),
-    ("ekf-uvd", "herath2007-stereo", {"motion": Stranger()}, "motion: 'Stranger' is no registered part"),
+    ("ekf-uvd", "herath2007-stereo", {"motion": Stranger()}, "motion: 'Stranger' is not a registered part"),
 ]
 
 

@@ -424,7 +424,7 @@ def test_an_unfinished_folder_says_so(place, capsys):
     status, out, err = consistency("analyse", "out", capsys=capsys)
     assert status == 0
     assert "0 of 13" in out
-    assert "only 13 of 14 runs are there; the same 'consistency monte-carlo' with --resume goes on" in err
+    assert "only 13 of 14 runs are there; the same 'consistency monte-carlo' with --resume continues" in err
     assert consistency("analyse", "out", "--fail-on", "inconsistent", capsys=capsys)[0] == 2
 
 
@@ -492,7 +492,7 @@ def test_a_stopped_study_loses_no_finished_run(number, place, capsys):
     said = command.communicate()[1].decode()
     if number == signal.SIGTERM:
         assert command.returncode == 128 + number
-        assert "the same command with --resume goes on" in said
+        assert "the same command with --resume continues" in said
         with pytest.raises(ProcessLookupError):
             _wait_for_the_end(program)
     else:

@@ -50,7 +50,7 @@ def read_code(path: Path, tell: bool = False) -> bytes | None:
         if not content:
             refusal = "somebody else may write there; code is compiled for this process"
         elif hashlib.sha256(payload).digest() != content[:_DIGEST]:
-            refusal = "compiled code is damaged there; it is compiled anew"
+            refusal = "compiled code is damaged there; it is compiled again"
     if refusal:
         if tell:
             _say(f"{path}: {refusal}")

@@ -36,7 +36,7 @@ class Watch(NamedTuple):
     sightings: Indices  # (n_landmarks,)
     misses: Indices  # (n_landmarks,) rejected one after the other, up to the last
     begun: Indices  # (n_landmarks,) row with which each landmark began, until another agrees with it; then -1
-    anew: Array  # (M,) rows with which a landmark begins anew
+    again: Array  # (M,) rows with which a landmark restarts
     kept: Array  # (m,) of the known landmarks in a step
     own: Array  # (m,) squared distance of each alone
     order: Indices  # (m,) those that pass the gate
@@ -320,7 +320,7 @@ def _screen_tracks(
 
 @inner
 def _begin_anew(data: Data, k: int, watch: Watch) -> None:
-    """What a landmark began with is rejected, where it begins anew with the first that disagrees."""
+    """What a landmark began with is rejected, where it restarts with the first that disagrees."""
     for i in range(data.first[k], data.first[k + 1]):
         if watch.anew[i]:
             label = data.landmark[i]

@@ -84,7 +84,7 @@ def _find_known(data: Data, k: int, offset: Indices, work: Work[NamedTuple]) -> 
 def _insert_new(
     slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple], watch: NamedTuple
 ) -> State:
-    """The state with the landmarks that begin in step k + 1: at its end, or anew at their place."""
+    """The state with the landmarks that begin in step k + 1: at its end, or again at their place."""
     w = landmark_width(slam.landmark)
     x, P, n, base, offset = state.x, state.P, state.n, state.base, state.offset
     for i in range(data.first[k], data.first[k + 1]):

@@ -72,7 +72,7 @@ def to_base(covariance: NamedTuple, x: Array, p: int, robot: Array, landmark: Ar
 def add_label(label: int, offset: int, n: int, b: int, w: int, local: Factors) -> None:
     """A block of the whole state, at ``offset``, is at ``n`` of the active part and at ``b`` of the base.
 
-    Of what is no landmark the ``label`` is -1 - offset.
+    Of what is not a landmark the ``label`` is -1 - offset.
     """
     local.label[(n - 3) // w], local.base[(b - 3) // w] = label, offset
 

@@ -151,13 +151,13 @@ def prepare_parked(
 
 @implement(withhold, Parking)
 def withhold_parked(
-    covariance: Parking, state: State, data: Data, k: int, rejected: Array, anew: Array, local: Clones
+    covariance: Parking, state: State, data: Data, k: int, rejected: Array, again: Array, local: Clones
 ) -> None:
     """What is rejected was not seen, and no return of it is in doubt."""
     fill(local.doubted, 0)
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
-        if anew[i] and local.of[label] >= 0:
+        if again[i] and local.of[label] >= 0:
             unpark(label, state, local)
         if rejected[i]:
             local.seen[label] = local.earlier[label]

@@ -83,7 +83,9 @@ from consistency.referee.types import Array
 
 EVERY, UNSEEN = 10, 4  # steps between two rounds of parking, and without a sight before a landmark is parked
 EVERY_LATE, UNSEEN_LATE = 50, 20  # without promptness
-DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
+DOUBT = (
+    0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is not a linear update
+)
 ADRIFT = 0.2  # rad, standard deviation of the heading from which any return is in doubt
 KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it

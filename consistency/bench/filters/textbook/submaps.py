@@ -79,7 +79,7 @@ class SubmapKalman:
 
 
 def in_world(state: Maps) -> SlamState:
-    """Robot, landmarks of the large map and those of the small one, all in the world; a landmark may be there twice."""
+    """Robot, landmarks of the large map and those of the small one, all in the world; a landmark may be duplicated."""
     large, small = state.large, state.small
     origin, n, turn = large.x[:3], len(large.x), heading_matrix(large.x[2])
     x, J = [large.x[3:]], np.eye(n + len(small.x))

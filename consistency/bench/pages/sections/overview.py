@@ -147,7 +147,7 @@ def places(report: Report) -> list[Place]:
 
 
 def window_of(found: list[Place], factor: float) -> tuple[float, float]:
-    """Drawn range of the ratios; ends of intervals are no reason for a wider one."""
+    """Drawn range of the ratios; ends of intervals are not reason for a wider one."""
     values = [1.0 / factor, factor, *(place.ratio.value for place in found)]
     return min(values) / ROOM, max(values) * ROOM
 
@@ -174,7 +174,7 @@ def _picture(report: Report) -> Figure:
     caption = (
         "By how much the covariance of the pose must grow to match the errors, with 95 % intervals; log axis. A filter "
         "is shown to be honest where its whole interval lies in the shade and no other question found a fault; to the "
-        "right of it is overconfident. An arrow goes on beyond the drawn range."
+        "right of it is overconfident. An arrow continues beyond the drawn range."
     )
     return Figure(TITLE, caption, (draw,), level=2)
 

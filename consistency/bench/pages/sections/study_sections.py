@@ -34,7 +34,7 @@ OF_MAPS = (
     "pose, so each run counts once. Together: by the joint covariance of pose and landmarks, whose NEES is chi-square "
     "with 3 degrees of freedom for the pose and 3 for each landmark; a dash where it was not kept. The verdict on the "
     "map asks what that on the pose asks, with landmarks in the place of steps, and of pose and map together; no "
-    "verdict on a pose depends on it. Left out: what is no landmark of the world, or has no covariance that is "
+    "verdict on a pose depends on it. Left out: what is not a landmark of the world, or has no covariance that is "
     "positive definite."
 )
 OF_REJECTIONS = (

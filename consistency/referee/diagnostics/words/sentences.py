@@ -28,8 +28,8 @@ from consistency.referee.diagnostics.words.groups import faults_of_groups, group
 from consistency.referee.diagnostics.words.numbers import is_or_are, p_text, percent, plural, ratio_text, short
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
-MUCH = 100_000  # runs; more are no advice
-MOST_STEPS = 10_000_000  # of a log; more are no advice
+MUCH = 100_000  # runs; more are not advice
+MOST_STEPS = 10_000_000  # of a log; more are not advice
 LATER = "no fault found in the scale; the other questions are asked at the next look"
 
 
@@ -340,7 +340,7 @@ def _early_ends(v: Findings) -> list[str]:
         return []
     return [
         f"{plural(v.ends.runs, v.unit)} that end early have a larger NEES in their last step than "
-        f"{100 * v.ends.above:.0f} % of the {v.unit}s that go on (p {p_text(v.ends.p_value)}): if they end because "
+        f"{100 * v.ends.above:.0f} % of the {v.unit}s that continue (p {p_text(v.ends.p_value)}): if they end because "
         "they are lost, no rate holds; write a row of NaN where a filter breaks down, so that it counts as failed"
     ]
 

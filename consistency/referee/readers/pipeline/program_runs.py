@@ -125,7 +125,7 @@ class ProgramStudy:
 
     @property
     def design(self) -> Design | None:
-        """Looks at growing numbers of runs, if the runs went on until decided."""
+        """Looks at growing numbers of runs, if the runs were made until decided."""
         plan = self.manifest["until_decided"]
         return sequential_design(**plan) if plan else None
 
@@ -193,7 +193,7 @@ def read_program_runs(folder: Path, r: Reading, found_in: Reader) -> list[Estima
     for run in runs_in(folder).values():
         runs.take(run)
     if not runs.found:
-        why = next(iter(runs.failed.values()), "none is finished; the same command with --resume goes on")
+        why = next(iter(runs.failed.values()), "none is finished; the same command with --resume continues")
         raise InputError(f"{folder}: no run can be judged: {why}")
     return runs.estimators(runs.first if study.design else None)
 
@@ -358,7 +358,7 @@ def _require_whole(records: Sequence[Record]) -> None:
 
 
 def _end_of(p: Poses) -> tuple[float, str]:
-    """Time or step of the last estimate, and what to say where the truth goes on."""
+    """Time or step of the last estimate, and what to say where the truth continues."""
     if len(p.t) < 2 or not len(p.true_t):
         return float(p.t[-1]), ""
     period = float(np.median(np.diff(p.t)))

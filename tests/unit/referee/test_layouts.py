@@ -206,7 +206,7 @@ def test_the_first_rows_of_euroc_judge_themselves(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "count"),
+    "name, count",
     [
         ("ece276a_stereo_tracks/kitti07_gt.txt", 1101),
         ("gtsam_stereo_factors/VO_camera_poses_large.txt", 26),
@@ -621,7 +621,7 @@ def millimetres(d):
 
 
 @pytest.mark.parametrize(
-    ("write", "mend"),
+    "write, mend",
     [
         (turned_quaternions, "the quaternions of the estimates are w x y z; write them x y z w"),
         (millimetres, "the positions of the truth are in millimetres; divide them by 1000"),
@@ -641,7 +641,7 @@ P = np.array([[0.04, 0.01, 0.005], [0.01, 0.09, -0.01], [0.005, -0.01, 0.01]])
 
 
 @pytest.mark.parametrize(
-    ("unit", "name"), [(10**3, "milliseconds"), (10**6, "microseconds"), (10**9, "nanoseconds"), (1, "")]
+    "unit, name", [(10**3, "milliseconds"), (10**6, "microseconds"), (10**9, "nanoseconds"), (1, "")]
 )
 def test_the_unit_that_makes_times_overlap_is_named(unit, name):
     for longer in (T, np.arange(600.0)):  # a truth may begin earlier and end later
@@ -664,7 +664,7 @@ def test_a_lower_triangle_is_a_covariance(heading, inside):
 
 
 @pytest.mark.parametrize(
-    ("name", "header", "rows", "said"),
+    "name, header, rows, said",
     [
         (
             "o.csv",

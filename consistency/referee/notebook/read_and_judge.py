@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -43,6 +43,12 @@ def read(
     truth_covariance: str | Path | None = None,
     truth_errors: str | None = None,
     truth_shared: bool = False,
+    columns: Mapping[str, str] | None = None,
+    truth_columns: Mapping[str, str] | None = None,
+    world: str | None = None,
+    body_axes: str | None = None,
+    truth_world: str | None = None,
+    truth_body_axes: str | None = None,
     filter: str | None = None,
 ) -> Record:
     """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
@@ -73,6 +79,9 @@ def read(
     truth_errors : how errors of the truth depend on each other: "independent", "per-run", or "common" to all runs; with
         None only what holds under any dependence is said
     truth_shared : the estimator has fused the truth
+    columns, truth_columns : names of columns here and in the file: ``{"x": "pos_n", "P*": "cov_*"}``
+    world, body_axes, truth_world, truth_body_axes : axes of each file, a letter each: "enu" or "ned"; "flu" or "frd".
+        A pose maps from its body axes to its world axes
     filter : which estimator, where the files hold several
 
     Raises
@@ -87,7 +96,7 @@ def read(
     reading = Reading(
         true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
         motions or None, windows, align, lever_arm, split, of_truth, truth_errors,
-        truth_shared or None,
+        truth_shared or None, columns, truth_columns, world, body_axes, truth_world, truth_body_axes,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates

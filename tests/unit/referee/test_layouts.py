@@ -16,7 +16,8 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.referee.readers.clock_units import unit_apart
-from consistency.referee.readers.formats.named_columns import fields_of, require_units
+from consistency.referee.readers.formats.file_head import fields_of
+from consistency.referee.readers.formats.named_columns import require_units
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.types import Array
 

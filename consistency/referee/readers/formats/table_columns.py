@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.named_columns import DEVIATIONS
+from consistency.referee.readers.formats.named_columns import DEVIATIONS, naming
 from consistency.referee.readers.formats.sheet import TableRows, are_dof
 from consistency.referee.readers.places import exact, refuse
 from consistency.referee.readers.runs_to_record import symmetric
@@ -111,7 +111,7 @@ def stated_covariance(sheet: TableRows, axes: tuple[str, ...], own: bool = False
                 wanted = upper[-1]
                 raise InputError(
                     f"{sheet.path}: column '{wanted}' is missing; the covariance of {', '.join(axes)} needs its "
-                    "upper triangle, zeros included; --state a,b judges fewer components"
+                    f"upper triangle, zeros included; {naming(wanted)}; --state a,b judges fewer components"
                 )
             out[:, i, j], out[:, j, i] = sheet.numbers(there[0]), sheet.numbers(there[-1])
     return symmetric(out, sheet.place)
@@ -122,7 +122,9 @@ def require_columns(sheet: TableRows, axes: tuple[str, ...]) -> None:
     missing = [axis for axis in axes if axis not in sheet]
     if missing:
         hint = "; name other states with --state a,b,c" if axes == POSE else ""
-        raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}{hint}")
+        raise InputError(
+            f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}; {naming(missing[0])}{hint}"
+        )
 
 
 def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:

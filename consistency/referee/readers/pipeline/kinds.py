@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.readers.declared_axes import OPTIONS
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
@@ -18,12 +19,16 @@ from consistency.referee.readers.formats.file_kinds import (
     is_foreign,
     is_plane,
     is_spatial,
+    table_files,
+    trajectory_files,
 )
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import Estimator
 
 OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
 OF_BAGS = ("topic", "truth_topic")
+OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # bags have these in messages
+OF_NAMES = ("columns", "truth_columns")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
 Found = Sequence[Estimator | Record]
 
@@ -50,8 +55,9 @@ def _archive(path: Path, r: Reading, poses_alone: bool) -> Found:
 
 def _tables(path: Path, r: Reading, poses_alone: bool) -> Found:
     from consistency.referee.readers.formats.table import read_tables
+    from consistency.referee.readers.formats.table_folder import read_folder
 
-    return read_tables(path, r, poses_alone)
+    return (read_folder if path.is_dir() else read_tables)(path, r, poses_alone)
 
 
 def _trajectories(path: Path, r: Reading, poses_alone: bool) -> Found:
@@ -65,8 +71,10 @@ def _is_archive(path: Path, r: Reading) -> bool:
 
 
 def _is_table(path: Path, r: Reading) -> bool:
-    named = path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path))
-    return named or is_plane(path)
+    named = path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path, r.columns))
+    if path.is_dir():
+        return bool(table_files(path)) and not trajectory_files(path, r.columns)
+    return named or is_plane(path, r.columns)
 
 
 def _is_trajectory(path: Path, r: Reading) -> bool:
@@ -74,8 +82,8 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 
 KINDS = (  # a file is of the first that knows it
-    Kind(lambda path, r: is_bag(path), ("state", "covariance", "covariance_order", "truth", "lever_arm"), _bags),
-    Kind(_is_archive, (*OF_BAGS, "state", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
+    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES), _bags),
+    Kind(_is_archive, (*OF_NAMES, *OPTIONS, *OF_BAGS, "state", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind(_is_trajectory, (*OF_BAGS, "state"), _trajectories),
 )

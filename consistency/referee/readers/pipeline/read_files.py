@@ -15,12 +15,14 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
 from consistency.referee.parsing import require_name
+from consistency.referee.readers.declared_axes import in_axes_of_estimates
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TRAJECTORIES,
     is_bag,
     is_drive,
     is_foreign,
+    table_files,
     trajectory_files,
     unknown_kind,
 )
@@ -49,9 +51,9 @@ def is_recording(path: Path, reading: Reading) -> bool:
     """
     given = reading.given()
     if path.is_dir() and not (path / "manifest.json").exists():
-        recording = bool(trajectory_files(path)) or is_bag(path) or bool(given)
+        recording = bool(trajectory_files(path) or table_files(path)) or is_bag(path) or bool(given)
         if not recording:
-            known = f"trajectories ({', '.join(TRAJECTORIES)}) or ROS bags"
+            known = f"trajectories ({', '.join(TRAJECTORIES)}), tables or ROS bags"
             raise InputError(f"{path}: holds no results of 'consistency run', and no {known}")
     else:
         recording = not path.is_dir() and (path.exists() or path.suffix != "")
@@ -147,7 +149,7 @@ def _records(found: Found, r: Reading) -> list[Record]:
     records: list[Record] = []
     for one in found:
         if isinstance(one, Estimator):
-            records.extend(records_of(one, r))
+            records.extend(records_of(in_axes_of_estimates(one, r), r))
         else:
             records.append(one)
     return records

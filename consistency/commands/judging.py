@@ -73,7 +73,10 @@ def analyse_command(
     ] = None,
     as_json: AsJson = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Overwrite what is not a report of this command, too."),
+    ] = False,
 ) -> None:
     """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
     from consistency.referee.document.judged_filters import document
@@ -91,6 +94,8 @@ def analyse_command(
     refused: InputError | None = None  # of a report, said below the verdict
     is_file = report is not None and report.suffix.lower() in FORMATS.keys() - {".html", ".json"}  # a folder has both
     require_written(overwrite, report, "--report")
+    if report is not None:
+        overwrite = require_report(report, is_file, overwrite)
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
         verdicts = judge_all(recordings, filters, settings=settings, optimal_gain=innovations is not None)
@@ -98,10 +103,8 @@ def analyse_command(
         if report is not None and not is_file:
             from consistency.referee.pages.write_pages import write_file_reports
             from consistency.referee.show.as_json import render
-            from consistency.referee.system.folders import require_free
 
             try:
-                require_free(report, overwrite, "verdict", "--report")
                 data = render(document(verdicts))
                 written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
                 if missing("report"):
@@ -129,7 +132,7 @@ def analyse_command(
         from consistency.referee.pages.write_pages import write_text_file
 
         try:
-            written = [write_text_file(shown, report, overwrite)]
+            written = [write_text_file(shown, report)]
         except InputError as error:
             refused = error
     print_document(shown, as_json, written)
@@ -140,6 +143,19 @@ def analyse_command(
         print(f"consistency: {refused}", file=sys.stderr)
     if is_failed:
         raise typer.Exit(1)
+
+
+def require_report(report: Path, is_file: bool, overwrite: bool) -> bool:
+    """Refuse, before any work, a report that cannot be written; return whether it replaces what is there."""
+    from consistency.referee.pages.write_pages import is_own_report, require_writable
+    from consistency.referee.system.folders import require_free
+
+    replaces = overwrite or is_own_report(report)
+    if is_file:
+        require_writable(report, replaces)
+    else:
+        require_free(report, replaces, "verdict", "--report")
+    return replaces
 
 
 @reads_files

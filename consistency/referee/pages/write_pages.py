@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from consistency.referee.document.blocks import Document
     from consistency.referee.system.progress import Advance
 
+REPORT_FILES = ("report.html", "report.pdf", "verdict.json")
+MARK = "<!-- written by consistency analyse, which replaces it -->\n"  # the end of a file of a verdict
 KINDS = (".png", ".pdf", ".svg")  # of a plot
 
 
@@ -86,21 +88,32 @@ def write_file_reports(
         write_file(at / "verdict.json", data.encode("utf-8"))
 
     write_folder(folder, manifest, contents, overwrite)
-    names = ("report.html", "report.pdf", "verdict.json")
-    return [path for path in (folder / name for name in names) if path.exists()]
+    return [path for path in (folder / name for name in REPORT_FILES) if path.exists()]
 
 
-def write_text_file(document: Document, path: Path, overwrite: bool) -> Path:
-    """One file, in the format of its suffix.
+def write_text_file(document: Document, path: Path) -> Path:
+    """One file, in the format of its suffix, with a mark by which :func:`is_own_report` knows it.
 
     Raises
     ------
     InputError
-        The file exists or cannot be written.
+        The file cannot be written.
     """
-    require_writable(path, overwrite)
-    write_file(path, rendered(document, path).encode("utf-8"))
+    write_file(path, f"{rendered(document, path)}{MARK}".encode())
     return path
+
+
+def is_own_report(path: Path) -> bool:
+    """Whether a folder or a file was written by ``analyse --report``, so that the next one replaces it."""
+    from consistency.referee.system.folders import read_manifest
+
+    try:
+        if path.is_dir():
+            others = {each.name for each in path.iterdir()} - {"manifest.json", *REPORT_FILES}
+            return read_manifest(path).get("kind") == "verdict" and not others
+        return path.read_bytes().endswith(MARK.encode())
+    except (InputError, OSError):
+        return False
 
 
 def write_document(

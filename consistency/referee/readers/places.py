@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,21 @@ def exact(value: float) -> str:
 def cut_note(path: Path, line: int) -> str:
     """A note that the last line of a text is left out."""
     return f"{path}: the last line, {line}, has no end and is left out; it seems to be cut short"
+
+
+def one_of_each_kind(notes: Iterable[str]) -> tuple[str, ...]:
+    """Notes of files, ``est/0.csv: read as poses``, of which those that say the same are one."""
+    files: dict[str, list[str]] = {}
+    for note in dict.fromkeys(filter(None, notes)):
+        file, _, text = note.partition(": ")
+        files.setdefault(text, []).append(file)
+    return tuple(f"{_first_of(names)}: {text}" if text else names[0] for text, names in files.items())
+
+
+def _first_of(names: Sequence[str]) -> str:
+    if len(names) == 1:
+        return names[0]
+    return f"{names[0]} and {len(names) - 1} other{'s' * (len(names) > 2)}"
 
 
 def listed(items: Sequence[object], most: int = 5) -> str:

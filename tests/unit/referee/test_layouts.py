@@ -694,7 +694,7 @@ def test_a_lower_triangle_is_a_covariance(heading: str, inside: Path) -> None:
             "d/0.csv",
             "t,x,y,heading",
             "0,1,2,3\n",
-            r"d: holds no \.txt .*; tables of several runs go into one file with a",
+            r"0\.csv: column 'P_xx' is missing; .*; --columns P_xx=NAME says what it is called",
         ),
     ],
 )

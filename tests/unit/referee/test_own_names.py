@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.referee.readers.formats.column_renaming import renamed
+from consistency.referee.readers.places import one_of_each_kind
 from consistency.referee.types import Array
 
 STEPS = 6
@@ -291,3 +292,9 @@ def test_refusals_name_the_option(tmp_path: Path) -> None:
         cs.read(own, own)
     with pytest.raises(cs.InputError, match=r"column 'x' is missing; .*; --columns x=NAME says what it is called"):
         cs.read(own, own, columns={"t": "clock"}, truth_columns={"t": "clock"})
+
+
+def test_notes_of_like_files_are_one() -> None:
+    notes = ["a/0.csv: read so", "b/0.csv: read otherwise", "a/1.csv: read so", "a/2.csv: read so", "", "whole"]
+    assert one_of_each_kind(notes) == ("a/0.csv and 2 others: read so", "b/0.csv: read otherwise", "whole")
+    assert one_of_each_kind(["a: so", "b: so"]) == ("a and 1 other: so",)

@@ -121,7 +121,9 @@ def require_columns(sheet: TableRows, axes: tuple[str, ...]) -> None:
     """Refuse a table that lacks a column of the state."""
     missing = [axis for axis in axes if axis not in sheet]
     if missing:
-        hint = "; name other states with --state a,b,c" if axes == POSE else ""
+        hint = ""
+        if axes == POSE:
+            hint = " (poses in space have x, y, z, qx, qy, qz, qw); name other states with --state a,b,c"
         raise InputError(
             f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}; {naming(missing[0])}{hint}"
         )

@@ -10,6 +10,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.file_kinds import is_drive, table_files
 from consistency.referee.readers.formats.table import read_tables
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.places import one_of_each_kind
 from consistency.referee.readers.truth_matching import Estimator
 
 
@@ -54,5 +55,5 @@ def _joined(name: str, folder: Path, parts: Sequence[Estimator]) -> Estimator:
                 f"{part.path}: is numbered otherwise, or states its covariance otherwise, than {first.path}"
             )
     runs = [replace(run, run=i) for i, run in enumerate(run for part in parts for run in part.runs)]
-    notes = dict.fromkeys(note for part in parts for note in part.notes)
-    return replace(first, name=name, path=folder, runs=runs, notes=tuple(notes))
+    notes = one_of_each_kind(note for part in parts for note in part.notes)
+    return replace(first, name=name, path=folder, runs=runs, notes=notes)

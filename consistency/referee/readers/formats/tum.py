@@ -42,7 +42,7 @@ from consistency.referee.readers.formats.position_truth import (
 )
 from consistency.referee.readers.formats.sheet import Lines, read_numbers
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.places import Places, refuse
+from consistency.referee.readers.places import Places, one_of_each_kind, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import (
     ALONE,
@@ -151,7 +151,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     return Estimator(
         path.stem, path, poses, STATE[: poses[0].covariance.shape[-1]], kind,
         f"{INERTIAL.get(kind) or PLANAR[kind]}{why}", layout.stated, path.name, r.covariance,
-        tuple(dict.fromkeys(note for note in notes if note)), in_space=True, position=3,
+        one_of_each_kind(notes), in_space=True, position=3,
     )  # fmt: skip
 
 
@@ -305,7 +305,7 @@ def _poses(
         if source.values.shape[1] == 1 + BOTH:
             cross = _cross(own, source, rows, picked, order)
     if covariance is None:
-        of = f"lines of t and {FULL} numbers"
+        of = f"lines of t and {FULL} numbers, or name its columns: --columns 'P*=NAME*'"
         if isinstance(own, States):
             of = f"the standard deviations of {DEVIATIONS_LAYOUT}"
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")

@@ -71,6 +71,9 @@ def analyse_command(
         Path | None,
         typer.Option("--report", help="Folder for an HTML and a PDF page on files, or FILE.xml (JUnit) or FILE.md."),
     ] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Show p values of all questions and credibility indices, too.")
+    ] = False,
     as_json: AsJson = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
     overwrite: Annotated[
@@ -127,7 +130,7 @@ def analyse_command(
             if fail_on:
                 raise InputError(f"--fail-on: {text}")
             print(f"consistency: {text}", file=sys.stderr)
-    shown = document(verdicts, path.name)
+    shown = document(verdicts, path.name, verbose=verbose)
     if report is not None and is_file:
         from consistency.referee.pages.write_pages import write_text_file
 

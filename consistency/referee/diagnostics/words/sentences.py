@@ -230,6 +230,8 @@ def _ratio_of_test(s: Scale) -> str:
     if shown.interval is None:
         return ratio_text(s.inflation)
     low, high = shown.interval
+    if np.isinf(high):
+        return f"{short(s.inflation.value)} (known to be above {short(low)} only)"
     if shown.one_sided:
         return f"{short(s.inflation.value)} (below {short(high)} at a confidence of {percent(1.0 - shown.level)})"
     return f"{short(s.inflation.value)} ({percent(1.0 - 2.0 * shown.level)} interval {short(low)} to {short(high)})"

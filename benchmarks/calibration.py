@@ -54,6 +54,7 @@ MODULES = (
     "calibration_pieces",
     "calibration_uneven",
     "calibration_spread",
+    "calibration_groups",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

@@ -34,6 +34,7 @@ _MODULES = {
     "guarded": "bench.filters.compiled",
     "judge": "referee.notebook.read_and_judge",
     "load_scenario": "bench.scenario",
+    "monte_carlo": "referee.programs.from_python",
     "nees": "referee.diagnostics.statistics.nees",
     "read": "referee.notebook.read_and_judge",
     "read_drives": "referee.fit_covariance.drives",

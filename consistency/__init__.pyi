@@ -37,3 +37,4 @@ from .referee.fit_covariance.noise_model import NoiseModel as NoiseModel
 from .referee.fit_covariance.noise_model import fit_covariance as fit_covariance
 from .referee.notebook.read_and_judge import judge as judge
 from .referee.notebook.read_and_judge import read as read
+from .referee.programs.from_python import monte_carlo as monte_carlo

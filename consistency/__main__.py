@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 GLANCE = 0.1  # s between looks, for a signal that another thread was given
 SHOW_CURSOR = "\x1b[?25h"
 GOES_ON = "; finished runs are kept where there are any: the same command goes on, 'run' with --resume"
+PROGRAMS_GO_ON = "; finished runs are kept: the same command with --resume goes on"
 
 
 class Command(threading.Thread):
@@ -34,9 +35,16 @@ class Command(threading.Thread):
 
 
 def main() -> NoReturn:
-    """Run the command line until it ends, or until Ctrl-C does; SIGTERM and SIGHUP end the process by themselves."""
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as of nohup, and of & in a script
-        signal.signal(signal.SIGINT, _stop)
+    """Run the command line until it ends, or until Ctrl-C does; SIGTERM and SIGHUP end the process by themselves.
+
+    Where programs are run, they end them, too.
+    """
+    signals = [signal.SIGINT]
+    if sys.argv[1:2] == ["monte-carlo"]:
+        signals += [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+    for number in signals:
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as of nohup, and of & in a script
+            signal.signal(number, _stop)
     command = Command()
     command.start()
     while command.is_alive():
@@ -44,16 +52,20 @@ def main() -> NoReturn:
     sys.exit(command.status)
 
 
-def _stop(*_: Any) -> NoReturn:
+def _stop(number: int, _: Any = None) -> NoReturn:
     """Say so in one line and end at once; an exception would be swallowed by serialisers and compilers."""
+    for end in getattr(sys.modules.get("consistency.referee.system.stopping"), "AT_STOP", ()):
+        end()
     line = "consistency: stopped"
     if sys.argv[1:2] in (["run"], ["sweep"]):
         line += GOES_ON
+    elif sys.argv[1:2] == ["monte-carlo"]:
+        line += PROGRAMS_GO_ON
     with suppress(OSError, ValueError, AttributeError):  # a stream that is closed
         if sys.stderr.isatty():
             line = f"{SHOW_CURSOR}\n{line}"
         os.write(sys.stderr.fileno(), f"{line}\n".encode())
-    os._exit(128 + signal.SIGINT)
+    os._exit(128 + number)
 
 
 if __name__ == "__main__":

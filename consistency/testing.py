@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics.comparison import FEWEST, Comparison
@@ -15,13 +14,11 @@ from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.verdict.answers import Settings
-from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.gating.candidates import Sides, of_arrays, of_filters
 from consistency.referee.gating.checked_arrays import planned_dof, rate_shares, record_of_checked, record_of_filter
+from consistency.referee.gating.found import Look, deciding_runs, entry_of, marker_text
 from consistency.referee.gating.watch import (
-    DEFAULTS,
-    Entry,
     Terms,
     current,
     fault_text,
@@ -147,20 +144,57 @@ def assert_consistent(
             skip=skip,
         )  # fmt: skip
 
-    def look(rate: float) -> _Look:
-        verdict = judge(record, _settings(rate, demand, subsets, method))
-        sure = bool(record.failures) or verdict.status == "failed"
-        bad = verdict.status not in ("consistent", "undecided")
-        return _Look(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
+    return _judged("assert_consistent", record, demand, subsets, method)
 
-    def needed(rate: float) -> int:
-        return gate_runs(
-            planned_dof(record), demand.detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
-        )
 
-    result = _settle("assert_consistent", record, demand, look, needed)
-    assert result.verdict is not None
-    return result.verdict
+def assert_program_consistent(
+    argv: Sequence[str],
+    *,
+    runs: int | None = None,
+    estimates: str = "estimates.csv",
+    truth: str | Path | None = None,
+    out: str | Path | None = None,
+    filter: str | None = None,
+    false_alarm: float | None = None,
+    detect: float | None = None,
+    power: float | None = None,
+    tolerance: float | None = None,
+    allow: str | None = None,
+    lost: float | None = None,
+    **options: Any,
+) -> Verdict:
+    """Run a program many times, and pass it if the errors that it writes are shown to have the stated covariance.
+
+    The runs are those of :func:`consistency.monte_carlo`, the verdict is that of :func:`assert_consistent`.
+
+    Parameters
+    ----------
+    argv : words of the command, with ``{seed}``, ``{run}``, ``{out}`` and ``{here}``
+    runs : number of runs; as many as ``detect`` and ``power`` need for the errors of the first run if not given
+    estimates, truth, out, filter : as for :func:`consistency.monte_carlo`
+    false_alarm, detect, power, tolerance, allow, lost : as for :func:`assert_consistent`
+    options : further ones of :func:`consistency.monte_carlo`, as ``jobs``, ``timeout``, ``state``
+
+    Returns
+    -------
+    The verdict, of status "consistent"
+
+    Raises
+    ------
+    ConsistencyError
+        A fault at the stated false-alarm rate, or failed runs.
+    InsufficientTrials
+        No fault, and too few runs.
+    InputError
+        The program does not exist, all of its first runs failed alike, or its tables cannot be read.
+    """
+    __tracebackhide__ = True
+    from consistency.referee.programs.from_python import record_of_program
+
+    demand = terms(false_alarm, detect, power, allow, tolerance, lost)
+    settings = _settings(demand.planned, demand)
+    record = record_of_program(argv, settings, runs, estimates, truth, out, filter, **options)
+    return _judged("assert_program_consistent", record, demand)
 
 
 def assert_not_worse(
@@ -236,6 +270,32 @@ def assert_not_worse(
     return _compare(sides, demand)
 
 
+def _judged(
+    gate: str,
+    record: Record,
+    demand: Terms,
+    subsets: Mapping[str, Sequence[int]] | None = None,
+    method: str = "max",
+) -> Verdict:
+    """The verdict on one estimator, or what its gate raises."""
+    __tracebackhide__ = True
+
+    def look(rate: float) -> Look:
+        verdict = judge(record, _settings(rate, demand, subsets, method))
+        sure = bool(record.failures) or verdict.status == "failed"
+        bad = verdict.status not in ("consistent", "undecided")
+        return Look(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
+
+    def needed(rate: float) -> int:
+        return gate_runs(
+            planned_dof(record), demand.detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
+        )
+
+    result = _settle(gate, record, demand, look, needed)
+    assert result.verdict is not None
+    return result.verdict
+
+
 def _compare(sides: Sides, demand: Terms) -> Comparison:
     __tracebackhide__ = True
     if sides.usable_runs < FEWEST:
@@ -249,12 +309,12 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
             sides.usable_runs,
         )
 
-    def look(rate: float) -> _Look:
+    def look(rate: float) -> Look:
         comparison = sides.compare(rate)
         worse = comparison.worse or sides.failed_more
         status = "worse" if worse else "not worse"
         reasons = sides.reasons(comparison)
-        return _Look(worse, sides.failed_more, comparison.p_value, status, reasons, None, comparison)
+        return Look(worse, sides.failed_more, comparison.p_value, status, reasons, None, comparison)
 
     def needed(rate: float) -> int:
         return sides.compare(rate).needed_runs(demand.detect, demand.power)
@@ -267,20 +327,9 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
 # --- code of both gates ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Look:
-    bad: bool
-    sure: bool  # bad at any rate
-    p_value: float
-    status: str
-    reasons: list[str]
-    verdict: Verdict | None
-    comparison: Comparison | None = None
-
-
 def _settle(
-    gate: str, record: Record, demand: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
-) -> _Look:
+    gate: str, record: Record, demand: Terms, look: Callable[[float], Look], needed: Callable[[float], int]
+) -> Look:
     __tracebackhide__ = True
     result, late = look(demand.false_alarm), None
     runs, dof = len(record.run_numbers), planned_dof(record)
@@ -291,8 +340,8 @@ def _settle(
     few = not fault and (runs < least if result.verdict is None else result.status == "undecided")
     outcome = "fault found" if fault else "too few runs" if few else "passed"
     if few:  # ask for what is enough at the end of the session too, and for more than there are
-        least = max(needed(demand.false_alarm), _deciding(result, runs))
-    current().keep(_entry(gate, record, demand, result, late, outcome, least))
+        least = max(needed(demand.false_alarm), deciding_runs(result, runs))
+    current().keep(entry_of(gate, record, demand, result, late, outcome, least))
     if fault:
         verdict = result.verdict or judge(record, _settings(demand.false_alarm, demand))
         raise ConsistencyError(fault_text(gate, record.name, result.reasons), verdict, result.comparison)
@@ -302,7 +351,7 @@ def _settle(
         else:
             each = replace(demand, false_alarm=demand.false_alarm / rate_shares(record))
             text = undecided_text(gate, record.name, result.reasons[0], least, dof, each)
-            text += _marker_text(dof, runs)
+            text += marker_text(dof, runs)
         raise InsufficientTrials(text, least, runs, result.verdict)
     return result
 
@@ -311,61 +360,6 @@ def _settings(
     rate: float, demand: Terms, subsets: Mapping[str, Sequence[int]] | None = None, method: str = "max"
 ) -> Settings:
     return Settings(rate, demand.detect, demand.power, demand.tolerance, demand.allow, method, subsets, demand.lost)
-
-
-def _marker_text(dof: int, runs: int) -> str:
-    """Advice to add a marker, where the fixture has planned for more dimensions than the error has."""
-    plan = current().plan
-    if plan is None or dof >= DEFAULTS["dof"] or (planned := plan(dof)) <= runs:
-        return ""
-    return (
-        f". The fixture consistency_runs has planned for an error of {DEFAULTS['dof']} dimensions: with "
-        f"@pytest.mark.consistency(dof={dof}) at this test it gives {planned} runs"
-    )
-
-
-def _deciding(result: _Look, runs: int) -> int:
-    """Number of runs that would probably decide, above the present one; 0 for a comparison, which gives its own."""
-    if result.verdict is None:
-        return 0
-    shown, lost = result.verdict.equivalence, result.verdict.lost
-    deciding = (shown.runs or 0) if shown is not None and not shown.shown else 0
-    return max(runs + 1, deciding, (lost.needed or 0) if lost is not None else 0)
-
-
-def _entry(
-    gate: str, record: Record, demand: Terms, result: _Look, late: _Look | None, outcome: str, least: int
-) -> Entry:
-    statistics = result.verdict.statistics if result.verdict is not None else {}
-    fields = _summary(result)
-    if (c := result.comparison) is not None:
-        fields |= plain({key: getattr(c, key) for key in ("distance", "standard_error")})
-        spread = {key: getattr(c, key) for key in ("at_most", "sum_error", "reference")}
-        fields["spread"] = {key: value for key, value in spread.items() if np.isfinite(value)}
-        statistics = {"differences": [vars(d) for d in c.differences]}
-    return Entry(
-        gate=gate, name=record.name, outcome=outcome, p_value=plain(result.p_value),
-        false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
-        in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
-        runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=rate_shares(record),
-        detect=demand.detect, power=demand.power, allow=demand.allow, lost=demand.lost,
-        late={} if late is None else _summary(late), statistics=statistics, **fields,
-    )  # fmt: skip
-
-
-def _summary(look: _Look) -> dict[str, Any]:
-    summary: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
-    if look.comparison is not None:
-        return summary | {"statistic": plain(look.comparison.differences[0].a)}
-    assert look.verdict is not None
-    v = look.verdict
-    axis, ratio = v.axis or (None, ())
-    rest: dict[str, Any] = plain({
-        "statistic": v.statistic, "threshold": v.threshold, "inflation": v.inflation,
-        "inflation_interval": v.inflation_interval, "axis": axis, "axis_ratio": ratio, "first_step": v.first_step,
-        "subset": v.subset, "faults": v.faults,
-    })  # fmt: skip
-    return summary | rest
 
 
 def _source(results: Any) -> Source:
@@ -397,4 +391,10 @@ def _refuse(arrays: Mapping[str, Any], why: str) -> None:
         raise ValueError(f"{', '.join(extra)}: {why}")
 
 
-__all__ = ["ConsistencyError", "InsufficientTrials", "assert_consistent", "assert_not_worse"]
+__all__ = [
+    "ConsistencyError",
+    "InsufficientTrials",
+    "assert_consistent",
+    "assert_not_worse",
+    "assert_program_consistent",
+]

@@ -42,6 +42,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
         study.finding(
             worse > study.runs / 2 and p_value < SIGN_TEST,
             scenario=far.name,
+            verdict_if_not="refuted" if p_value < SIGN_TEST else "not reproduced",
             id="long-range",
             source="this project, beyond Herath 2007 sec. 4.5",
             claim="with landmarks up to 8 m the (u, v, d) EKF is worse than the (x, y, z) one",

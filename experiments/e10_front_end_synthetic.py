@@ -129,6 +129,7 @@ def figure_23(study: cs.Study) -> list[cs.Finding]:
     rate = study.finding(
         p_value > LEVEL,
         scenario="none",
+        verdict_if_not="refuted",
         id="frontend-rate",
         source=f"{OURS}, on Valencia & Andrade-Cetto 2018, fig. 2.3",
         claim="the test of fig. 2.3 accepts as often as it accepts a right covariance",

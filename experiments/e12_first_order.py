@@ -143,6 +143,7 @@ def described(study: cs.Study, name: str, cells: pd.DataFrame) -> cs.Finding:
     return study.finding(
         bool(accepted[near].all()),
         scenario="none",
+        verdict_if_not="refuted" if (cells["faults"][near] != "").any() else "not reproduced",
         id=f"first-order-{name}",
         source=f"{OURS}, beyond Valencia & Andrade-Cetto 2018, sec. 2.3.3",
         claim=f"{name}: first order holds while the disparity's noise is at most {HOLDS:.0%} of the disparity",

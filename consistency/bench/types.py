@@ -153,10 +153,10 @@ OURS = "this project"  # how the source of a question begins that no paper asks
 
 
 def outcome(source: str, verdict: str) -> str:
-    """The verdict on a finding in words: an unpublished one holds or does not hold, and is never reproduced."""
+    """The verdict on a finding in words: a conjecture of ours holds, is refuted, or is not shown."""
     if not source.startswith(OURS):
         return verdict
-    return "holds" if verdict == "reproduced" else "does not hold"
+    return {"reproduced": "holds", "refuted": "refuted"}.get(verdict, "not shown")
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from consistency.commands.shared_options import (
 )
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.errors import InputError
-from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.options import GROUPED, Reading, flag_of
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.record import Record
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from consistency.referee.verdicts.sources import Source
 
 
-@reads_files
+@reads_files(without=GROUPED)
 def compare_command(
     path: Judged,
     files: Reading,
@@ -90,7 +90,7 @@ def _summaries(path: Path, recordings: list[Record] | None, first: FirstSteps | 
     return read_baseline(path, first)
 
 
-@reads_files
+@reads_files(without=GROUPED)
 def baseline_command(
     path: Judged,
     out: Annotated[Path, typer.Option("--out", help="JSON file to write; small enough for version control.")],

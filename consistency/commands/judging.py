@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -28,10 +28,14 @@ from consistency.commands.shared_options import (
     require_written,
     tell_notes,
 )
+from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy
 from consistency.referee.readers.options import Reading
+
+if TYPE_CHECKING:
+    from consistency.referee.verdicts.sources import Source
 
 
 @reads_files
@@ -85,7 +89,7 @@ def analyse_command(
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.command_settings import settings_of, skip_asked
-    from consistency.referee.verdicts.sources import judge_all
+    from consistency.referee.verdicts.sources import files_source, judge_all
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -101,8 +105,10 @@ def analyse_command(
         overwrite = require_report(report, is_file, overwrite)
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
-        verdicts = judge_all(recordings, filters, settings=settings, optimal_gain=innovations is not None)
+        source = files_source(path, recordings)
+        verdicts = judge_all(source, filters, settings=settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
+        _refuse_unfinished(path, source, "monte-carlo", fail_on)
         if report is not None and not is_file:
             from consistency.referee.pages.write_pages import write_file_reports
             from consistency.referee.show.as_json import render
@@ -125,11 +131,7 @@ def analyse_command(
                 "--innovations is for files of another estimator; filters of the bench declare it themselves"
             )
         verdicts = judge_all(results, filters, settings=settings, skip=first)
-        if results.unfinished:
-            text = f"{path}: {results.unfinished}; the same 'consistency run' with --resume goes on"
-            if fail_on:
-                raise InputError(f"--fail-on: {text}")
-            print(f"consistency: {text}", file=sys.stderr)
+        _refuse_unfinished(path, results, "run", fail_on)
     shown = document(verdicts, path.name, verbose=verbose)
     if report is not None and is_file:
         from consistency.referee.pages.write_pages import write_text_file
@@ -161,6 +163,16 @@ def require_report(report: Path, is_file: bool, overwrite: bool) -> bool:
     return replaces
 
 
+def _refuse_unfinished(path: Path, source: Source, command: str, fail_on: str | None) -> None:
+    """Say that runs are missing; refuse them with ``--fail-on``."""
+    if not source.unfinished:
+        return
+    text = f"{path}: {source.unfinished}; the same 'consistency {command}' with --resume goes on"
+    if fail_on:
+        raise InputError(f"--fail-on: {text}")
+    print(f"consistency: {text}", file=sys.stderr)
+
+
 @reads_files
 def report_command(
     path: Annotated[
@@ -176,7 +188,7 @@ def report_command(
 ) -> None:
     """Write a report of results as one offline HTML file and a PDF."""
     from consistency.referee.pages.write_pages import require_pages, write_file_pages
-    from consistency.referee.verdicts.sources import judge_all
+    from consistency.referee.verdicts.sources import files_source, judge_all
 
     estimates = are_files(path, files)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
@@ -185,7 +197,7 @@ def report_command(
     if estimates:
         require_pages(*targets, overwrite)
         recordings = read_files(path, files)
-        write_file_pages(recordings, judge_all(recordings), *targets, path.name)
+        write_file_pages(recordings, judge_all(files_source(path, recordings)), *targets, path.name)
         tell_notes(recordings)
     else:
         from consistency.bench.pages import write_reports
@@ -216,6 +228,9 @@ def plan_command(
         str | None, typer.Option("--allow", help="'conservative': a covariance too large is no fault.")
     ] = None,
     lost: Annotated[float | None, typer.Option("--lost", help=f"{LOST_HELP.capitalize()}.", metavar="P")] = None,
+    groups: Annotated[
+        int | None, typer.Option("--groups", help="Number of groups of --by, in one of which that ratio must be found.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
@@ -228,17 +243,22 @@ def plan_command(
         raise InputError("--filter goes with a SCENARIO or --like RESULTS")
     if scenario is not None and not filters:
         raise InputError(f"--filter: name the filter to plan for in {scenario}")
-    pilots = None
-    if like is not None:
+    pilots, pilot_dof = None, len(POSE)
+    if like is not None and are_files(like, Reading()):
+        from consistency.referee.verdicts.command_settings import pilots_of_records
+
+        pilots, pilot_dof = pilots_of_records(read_files(like, Reading()), filters)
+        dof = pilot_dof
+    elif like is not None:
         from consistency.bench.runs.sequential import pilots_in
 
         pilots = pilots_in(like, filters)
     elif scenario is not None and filters:
-        plan_runs(dof, detect, false_alarm, power, allow, lost=lost)  # refuse before the work
+        plan_runs(dof, detect, false_alarm, power, allow, lost=lost, groups=groups)  # refuse before the work
         from consistency.bench.runs.sequential import pilots_in_world
 
         pilots = pilots_in_world(scenario, filters, pilot_runs, seed)
-    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost)
+    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)
     if as_json:
         print(json.dumps(planned, indent=2))
     else:

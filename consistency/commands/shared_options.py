@@ -113,13 +113,16 @@ def tell(notes: Iterable[str]) -> None:
         print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
 
 
-def reads_files(command: Callable[..., Any] | None = None, only: Collection[str] | None = None) -> Callable[..., Any]:
-    """A command with the options of files, which it gets as one argument ``files``; with all, or ``only`` some."""
+def reads_files(
+    command: Callable[..., Any] | None = None, only: Collection[str] | None = None, without: Collection[str] = ()
+) -> Callable[..., Any]:
+    """A command with the options of files, which it gets as one argument ``files``: all, ``only`` some, or without."""
     if command is None:
-        return partial(reads_files, only=only)
+        return partial(reads_files, only=only, without=without)
     signature = inspect.signature(command, eval_str=True)
     hints = get_type_hints(Reading)
     taken = [each for each in fields(Reading) if only is None or each.name in only]
+    taken = [each for each in taken if each.name not in without]
     own = {each.name: _parameter(each, hints[each.name]) for each in taken}
 
     @wraps(command)

@@ -29,6 +29,7 @@ DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 STUDY = "takes from half a minute to hours even with two runs; tests of its experiment run its parts"
 REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
 NOT_RUN = [
+    ("docs/any-program.md", "", "needs MATLAB, Julia and ROS; tests/smoke/test_cpp_example.py runs what is in C++"),
     ("docs/case-studies.md", "python docs/case-studies", "needs the libraries; tests/oracle/test_case_studies_live.py"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
     ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and unit/bench/test_slurm.py stand in"),
@@ -44,6 +45,7 @@ NOT_RUN = [
     ("docs/fit-covariance.md", "consistency", "needs real drives; unit/referee/test_fit_command.py simulates"),
     ("docs/front-end.md", "from consistency.vision import fit_shared", "tests/unit/stereo/test_vision_shared.py"),
     ("docs/front-end.md", "python experiments/e11", REAL),
+    ("docs/gates.md", "from consistency.testing import assert_program", "tests/smoke/test_cpp_example.py has one"),
     ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/bench/test_guards.py runs such"),
     ("docs/kitti07.md", "", REAL),
     ("docs/planar.md", "", f"{STUDY}; e15: {REAL}"),

@@ -6,9 +6,7 @@ of a bias map is one without it on data that somebody else has cleaned.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,14 +15,12 @@ import consistency as cs
 from consistency.bench.filters import MODULES, usable_names
 from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.stepping import run_filter, step_through
-from consistency.bench.protocols import Problem
 from consistency.bench.scenario import BelievedSensor, BiasMap
-from consistency.bench.types import Control, Estimates, Gaussian, Observation, Trial
+from consistency.bench.types import Gaussian
 from consistency.referee.types import Array
 
 pytestmark = pytest.mark.usefixtures("dense")
 
-Small = Callable[..., cs.Scenario]
 NAMES = [name for name in MODULES if name.endswith(("-uvd", "-xyz"))]
 COMPILED = [
     "ekf-uvd",
@@ -44,7 +40,7 @@ MAP = {
 }  # fmt: skip
 
 
-def filter_of(name: str, kernel: bool) -> Any:
+def filter_of(name, kernel):
     """A built-in filter, or its plain twin where it has one."""
     if name not in usable_names():
         pytest.skip(f"the library of {name} is not installed")
@@ -52,7 +48,7 @@ def filter_of(name: str, kernel: bool) -> Any:
     return filter_ if kernel else getattr(filter_, "textbook", filter_)
 
 
-def same(a: Estimates, b: Estimates, tolerance: float) -> bool:
+def same(a, b, tolerance):
     """Poses and covariances are the same to a part of the standard deviation; a failure is no estimate."""
     assert a.failure is None, a.failure
     assert b.failure is None, b.failure
@@ -64,17 +60,17 @@ def same(a: Estimates, b: Estimates, tolerance: float) -> bool:
     )
 
 
-def short(small: Small, **changes: Any) -> tuple[cs.Scenario, Trial]:
+def short(small, **changes):
     scenario = small("herath2007-stereo", truth__steps=12, **changes)
     return scenario, cs.simulate(scenario, run=1)
 
 
-def believing(scenario: cs.Scenario, **changes: Any) -> cs.Scenario:
+def believing(scenario, **changes):
     return scenario.variant("other", **{f"belief__sensor__{key}": value for key, value in changes.items()})
 
 
 @pytest.mark.parametrize(("name", "kernel"), CASES)
-def test_where_all_disparities_are_alike_a_growth_is_another_sigma(small: Small, name: str, kernel: bool) -> None:
+def test_where_all_disparities_are_alike_a_growth_is_another_sigma(small, name, kernel):
     """At the measured disparity, except where a filter takes all its noise at the prediction, which is not 6 px."""
     scenario, trial = short(small)
     z = np.array(trial.z)
@@ -88,9 +84,7 @@ def test_where_all_disparities_are_alike_a_growth_is_another_sigma(small: Small,
 
 
 @pytest.mark.parametrize(("name", "kernel"), [case for case in CASES if case[0] in PREDICTING | {"ekf-uvd"}])
-def test_filters_with_their_noise_at_the_prediction_take_the_growth_there(
-    small: Small, name: str, kernel: bool
-) -> None:
+def test_filters_with_their_noise_at_the_prediction_take_the_growth_there(small, name, kernel):
     """One landmark is seen at 6 px, is expected near that in the next step, and is measured at 9 px."""
     scenario, trial = short(small)
     z = np.array([[10.0, 5.0, 6.0], [10.5, 5.0, 9.0]])
@@ -105,7 +99,7 @@ def test_filters_with_their_noise_at_the_prediction_take_the_growth_there(
 
 
 @pytest.mark.parametrize(("name", "kernel"), CASES)
-def test_a_believed_bias_is_subtracted_before_anything_else(small: Small, name: str, kernel: bool) -> None:
+def test_a_believed_bias_is_subtracted_before_anything_else(small, name, kernel):
     scenario, trial = short(small)
     filter_ = filter_of(name, kernel)
     told = run_filter(filter_, trial, believing(scenario, bias=MAP).belief)
@@ -117,7 +111,7 @@ def test_a_believed_bias_is_subtracted_before_anything_else(small: Small, name: 
 
 
 @pytest.mark.parametrize("name", ["parked-ekf-uvd", "gtsam-batch-uvd"])
-def test_the_search_range_moves_with_the_bias(small: Small, name: str) -> None:
+def test_the_search_range_moves_with_the_bias(small, name):
     """Negative control of the test above, near the least disparity."""
     _, trial = short(small)
     least = trial.z[:, 2].min() - 0.01
@@ -130,7 +124,7 @@ def test_the_search_range_moves_with_the_bias(small: Small, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", COMPILED)
-def test_kernels_equal_their_twins_with_both(small: Small, name: str) -> None:
+def test_kernels_equal_their_twins_with_both(small, name):
     effects = [{"kind": "local-bias", **MAP, "bias_d": [[1.0, -0.5, 0.3], [0.0, 0.6, -0.2]]}]
     bias = {key: value for key, value in effects[0].items() if key != "kind"}
     scenario = small(
@@ -141,7 +135,7 @@ def test_kernels_equal_their_twins_with_both(small: Small, name: str) -> None:
     assert same(filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief), 1e-7)
 
 
-def test_the_noise_of_a_point_is_that_of_its_own_pixels() -> None:
+def test_the_noise_of_a_point_is_that_of_its_own_pixels():
     """Eq. 21 by hand: x = f B / d, y = -B u / d, z = -B v / d, with sigma_d at each disparity and no bias left."""
     f, B, sigma = 150.0, 0.09, np.array([1.34, 1.53, 0.65])
     sensor = BelievedSensor.model_validate(
@@ -164,26 +158,26 @@ def test_the_noise_of_a_point_is_that_of_its_own_pixels() -> None:
 class Recorder:
     """A filter of a user's own that keeps what it is given."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.z: list[Array] = []
         self.sensor: BelievedSensor | None = None
 
-    def init(self, problem: Problem) -> int:
+    def init(self, problem):
         self.sensor = problem.belief.sensor
         return 0
 
-    def predict(self, state: int, control: Control) -> int:
+    def predict(self, state, control):
         return state
 
-    def update(self, state: int, observation: Observation) -> tuple[int, None]:
+    def update(self, state, observation):
         self.z.append(observation.z)
         return state, None
 
-    def pose(self, state: int) -> Gaussian:
+    def pose(self, state):
         return Gaussian(np.zeros(3), np.eye(3))
 
 
-def test_a_filter_of_the_users_own_gets_what_was_measured_and_the_belief(small: Small) -> None:
+def test_a_filter_of_the_users_own_gets_what_was_measured_and_the_belief(small):
     scenario, trial = short(small, belief__sensor__bias=MAP, belief__sensor__disparity_growth=GROWTH)
     recorder = Recorder()
     step_through(recorder, trial, scenario.belief)

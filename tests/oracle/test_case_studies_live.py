@@ -1,7 +1,5 @@
 """The case studies whose library is installed, run again: a fault that is mended is told, and fails nothing."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -10,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs/case-studies"
@@ -23,7 +22,7 @@ LIVE = {
 }  # fmt: skip
 
 
-def installed(library: str) -> str:
+def installed(library):
     try:
         return version(library)
     except PackageNotFoundError:
@@ -32,7 +31,7 @@ def installed(library: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", LIVE)
-def test_the_library_says_what_is_kept(case: str, tmp_path: Path) -> None:
+def test_the_library_says_what_is_kept(case, tmp_path):
     """The noise is that of the kept verdicts; of another version a control may be at fault by chance in 1 of 100."""
     here = installed(LIVE[case])
     out = tmp_path / "found.json"
@@ -46,14 +45,14 @@ def test_the_library_says_what_is_kept(case: str, tmp_path: Path) -> None:
         assert row["row"] == before["row"]
         if here == kept["version"]:
             assert row["status"] == before["status"], row["sentence"]
-            np.testing.assert_allclose(row["ratio"], before["ratio"], rtol=0.01)
+            assert_allclose(row["ratio"], before["ratio"], rtol=0.01)
         elif row["role"] == "control":
             assert row["status"] == "consistent", row["sentence"]
         elif row["status"] != before["status"]:
             print(f"no longer found: {row['row']} of {LIVE[case]} {here}: {row['sentence']}")
 
 
-def test_the_script_makes_the_stored_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_script_makes_the_stored_draws(monkeypatch):
     """Rounding of the archives is that of float32; other processors differ in last digits."""
     stored = FOLDER / f"gtsam-{installed('gtsam')}.npz"
     if not stored.exists():
@@ -63,5 +62,5 @@ def test_the_script_makes_the_stored_draws(monkeypatch: pytest.MonkeyPatch) -> N
 
     residual, stated, _, _ = gtsam_imu.simulate(np.random.default_rng(20070), 200, turns=(1.0,))[1.0]
     with np.load(stored) as archive:
-        np.testing.assert_allclose(residual, archive["errors"][:, 0], rtol=1e-4, atol=1e-6)
-        np.testing.assert_allclose(stated, archive["covariances"][:, 0], rtol=1e-4, atol=1e-9)
+        assert_allclose(residual, archive["errors"][:, 0], rtol=1e-4, atol=1e-6)
+        assert_allclose(stated, archive["covariances"][:, 0], rtol=1e-4, atol=1e-9)

@@ -1,10 +1,5 @@
 """filterpy's filters, put behind the same interface, say what ours say."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,9 +8,8 @@ from estimates import apart
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter
 
-Small = Callable[..., cs.Scenario]
 MERWE = {"belief__sigma_points": {"alpha": 0.5, "beta": 2.0, "kappa": 1.0}}
-CASES: list[tuple[str, str, dict[str, Any]]] = [
+CASES = [
     ("ekf-xyz", "herath2007-xyz", {}),
     ("ekf-xyz", "herath2007-stereo", {}),
     ("ekf-uvd", "herath2007-stereo", {"truth__steps": 120}),
@@ -27,7 +21,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("name", "world", "changes"), CASES)
-def test_filterpy_agrees(small: Small, name: str, world: str, changes: dict[str, Any]) -> None:
+def test_filterpy_agrees(small, name, world, changes):
     scenario = small(world, **changes)
     trial = cs.simulate(scenario, run=2)
     peer, ours = (run_filter(cs.get_filter(n), trial, scenario.belief) for n in (f"filterpy-{name}", name))
@@ -36,7 +30,7 @@ def test_filterpy_agrees(small: Small, name: str, world: str, changes: dict[str,
     assert apart(peer, ours) < 1e-9
 
 
-def test_the_comparison_sees_another_filter(uvd: cs.Scenario) -> None:
+def test_the_comparison_sees_another_filter(uvd):
     """Negative control."""
     trial = cs.simulate(uvd, run=2)
     peer, ours = (run_filter(cs.get_filter(n), trial, uvd.belief) for n in ("filterpy-ukf-uvd", "ekf-uvd"))
@@ -44,7 +38,7 @@ def test_the_comparison_sees_another_filter(uvd: cs.Scenario) -> None:
 
 
 @pytest.mark.parametrize("name", ["filterpy-ekf-xyz", "filterpy-ekf-uvd", "filterpy-ukf-xyz", "filterpy-ukf-uvd"])
-def test_a_peer_runs_beside_ours_in_processes(small: Small, name: str) -> None:
+def test_a_peer_runs_beside_ours_in_processes(small, name):
     scenario = small("herath2007-stereo", truth__steps=20)
     alone = cs.run_trials(scenario, [name], runs=2, jobs=1)
     among = cs.run_trials(scenario, [name, "ekf-uvd"], runs=2, jobs=2).estimates

@@ -1,11 +1,8 @@
 """Windows of a chain of motions: gtsam's joint marginals and independent motions say the same, in files as well."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import consistency as cs
 
@@ -17,7 +14,7 @@ STEPS, APART = 40, 5
 ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 
 
-def test_joint_marginals_of_keyframes_agree_with_independent_motions(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_joint_marginals_of_keyframes_agree_with_independent_motions(tmp_path, rng):
     """As docs/files.md writes them: the error ``left``, rotation first."""
     log = drive(rng, "SE(3)", STEPS)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -49,6 +46,6 @@ def test_joint_marginals_of_keyframes_agree_with_independent_motions(tmp_path: P
         covariance_order="rotation-translation",
     )  # fmt: skip
     motions = cs.read(tmp_path / "motions.tum", tmp_path / "truth.tum", relative=APART, motions=True)
-    np.testing.assert_allclose(poses.error, motions.error, atol=1e-9)
-    np.testing.assert_allclose(poses.covariance, motions.covariance, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(poses.nees, motions.nees, rtol=1e-6)
+    assert_allclose(poses.error, motions.error, atol=1e-9)
+    assert_allclose(poses.covariance, motions.covariance, rtol=1e-6, atol=1e-12)
+    assert_allclose(poses.nees, motions.nees, rtol=1e-6)

@@ -1,23 +1,16 @@
 """Whole trials where a kernel could go wrong and small worlds would not tell: many landmarks, singular starts."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
 import consistency as cs
 from consistency.bench.filters.kernel.linalg import ROUNDING
 from consistency.bench.filters.stepping import step_through
-from consistency.bench.types import Estimates
 
-Small = Callable[..., cs.Scenario]
 MANY = {"truth__landmarks__count": 600, "truth__steps": 25}
 
 
-def gap(a: Estimates, b: Estimates) -> float:
+def gap(a, b):
     """Largest difference of poses, of covariances relative to a step's largest entry, and of NIS relative to it.
 
     What is less than ``ROUNDING`` counts as no variance.
@@ -31,7 +24,7 @@ def gap(a: Estimates, b: Estimates) -> float:
     return float(max(np.abs(a.pose - b.pose).max(), (covariance / largest).max(), nis))
 
 
-def both(name: str, scenario: cs.Scenario) -> tuple[Estimates, Estimates]:
+def both(name, scenario):
     trial, filter_ = cs.simulate(scenario, run=3), cs.get_filter(name)
     return filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
 
@@ -46,7 +39,7 @@ def both(name: str, scenario: cs.Scenario) -> tuple[Estimates, Estimates]:
         ("ukf-uvd", "herath2007-stereo"),
     ],
 )
-def test_many_landmarks(small: Small, name: str, world: str) -> None:
+def test_many_landmarks(small, name, world):
     ours, twin = both(name, small(world, **MANY))
     assert twin.nis_dof.max() >= 36  # a dozen landmarks in a step
     assert gap(ours, twin) < 1e-9
@@ -54,8 +47,8 @@ def test_many_landmarks(small: Small, name: str, world: str) -> None:
 
 @pytest.mark.parametrize("name", ["ukf-xyz", "ukf-uvd", "ekf-uvd"])
 @pytest.mark.parametrize("still", [("sigma_v",), ("sigma_omega",), ("sigma_v", "sigma_omega")], ids="-".join)
-def test_a_covariance_that_stays_singular(small: Small, name: str, still: tuple[str, ...]) -> None:
+def test_a_covariance_that_stays_singular(small, name, still):
     """Without noise on v, on omega or on both, pivots stay zero and LAPACK's Cholesky has to be replaced."""
-    changes: dict[str, Any] = {f"{table}__motion__{key}": 0.0 for table in ("truth", "belief") for key in still}
+    changes = {f"{table}__motion__{key}": 0.0 for table in ("truth", "belief") for key in still}
     ours, twin = both(name, small("herath2007-stereo", truth__steps=40, **changes))
     assert gap(ours, twin) < 1e-9

@@ -1,14 +1,7 @@
 """Our EKF against one that was written from the contract alone and reads nothing but a log folder."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import independent_ekf
 import numpy as np
-import pandas as pd
 import pytest
 
 import consistency as cs
@@ -28,7 +21,7 @@ VARIANCE = {"P_xx": ("P_xx", "P_xx"), "P_yy": ("P_yy", "P_yy"), "P_hh": ("P_hh",
 COVARIANCE = {"P_xy": ("P_xx", "P_yy"), "P_xh": ("P_xx", "P_hh"), "P_yh": ("P_yy", "P_hh")}
 
 
-def relative_covariance(ours: pd.DataFrame, theirs: pd.DataFrame) -> float:
+def relative_covariance(ours, theirs):
     """Largest difference of the six entries in units of the standard deviations that they belong to."""
     later = theirs["step"] > 1  # in step 1 some variances are zero
     worst = 0.0
@@ -38,8 +31,8 @@ def relative_covariance(ours: pd.DataFrame, theirs: pd.DataFrame) -> float:
     return worst
 
 
-@pytest.mark.parametrize(("name", "model", "scenario", "steps"), CASES)
-def test_two_authors_agree(name: str, model: str, scenario: str, steps: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name, model, scenario, steps", CASES)
+def test_two_authors_agree(name, model, scenario, steps, tmp_path):
     world = cs.load_scenario(scenario).variant("two-authors", truth__steps=steps)
     simulate_log(world, RUNS, SEED, tmp_path / "log")
     results = cs.run_trials(world, [name], RUNS, SEED, jobs=1)
@@ -54,11 +47,11 @@ def test_two_authors_agree(name: str, model: str, scenario: str, steps: int, tmp
         assert np.array_equal(ours["nis_dof"], theirs["nis_dof"])
 
 
-def test_the_comparison_sees_a_small_difference(small: Callable[..., cs.Scenario], tmp_path: Path) -> None:
+def test_the_comparison_sees_a_small_difference(small, tmp_path):
     """Negative control: a belief that is 0.1 % off is not the same filter."""
     simulate_log(small("herath2007-stereo"), 1, SEED, tmp_path / "log")
     off = small("herath2007-stereo", belief__motion__sigma_v=0.05005)
     ours = cs.run_trials(off, ["ekf-uvd"], 1, SEED, jobs=1).estimates
-    theirs: Any = independent_ekf.run(tmp_path / "log", 0, "uvd")
+    theirs = independent_ekf.run(tmp_path / "log", 0, "uvd")
     assert not np.allclose(ours[POSE], theirs[POSE], rtol=0, atol=1e-6)
     assert relative_covariance(ours, theirs) > 1e-6

@@ -1,10 +1,5 @@
 """Local updating is the dense filter: the same numbers whatever is active, when it is settled and how often."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 from bench_trials import growing, grown
@@ -12,8 +7,6 @@ from estimates import apart
 
 import consistency as cs
 from consistency.bench.filters.stepping import step_through
-from consistency.bench.scenario import Belief
-from consistency.bench.types import Estimates, Trial
 
 NEVER = 10**9
 ALL = [
@@ -29,14 +22,14 @@ ALL = [
 ]
 
 
-def run(name: str, trial: Trial, belief: Belief, local_from: int, monkeypatch: pytest.MonkeyPatch) -> Estimates:
+def run(name, trial, belief, local_from, monkeypatch):
     filter_ = cs.get_filter(name)
     monkeypatch.setattr(filter_, "local_from", local_from)
-    said: Estimates = filter_.run(trial, belief)
+    said = filter_.run(trial, belief)
     return said
 
 
-def gap(a: Estimates, b: Estimates) -> float:
+def gap(a, b):
     """As :func:`apart`, and of the maps."""
     assert np.array_equal(a.map.landmarks, b.map.landmarks)
     spread = np.abs(b.map.covariance).max(axis=(1, 2), keepdims=True)
@@ -44,8 +37,8 @@ def gap(a: Estimates, b: Estimates) -> float:
     return float(max(apart(a, b), points))
 
 
-@pytest.mark.parametrize(("name", "world"), ALL)
-def test_every_filter_equals_its_dense_self(monkeypatch: pytest.MonkeyPatch, name: str, world: str) -> None:
+@pytest.mark.parametrize("name, world", ALL)
+def test_every_filter_equals_its_dense_self(monkeypatch, name, world):
     scenario = cs.load_scenario(world)
     trial = cs.simulate(scenario, run=2)
     local, dense = (run(name, trial, scenario.belief, each, monkeypatch) for each in (10, NEVER))
@@ -53,7 +46,7 @@ def test_every_filter_equals_its_dense_self(monkeypatch: pytest.MonkeyPatch, nam
     assert not np.array_equal(local.covariance, dense.covariance), "nothing was updated locally"
 
 
-def test_first_estimates_are_kept_while_updating_is_local(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_first_estimates_are_kept_while_updating_is_local(monkeypatch):
     """``dense`` is the same kernel with a bound that the state does not reach."""
     scenario = cs.load_scenario("herath2007-xyz")
     trial = cs.simulate(scenario, run=2)
@@ -62,14 +55,14 @@ def test_first_estimates_are_kept_while_updating_is_local(monkeypatch: pytest.Mo
     assert not np.array_equal(local.covariance, dense.covariance), "nothing was updated locally"
 
 
-def test_the_textbook_twin_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_textbook_twin_says_the_same(monkeypatch):
     case = growing(80, 3)
     local = run("ekf-xyz", case.trial, case.belief, 10, monkeypatch)
     assert gap(local, step_through(cs.get_filter("ekf-xyz").textbook, case.trial, case.belief)) < 1e-9
 
 
 @pytest.mark.parametrize("local_from", [4, 60, 150])
-def test_places_seen_again(monkeypatch: pytest.MonkeyPatch, local_from: int) -> None:
+def test_places_seen_again(monkeypatch, local_from):
     """A loop of which every landmark is left and met again."""
     scenario = cs.load_scenario("long-loop")
     trial = cs.simulate(scenario)
@@ -80,14 +73,14 @@ def test_places_seen_again(monkeypatch: pytest.MonkeyPatch, local_from: int) -> 
 
 @pytest.mark.parametrize("name", ["ekf-xyz", "ukf-xyz"])
 @pytest.mark.parametrize("make", [lambda: growing(300, 2), lambda: grown(200, 150)], ids=["new ones", "known ones"])
-def test_one_landmark_more_in_each_step(monkeypatch: pytest.MonkeyPatch, name: str, make: Callable[[], Any]) -> None:
+def test_one_landmark_more_in_each_step(monkeypatch, name, make):
     case = make()
     local, dense = (run(name, case.trial, case.belief, each, monkeypatch) for each in (40, NEVER))
     assert gap(local, dense) < 1e-9
     assert not np.array_equal(local.covariance, dense.covariance)
 
 
-def test_steps_without_a_landmark(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_without_a_landmark(monkeypatch):
     """The robot alone stays active; then it sees again what it saw at first."""
     case = grown(30, 60)
     trial = case.trial
@@ -103,7 +96,7 @@ def test_steps_without_a_landmark(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("steps", [3, 30, 80])
-def test_a_failure_is_in_the_same_step(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+def test_a_failure_is_in_the_same_step(monkeypatch, steps):
     case = growing(100, 1)
     z = case.trial.z.copy()
     z[case.trial.first[steps - 1]] = np.nan

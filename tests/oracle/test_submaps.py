@@ -1,10 +1,5 @@
 """Sub-maps: one large filter to first order after each join, and less certain between them."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -12,14 +7,12 @@ import consistency as cs
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook.submaps import SubmapKalman, joined_map
 from consistency.bench.protocols import Problem
-from consistency.referee.types import Array
 
-Small = Callable[..., cs.Scenario]
 STEPS = 20
 WORLDS = {True: "herath2007-wide-baseline", False: "herath2007-xyz"}
 
 
-def quiet(scenario: cs.Scenario, scale: float) -> cs.Scenario:
+def quiet(scenario, scale):
     """The world with all noise, true and believed, multiplied."""
     belief, changes = scenario.belief, {}
     for table in ("truth", "belief"):
@@ -29,7 +22,7 @@ def quiet(scenario: cs.Scenario, scale: float) -> cs.Scenario:
     return scenario.variant("quiet", **changes)
 
 
-def compared(scenario: cs.Scenario, uvd: bool) -> tuple[Array, Array]:
+def compared(scenario, uvd):
     """Of each step: distance from the EKF's pose in standard deviations, and the ratio of the traces of P."""
     trial = cs.simulate(scenario, run=1)
     ours = step_through(SubmapKalman("submaps", uvd, STEPS), trial, scenario.belief)
@@ -43,7 +36,7 @@ def compared(scenario: cs.Scenario, uvd: bool) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("uvd", [True, False])
-def test_a_join_gives_what_one_filter_has(small: Small, uvd: bool, tilted: dict[str, Any]) -> None:
+def test_a_join_gives_what_one_filter_has(small, uvd, tilted):
     world = small(WORLDS[uvd], truth__sensor__mount=tilted, belief__sensor__mount=tilted)
     at = np.arange(STEPS, 61, STEPS) - 1
     (tenth, _), (hundredth, spread) = (compared(quiet(world, scale), uvd) for scale in (0.1, 0.01))
@@ -55,7 +48,7 @@ def test_a_join_gives_what_one_filter_has(small: Small, uvd: bool, tilted: dict[
     assert spread[between] > 1.05
 
 
-def test_a_landmark_is_in_the_map_once(small: Small) -> None:
+def test_a_landmark_is_in_the_map_once(small):
     scenario = small(WORLDS[True])
     trial, filter_ = cs.simulate(scenario, run=1), SubmapKalman("submaps", True, STEPS)
     state = filter_.init(Problem(scenario.belief, trial.start))

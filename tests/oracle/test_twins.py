@@ -1,10 +1,6 @@
 """Compiled filters against their textbook twins, and the Kalman filter against batch least squares."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,17 +9,13 @@ import consistency as cs
 from consistency.bench.filters.kernel.loop import trial_kernel
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook.ukf import CUBATURE, sigma_points
-from consistency.bench.scenario import Belief
 from consistency.bench.simulation import planned_path
-from consistency.bench.types import Estimates, Trial
-from consistency.referee.types import Array
 
-Small = Callable[..., cs.Scenario]
 MERWE = {"belief__sigma_points": {"alpha": 0.5, "beta": 2.0, "kappa": 1.0}}
 EIGHT = {"shape": "figure-of-eight", "radius": 2.0, "start": (0.0, 0.0), "heading": 0.3, "speed": 0.8}
 
 
-def differences(a: Estimates, b: Estimates) -> tuple[float, float, float]:
+def differences(a, b):
     """Largest difference of poses (m, rad), of covariances in correlation units, and of NIS, relative, or log det S."""
     sigma = np.sqrt(np.einsum("kii->ki", b.covariance))
     scale = np.maximum(sigma[:, :, None] * sigma[:, None, :], 1e-30)
@@ -36,19 +28,19 @@ def differences(a: Estimates, b: Estimates) -> tuple[float, float, float]:
     return float(pose), float(covariance), float(max(nis, log_det))
 
 
-def agree(a: Estimates, b: Estimates, tolerance: float = 1e-9) -> bool:
+def agree(a, b, tolerance=1e-9):
     assert a.failure is None
     assert b.failure is None
     return max(differences(a, b)) < tolerance
 
 
-def compiled(name: str, trial: Trial, belief: Belief) -> Estimates:
+def compiled(name, trial, belief):
     return cs.get_filter(name).run(trial, belief)
 
 
 # --- twins -----------------------------------------------------------------------------------
 
-CASES: list[tuple[str, str, int, dict[str, Any]]] = [
+CASES = [
     ("ekf-xyz", "herath2007-stereo", 300, {}),
     ("ekf-xyz", "long-loop", 300, {}),
     ("ekf-uvd", "herath2007-wide-baseline", 150, {"truth__motion__noise_on": "motion"}),
@@ -60,7 +52,7 @@ CASES: list[tuple[str, str, int, dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("name", "world", "steps", "changes"), CASES)
-def test_kernel_equals_its_twin(small: Small, name: str, world: str, steps: int, changes: dict[str, Any]) -> None:
+def test_kernel_equals_its_twin(small, name, world, steps, changes):
     scenario = small(world, truth__steps=steps, **changes)
     trial = cs.simulate(scenario, run=1)
     assert agree(
@@ -68,13 +60,13 @@ def test_kernel_equals_its_twin(small: Small, name: str, world: str, steps: int,
     )
 
 
-def test_the_four_steps_of_a_compiled_filter_are_its_twin(uvd: cs.Scenario) -> None:
+def test_the_four_steps_of_a_compiled_filter_are_its_twin(uvd):
     trial, filter_ = cs.simulate(uvd), cs.get_filter("ekf-uvd")
     stepped = step_through(filter_, trial, uvd.belief)
     assert np.array_equal(stepped.pose, step_through(filter_.textbook, trial, uvd.belief).pose)
 
 
-def test_one_compiled_signature_serves_every_caller(uvd: cs.Scenario) -> None:
+def test_one_compiled_signature_serves_every_caller(uvd):
     """Arrays from a table are often column-major; a second signature would cost half a minute to compile."""
     trial = cs.simulate(uvd)
     ours = compiled("ekf-uvd", trial, uvd.belief)
@@ -86,7 +78,7 @@ def test_one_compiled_signature_serves_every_caller(uvd: cs.Scenario) -> None:
     assert len(trial_kernel._entries) == signatures
 
 
-def test_the_cubature_filter_has_its_points_whatever_the_belief_says(small: Small) -> None:
+def test_the_cubature_filter_has_its_points_whatever_the_belief_says(small):
     trial = cs.simulate(small("herath2007-stereo"))
     default, merwe = (small("herath2007-stereo", **changes).belief for changes in ({}, MERWE))
     ckf = compiled("ckf-uvd", trial, merwe)
@@ -95,7 +87,7 @@ def test_the_cubature_filter_has_its_points_whatever_the_belief_says(small: Smal
     assert not agree(ckf, compiled("ukf-uvd", trial, merwe), 1e-6)
 
 
-def test_cubature_points(rng: np.random.Generator) -> None:
+def test_cubature_points(rng):
     """Arasaratnam & Haykin (2009): 2 L points at a distance of sqrt(L), equal weights, none for the centre."""
     L, root = 5, np.tril(rng.normal(size=(5, 5)))
     points, wm, wc = sigma_points(np.zeros(L), root @ root.T, np.arange(L), CUBATURE)
@@ -106,7 +98,7 @@ def test_cubature_points(rng: np.random.Generator) -> None:
     assert wm[0] == pytest.approx(0, abs=1e-15)
 
 
-def test_filters_differ_where_the_world_is_nonlinear(uvd: cs.Scenario) -> None:
+def test_filters_differ_where_the_world_is_nonlinear(uvd):
     """Negative control: the four stereo filters are four filters."""
     trial = cs.simulate(uvd)
     every = [compiled(name, trial, uvd.belief) for name in ("ekf-xyz", "ekf-uvd", "ukf-xyz", "ukf-uvd")]
@@ -118,7 +110,7 @@ def test_filters_differ_where_the_world_is_nonlinear(uvd: cs.Scenario) -> None:
 # --- the linear world ----------------------------------------------------------------------------
 
 
-def batch(scenario: cs.Scenario, trial: Trial, steps: int) -> tuple[Array, Array, float]:
+def batch(scenario, trial, steps):
     """Pose of step ``steps`` and its covariance by weighted least squares over all noises and landmarks.
 
     Unknowns are the motion noises (2 a step, prior Q) and the positions of the seen landmarks (no
@@ -155,7 +147,7 @@ def batch(scenario: cs.Scenario, trial: Trial, steps: int) -> tuple[Array, Array
 
 
 @pytest.mark.parametrize("run", [0, 1])
-def test_kalman_filter_is_batch_least_squares(small: Small, run: int) -> None:
+def test_kalman_filter_is_batch_least_squares(small, run):
     scenario = small("linear-gaussian", truth__steps=40)
     trial = cs.simulate(scenario, run)
     kf = compiled("kf", trial, scenario.belief)
@@ -170,12 +162,12 @@ def test_kalman_filter_is_batch_least_squares(small: Small, run: int) -> None:
     assert not np.allclose(kf.pose[-1], batch(other, trial, 40)[0], rtol=0, atol=1e-6)
 
 
-def with_xyz(belief: Belief) -> Belief:
+def with_xyz(belief):
     """The belief of a linear world, for a filter that takes it to be the nonlinear one."""
     return belief.model_copy(update={"sensor": belief.sensor.model_copy(update={"model": "xyz"})})
 
 
-def noise(scale: float) -> dict[str, Any]:
+def noise(scale):
     sigmas = {
         "motion__sigma_v": 0.05 * scale,
         "motion__sigma_omega": 0.09 * scale,
@@ -184,7 +176,7 @@ def noise(scale: float) -> dict[str, Any]:
     return {f"{table}__{key}": value for table in ("truth", "belief") for key, value in sigmas.items()}
 
 
-def test_ekf_equals_the_kalman_filter_where_noise_vanishes(small: Small) -> None:
+def test_ekf_equals_the_kalman_filter_where_noise_vanishes(small):
     """The second-order terms are of the order of the noise, relative to its standard deviation."""
     gaps = []
     for scale in (1.0, 1e-2, 1e-4):
@@ -201,7 +193,7 @@ def test_ekf_equals_the_kalman_filter_where_noise_vanishes(small: Small) -> None
 
 
 @pytest.mark.parametrize("points", [{}, MERWE], ids=["cubature", "Merwe"])
-def test_every_filter_is_the_kalman_filter_where_the_heading_is_known(small: Small, points: dict[str, Any]) -> None:
+def test_every_filter_is_the_kalman_filter_where_the_heading_is_known(small, points):
     """With no noise on omega eq. 18 and 19 are linear in what is left, so all rules are exact."""
     known = {"truth__motion__sigma_omega": 0.0, "belief__motion__sigma_omega": 0.0, "truth__steps": 100}
     scenario = small("linear-gaussian", **known, **points)

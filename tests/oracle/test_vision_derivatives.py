@@ -1,10 +1,5 @@
 """Closed-form derivatives of every cost of the front-end against automatic differentiation, to 1e-8."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 import pytest
 from hyperdual import HyperDual, derivatives
@@ -20,18 +15,17 @@ from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches, Poin
 from consistency.stereo.visual_odometry.two_frame_cost import cost_derivatives as two_frame_derivatives
 from consistency.vision import RelativePose, StereoRig, register_svd, triangulate
 
-Array = np.ndarray[Any, Any]
 TOLERANCE = 1e-8  # of the largest entry
 K = np.array([[500.0, 1.5, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 RIG = StereoRig(K, K + np.diag([9.0, -7.0, 0.0]), rotation(0.04, 0.016, 0.014), [0.385, 0.007, 0.02], (640, 480))
 POSES = [(0.0,) * 6, (0.3, -0.2, 0.9, 0.04, -0.03, 0.2), (-4.0, 2.0, 7.0, 2.5, -1.1, -2.9)]
 
 
-def close(a: Array, b: Array) -> bool:
+def close(a, b):
     return a.shape == b.shape and float(np.abs(a - b).max()) <= TOLERANCE * float(np.abs(b).max())
 
 
-def matrix(angles: Sequence[HyperDual]) -> list[list[HyperDual]]:
+def matrix(angles):
     """Rz Ry Rx written out."""
     (sr, sp, sy), (cr, cp, cy) = [a.sin() for a in angles], [a.cos() for a in angles]
     return [
@@ -41,11 +35,11 @@ def matrix(angles: Sequence[HyperDual]) -> list[list[HyperDual]]:
     ]
 
 
-def moved(d: Sequence[HyperDual], q: Sequence[HyperDual]) -> list[HyperDual]:
+def moved(d, q):
     return [sum((m * x for m, x in zip(row, q, strict=True)), t) for row, t in zip(matrix(d[3:]), d[:3], strict=True)]
 
 
-def seen(p: Sequence[HyperDual]) -> list[HyperDual]:
+def seen(p):
     """u, v, u', v' from the cameras' matrices."""
     out = []
     for camera in RIG.cameras:
@@ -54,19 +48,19 @@ def seen(p: Sequence[HyperDual]) -> list[HyperDual]:
     return out
 
 
-def quadratic(e: Sequence[HyperDual], W: Array) -> HyperDual:
+def quadratic(e, W):
     terms = [e[i] * e[j] * W[i, j] for i in range(len(e)) for j in range(len(e))]
     return 0.5 * sum(terms[1:], terms[0])
 
 
-def test_triangulation(rng: np.random.Generator) -> None:
+def test_triangulation(rng):
     """Eq. 2.25 at noisy matches, where the residual's part of the mixed derivative is not zero."""
     points = rng.uniform([-2, -1, 3], [2, 1, 9], (5, 3))
     uv = RIG.project(points) + rng.normal(0, 2, (5, 4))
     A, b, p = solved(RIG, uv)
     C_pp, C_pu = triangulation_derivatives(RIG, A, b, p)
 
-    def cost(x: Sequence[HyperDual]) -> HyperDual:  # x: p, u
+    def cost(x):  # x: p, u
         rows = [
             (camera[2] @ [0, 0, 0, 1] * x[3 + 2 * i + j]) - camera[j, 3]
             + sum((x[3 + 2 * i + j] * camera[2, k] - camera[j, k]) * x[k] for k in range(3))
@@ -85,7 +79,7 @@ def test_triangulation(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("vector", POSES)
-def test_registration(vector: tuple[float, ...], rng: np.random.Generator) -> None:
+def test_registration(vector, rng):
     """Eq. 2.28 at noisy points, near the identity and far from it."""
     truth = RelativePose.from_vector(np.array(vector))
     p2 = rng.uniform([-2, -1, 3], [2, 1, 9], (5, 3))
@@ -93,8 +87,8 @@ def test_registration(vector: tuple[float, ...], rng: np.random.Generator) -> No
     pose = register_svd(p1, p2)
     C_d, C_dd, C_dp = registration_derivatives(p1, p2, pose)
 
-    def cost(x: Sequence[HyperDual]) -> HyperDual:  # x: d, p1, p2
-        total: Any = 0.0
+    def cost(x):  # x: d, p1, p2
+        total = 0.0
         for n in range(5):
             a, q = x[6 + 3 * n : 9 + 3 * n], x[21 + 3 * n : 24 + 3 * n]
             total += quadratic([u - v for u, v in zip(a, moved(x[:6], q), strict=True)], np.eye(3))
@@ -111,7 +105,7 @@ def test_registration(vector: tuple[float, ...], rng: np.random.Generator) -> No
 
 @pytest.mark.parametrize("vector", POSES[:2])
 @pytest.mark.parametrize("measure", [PointMatches(), PixelMatches(RIG)], ids=["points", "pixels"])
-def test_two_frames(measure: PointMatches | PixelMatches, vector: tuple[float, ...], rng: np.random.Generator) -> None:
+def test_two_frames(measure, vector, rng):
     """All blocks of the cost of pose and points, at noisy measurements with correlated noise."""
     pose = RelativePose.from_vector(np.array(vector))
     n = 4
@@ -125,7 +119,7 @@ def test_two_frames(measure: PointMatches | PixelMatches, vector: tuple[float, .
     sensed = seen if isinstance(measure, PixelMatches) else list
     for i in range(n):
 
-        def cost(x: Sequence[HyperDual], i: int = i) -> HyperDual:  # x: d, q, z1, z2
+        def cost(x, i=i):  # x: d, q, z1, z2
             e1 = [a - b for a, b in zip(x[9 : 9 + k], sensed(moved(x[:6], x[6:9])), strict=True)]
             e2 = [a - b for a, b in zip(x[9 + k :], sensed(x[6:9]), strict=True)]
             return quadratic(e1, W1[i]) + quadratic(e2, W2[i])
@@ -143,7 +137,7 @@ def test_two_frames(measure: PointMatches | PixelMatches, vector: tuple[float, .
 
 
 @pytest.mark.parametrize("robust", [None, "huber", "cauchy"])
-def test_elimination_and_loss(robust: Any, rng: np.random.Generator) -> None:
+def test_elimination_and_loss(robust, rng):
     """Schur complement and loss: with linear measurements of one point the profile cost has a formula.
 
     f = e' (S1 + R S2 R')^-1 e / 2 with e = z1 - (R z2 + t); its derivatives by t and z1, through the loss, are
@@ -165,7 +159,7 @@ def test_elimination_and_loss(robust: Any, rng: np.random.Generator) -> None:
     _, weight, bend = loss(robust, s, c)
     C_dd, C_dz = _profile(two_frame_derivatives(frames, pose, best, exact=True), weight, bend)
 
-    def cost(x: Sequence[HyperDual]) -> HyperDual:  # x: t, z1
+    def cost(x):  # x: t, z1
         d = [HyperDual(a) for a in pose.R @ z2[0]]
         half = quadratic([x[3 + k] - x[k] - d[k] for k in range(3)], G)
         value = half.parts[0] * 2.0
@@ -178,7 +172,7 @@ def test_elimination_and_loss(robust: Any, rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("robust", [None, "huber", "cauchy"])
-def test_loss(robust: Any) -> None:
+def test_loss(robust):
     """rho' and rho'' by the complex step and by differences, on both sides of the threshold."""
     s, c, h = np.array([0.3, 3.9, 4.1, 90.0]), 2.0, 1e-6
     rho, first, second = loss(robust, s, c)
@@ -188,7 +182,7 @@ def test_loss(robust: Any) -> None:
     assert rho[0] <= s[0]
 
 
-def test_triangulation_is_the_printed_system(rng: np.random.Generator) -> None:
+def test_triangulation_is_the_printed_system(rng):
     """Eq. 2.3 and 2.26 as printed, with R' and -R't for its [R t], give the same points."""
     plain = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
     rig = StereoRig(plain, plain, RIG.R, RIG.t, (640, 480))

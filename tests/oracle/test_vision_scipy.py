@@ -1,9 +1,5 @@
 """Registrations and refinement against SciPy's."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from rigs import MOTION, RIG
@@ -21,23 +17,21 @@ from consistency.vision import (
     triangulation_covariance,
 )
 
-Array = np.ndarray[Any, Any]
 
-
-def frames(rng: np.random.Generator, n: int, noise: float) -> tuple[Array, Array]:
+def frames(rng, n, noise):
     p = rng.uniform([-2, -1.5, 4], [2, 1.5, 10], (n, 3))
     uv = [RIG.project(q) for q in (p, MOTION.inverse().apply(p))]
     return uv[0] + rng.normal(0, noise, (n, 4)), uv[1] + rng.normal(0, noise, (n, 4))
 
 
-def solution(fun: Any, start: Array) -> Array:
+def solution(fun, start):
     return np.asarray(
         least_squares(fun, start, method="trf", x_scale="jac", jac="3-point", ftol=1e-15, xtol=1e-15, gtol=1e-15).x
     )
 
 
 @pytest.mark.parametrize("register", [register_svd, register_horn])
-def test_registration_is_align_vectors(register: Any, rng: np.random.Generator) -> None:
+def test_registration_is_align_vectors(register, rng):
     for _ in range(20):
         R = Rotation.random(rng=rng).as_matrix()
         p2 = rng.normal(size=(8, 3)) + rng.normal(0, 9, 3)
@@ -48,7 +42,7 @@ def test_registration_is_align_vectors(register: Any, rng: np.random.Generator) 
         assert np.abs(ours.t - (p1.mean(0) - theirs @ p2.mean(0))).max() < 1e-8
 
 
-def test_refinement_is_least_squares(rng: np.random.Generator) -> None:
+def test_refinement_is_least_squares(rng):
     """Pose and points of the bundle to 1e-8, with different noise for each match and frame."""
     n = 12
     uv1, uv2 = frames(rng, n, 1.0)
@@ -57,7 +51,7 @@ def test_refinement_is_least_squares(rng: np.random.Generator) -> None:
     start = register_svd(triangulate(RIG, uv1), triangulate(RIG, uv2))
     ours = refine_reprojection(RIG, uv1, uv2, start, S1, S2)
 
-    def fun(x: Array) -> Array:
+    def fun(x):
         pose, q = RelativePose.from_vector(x[:6]), x[6:].reshape(n, 3)
         e1 = (RIG.project(pose.apply(q)) - uv1) / sigma1[:, None]
         e2 = (RIG.project(q) - uv2) / sigma2[:, None]
@@ -72,7 +66,7 @@ def test_refinement_is_least_squares(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("robust", [None, "huber", "cauchy"])
-def test_weighted_registration_is_least_squares(robust: Any, rng: np.random.Generator) -> None:
+def test_weighted_registration_is_least_squares(robust, rng):
     """The minimum of the sum of rho(e' (S1 + R S2 R')^-1 e) to 1e-8, with an outlier for the losses."""
     n = 15
     root = rng.normal(0, 0.1, (2, n, 3, 3))
@@ -83,7 +77,7 @@ def test_weighted_registration_is_least_squares(robust: Any, rng: np.random.Gene
     ours = register_weighted(p1, p2, S1, S2, robust=robust)
     c2 = 7.814727903251179  # 95 % quantile of chi-square(3)
 
-    def cost(x: Array) -> float:
+    def cost(x):
         pose = RelativePose.from_vector(x)
         e = p1 - pose.apply(p2)
         s = np.einsum("ni,ni->n", e, np.linalg.solve(S1 + pose.R @ S2 @ pose.R.T, e[:, :, None])[:, :, 0])
@@ -104,7 +98,7 @@ def test_weighted_registration_is_least_squares(robust: Any, rng: np.random.Gene
 
 
 @pytest.mark.parametrize("robust", [None, "huber", "cauchy"])
-def test_covariances_are_those_of_the_estimators(robust: Any, rng: np.random.Generator) -> None:
+def test_covariances_are_those_of_the_estimators(robust, rng):
     """J S J' with J from differences of the estimators themselves, noise, outlier and all."""
     n = 8
     uv1, uv2 = frames(rng, n, 1.0)
@@ -112,7 +106,7 @@ def test_covariances_are_those_of_the_estimators(robust: Any, rng: np.random.Gen
     start = register_svd(triangulate(RIG, uv1), triangulate(RIG, uv2))
     ours = refine_reprojection(RIG, uv1, uv2, start, 0.5 * np.eye(4), robust=robust)
 
-    def refined(z: Array) -> Array:
+    def refined(z):
         a, b = z.reshape(2, n, 4)
         return refine_reprojection(RIG, a, b, ours.pose, 0.5 * np.eye(4), robust=robust).pose.vector
 
@@ -121,7 +115,7 @@ def test_covariances_are_those_of_the_estimators(robust: Any, rng: np.random.Gen
     assert ours.covariance != pytest.approx(0.51 * J @ J.T, rel=1e-4, abs=1e-7 * ours.covariance.max())
 
 
-def test_propagation_is_that_of_the_registration(rng: np.random.Generator) -> None:
+def test_propagation_is_that_of_the_registration(rng):
     """Both steps of sec. 2.3 at noisy matches against differences of triangulation and registration."""
     n = 6
     uv1, uv2 = frames(rng, n, 1.0)
@@ -129,7 +123,7 @@ def test_propagation_is_that_of_the_registration(rng: np.random.Generator) -> No
     p1, p2 = triangulate(RIG, uv1), triangulate(RIG, uv2)
     ours = registration_covariance(p1, p2, S1, S2, register_svd(p1, p2))
 
-    def registered(z: Array) -> Array:
+    def registered(z):
         a, b = z.reshape(2, n, 4)
         return register_svd(triangulate(RIG, a), triangulate(RIG, b)).vector
 
@@ -137,5 +131,5 @@ def test_propagation_is_that_of_the_registration(rng: np.random.Generator) -> No
     assert ours == pytest.approx(J @ J.T, rel=1e-4, abs=1e-7 * ours.max())
 
 
-def jacobian(fun: Any, x: Array, h: float) -> Array:
+def jacobian(fun, x, h):
     return np.array([(fun(x + h * e) - fun(x - h * e)) / (2 * h) for e in np.eye(len(x))]).T

@@ -1,12 +1,8 @@
 """Commands on files: what they print, and their exit status."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import inputs
 import pytest
@@ -15,7 +11,7 @@ from consistency.commands import main
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     at = tmp_path_factory.mktemp("files")
     for name, scale in (("fair", 1.0), ("bold", 1.6)):
         inputs.planar(at, name, scale, optimal=True)
@@ -24,7 +20,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return at
 
 
-def consistency(folder: Path, *words: str, text: str | None = None) -> tuple[int, str, str]:
+def consistency(folder, *words, text=None):
     """Exit status, standard output and standard error of a process of its own."""
     done = subprocess.run(
         [sys.executable, "-m", "consistency", *words],
@@ -33,14 +29,14 @@ def consistency(folder: Path, *words: str, text: str | None = None) -> tuple[int
     return done.returncode, done.stdout, done.stderr
 
 
-def here(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[Any, str, str]:
+def here(words, capsys):
     """As :func:`consistency`, in this process."""
     with pytest.raises(SystemExit) as end:
         main(words)
     return end.value.code or 0, *capsys.readouterr()
 
 
-def test_a_verdict_in_words(folder: Path) -> None:
+def test_a_verdict_in_words(folder):
     status, out, _ = consistency(folder, "analyse", "bold.csv", "--truth", "truth.csv", "--fail-on", "inconsistent")
     assert status == 1
     assert "overconfident" in out
@@ -49,9 +45,7 @@ def test_a_verdict_in_words(folder: Path) -> None:
     assert "consistent" in out
 
 
-def test_a_baseline_is_written_and_compared_with(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_baseline_is_written_and_compared_with(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     status, out, _ = here(["baseline", "fair.csv", "--truth", "truth.csv", "--out", "base.json"], capsys)
     assert status == 0
@@ -66,7 +60,7 @@ def test_a_baseline_is_written_and_compared_with(
     assert "base.json: exists already" in err
 
 
-def test_innovations_from_a_pipe(folder: Path) -> None:
+def test_innovations_from_a_pipe(folder):
     lines = "nis,nis_dof\n" + "".join(f"{nis},2\n" for nis in [1.0, 3.0] * 20 + [20.0] * 20)
     status, out, err = consistency(folder, "monitor", "-", "--innovations", "optimal", "--fail-on", "alarm", text=lines)
     assert status == 1
@@ -74,7 +68,7 @@ def test_innovations_from_a_pipe(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["", "analyse", "compare", "baseline", "monitor", "plan"])
-def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help(command, capsys):
     status, out, err = here([*command.split(), "--help"], capsys)
     assert (status, err) == (0, "")
     assert "Usage: " in out
@@ -83,7 +77,7 @@ def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    "words, expected",
     [
         ("analyse nowhere.csv", "nowhere.csv: no such file"),
         ("analyse short.csv --truth truth.csv", "short.csv: column 'heading' is missing"),
@@ -97,9 +91,7 @@ def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
         ("nonsense", "nonsense"),
     ],
 )
-def test_bad_input_ends_in_one_line(
-    words: str, expected: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_ends_in_one_line(words, expected, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     status, out, err = here(words.split(), capsys)
     assert (status, out) == (2, "")

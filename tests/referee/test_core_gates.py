@@ -1,7 +1,5 @@
 """Gates in tests of an estimator, with the plugin of pytest and without it."""
 
-from __future__ import annotations
-
 import json
 import sys
 
@@ -42,11 +40,11 @@ def test_wanted(consistency_runs):
 """
 
 
-def errors(scale: float = 1.0, runs: int = 200) -> inputs.Array:
+def errors(scale=1.0, runs=200):
     return np.asarray(scale * inputs.normal(3 * runs, 2).reshape(runs, 3, 2))
 
 
-def test_a_gate_passes_and_fails() -> None:
+def test_a_gate_passes_and_fails():
     P = np.broadcast_to(np.eye(2), (200, 3, 2, 2))
     assert assert_consistent(errors(), P).status == "consistent"
     with pytest.raises(ConsistencyError, match="the estimator is overconfident"):
@@ -58,14 +56,14 @@ def test_a_gate_passes_and_fails() -> None:
         assert_consistent(errors(runs=10), P[:10])
 
 
-def test_estimates_are_compared() -> None:
+def test_estimates_are_compared():
     P = np.broadcast_to(np.eye(2), (200, 3, 2, 2))
     assert_not_worse(errors(), P, errors(), P)
     with pytest.raises(ConsistencyError, match="the candidate is worse"):
         assert_not_worse(errors(1.6), P, errors(), P)
 
 
-def test_a_monitor_sounds_once_the_innovations_are_too_large() -> None:
+def test_a_monitor_sounds_once_the_innovations_are_too_large():
     monitor = cs.Monitor()
     nis = np.square(inputs.normal(300, 2)).sum(axis=1)
     assert all(monitor.update(value, 2) is None for value in nis)
@@ -73,13 +71,13 @@ def test_a_monitor_sounds_once_the_innovations_are_too_large() -> None:
 
 
 @pytest.fixture
-def session(pytester: pytest.Pytester) -> pytest.Pytester:
+def session(pytester):
     pytester.makepyfile(test_it=TESTS)
     pytester.makeini("[pytest]\naddopts = --strict-markers -p no:cacheprovider\nfilterwarnings = error")
     return pytester
 
 
-def test_a_session_with_gates(session: pytest.Pytester) -> None:
+def test_a_session_with_gates(session):
     """In a process of its own, where the plugin is found as users find it."""
     result = session.run(sys.executable, "-m", "pytest", "--consistency-report=gates.json", "--junitxml=junit.xml")
     result.assert_outcomes(passed=2, failed=2)
@@ -91,7 +89,7 @@ def test_a_session_with_gates(session: pytest.Pytester) -> None:
     assert (session.path / "junit.xml").read_text().count('name="consistency"') == 4
 
 
-def test_a_session_with_one_false_alarm_rate(session: pytest.Pytester) -> None:
+def test_a_session_with_one_false_alarm_rate(session):
     words = ("--consistency-false-alarm=0.01", "--consistency-report=gates.html")
     result = session.run(sys.executable, "-m", "pytest", *words)
     result.assert_outcomes(passed=2, failed=2)
@@ -101,7 +99,7 @@ def test_a_session_with_one_false_alarm_rate(session: pytest.Pytester) -> None:
     assert "://" not in page.replace("http://www.w3.org", "")
 
 
-def test_a_bad_option_ends_the_session(session: pytest.Pytester) -> None:
+def test_a_bad_option_ends_the_session(session):
     result = session.run(sys.executable, "-m", "pytest", "--consistency-runs=0")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["*--consistency-runs must be at least 1, got 0*"])

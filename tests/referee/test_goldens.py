@@ -3,15 +3,12 @@
 ``python tests/referee/test_goldens.py`` writes ``goldens.json`` anew.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import inputs
 import pytest
@@ -34,7 +31,7 @@ COMMANDS = {
 }
 
 
-def consistency(folder: Path, command: str) -> Any:
+def consistency(folder, command):
     """What a command prints as JSON."""
     before = Path.cwd()
     os.chdir(folder)
@@ -46,7 +43,7 @@ def consistency(folder: Path, command: str) -> Any:
     return json.loads(out.getvalue())
 
 
-def write(at: Path) -> Path:
+def write(at):
     for name, scale in (("fair", 1.0), ("bold", 1.6), ("shy", 0.6)):
         inputs.planar(at, name, scale)
     inputs.planar(at, "gains", 1.1, optimal=True)
@@ -57,11 +54,11 @@ def write(at: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return write(tmp_path_factory.mktemp("goldens"))
 
 
-def differences(now: Any, before: Any, place: str = "") -> list[str]:
+def differences(now, before, place=""):
     """Places where two documents differ: in a key, a word, or a number by more than 1e-9, beyond 1 of its size.
 
     Student's quantiles of SciPy before 1.12 are right to 1e-9. The sign of an eigenvector is left to LAPACK.
@@ -80,7 +77,7 @@ def differences(now: Any, before: Any, place: str = "") -> list[str]:
     return [] if type(now) is type(before) and now == before else [f"{place}: {now!r}, not {before!r}"]
 
 
-def turned(document: dict[str, Any]) -> dict[str, Any]:
+def turned(document):
     direction = document.get("largest_direction")
     if not direction or max(direction, key=abs) > 0.0:
         return document
@@ -88,13 +85,13 @@ def turned(document: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_document_is_as_it_was(name: str, folder: Path) -> None:
+def test_a_document_is_as_it_was(name, folder):
     before = json.loads(GOLDENS.read_text(encoding="utf-8"))
     assert list(before) == list(COMMANDS)
     assert differences(consistency(folder, COMMANDS[name]), before[name]) == []
 
 
-def test_differences_are_found() -> None:
+def test_differences_are_found():
     assert differences({"largest_direction": [0.8, -0.6]}, {"largest_direction": [-0.8, 0.6]}) == []
     assert len(differences({"largest_direction": [0.8, 0.6]}, {"largest_direction": [-0.8, 0.6]})) == 1
     before = {"a": [1.0, "x", None], "b": 2}

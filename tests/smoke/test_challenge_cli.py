@@ -1,16 +1,13 @@
 """``consistency challenge`` as a newcomer types it, in a process of its own, from an empty folder."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 from own_process import consistency
 
 FAR = ("--within", "steps=50:100", "--within", "range=6:9", "--trials", "100", "--jobs", "1")
 
 
-def test_a_world_is_found_and_can_be_run(tmp_path: Path) -> None:
+def test_a_world_is_found_and_can_be_run(tmp_path):
     done = consistency(
         "challenge", "ekf-uvd", *FAR, "--out", "far.toml", "--json", "--fail-on", "found", cwd=tmp_path, status=1
     )

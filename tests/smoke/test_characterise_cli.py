@@ -1,7 +1,5 @@
 """``consistency characterise`` from the command line: files, tables, refusals. What it estimates: tests/unit."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tomllib
@@ -21,7 +19,7 @@ from consistency.stereo.characterising.log_residuals import Residuals
 from consistency.stereo.characterising.sensor_text import believed_sensor, measured_sensor_toml
 
 
-def run(*arguments: object) -> int:
+def run(*arguments):
     """Exit status of the command line."""
     with pytest.raises(SystemExit) as stop:
         main([str(argument) for argument in arguments])
@@ -29,14 +27,14 @@ def run(*arguments: object) -> int:
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     folder = tmp_path_factory.mktemp("characterise") / "log"
     scenario = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=150)
     simulate_log(scenario, runs=2, seed=3, out=folder)
     return folder
 
 
-def without(log: Path, tmp_path: Path, *names: str) -> Path:
+def without(log, tmp_path, *names):
     """A copy of the log that lacks some tables."""
     folder = Path(shutil.copytree(log, tmp_path / "copy"))
     for name in names:
@@ -44,7 +42,7 @@ def without(log: Path, tmp_path: Path, *names: str) -> Path:
     return folder
 
 
-def test_a_log_becomes_a_sensor_and_a_report(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_becomes_a_sensor_and_a_report(log, tmp_path, capsys):
     out, report = tmp_path / "sensor.toml", tmp_path / "report"
     assert run("characterise", log, "--out", out, "--report", report) == 0
     text = capsys.readouterr().out
@@ -64,9 +62,7 @@ def test_a_log_becomes_a_sensor_and_a_report(log: Path, tmp_path: Path, capsys: 
     assert run("characterise", log, "--out", out, "--report", report) == 2
 
 
-def test_without_landmarks_json_has_all_estimates(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_landmarks_json_has_all_estimates(log, tmp_path, capsys):
     folder, out = without(log, tmp_path, "landmarks"), tmp_path / "sensor.toml"
     out.write_text("")
     assert run("characterise", folder, "--out", out, "--overwrite", "--json") == 0
@@ -76,7 +72,7 @@ def test_without_landmarks_json_has_all_estimates(
     assert data["sensor"]["sigma"][0] == read_table(out, SensorFile).sigma[0]
 
 
-def test_the_sensor_is_believed_by_a_log_and_a_scenario(log: Path, tmp_path: Path) -> None:
+def test_the_sensor_is_believed_by_a_log_and_a_scenario(log, tmp_path):
     folder = Path(shutil.copytree(log, tmp_path / "copy"))
     before = read_log(folder)
     assert run("characterise", folder, "--out", folder / "sensor.toml", "--overwrite") == 0
@@ -90,7 +86,7 @@ def test_the_sensor_is_believed_by_a_log_and_a_scenario(log: Path, tmp_path: Pat
     assert belief.sensor == after.belief.sensor
 
 
-def test_growth_and_bias_are_read_back_as_they_were_found(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_growth_and_bias_are_read_back_as_they_were_found(tmp_path, rng):
     n = 6_000
     ideal = rng.uniform((-160, -120, 4), (160, 120, 28), (n, 3))
     r = rng.standard_normal((n, 3)) * np.column_stack([np.ones(n), np.ones(n), ideal[:, 2] / 20.0])
@@ -112,9 +108,7 @@ def test_growth_and_bias_are_read_back_as_they_were_found(tmp_path: Path, rng: n
     tomllib.loads(path.read_text())
 
 
-def test_without_landmarks_the_noise_alone_is_told(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_landmarks_the_noise_alone_is_told(log, tmp_path, capsys):
     folder = without(log, tmp_path, "landmarks")
     assert run("characterise", folder, "--out", tmp_path / "sensor.toml") == 0
     assert "Landmarks are not known" in capsys.readouterr().out
@@ -122,9 +116,7 @@ def test_without_landmarks_the_noise_alone_is_told(
     assert np.allclose(sigma, (1.34, 1.53, 0.65), rtol=0.15)
 
 
-def test_without_truth_a_moving_robot_is_refused_and_one_at_rest_is_not(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_truth_a_moving_robot_is_refused_and_one_at_rest_is_not(log, tmp_path, capsys):
     folder = without(log, tmp_path, "landmarks", "truth")
     out = tmp_path / "sensor.toml"
     assert run("characterise", folder, "--out", out) == 2
@@ -143,7 +135,7 @@ def test_without_truth_a_moving_robot_is_refused_and_one_at_rest_is_not(
     assert np.allclose(read_table(out, SensorFile).sigma, (0.3, 0.4, 0.1), rtol=0.15)
 
 
-def images(folder: Path, left: int, right: int, sizes: tuple[tuple[int, int], ...] = ((64, 48),)) -> Path:
+def images(folder, left, right, sizes=((64, 48),)):
     """Grey images left1.png ..., right1.png ..., of sizes (width, height) in turns."""
     cv2 = pytest.importorskip("cv2")
     folder.mkdir()
@@ -176,9 +168,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_unusable_input_is_one_sentence_and_nothing_is_written(
-    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unusable_input_is_one_sentence_and_nothing_is_written(case, tmp_path, capsys):
     counts, options, message = BAD[case]
     folder = tmp_path / "images" if counts is None else images(tmp_path / "images", *counts)
     calibration = tmp_path / "calib.txt"
@@ -192,15 +182,13 @@ def test_unusable_input_is_one_sentence_and_nothing_is_written(
     assert not out.exists()
 
 
-def test_images_of_several_sizes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_of_several_sizes_are_refused(tmp_path, capsys):
     folder = images(tmp_path / "images", 6, 6, ((64, 48), (80, 60)))
     assert run("characterise", folder, "--out", tmp_path / "sensor.toml", *BOARD) == 2
     assert "all must have one size" in capsys.readouterr().err
 
 
-def test_another_sensor_and_options_of_images_are_refused(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_sensor_and_options_of_images_are_refused(log, tmp_path, capsys):
     assert run("characterise", log, "--out", tmp_path / "sensor.toml", *BOARD) == 2
     assert "goes with images" in capsys.readouterr().err
     assert run("characterise", log, "--out", tmp_path / "sensor.txt") == 2

@@ -1,30 +1,26 @@
 """The commands as a newcomer types them, in a process of their own, from an empty folder."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from documents import blocks
+from numpy.testing import assert_allclose
 from own_process import consistency
 from scipy import stats
 
 import consistency as cs
 from consistency.bench.scenario import data_folder
 
-ROOT = Path(__file__).parents[2]
 RUNS = 6
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A folder with ``sim`` (a simulated log) and ``out`` (results of two filters, all runs)."""
     at = tmp_path_factory.mktemp("cli")
     scenario = (data_folder("scenarios") / "herath2007-stereo.toml").read_text()
@@ -35,14 +31,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return at
 
 
-def test_a_simulated_log_gives_the_same_estimates(folder: Path) -> None:
+def test_a_simulated_log_gives_the_same_estimates(folder):
     consistency("run", "--log", "sim", "--filter", "ekf-uvd", "--out", "from-log", cwd=folder)
     log = pd.read_parquet(folder / "from-log/estimates.parquet")
     direct = pd.read_parquet(folder / "out/estimates.parquet").query("filter == 'ekf-uvd' and run < 2")
     pd.testing.assert_frame_equal(log, direct.reset_index(drop=True), check_exact=False, rtol=1e-9)
 
 
-def test_nees_by_hand(folder: Path) -> None:
+def test_nees_by_hand(folder):
     """NEES from the files with nothing but NumPy; ANEES and its interval with SciPy."""
     table = pd.read_parquet(folder / "out/estimates.parquet")
     truth = pd.read_parquet(folder / "out/truth.parquet")
@@ -55,33 +51,33 @@ def test_nees_by_hand(folder: Path) -> None:
     judged = np.isfinite(stored)
     assert set(joined["step"][~judged]) == {1}
     by_hand = np.array([e @ np.linalg.inv(p) @ e for e, p in zip(error[judged], P[judged], strict=True)])
-    np.testing.assert_allclose(by_hand, stored[judged], rtol=1e-9)
+    assert_allclose(by_hand, stored[judged], rtol=1e-9)
 
     verdict = json.loads(consistency("analyse", "out", "--json", cwd=folder).stdout)["ekf-uvd"]["statistics"]
     curve = joined[joined["filter"] == "ekf-uvd"].groupby("step")["nees"].mean().to_numpy()
-    np.testing.assert_allclose(np.array(verdict["anees"][1:], float), curve[1:], rtol=1e-12)
+    assert_allclose(np.array(verdict["anees"][1:], float), curve[1:], rtol=1e-12)
     band = stats.chi2.ppf([0.025, 0.975], 3 * RUNS) / RUNS
-    np.testing.assert_allclose(verdict["band"][1], band, rtol=1e-12)
+    assert_allclose(verdict["band"][1], band, rtol=1e-12)
     share = next(a["share"] for a in verdict["answers"] if a["question"] == "scale in some step")
     tail = 0.025 * share / 79  # so few runs that all steps count
     simultaneous = [stats.chi2.ppf(tail, 3 * RUNS) / RUNS, stats.chi2.isf(tail, 3 * RUNS) / RUNS]
-    np.testing.assert_allclose(verdict["simultaneous"][1], simultaneous, rtol=1e-9)
+    assert_allclose(verdict["simultaneous"][1], simultaneous, rtol=1e-9)
 
 
-def test_exit_status_of_a_verdict(folder: Path) -> None:
+def test_exit_status_of_a_verdict(folder):
     arguments = ("run", "herath2007-optimistic", "--filter", "ekf-xyz", "--runs", "5", "--out", "optimistic")
     consistency(*arguments, cwd=folder)
     consistency("analyse", "optimistic", cwd=folder)
     consistency("analyse", "optimistic", "--fail-on", "inconsistent", cwd=folder, status=1)
 
 
-def test_a_report_and_its_refusal_to_overwrite(folder: Path) -> None:
+def test_a_report_and_its_refusal_to_overwrite(folder):
     consistency("report", "out", "--html", "r.html", cwd=folder)
     assert (folder / "r.html").stat().st_size < 6 * 2**20
     assert "r.html" in consistency("report", "out", "--html", "r.html", cwd=folder, status=2).stderr
 
 
-def test_list_names_everything(folder: Path) -> None:
+def test_list_names_everything(folder):
     listed = json.loads(consistency("list", "--json", cwd=folder).stdout)
     assert {"herath2007-stereo", "linear-gaussian", "long-loop"} <= set(listed["scenarios"])
     assert {"kf", "ukf-uvd", "filterpy-ukf-xyz"} <= set(listed["filters"])
@@ -92,7 +88,7 @@ def test_list_names_everything(folder: Path) -> None:
     assert f"ispkf-uvd            {summary}\n" in consistency("list", cwd=folder).stdout
 
 
-def test_reproduce_writes_findings(folder: Path) -> None:
+def test_reproduce_writes_findings(folder):
     consistency("reproduce", "--only", "interval-eq17", "--only", "fig12a", "--out", "found", cwd=folder)
     findings = json.loads((folder / "found/findings.json").read_text())
     assert [finding["id"] for finding in findings] == ["interval-eq17", "fig12a"]
@@ -118,13 +114,13 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input(folder: Path, refused: Callable[..., str], case: str) -> None:
+def test_bad_input(folder, refused, case):
     _bad_files(folder)
     arguments, expected = BAD[case]
     assert expected in refused(folder, *arguments)
 
 
-def _bad_files(folder: Path) -> None:
+def _bad_files(folder):
     if (folder / "mine").exists():
         return
     text = (folder / "small.toml").read_text()
@@ -137,7 +133,7 @@ def _bad_files(folder: Path) -> None:
     (folder / "mine/thesis.txt").write_text("all of it")
 
 
-def test_the_documented_filter_runs(tmp_path: Path) -> None:
+def test_the_documented_filter_runs(tmp_path):
     """The example of a filter of one's own, with fewer runs: too few to show that it is right."""
     (example,) = (block.text for block in blocks("docs/own-filter.md", "python") if "class DeadReckoning" in block.text)
     (tmp_path / "mine.py").write_text(example.replace("runs=50", "runs=4"))
@@ -152,27 +148,27 @@ class ThrowsInRun7:
 
     name = "throws-in-run-7"
 
-    def __init__(self, mark: float) -> None:
+    def __init__(self, mark):
         self.inner, self.mark = cs.get_filter("ekf-uvd"), mark
 
-    def init(self, problem: object) -> object:
+    def init(self, problem):
         self.steps = 0
         return self.inner.init(problem)
 
-    def predict(self, state: object, control: cs.Control) -> object:
+    def predict(self, state, control):
         return self.inner.predict(state, control)
 
-    def update(self, state: object, observation: cs.Observation) -> object:
+    def update(self, state, observation):
         self.steps += 1
         if self.steps == 20 and np.isclose(observation.z.sum(), self.mark):
             raise RuntimeError("diverged")
         return self.inner.update(state, observation)
 
-    def pose(self, state: object) -> cs.Gaussian:
+    def pose(self, state):
         return self.inner.pose(state)
 
 
-def test_a_failed_run_is_in_results_verdict_and_report(tmp_path: Path) -> None:
+def test_a_failed_run_is_in_results_verdict_and_report(tmp_path):
     scenario = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
     mark = float(cs.simulate(scenario, run=7, seed=0).observation(20).z.sum())
     results = cs.run_trials(scenario, [ThrowsInRun7(mark), "ekf-uvd"], runs=12, jobs=1)

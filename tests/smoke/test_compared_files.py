@@ -1,10 +1,6 @@
 """``compare``, ``baseline`` and ``report`` on files of another estimator."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -20,7 +16,7 @@ RUNS, STEPS = 24, 15
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Estimates that state their covariance, and the same ones that state a fifth of it; chance of a mix-up < 1e-9."""
     at, rng = tmp_path_factory.mktemp("files"), np.random.default_rng(40321)
     P = np.array([[0.3, 0.1], [0.1, 0.2]])
@@ -35,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return at
 
 
-def frame(values: np.ndarray, P: np.ndarray | None = None) -> pd.DataFrame:
+def frame(values, P=None):
     run, step = np.mgrid[0:RUNS, 0:STEPS].reshape(2, -1)
     columns = {"run": run, "step": step, **dict(zip("ab", values.reshape(-1, 2).T, strict=True))}
     if P is not None:
@@ -43,7 +39,7 @@ def frame(values: np.ndarray, P: np.ndarray | None = None) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def test_files_against_each_other(folder: Path) -> None:
+def test_files_against_each_other(folder):
     done = consistency("compare", "proud.csv", "honest.csv", *OPTIONS, "--fail-on", "worse", cwd=folder, status=1)
     assert f"proud is less consistent than honest: {RUNS} runs, run by run on the same trials" in done.stdout
     assert "RMSE a" in done.stdout
@@ -54,7 +50,7 @@ def test_files_against_each_other(folder: Path) -> None:
     assert ratios["RMSE a"] == pytest.approx(1.0)
 
 
-def test_a_baseline_of_files(folder: Path) -> None:
+def test_a_baseline_of_files(folder):
     for name in ("kept.json", "kept"):
         done = consistency("baseline", "honest.csv", *OPTIONS, "--out", name, cwd=folder)
         assert "next: consistency compare NEW" in done.stdout
@@ -68,7 +64,7 @@ def test_a_baseline_of_files(folder: Path) -> None:
     assert "Log or truth differ: the trials are not the same" in done.stdout
 
 
-def test_a_report_of_files(folder: Path) -> None:
+def test_a_report_of_files(folder):
     done = consistency("report", "proud.csv", *OPTIONS, cwd=folder)
     assert done.stdout.split() == ["proud-report.html", "proud-report.pdf"]
     assert "proud is overconfident" in (folder / "proud-report.html").read_text("utf-8")
@@ -78,7 +74,7 @@ def test_a_report_of_files(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    "command, said",
     [
         (("compare", "proud.csv", "honest.csv"), "proud.csv: needs --truth FILE"),
         (("baseline", "proud.csv", "--out", "no.json"), "proud.csv: needs --truth FILE"),
@@ -92,15 +88,13 @@ def test_a_report_of_files(folder: Path) -> None:
         (("analyse", "empty"), "empty: holds no results of 'consistency run', and no trajectories"),
     ],
 )
-def test_what_cannot_be_compared(
-    folder: Path, refused: Callable[..., str], command: tuple[str, ...], said: str
-) -> None:
+def test_what_cannot_be_compared(folder, refused, command, said):
     (folder / "empty").mkdir(exist_ok=True)
     (folder / "kept.json").write_text("{}")
     assert said in refused(folder, *command)
 
 
-def test_files_without_truth(folder: Path) -> None:
+def test_files_without_truth(folder):
     """The NIS alone can be judged, but not compared."""
     table = pd.read_csv(folder / "honest.csv")
     table.assign(nis=1.0, nis_dof=2).to_csv(folder / "nis.csv", index=False)
@@ -108,7 +102,7 @@ def test_files_without_truth(folder: Path) -> None:
         baseline(read_recordings(folder / "nis.csv", state=["a", "b"]), "nis.csv")
 
 
-def test_errors_of_different_components(folder: Path) -> None:
+def test_errors_of_different_components(folder):
     consistency("baseline", "honest.csv", *OPTIONS, "--out", "ab.json", "--overwrite", cwd=folder)
     kept = json.loads((folder / "ab.json").read_text())
     kept["filters"]["honest"]["axes"] = ["c", "d"]

@@ -1,12 +1,8 @@
 """The command on workers of dask: Ctrl-C, a scheduler that dies and comes back, or does not."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from cluster import Cluster
@@ -18,12 +14,12 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="sign
 
 
 @pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[Cluster]:
+def cluster(tmp_path):
     with Cluster(tmp_path, 1, "--no-nanny") as cluster:
         yield cluster
 
 
-def remaining(session: int) -> bool:
+def remaining(session):
     """Whether a process of the session is still there after some seconds."""
     for _ in range(100):
         try:
@@ -35,7 +31,7 @@ def remaining(session: int) -> bool:
 
 
 @pytest.mark.parametrize("to_all", [False, True])
-def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(fresh: Path, to_all: bool) -> None:
+def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(fresh, to_all):
     process = begin(fresh, "--backend", "dask", "--jobs", "1")
     wait_for(working(fresh), process)
     (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)  # in a terminal all processes get it
@@ -47,7 +43,7 @@ def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(fresh: Path, to_all
     resume(fresh)
 
 
-def test_a_killed_client_leaves_no_process(fresh: Path) -> None:
+def test_a_killed_client_leaves_no_process(fresh):
     process = begin(fresh, "--backend", "dask")
     wait_for(working(fresh), process)
     process.kill()
@@ -57,7 +53,7 @@ def test_a_killed_client_leaves_no_process(fresh: Path) -> None:
     resume(fresh)
 
 
-def test_a_scheduler_that_ends(fresh: Path, cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_ends(fresh, cluster, monkeypatch):
     monkeypatch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
     process = begin(fresh, "--backend", "dask", "--jobs", "-1", "--scheduler", cluster.address)
     wait_for(working(fresh), process)
@@ -70,7 +66,7 @@ def test_a_scheduler_that_ends(fresh: Path, cluster: Cluster, monkeypatch: pytes
     resume(fresh)
 
 
-def test_workers_that_come_back(fresh: Path, cluster: Cluster) -> None:
+def test_workers_that_come_back(fresh, cluster):
     process = begin(fresh, "--backend", "dask", "--jobs", "-1", "--scheduler", cluster.address)
     wait_for(working(fresh), process)
     cluster.kill_workers()

@@ -3,17 +3,14 @@
 A process of the command line each. The same inside one process: ``test_kept_looks.py`` and ``test_kept_cells.py``.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from forks import LIMIT, Program
+from forks import LIMIT
 from own_process import begun, consistency, size_of
 
 from consistency.bench.scenario import data_folder
@@ -48,7 +45,7 @@ density = [0.5, 1.0, 1.5]
 
 
 @pytest.fixture(scope="module")
-def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def at(tmp_path_factory):
     """A folder with a world of 40 steps, a log and a sweep of it, and what each leaves in one go."""
     folder = tmp_path_factory.mktemp("ended")
     text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
@@ -61,20 +58,20 @@ def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def runs_in(journal: Path) -> int:
+def runs_in(journal):
     opened = Journal(journal)
     opened.close()
     return len(opened.runs)
 
 
-def sizes(folder: Path) -> Iterator[int]:
+def sizes(folder):
     """Bytes of each journal below a folder, while folders come and go."""
     for at, _, names in os.walk(folder):
         for name in {DATABASE, f"{DATABASE}-wal"} & set(names):
             yield size_of(Path(at) / name)
 
 
-def stopped_once_grown(process: Program, out: Path, size: int, number: int, wait: float) -> None:
+def stopped_once_grown(process, out, size, number, wait):
     """Send the signal some time after the journals below a folder have grown by ``size`` bytes in all."""
     before, end = sum(sizes(out.parent)), time.monotonic() + LIMIT
     while process.poll() is None and sum(sizes(out.parent)) < before + size and time.monotonic() < end:
@@ -85,7 +82,7 @@ def stopped_once_grown(process: Program, out: Path, size: int, number: int, wait
 
 
 @pytest.mark.parametrize("which", ["looks", "log"])
-def test_killed_again_and_again(at: Path, which: str) -> None:
+def test_killed_again_and_again(at, which):
     """No run that a journal has is lost by the next kill."""
     moments, command, name = random.Random(), {"looks": LOOKS, "log": LOG}[which], f"{which}-out"
     journal, done = at / f".{name}.unfinished" / DATABASE, 0
@@ -105,9 +102,9 @@ def test_killed_again_and_again(at: Path, which: str) -> None:
     assert not journal.exists()
 
 
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", -15)])
+@pytest.mark.parametrize("name, status", [("SIGINT", 130), ("SIGTERM", -15)])
 @pytest.mark.parametrize("which", ["looks", "log", "sweep"])
-def test_a_signal_keeps_what_is_finished(at: Path, which: str, name: str, status: int) -> None:
+def test_a_signal_keeps_what_is_finished(at, which, name, status):
     command = {"looks": LOOKS, "log": LOG, "sweep": ("sweep", "grid.toml")}[which]
     out = at / f"{which}-{name}" / "out"
     process = begun(*command, "--out", str(out), cwd=at)
@@ -126,7 +123,7 @@ def test_a_signal_keeps_what_is_finished(at: Path, which: str, name: str, status
     require_same(at, out, which)
 
 
-def require_same(at: Path, out: Path, which: str) -> None:
+def require_same(at, out, which):
     whole = at / f"{which}-whole"
     paths = list(whole.rglob("runs.csv") if which == "sweep" else whole.glob("*.parquet"))
     assert paths
@@ -135,7 +132,7 @@ def require_same(at: Path, out: Path, which: str) -> None:
     assert not [*out.parent.rglob(".*.unfinished")]
 
 
-def test_a_sweep_that_is_killed_again_and_again(at: Path) -> None:
+def test_a_sweep_that_is_killed_again_and_again(at):
     moments, out = random.Random(), at / "killed" / "out"
     for _ in range(8):
         process = begun("sweep", "grid.toml", "--out", str(out), cwd=at)
@@ -144,7 +141,7 @@ def test_a_sweep_that_is_killed_again_and_again(at: Path) -> None:
     require_same(at, out, "sweep")
 
 
-def test_two_processes_on_one_sweep(at: Path) -> None:
+def test_two_processes_on_one_sweep(at):
     """Each cell is done by one of them; one that is killed leaves its cell to the other."""
     out = at / "two" / "out"
     first, second = (begun("sweep", "grid.toml", "--out", str(out), cwd=at) for _ in range(2))

@@ -4,8 +4,6 @@ A process of the command line each: the first of its own, the others forks. The 
 ``tests/unit/bench/test_journal.py``.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import resource
@@ -15,13 +13,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
-from forks import LIMIT, Program
+from forks import LIMIT
 from own_process import COMPILING, begun, size_of
 
 from consistency.bench.scenario import data_folder
@@ -35,7 +31,7 @@ UNFINISHED = ".out.unfinished"
 
 
 @pytest.fixture(scope="module")
-def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def at(tmp_path_factory):
     """A folder with a short world and results of one go."""
     folder = tmp_path_factory.mktemp("faults")
     text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
@@ -45,49 +41,49 @@ def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def steps_of(text: str) -> str:
+def steps_of(text):
     return next(line.split("=")[1].strip() for line in text.splitlines() if line.startswith("steps"))
 
 
-def words(out: str = "out", runs: int = RUNS) -> list[str]:
+def words(out="out", runs=RUNS):
     """The command as a process of its own."""
     options = ["--filter", FILTER, "--out", out, "--runs", str(runs), "--jobs", "2"]
     return [sys.executable, "-m", "consistency", "run", "world.toml", *options]
 
 
-def begin(at: Path, *options: str, runs: int = RUNS, **how: Any) -> Program:
+def begin(at, *options, runs=RUNS, **how):
     return begun(*words(runs=runs)[3:], *options, cwd=at, **how)
 
 
-def end(process: Program) -> tuple[int, str]:
+def end(process):
     """Exit status and what was said on standard error."""
     _, error = process.communicate()
     return process.wait(), error
 
 
-def wait_for(condition: Callable[[], bool], process: Program | subprocess.Popen[str]) -> None:
+def wait_for(condition, process):
     end = time.monotonic() + LIMIT
     while not condition() and process.poll() is None and time.monotonic() < end:
         time.sleep(0.002)
 
 
-def working(at: Path, size: int = 200_000) -> Callable[[], bool]:
+def working(at, size=200_000):
     """Whether the journal has grown so large."""
     return lambda: journal_size(at / UNFINISHED) > size
 
 
-def journal_size(folder: Path) -> int:
+def journal_size(folder):
     """Bytes of the database and of its log."""
     return size_of(folder / DATABASE) + size_of(folder / f"{DATABASE}-wal")
 
 
-def kept(at: Path) -> int:
+def kept(at):
     journal = Journal(at / UNFINISHED / DATABASE)
     journal.close()
     return len(journal.runs)
 
 
-def kept_beside(at: Path) -> int:
+def kept_beside(at):
     """As :func:`kept`, of a journal that another process writes."""
     shutil.copytree(at / UNFINISHED, at / ".out-copied")
     journal = Journal(at / ".out-copied" / DATABASE)
@@ -96,33 +92,33 @@ def kept_beside(at: Path) -> int:
 
 
 @pytest.fixture
-def fresh(at: Path) -> Path:
+def fresh(at):
     for path in at.iterdir():
         if path.name.startswith(("out", ".out")):
             shutil.rmtree(path)
     return at
 
 
-def require_same(at: Path, out: str = "out") -> None:
+def require_same(at, out="out"):
     for path in (at / "whole").glob("*.parquet"):
         assert (at / out / path.name).read_bytes() == path.read_bytes(), path.name
     assert not (at / f".{out}.unfinished").exists()
 
 
-def resume(at: Path) -> None:
+def resume(at):
     status, error = end(begin(at, "--resume"))
     assert status == 0, error
     require_same(at)
 
 
-def one_sentence(error: str) -> str:
+def one_sentence(error):
     """What was said beside progress."""
     lines = [line for line in error.splitlines() if not line.startswith("runs: ")]
     assert len(lines) == 1, error
     return lines[0]
 
 
-def test_killed_and_resumed(fresh: Path) -> None:
+def test_killed_and_resumed(fresh):
     pipe = subprocess.PIPE
     with subprocess.Popen(words(), cwd=fresh, stdout=pipe, stderr=pipe, text=True) as process:
         wait_for(working(fresh), process)
@@ -134,7 +130,7 @@ def test_killed_and_resumed(fresh: Path) -> None:
 
 
 @pytest.mark.slow
-def test_twenty_kills_at_random_moments(fresh: Path) -> None:
+def test_twenty_kills_at_random_moments(fresh):
     """Half of them while runs are done, half while the tables are written or put in place."""
     moments, done = random.Random(), 0
     for kill in range(20):
@@ -160,8 +156,8 @@ GONE = "consistency: stopped; finished runs are kept where there are any: the sa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "status", "said"), [("SIGINT", 130, GONE), ("SIGTERM", -15, ""), ("SIGHUP", -1, "")])
-def test_a_signal_keeps_what_is_finished(fresh: Path, name: str, status: int, said: str) -> None:
+@pytest.mark.parametrize("name, status, said", [("SIGINT", 130, GONE), ("SIGTERM", -15, ""), ("SIGHUP", -1, "")])
+def test_a_signal_keeps_what_is_finished(fresh, name, status, said):
     """The same command writes what is finished, and goes on."""
     process = begin(fresh)
     wait_for(working(fresh), process)
@@ -180,7 +176,7 @@ def test_a_signal_keeps_what_is_finished(fresh: Path, name: str, status: int, sa
 
 
 @pytest.mark.slow
-def test_ctrl_c_says_one_line(fresh: Path) -> None:
+def test_ctrl_c_says_one_line(fresh):
     process = begin(fresh)
     wait_for(working(fresh), process)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
@@ -191,7 +187,7 @@ def test_ctrl_c_says_one_line(fresh: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_terminal_that_is_closed(fresh: Path) -> None:
+def test_a_terminal_that_is_closed(fresh):
     """SIGHUP to all, and nothing can be written any more."""
     terminal, theirs = os.pipe()
     process = begin(fresh, out=theirs, err=theirs)
@@ -206,7 +202,7 @@ def test_a_terminal_that_is_closed(fresh: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["pipe", "closed"])
-def test_output_that_nobody_reads(fresh: Path, how: str) -> None:
+def test_output_that_nobody_reads(fresh, how):
     """As ``2>&1 | head -1`` and ``>&- 2>&-``."""
     if how == "pipe":
         with nobody() as pipe:
@@ -218,7 +214,7 @@ def test_output_that_nobody_reads(fresh: Path, how: str) -> None:
 
 
 @contextmanager
-def nobody() -> Iterator[int]:
+def nobody():
     """The end of a pipe whose other end is closed."""
     other, pipe = os.pipe()
     os.close(other)
@@ -227,7 +223,7 @@ def nobody() -> Iterator[int]:
 
 
 @pytest.mark.slow
-def test_standard_output_alone_is_closed(fresh: Path) -> None:
+def test_standard_output_alone_is_closed(fresh):
     with nobody() as pipe:
         status, error = end(begin(fresh, out=pipe))
     assert status == 141
@@ -236,7 +232,7 @@ def test_standard_output_alone_is_closed(fresh: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_limit_on_the_size_of_files(fresh: Path) -> None:
+def test_a_limit_on_the_size_of_files(fresh):
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))"
     status, error = end(begin(fresh, before=limit))
     assert status == 2
@@ -247,7 +243,7 @@ def test_a_limit_on_the_size_of_files(fresh: Path) -> None:
 
 
 @pytest.mark.slow
-def test_three_processes_on_one_place(fresh: Path) -> None:
+def test_three_processes_on_one_place(fresh):
     first = begin(fresh)
     wait_for(working(fresh), first)
     os.killpg(first.pid, signal.SIGSTOP)  # as a terminal does
@@ -261,7 +257,7 @@ def test_three_processes_on_one_place(fresh: Path) -> None:
 
 
 @pytest.mark.slow
-def test_results_that_are_removed_meanwhile(fresh: Path) -> None:
+def test_results_that_are_removed_meanwhile(fresh):
     """Those that a resume goes on from: the runs that it has done are kept."""
     assert end(begin(fresh, runs=50))[0] == 0
     process = begin(fresh, "--resume")
@@ -273,7 +269,7 @@ def test_results_that_are_removed_meanwhile(fresh: Path) -> None:
 
 
 @pytest.mark.slow
-def test_memory_that_is_taken_away(fresh: Path) -> None:
+def test_memory_that_is_taken_away(fresh):
     """A limit on the address space at what is taken; no run is lost.
 
     There is a sentence, or the C library ends the process, or Python waits for ever for a thread that never began.
@@ -298,7 +294,7 @@ def test_memory_that_is_taken_away(fresh: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
 @pytest.mark.parametrize("arguments", [["list"], ["--help"]])
-def test_standard_output_on_a_full_disk(arguments: list[str]) -> None:
+def test_standard_output_on_a_full_disk(arguments):
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "consistency", *arguments]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=LIMIT)

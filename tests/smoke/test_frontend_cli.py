@@ -1,11 +1,7 @@
 """Images to a log to a verdict, as a newcomer types it."""
 
-from __future__ import annotations
-
 import json
 import re
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +14,7 @@ pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """``images``, a KITTI sequence of a wall, and ``log``, what the front-end makes of it."""
     at = tmp_path_factory.mktemp("frontend")
     scene.write_kitti(at / "images", scene.drive(8), scene.texture(np.random.default_rng(0)))
@@ -30,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return at
 
 
-def test_filters_run_on_the_log_and_are_judged(folder: Path) -> None:
+def test_filters_run_on_the_log_and_are_judged(folder):
     filters = ("--filter", "ekf-uvd", "--filter", "ukf-uvd")
     consistency("run", "--log", "log", *filters, "--out", "results", cwd=folder)
     verdicts = json.loads(consistency("analyse", "results", "--json", cwd=folder).stdout)
@@ -49,13 +45,13 @@ def test_filters_run_on_the_log_and_are_judged(folder: Path) -> None:
     assert "--screen goes with --log" in done.stderr
 
 
-def test_the_trajectory_is_judged(folder: Path) -> None:
+def test_the_trajectory_is_judged(folder):
     files = ("--truth", "log/truth.tum", "--covariance", "log/covariance.txt", "--error", "so3")
     done = consistency("analyse", "log/trajectory.tum", *files, cwd=folder)
     assert "trajectory" in done.stdout
 
 
-def test_the_motions_are_judged_over_windows(folder: Path) -> None:
+def test_the_motions_are_judged_over_windows(folder):
     """In whatever world: the truth of the log begins at the first camera, that of the sequence where it was driven."""
     files = ("--truth", "log/truth.tum", "--motions", "--relative", "0.2s")
     verdicts = consistency("analyse", "log/motions.tum", *files, "--json", cwd=folder)
@@ -64,7 +60,7 @@ def test_the_motions_are_judged_over_windows(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    "arguments, said",
     [
         (("nowhere",), "nowhere: no such folder of images"),
         (("images", "--calibration", "none.yaml"), "--calibration none.yaml: no such file"),
@@ -79,11 +75,11 @@ def test_the_motions_are_judged_over_windows(folder: Path) -> None:
         (("images", "--seed", "-1"), "--seed -1: must not be negative"),
     ],
 )
-def test_bad_input(folder: Path, refused: Callable[..., str], arguments: tuple[str, ...], said: str) -> None:
+def test_bad_input(folder, refused, arguments, said):
     assert said in refused(folder, "frontend", *arguments, "--out", "other")
 
 
-def test_two_pairs_make_a_motion_and_no_log(folder: Path) -> None:
+def test_two_pairs_make_a_motion_and_no_log(folder):
     """The rendered motion is known to 0.02 px, far below 7 stated sigma (1e-8 by chance)."""
     poses = scene.drive(2)
     scene.write_kitti(folder / "short", poses, scene.texture(np.random.default_rng(0)))
@@ -102,7 +98,7 @@ def test_two_pairs_make_a_motion_and_no_log(folder: Path) -> None:
     consistency("frontend", "short", "--out", "one", "--overwrite", cwd=folder)
 
 
-def test_a_camera_that_leaves_the_plane_has_no_planar_log(folder: Path) -> None:
+def test_a_camera_that_leaves_the_plane_has_no_planar_log(folder):
     """It nods by 8 degrees at each pair; a tenth of a landmark's distance is 32 px, or 6 degrees."""
     poses = [
         pose.compose(RelativePose.from_vector(np.array([0.0, 0.0, 0.0, np.deg2rad(8.0) * (k % 2), 0.0, 0.0])))
@@ -122,6 +118,6 @@ def test_a_camera_that_leaves_the_plane_has_no_planar_log(folder: Path) -> None:
     assert (folder / "nods/sensor.toml").is_file()
 
 
-def test_images_are_no_log(folder: Path) -> None:
+def test_images_are_no_log(folder):
     done = consistency("run", "--log", "images", "--filter", "ekf-uvd", "--out", "other", cwd=folder, status=2)
     assert "images/sensor.toml: missing; 'consistency frontend' makes" in done.stderr

@@ -1,11 +1,8 @@
 """Damaged files through every reader: one sentence and exit status 2, or what the file holds."""
 
-from __future__ import annotations
-
 import io
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -18,23 +15,23 @@ import consistency as cs
 from consistency.bench.store.parquet import read_parquet
 
 
-def test_a_few_hundred_damaged_files() -> None:
+def test_a_few_hundred_damaged_files():
     statuses, wrong = fuzz(300, seed=3)
     assert wrong == []
     assert min(statuses[0], statuses[2]) > 20
 
 
-def test_the_fuzzer_sees_what_is_wrong(tmp_path: Path) -> None:
+def test_the_fuzzer_sees_what_is_wrong(tmp_path):
     """Negative control: a traceback, a warning, a sentence that is none, memory, and nothing wrong."""
 
-    def warn(_: Path) -> None:
+    def warn(_):
         np.log(np.zeros(1))
 
-    def fall(_: Path) -> None:
+    def fall(_):
         raise KeyError("complete")
 
-    def say(text: str) -> object:
-        def read(_: Path) -> None:
+    def say(text):
+        def read(_):
             raise cs.InputError(text)
 
         return read
@@ -47,20 +44,18 @@ def test_the_fuzzer_sees_what_is_wrong(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def valid(tmp_path_factory):
     folder = tmp_path_factory.mktemp("valid")
     write_all(folder)
     return folder
 
 
 @pytest.mark.parametrize(
-    ("name", "file", "damage"),
+    "name, file, damage",
     [("archive", "est.npz", bomb), ("table", "est.parquet", long_run)],
     ids=["npz", "Parquet"],
 )
-def test_a_small_file_that_unfolds_to_gigabytes_is_not_read(
-    valid: Path, tmp_path: Path, name: str, file: str, damage
-) -> None:
+def test_a_small_file_that_unfolds_to_gigabytes_is_not_read(valid, tmp_path, name, file, damage):
     target = next(target for target in TARGETS if target.name == name and file in target.files)
     folder = copied(valid / name, tmp_path / "copy")
     damage(folder / file, np.random.default_rng(0))
@@ -69,7 +64,7 @@ def test_a_small_file_that_unfolds_to_gigabytes_is_not_read(
     assert "GiB in memory" in said
 
 
-def test_a_flipped_bit_of_our_tables_is_never_read_as_another_number(valid: Path, tmp_path: Path) -> None:
+def test_a_flipped_bit_of_our_tables_is_never_read_as_another_number(valid, tmp_path):
     """Our pages have checksums; of two bits, one in a page and one anywhere, 400 pairs that a fresh seed draws."""
     source = valid / "results" / "truth.parquet"
     content, path, right = source.read_bytes(), tmp_path / "truth.parquet", read_parquet(source.parent, "truth")
@@ -110,7 +105,7 @@ sys.exit(0 if refused > 300 else 1)
 """
 
 
-def test_no_bit_of_a_footer_ends_the_process(valid: Path, tmp_path: Path) -> None:
+def test_no_bit_of_a_footer_ends_the_process(valid, tmp_path):
     """One bit of 180 did where pyarrow was asked for its statistics: 1500 miss all of them once in 4,000 times.
 
     That is the chance to overlook the fault; there is none to find it where it is not.
@@ -120,7 +115,7 @@ def test_no_bit_of_a_footer_ends_the_process(valid: Path, tmp_path: Path) -> Non
     assert done.returncode == 0, done.stderr
 
 
-def test_a_file_of_other_numbers_is_told_from_damage(valid: Path) -> None:
+def test_a_file_of_other_numbers_is_told_from_damage(valid):
     """Without checksums nobody can see that a page was changed; a changed footer can be seen."""
     content = (valid / "table" / "est.parquet").read_bytes()
     column = pq.read_metadata(io.BytesIO(content)).row_group(0).column(3)
@@ -131,7 +126,7 @@ def test_a_file_of_other_numbers_is_told_from_damage(valid: Path) -> None:
     assert not in_pages(content, content[:-1])
 
 
-def test_each_file_is_damaged_within_6000_cases() -> None:
+def test_each_file_is_damaged_within_6000_cases():
     targets = [(target.name, file) for target in TARGETS for file in target.files]
     drawn = {(TARGETS[k].name, file) for k, file, _, _ in cases(6000, seed=0)}
     assert drawn == set(targets)

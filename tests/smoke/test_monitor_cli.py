@@ -1,12 +1,8 @@
 """``consistency monitor`` as a newcomer types it, in a process of its own, from an empty folder."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from own_process import consistency
@@ -15,7 +11,7 @@ OPTIMAL = ("--innovations", "optimal")
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """``good.csv``, whose NIS is always the expected one, and ``bad.csv``, where it is 4 times that from row 101 on."""
     for name, ratio in (("good", 1.0), ("bad", 4.0)):
         rows = "".join(f"{k / 10},{2.0 if k <= 100 else 2.0 * ratio},2\n" for k in range(1, 201))
@@ -23,14 +19,14 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_log_without_an_alarm(folder: Path) -> None:
+def test_a_log_without_an_alarm(folder):
     done = consistency("monitor", "good.csv", *OPTIMAL, "--fail-on", "alarm", cwd=folder)
     assert "no alarm" in done.stdout
     assert "says anything about the pose" in done.stdout
     assert not done.stderr
 
 
-def test_an_alarm_with_plot_json_and_status(folder: Path) -> None:
+def test_an_alarm_with_plot_json_and_status(folder):
     options = ("--tolerance", "1", "--false-alarm", "0.01", "--plot", "new/plot.png", "--json")
     done = consistency("monitor", "bad.csv", *OPTIMAL, *options, cwd=folder)
     data = json.loads(done.stdout)
@@ -50,7 +46,7 @@ def test_an_alarm_with_plot_json_and_status(folder: Path) -> None:
     assert (data["gate"], data["mission"]) == (0.99, 500)
 
 
-def test_lines_as_they_come(folder: Path) -> None:
+def test_lines_as_they_come(folder):
     """The alarm is there before the stream ends."""
     command = [sys.executable, "-m", "consistency", "monitor", "-", *OPTIMAL, "--fail-on", "alarm"]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
@@ -65,7 +61,7 @@ def test_lines_as_they_come(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    "arguments, said",
     [
         (("good.csv",), "--innovations must be 'optimal'"),
         (("good.csv", "--innovations", "fixed"), "--innovations must be 'optimal', got 'fixed'"),
@@ -80,5 +76,5 @@ def test_lines_as_they_come(folder: Path) -> None:
         ((".", *OPTIMAL), "manifest"),
     ],
 )
-def test_bad_input(refused: Callable[..., str], arguments: tuple[str, ...], said: str, folder: Path) -> None:
+def test_bad_input(refused, arguments, said, folder):
     assert said in refused(folder, "monitor", *arguments)

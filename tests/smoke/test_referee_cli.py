@@ -1,10 +1,6 @@
 """Planning, early stopping, comparisons and baselines as a newcomer types them."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from own_process import consistency
@@ -13,7 +9,7 @@ from consistency.bench.scenario import data_folder
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """``small.toml``, a short world in which stereo points make the EKF inconsistent, and ``out``, 12 runs in it."""
     at = tmp_path_factory.mktemp("referee")
     scenario = (data_folder("scenarios") / "herath2007-stereo.toml").read_text()
@@ -23,7 +19,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return at
 
 
-def test_plan(tmp_path: Path) -> None:
+def test_plan(tmp_path):
     done = consistency(
         "plan", "--dof", "3", "--detect", "1.2", "--false-alarm", "0.05", "--power", "0.95", cwd=tmp_path
     )
@@ -34,7 +30,7 @@ def test_plan(tmp_path: Path) -> None:
         assert json.loads(done.stdout)["one_step"] == one_step
 
 
-def test_plan_by_a_pilot(folder: Path, tmp_path: Path) -> None:
+def test_plan_by_a_pilot(folder, tmp_path):
     """A run is worth at least what its pilot shows, and a plan never takes more runs than the worst case."""
     consistency("run", "linear-gaussian", "--filter", "kf", "--runs", "25", "--out", "pilot", cwd=tmp_path)
     done = consistency("plan", "--like", "pilot", "--detect", "1.2", cwd=tmp_path)
@@ -48,7 +44,7 @@ def test_plan_by_a_pilot(folder: Path, tmp_path: Path) -> None:
     consistency("plan", "--like", str(folder / "out"), cwd=tmp_path, status=2)  # 12 runs are no pilot
 
 
-def test_what_is_shown_depends_on_what_is_asked(folder: Path) -> None:
+def test_what_is_shown_depends_on_what_is_asked(folder):
     """12 runs do not show a ratio of 1.01; a confidence is 1 less a false-alarm rate."""
     verdicts = json.loads(
         consistency("analyse", "out", "--detect", "1.01", "--false-alarm", "1e-12", "--json", cwd=folder).stdout
@@ -63,7 +59,7 @@ def test_what_is_shown_depends_on_what_is_asked(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    "arguments, said",
     [
         (("plan", "--detect", "1"), "--detect must be positive and not 1"),
         (("plan", "--power", "2"), "--power must lie between 0 and 1, got 2"),
@@ -92,11 +88,11 @@ def test_what_is_shown_depends_on_what_is_asked(folder: Path) -> None:
         (("compare", "nowhere", "--fail-on", "sun"), "--fail-on must be 'worse'"),
     ],
 )
-def test_bad_input(refused: Callable[..., str], arguments: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_bad_input(refused, arguments, said, tmp_path):
     assert said in refused(tmp_path, *arguments)
 
 
-def test_until_decided_stops_at_the_first_look_and_says_so(folder: Path) -> None:
+def test_until_decided_stops_at_the_first_look_and_says_so(folder):
     done = consistency("run", "small.toml", "--filter", "ekf-xyz", "--until-decided", "--out", "decided", cwd=folder)
     first = json.loads(consistency("plan", "--json", cwd=folder).stdout)["looks"][0]
     assert f"{first} runs: ekf-xyz overconfident" in done.stderr
@@ -105,14 +101,14 @@ def test_until_decided_stops_at_the_first_look_and_says_so(folder: Path) -> None
     assert manifest["until_decided"]["detect"] == 1.5
 
 
-def test_undecided_is_a_verdict(folder: Path) -> None:
+def test_undecided_is_a_verdict(folder):
     arguments = ("--until-decided", "--max-runs", "14", "--false-alarm", "1e-6", "--seed", "5")
     consistency("run", "linear-gaussian", "--filter", "kf", *arguments, "--out", "open", cwd=folder)
     done = consistency("analyse", "open", "--fail-on", "inconsistent", cwd=folder, status=1)
     assert "undecided: no fault found, but 14 runs do not show the covariance ratio " in done.stdout
 
 
-def test_a_filter_against_another_and_against_its_baseline(folder: Path) -> None:
+def test_a_filter_against_another_and_against_its_baseline(folder):
     pair = ("--filter", "ekf-xyz", "--filter", "ekf-uvd")
     done = consistency("compare", "out", *pair, "--fail-on", "worse", cwd=folder, status=1)
     assert "ekf-xyz is less consistent than ekf-uvd" in done.stdout

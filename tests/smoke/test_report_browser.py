@@ -1,12 +1,9 @@
 """The report opened from disk in a real browser: no error, no request, charts drawn, switches work."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import time
-from pathlib import Path
 
 import pytest
 
@@ -37,7 +34,7 @@ return parts.map((part) => getComputedStyle(part).display !== 'none');
 
 
 @pytest.fixture(scope="module")
-def report(small, tmp_path_factory) -> Path:
+def report(small, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report") / "run"
     results = cs.run_trials(small("herath2007-stereo"), ["ekf-xyz", "ekf-uvd"], runs=12, seed=0, jobs=1)
     for table in (results.estimates, results.map):
@@ -69,7 +66,7 @@ def browser(report, tmp_path_factory):
         driver.quit()
 
 
-def wait_for(condition, seconds: float = 30.0) -> None:
+def wait_for(condition, seconds=30.0):
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:

@@ -1,10 +1,5 @@
 """``sweep`` in processes of its own."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import pandas as pd
 import pytest
 from own_process import consistency
@@ -24,7 +19,7 @@ density = [0.2]
 
 
 @pytest.fixture(scope="module")
-def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def at(tmp_path_factory):
     """A folder with ``small.toml``, a short world, and ``grid.toml``, a sweep of it."""
     folder = tmp_path_factory.mktemp("sweep")
     text = (data_folder("scenarios") / "herath2007-stereo.toml").read_text()
@@ -35,20 +30,20 @@ def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def out(at: Path) -> Path:
+def out(at):
     done = consistency("sweep", "grid.toml", "--out", "out", "--jobs", "1", cwd=at)
     assert "out/report.pdf" in done.stdout
     return at / "out"
 
 
-def test_a_sweep_leaves_a_map_and_a_report(out: Path) -> None:
+def test_a_sweep_leaves_a_map_and_a_report(out):
     assert list(pd.read_csv(out / "map.csv")["range"]) == [3.0, 4.0]
     assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
     page = (out / "report.html").read_text().split("<main")[1].split("<script")[0]
     assert "://" not in page.replace("http://www.w3.org", "")
 
 
-def test_the_same_command_has_nothing_to_do(out: Path) -> None:
+def test_the_same_command_has_nothing_to_do(out):
     before = {path: path.stat().st_mtime_ns for path in out.glob("cells/*/*/*")}
     again = consistency("sweep", "grid.toml", "--out", "out", cwd=out.parent)
     assert "2 of 2 are there already" in again.stderr
@@ -68,6 +63,6 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input(out: Path, refused: Callable[..., str], case: str) -> None:
+def test_bad_input(out, refused, case):
     arguments, expected = BAD[case]
     assert expected in refused(out.parent, *arguments)

@@ -1,7 +1,5 @@
 """A challenge finds a right filter overconfident at the stated rate at most."""
 
-from __future__ import annotations
-
 import pytest
 from scipy import stats
 
@@ -12,7 +10,7 @@ SHORT = ("steps=50:100",)
 
 
 @pytest.mark.slow
-def test_a_right_filter_is_rarely_found() -> None:
+def test_a_right_filter_is_rarely_found():
     """Fails by chance in 3 of 10,000 runs where the rate is as large as stated."""
     found = sum(
         challenge("kf", None, Plan(minutes=None, trials=60, seed=seed, false_alarm=STATED), SHORT).found

@@ -1,7 +1,5 @@
 """Characterisation over many repetitions: how often all intervals hold together."""
 
-from __future__ import annotations
-
 import characterisation as benchmark
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ REPETITIONS, RUNS, MISSES = 20, 3, 5
 
 
 @pytest.mark.parametrize("truth", [benchmark.Real(None, None), benchmark.real()], ids=["plain", "real"])
-def test_all_intervals_hold_together(truth: benchmark.Real) -> None:
+def test_all_intervals_hold_together(truth):
     """Of 20 repetitions, each missed with 1 % at most, more than 5 are missed once in 10^7."""
     assert stats.binom.sf(MISSES, REPETITIONS, 0.01) < 1e-6
     outcome = benchmark.repeat(truth, REPETITIONS, RUNS, seed=4000)

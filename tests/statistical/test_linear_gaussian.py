@@ -6,8 +6,6 @@ single runs and the NEES of single runs in the last step. ANEES(k) is chi-square
 a ratio of 1.19 (covariance too small) with even odds and one of 1.26 with 9 in 10.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,7 +13,6 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
-from consistency.diagnostics import Record
 
 pytestmark = pytest.mark.slow
 
@@ -24,7 +21,7 @@ CHECKPOINTS = (2, 25, 50, 100, 200, 350, 500)
 ALPHA = 1e-4 / 10
 
 
-def scenario(factor: float = 1.0) -> cs.Scenario:
+def scenario(factor=1.0):
     """The built-in world; the belief has all its standard deviations times ``factor``."""
     base = cs.load_scenario("linear-gaussian")
     motion, sensor = base.truth.motion, base.truth.sensor
@@ -37,46 +34,46 @@ def scenario(factor: float = 1.0) -> cs.Scenario:
     )
 
 
-def run(factor: float) -> cs.Results:
+def run(factor):
     return cs.run_trials(scenario(factor), ["kf"], runs=RUNS)
 
 
 @pytest.fixture(scope="module")
-def results() -> cs.Results:
+def results():
     return run(1.0)
 
 
 @pytest.fixture(scope="module")
-def kf(results: cs.Results) -> Record:
+def kf(results):
     return record_of(results, "kf")
 
 
 @pytest.fixture(scope="module", params=[1 / 1.5, 1.5], ids=["overconfident", "conservative"])
-def off(request: pytest.FixtureRequest) -> tuple[float, cs.Results]:
+def off(request):
     return request.param, run(request.param)
 
 
-def anees_holds(c: Record, step: int) -> bool:
+def anees_holds(c, step):
     low, high = cs.anees_interval(3, RUNS, 1 - ALPHA)
     return bool(low <= c.nees[:, step - 1].mean() <= high)
 
 
-def nis_sum_holds(c: Record) -> bool:
+def nis_sum_holds(c):
     low, high = stats.chi2.interval(1 - ALPHA, c.nis_dof.sum())
     return bool(low <= np.nansum(c.nis) <= high)
 
 
-def nis_of_runs_holds(c: Record) -> bool:
+def nis_of_runs_holds(c):
     """The NIS of a run is chi-square with its degrees of freedom, independently of other runs."""
     p = stats.chi2.cdf(np.nansum(c.nis, axis=1), c.nis_dof.sum(axis=1))
     return bool(stats.kstest(p, "uniform").pvalue > ALPHA)
 
 
-def nees_of_runs_holds(c: Record) -> bool:
+def nees_of_runs_holds(c):
     return bool(stats.kstest(c.nees[:, -1], stats.chi2(3).cdf).pvalue > ALPHA)
 
 
-def test_no_run_fails_and_only_the_first_step_is_left_out(results: cs.Results, kf: Record) -> None:
+def test_no_run_fails_and_only_the_first_step_is_left_out(results, kf):
     assert len(results.failures) == 0
     assert kf.nees.shape == (RUNS, STEPS)
     assert np.isnan(kf.nees[:, 0]).all()
@@ -84,28 +81,28 @@ def test_no_run_fails_and_only_the_first_step_is_left_out(results: cs.Results, k
 
 
 @pytest.mark.parametrize("step", CHECKPOINTS)
-def test_anees_is_three(kf: Record, step: int) -> None:
+def test_anees_is_three(kf, step):
     assert anees_holds(kf, step)
 
 
-def test_sum_of_nis_is_its_degrees_of_freedom(kf: Record) -> None:
+def test_sum_of_nis_is_its_degrees_of_freedom(kf):
     assert nis_sum_holds(kf)
 
 
-def test_nis_of_single_runs_is_chi_square(kf: Record) -> None:
+def test_nis_of_single_runs_is_chi_square(kf):
     assert nis_of_runs_holds(kf)
 
 
-def test_nees_of_single_runs_is_chi_square(kf: Record) -> None:
+def test_nees_of_single_runs_is_chi_square(kf):
     assert nees_of_runs_holds(kf)
 
 
-def test_the_verdict_is_consistent(results: cs.Results) -> None:
+def test_the_verdict_is_consistent(results):
     """A further false-alarm rate of 1e-5, by the verdict's own bound."""
     assert cs.analyse(results, confidence=1 - ALPHA)["kf"].status == "consistent"
 
 
-def test_a_belief_off_by_half_is_caught_everywhere(off: tuple[float, cs.Results]) -> None:
+def test_a_belief_off_by_half_is_caught_everywhere(off):
     """Negative control of all ten tests: ANEES becomes 6.75 or 1.33."""
     factor, wrong = off
     c = record_of(wrong, "kf")
@@ -117,7 +114,7 @@ def test_a_belief_off_by_half_is_caught_everywhere(off: tuple[float, cs.Results]
     assert cs.analyse(wrong, confidence=1 - ALPHA)["kf"].status == status
 
 
-def test_scaled_beliefs_give_the_same_estimates(results: cs.Results, off: tuple[float, cs.Results]) -> None:
+def test_scaled_beliefs_give_the_same_estimates(results, off):
     """The gain depends on ratios of covariances alone, so NEES scales exactly by the factor squared."""
     factor, wrong = off
     pd.testing.assert_series_equal(wrong.estimates["x"], results.estimates["x"], rtol=0, atol=1e-9)

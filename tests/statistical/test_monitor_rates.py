@@ -4,8 +4,6 @@ Random numbers are fresh in every run (the seed is printed when a test fails). B
 them, together under 1 false failure in 3,000 runs of this file.
 """
 
-from __future__ import annotations
-
 import calibration_monitor as calibration
 import numpy as np
 import pytest
@@ -20,9 +18,7 @@ MISSIONS, STEPS = 1000, 5000
 
 @pytest.mark.parametrize("gate", [None, 0.99, 0.95])
 @pytest.mark.parametrize("name", list(calibration.WORLDS))
-def test_right_filters_alarm_no_more_often_than_stated(
-    name: str, gate: float | None, fresh: np.random.Generator
-) -> None:
+def test_right_filters_alarm_no_more_often_than_stated(name, gate, fresh):
     """1,000 missions of 5,000 steps at 5 % and 1 %, with tolerance 1 and at either edge of tolerance 1.2.
 
     Seen with 9 in 10: a rate of 5 % that is really 9 %, a rate of 1 % that is really 3 %.
@@ -35,7 +31,7 @@ def test_right_filters_alarm_no_more_often_than_stated(
         assert (alarms <= limits).all(), (tolerance, ratio, alarms)
 
 
-def test_without_the_rest_after_a_rejection_they_do(fresh: np.random.Generator) -> None:
+def test_without_the_rest_after_a_rejection_they_do(fresh):
     """Negative control: what the rest is for."""
     world = calibration.Position(fresh, MISSIONS)
     monitor = calibration.Monitors(MISSIONS, world.dof, 1.0, 0.95)
@@ -44,7 +40,7 @@ def test_without_the_rest_after_a_rejection_they_do(fresh: np.random.Generator) 
     assert (alarms > [stats.binom.ppf(SURE, MISSIONS, rate) for rate in RATES]).all()
 
 
-def test_faults_are_found_as_soon_as_the_manual_says(fresh: np.random.Generator) -> None:
+def test_faults_are_found_as_soon_as_the_manual_says(fresh):
     """The exact test at 5 %: medians are below the limit unless more than half of 300 missions are late (1e-5)."""
     most = stats.binom.ppf(SURE, 300, 0.5)
     for since, limit in ((0, 45), (5000, 150)):

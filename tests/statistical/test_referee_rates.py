@@ -4,10 +4,6 @@ Random numbers are fresh in every run (the seed is printed when a test fails). E
 limits at 1e-5 or further out: under 40 of them, together under 1 false failure in 2,000 runs of this file.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from draws import errs_at_most, identities
@@ -15,7 +11,6 @@ from referee import judge
 from scipy import stats
 
 from consistency.diagnostics import mean_shape, mean_test, nis_whiteness, simultaneous_band
-from consistency.referee.types import Array
 
 pytestmark = pytest.mark.slow
 
@@ -27,39 +22,39 @@ DOF = 3
 RUNS, STEPS = 20, 40
 
 
-def constant_axis(rng: np.random.Generator) -> Array:
+def constant_axis(rng):
     """Nine tenths of an axis are one and the same error in all steps: a mean of few, skewed squares."""
     w = rng.standard_normal((RUNS, STEPS, DOF))
     w[..., 0] = np.sqrt(0.9) * rng.standard_normal((RUNS, 1)) + np.sqrt(0.1) * w[..., 0]
     return w
 
 
-def nearly_constant(rng: np.random.Generator) -> Array:
+def nearly_constant(rng):
     return np.sqrt(0.97) * rng.standard_normal((RUNS, 1, DOF)) + np.sqrt(0.03) * rng.standard_normal((RUNS, STEPS, DOF))
 
 
-def independent(rng: np.random.Generator) -> Array:
+def independent(rng):
     return rng.standard_normal((RUNS, STEPS, DOF))
 
 
-def few_runs(rng: np.random.Generator) -> Array:
+def few_runs(rng):
     return constant_axis(rng)[:10]
 
 
-def one_run_of_one_step(rng: np.random.Generator) -> Array:
+def one_run_of_one_step(rng):
     w = independent(rng)
     w[0, 1:] = np.nan
     return w
 
 
-def ever_longer(rng: np.random.Generator) -> Array:
+def ever_longer(rng):
     w = independent(rng)
     for run in range(RUNS):
         w[run, 1 + 2 * run :] = np.nan
     return w
 
 
-def no_common_step(rng: np.random.Generator) -> Array:
+def no_common_step(rng):
     w = np.full((RUNS, STEPS, DOF), np.nan)
     for run in range(RUNS):
         w[run, 2 * run : 2 * run + 2] = rng.standard_normal((2, DOF))
@@ -70,12 +65,10 @@ WORLDS = [constant_axis, nearly_constant, independent, few_runs, one_run_of_one_
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_no_question_alarms_more_often_than_it_may(
-    fresh: np.random.Generator, world: Callable[[np.random.Generator], Array]
-) -> None:
+def test_no_question_alarms_more_often_than_it_may(fresh, world):
     """1,000 draws at the level that a verdict at 5 % gives the mean, and at a tenth of it."""
     draws = 1000
-    p: dict[str, list[float]] = {"scale": [], "band": [], "shape": []}
+    p = {"scale": [], "band": [], "shape": []}
     for _ in range(draws):
         w = world(fresh)
         nees = np.square(w).sum(axis=-1)
@@ -88,7 +81,7 @@ def test_no_question_alarms_more_often_than_it_may(
         assert max(counts.values()) <= limit, (level, limit, counts)
 
 
-def test_the_nis_alone_is_white_far_out_in_the_tail(fresh: np.random.Generator) -> None:
+def test_the_nis_alone_is_white_far_out_in_the_tail(fresh):
     """Squares have long tails and their correlations too: 3,000 draws at 0.001."""
     dof = np.full((20, 30), 2)
     assert errs_at_most(1e-3, 3000, lambda: nis_whiteness(fresh.chisquare(2, (20, 30)), dof).p_value <= 1e-3)
@@ -96,12 +89,10 @@ def test_the_nis_alone_is_white_far_out_in_the_tail(fresh: np.random.Generator) 
 
 @pytest.mark.parametrize("options", [{}, {"allow": "conservative"}, {"method": "bonferroni"}])
 @pytest.mark.parametrize("world", [constant_axis, few_runs, ever_longer])
-def test_whole_verdicts_alarm_no_more_than_stated(
-    fresh: np.random.Generator, world: Callable[[np.random.Generator], Array], options: dict[str, str]
-) -> None:
+def test_whole_verdicts_alarm_no_more_than_stated(fresh, world, options):
     """200 verdicts at 10 %."""
 
-    def alarms() -> bool:
+    def alarms():
         w = world(fresh)
         return bool(judge("f", w, identities(w), false_alarm=0.1, **options).faults)
 

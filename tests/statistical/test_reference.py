@@ -1,7 +1,5 @@
 """The whole reproduction, derived again and compared with the summaries in reports/reference."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -15,9 +13,9 @@ from consistency.bench.runs.results_to_records import record_of
 REFERENCE = Path(__file__).parents[2] / "reports" / "reference"
 
 
-def summary(folder: Path) -> dict[str, dict[str, list[object]]]:
+def summary(folder):
     """Status and median run's mean NEES by study and filter; the median, because one diverging run decides a mean."""
-    out: dict[str, dict[str, list[object]]] = {}
+    out = {}
     for path in sorted(folder.glob("*/estimates.parquet")):
         results = cs.read_results(path.parent)
         out[path.parent.name] = {
@@ -28,7 +26,7 @@ def summary(folder: Path) -> dict[str, dict[str, list[object]]]:
 
 
 @pytest.mark.slow
-def test_findings_and_verdicts_are_those_of_the_reference(tmp_path: Path) -> None:
+def test_findings_and_verdicts_are_those_of_the_reference(tmp_path):
     """Deterministic: same seed, so no chance of a false alarm; 1 % is left to other processors' last digits."""
     findings = reproduce(None, runs=50, seed=0, jobs=-1, out=tmp_path / "out")
     reference = json.loads((REFERENCE / "findings.json").read_text(encoding="utf-8"))

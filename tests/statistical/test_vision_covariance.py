@@ -4,10 +4,6 @@ The pixel noise is so small that second-order terms stay far below the sampling 
 unweighted registration needs less of it: at 0.05 px it already fails this test, in the directions that it fixes best.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from rigs import RIG
@@ -26,7 +22,6 @@ from consistency.vision import (
 
 pytestmark = pytest.mark.slow
 
-Array = np.ndarray[Any, Any]
 SAMPLES, CHUNK = 100_000, 10_000
 FALSE_ALARM = 1e-5  # of each test
 NOISE, LESS = 0.05, 0.01  # px
@@ -35,7 +30,7 @@ MOTION = RelativePose.from_vector(np.array([0.3, -0.2, 0.4, 0.04, -0.5, 2.0]))  
 S_UV = NOISE**2 * (np.eye(4) + 0.3 * np.eye(4, k=1) + 0.3 * np.eye(4, k=-1))
 
 
-def discrepancy(estimates: Array, covariance: Array) -> float:
+def discrepancy(estimates, covariance):
     """Smallest p-value over the entries of the whitened sample covariance, times their number (Bonferroni).
 
     Whitened by the right covariance its entries are independent in the limit, with variances 2/n and 1/n; at
@@ -48,7 +43,7 @@ def discrepancy(estimates: Array, covariance: Array) -> float:
     return float(2 * stats.norm.sf(worst) * m * (m + 1) / 2)
 
 
-def holds(estimates: Array, covariance: Array) -> None:
+def holds(estimates, covariance):
     """The right covariance is accepted, and one that is 3 % off in one direction is not."""
     assert discrepancy(estimates, covariance) > FALSE_ALARM
     wrong = covariance.copy()
@@ -58,7 +53,7 @@ def holds(estimates: Array, covariance: Array) -> None:
 
 
 @pytest.fixture(scope="module")
-def scene() -> tuple[Array, Array]:
+def scene():
     """True points in frame 1 and 2."""
     rng = np.random.default_rng(2)
     p = rng.uniform([-2, -1.5, 4], [2, 1.5, 7], (POINTS, 3))
@@ -66,29 +61,29 @@ def scene() -> tuple[Array, Array]:
     return p, turn.inverse().apply(p)
 
 
-def drawn(rng: np.random.Generator, p: Array, noise: float = NOISE) -> Array:
+def drawn(rng, p, noise=NOISE):
     """(CHUNK, N, 4) noisy matches."""
     root = np.linalg.cholesky(S_UV) * noise / NOISE
     return RIG.project(p) + rng.normal(size=(CHUNK, len(p), 4)) @ root.T
 
 
-def vectors(R: Array, t: Array) -> Array:
+def vectors(R, t):
     angles = [np.arctan2(R[:, 2, 1], R[:, 2, 2]), -np.arcsin(R[:, 2, 0]), np.arctan2(R[:, 1, 0], R[:, 0, 0])]
     return np.column_stack([t, *angles])
 
 
-def clouds(uv: Array) -> Array:
+def clouds(uv):
     return triangulate(RIG, uv.reshape(-1, 4)).reshape(*uv.shape[:2], 3)
 
 
-def test_triangulation(scene: tuple[Array, Array]) -> None:
+def test_triangulation(scene):
     """False alarm 1e-5."""
     rng = np.random.default_rng(3)
     points = np.concatenate([triangulate(RIG, drawn(rng, scene[0][:1])[:, 0]) for _ in range(SAMPLES // CHUNK)])
     holds(points, triangulation_covariance(RIG, RIG.project(scene[0][:1]), S_UV)[0])
 
 
-def test_registration(scene: tuple[Array, Array]) -> None:
+def test_registration(scene):
     """Pixels to pose through both steps, at a rotation of 2 rad and a translation of metres. False alarm 1e-5."""
     rng, poses = np.random.default_rng(4), []
     for _ in range(SAMPLES // CHUNK):
@@ -98,7 +93,7 @@ def test_registration(scene: tuple[Array, Array]) -> None:
     holds(np.concatenate(poses), registration_covariance(*scene, S1, S2, register_svd(*scene)))
 
 
-def test_weighted_registration(scene: tuple[Array, Array]) -> None:
+def test_weighted_registration(scene):
     """Points with fixed, correlated noise. False alarm 1e-5."""
     p1, p2 = scene
     S1, S2 = (triangulation_covariance(RIG, RIG.project(p), S_UV) for p in scene)
@@ -122,7 +117,7 @@ def test_weighted_registration(scene: tuple[Array, Array]) -> None:
     holds(np.concatenate(poses), register_weighted(p1, p2, S1, S2).covariance)
 
 
-def test_reprojection(scene: tuple[Array, Array]) -> None:
+def test_reprojection(scene):
     """The bundle of two frames. False alarm 1e-5."""
     p1, p2 = scene
     start = register_svd(p1, p2)
@@ -137,7 +132,7 @@ def test_reprojection(scene: tuple[Array, Array]) -> None:
     holds(np.concatenate(poses), refine_reprojection(RIG, RIG.project(p1), RIG.project(p2), start, S_UV).covariance)
 
 
-def gauss_newton(cameras: Array | None, z1: Array, z2: Array, W: Array, start: RelativePose, q: Array) -> Array:
+def gauss_newton(cameras, z1, z2, W, start, q):
     """Poses (M, 6) of M bundles at once, all unknowns in one matrix, from the truth: a second way to the minimum.
 
     The rotation is updated by a left perturbation; without cameras the points themselves are measured.
@@ -165,7 +160,7 @@ def gauss_newton(cameras: Array | None, z1: Array, z2: Array, W: Array, start: R
     return vectors(R, t)
 
 
-def seen(cameras: Array | None, p: Array) -> tuple[Array, Array]:
+def seen(cameras, p):
     if cameras is None:
         return p, np.broadcast_to(np.eye(3), (*p.shape[:2], 3, 3))
     h = np.einsum("cij,mnj->mnci", cameras[:, :, :3], p) + cameras[:, :, 3]
@@ -174,13 +169,13 @@ def seen(cameras: Array | None, p: Array) -> tuple[Array, Array]:
     return uv.reshape(*p.shape[:2], 4), J.reshape(*p.shape[:2], 4, 3)
 
 
-def skew(v: Array) -> Array:
+def skew(v):
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return out - np.swapaxes(out, -1, -2)
 
 
-def cayley(omega: Array) -> Array:
+def cayley(omega):
     """A rotation that is I + [omega]x to first order."""
     half = 0.5 * skew(omega)
     return np.linalg.solve(np.eye(3) - half, np.eye(3) + half)

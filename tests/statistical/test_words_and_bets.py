@@ -4,16 +4,11 @@ Random numbers are fresh in every run (the seed is printed when a test fails). L
 assertions, together under 1 false failure in 2,000 runs of this file.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from draws import autoregression, errs_at_most, fully_dependent, independent, slow_axis
 
 from consistency.diagnostics import e_process, largest_direction
-from consistency.referee.types import Array
 
 pytestmark = pytest.mark.slow
 
@@ -32,19 +27,17 @@ DRAWS, STEPS = 500, 100
 @pytest.mark.parametrize("runs", [21, 50, 100])
 @pytest.mark.parametrize("n", [2, 6])
 @pytest.mark.parametrize("world", [fully_dependent, autoregression, slow_axis, independent])
-def test_no_direction_is_found_in_a_right_filter(
-    fresh: np.random.Generator, world: Callable[..., Array], n: int, runs: int
-) -> None:
+def test_no_direction_is_found_in_a_right_filter(fresh, world, n, runs):
     """2,000 draws at 5 %; Student's t leaves up to a tenth more (5.5 %)."""
     assert errs_at_most(0.055, 2000, lambda: largest_direction(world(fresh, runs, 20, n)).p_value <= 0.05)
 
 
 @pytest.mark.parametrize("n", [1, 3])
-def test_ville(fresh: np.random.Generator, n: int) -> None:
+def test_ville(fresh, n):
     """Of 20,000 sequences of 200 fully dependent runs at most 5 % ever reach 20; each side too."""
     reached = []
 
-    def reaches() -> Array:
+    def reaches():
         bet = e_process(fresh.chisquare(n, 200) / n, n)
         reached.append(np.array([bet.up.max(), bet.down.max(), bet.both.max()]) >= 20.0)
         return reached[-1]

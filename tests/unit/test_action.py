@@ -10,12 +10,9 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import forks
 import pytest
@@ -38,7 +35,7 @@ EXPRESSION = re.compile(r"\$\{\{\s*(.*?)\s*\}\}")
 # --- what GitHub demands ------------------------------------------------------------------------------
 
 
-def test_the_action_is_a_composite_one() -> None:
+def test_the_action_is_a_composite_one():
     assert set(FILE) == {"name", "description", "inputs", "outputs", "runs"}
     assert FILE["runs"]["using"] == "composite"
     assert set(FILE["runs"]) == {"using", "steps"}
@@ -51,7 +48,7 @@ def test_the_action_is_a_composite_one() -> None:
 
 
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step["name"])
-def test_a_step_of_the_action(step: dict[str, Any]) -> None:
+def test_a_step_of_the_action(step):
     """``shell`` is demanded of each ``run``; an expression in a script would be pasted into it."""
     assert set(step) <= STEP_KEYS
     assert ("run" in step) != ("uses" in step)
@@ -60,7 +57,7 @@ def test_a_step_of_the_action(step: dict[str, Any]) -> None:
     assert "run" in step or re.fullmatch(r"[\w./-]+@v\d+", step["uses"])
 
 
-def test_inputs_are_used_and_what_is_used_exists() -> None:
+def test_inputs_are_used_and_what_is_used_exists():
     text = "\n".join(part.text for part in expressions(FILE))
     assert set(re.findall(r"inputs\.([\w-]+)", text)) == set(FILE["inputs"])
     ids = {step["id"] for step in STEPS if "id" in step}
@@ -76,7 +73,7 @@ class Part:
     text: str
 
 
-def expressions(value: Any, key: str = "") -> list[Part]:
+def expressions(value, key=""):
     """What GitHub evaluates in a value: what stands in ``${{ }}``, and all of an ``if``."""
     if isinstance(value, dict):
         return [part for name, inner in value.items() for part in expressions(inner, str(name))]
@@ -86,7 +83,7 @@ def expressions(value: Any, key: str = "") -> list[Part]:
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_workflow_gives_inputs_that_the_action_has(path: Path) -> None:
+def test_a_workflow_gives_inputs_that_the_action_has(path):
     """Those in the documents are among the blocks of test_documents.py."""
     text = path.read_text()
     action.require_uses(text)
@@ -105,7 +102,7 @@ class Outcome:
     log: str
 
 
-def run_action(workspace: Path, bash: bool = True, **inputs: str) -> Outcome:
+def run_action(workspace, bash=True, **inputs):
     """The steps in order, up to the first that fails: by bash, or scripts of Python alone in a fork, in less time."""
     given = {name: str(value["default"]) for name, value in FILE["inputs"].items()}
     given |= {name.replace("_", "-"): value for name, value in inputs.items()}
@@ -139,16 +136,16 @@ def run_action(workspace: Path, bash: bool = True, **inputs: str) -> Outcome:
     return Outcome(status, paths["GITHUB_STEP_SUMMARY"].read_text(), {name: text for name, _, text in found}, log)
 
 
-def evaluated(text: str, inputs: dict[str, str]) -> str:
+def evaluated(text, inputs):
     return EXPRESSION.sub(lambda match: inputs[match[1].removeprefix("inputs.")], text)
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def workspace(tmp_path_factory):
     """A copy of the worked repository, with a change of its filter, and its trials; one for each change."""
 
     @cache
-    def make(sigma_fix: str = "0.3") -> Path:
+    def make(sigma_fix="0.3"):
         at = tmp_path_factory.mktemp("runner") / "workspace"
         shutil.copytree(REPOSITORY, at, ignore=shutil.ignore_patterns("__pycache__", "*.csv"))
         text = (at / "cart/ekf.py").read_text()
@@ -164,7 +161,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 INPUTS = {name.replace("-", "_"): value for name, value in USE["with"].items()} | {"install": "false"}
 
 
-def test_an_honest_filter_passes(workspace: Callable[..., Path]) -> None:
+def test_an_honest_filter_passes(workspace):
     """False-alarm rate 1e-3 of the estimates, but their seed is the repository's; the gates have 1e-6."""
     done = run_action(workspace(), **INPUTS)
     assert done.status == 0, done.log
@@ -182,7 +179,7 @@ def test_an_honest_filter_passes(workspace: Callable[..., Path]) -> None:
 
 
 @pytest.mark.slow
-def test_an_overconfident_filter_fails(workspace: Callable[..., Path]) -> None:
+def test_an_overconfident_filter_fails(workspace):
     done = run_action(workspace("0.2"), **{**INPUTS, "fail_on": "worse", "tests": ""})
     assert done.status == 1, done.log
     assert done.outputs["verdict"] == "fail"
@@ -194,7 +191,7 @@ def test_an_overconfident_filter_fails(workspace: Callable[..., Path]) -> None:
     assert "::error" in done.log
 
 
-def test_a_gate_that_fails_is_in_the_summary(workspace: Callable[..., Path]) -> None:
+def test_a_gate_that_fails_is_in_the_summary(workspace):
     done = run_action(workspace("0.15"), install="false", tests="tests -k consistent")
     assert (done.status, done.outputs["verdict"]) == (1, "fail")
     assert "test_the_ekf_is_consistent | overconfident | x" in done.summary
@@ -217,7 +214,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_inputs(workspace: Callable[..., Path], case: str) -> None:
+def test_wrong_inputs(workspace, case):
     """Exit 2 and one line that names the input, in the log and in the summary."""
     inputs, expected = WRONG[case]
     at = workspace()
@@ -232,12 +229,12 @@ def test_wrong_inputs(workspace: Callable[..., Path], case: str) -> None:
 
 
 @pytest.fixture
-def gate() -> ModuleType:
+def gate():
     return sibling(str(action.FOLDER / "action.yml"), "gate")
 
 
 @pytest.mark.parametrize(
-    ("tests", "consistent", "no_worse", "fail_on", "status", "verdict"),
+    "tests, consistent, no_worse, fail_on, status, verdict",
     [
         (True, True, True, "inconsistent", 0, "pass"), (False, True, True, "inconsistent", 1, "fail"),
         (True, False, True, "inconsistent", 1, "fail"), (True, True, False, "inconsistent", 1, "fail"),
@@ -246,9 +243,9 @@ def gate() -> ModuleType:
     ],
 )  # fmt: skip
 def test_what_fails_the_job(
-    gate: ModuleType, tests: bool, consistent: bool, no_worse: bool, fail_on: str, status: int, verdict: str,
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    gate, tests, consistent, no_worse, fail_on, status, verdict,
+    tmp_path, monkeypatch,
+):  # fmt: skip
     for name, good in (("run_tests", tests), ("judge", consistent), ("compare", no_worse)):
         monkeypatch.setattr(gate, name, lambda *given, good=good: (good, [gate.Row("what", "verdict", "", "1", "why")]))
     for name in ("old.json", "est.csv"):
@@ -262,15 +259,13 @@ def test_what_fails_the_job(
     assert (tmp_path / "summary.md").read_text().count("| what | verdict |") == 1 + 3
 
 
-def test_a_cell_of_the_summary_cannot_break_the_table(gate: ModuleType) -> None:
+def test_a_cell_of_the_summary_cannot_break_the_table(gate):
     row = gate.Row("test[a|b]", "failed", "", "1", "<img src=x>\nand `code` & more")
     line = gate.markdown("fail", [row]).splitlines()[4]
     assert line == "| test[a\\|b] | failed |  | 1 | &lt;img src=x> and \\`code\\` &amp; more |"
 
 
-def test_names_are_no_commands_of_the_runner(
-    gate: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_names_are_no_commands_of_the_runner(gate, tmp_path, monkeypatch, capfd):
     """A runner takes a line that begins with :: for a command, unless a mark has stopped that."""
     hostile = "ekf\n::add-mask::x\r::warning::y\x1b[2J"
     (tmp_path / "loud.py").write_text("import sys; print('::set-output name=a::b', file=sys.stderr); print('{}')")
@@ -294,7 +289,7 @@ def test_names_are_no_commands_of_the_runner(
     ]
 
 
-def commands(log: str) -> list[str]:
+def commands(log):
     """Those that the runner obeys, as its ActionCommandManager does."""
     found, mark = [], ""
     for line in map(str.strip, re.split("[\r\n]", log)):
@@ -307,19 +302,19 @@ def commands(log: str) -> list[str]:
     return found
 
 
-def test_options_that_compare_lacks_are_left_out(gate: ModuleType) -> None:
+def test_options_that_compare_lacks_are_left_out(gate):
     options = ["--truth", "t.csv", "--detect", "2", "--tolerance=1.1", "--error", "so2"]
     assert gate.shared(options) == ["--truth", "t.csv", "--error", "so2"]
     lacking = {option for option in options_of("analyse") - options_of("compare") if option in gate.OF_ANALYSE}
     assert lacking == set(gate.OF_ANALYSE)
 
 
-def options_of(name: str) -> set[str]:
+def options_of(name):
     command = typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
     return {option for parameter in command.params for option in parameter.opts}
 
 
-def test_an_input_is_never_run_by_the_shell(workspace: Callable[..., Path]) -> None:
+def test_an_input_is_never_run_by_the_shell(workspace):
     at = workspace()
     hostile = '$(touch broken) `touch broken`; touch broken #"'
     names = ("estimates", "compare_with", "report", "tests", "options", "fail_on")
@@ -330,9 +325,7 @@ def test_an_input_is_never_run_by_the_shell(workspace: Callable[..., Path]) -> N
     assert not (at / "broken").exists()
 
 
-def test_installs_what_is_asked_for(
-    workspace: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_installs_what_is_asked_for(workspace, tmp_path, monkeypatch):
     """By a stand-in for pip: the version of the action itself by default."""
     bin = tmp_path / "bin"
     bin.mkdir()

@@ -3,8 +3,6 @@
 tests/smoke/test_documents_run.py runs them.
 """
 
-from __future__ import annotations
-
 import ast
 import difflib
 import importlib
@@ -15,16 +13,13 @@ import runpy
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
 from contextlib import redirect_stdout
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import pytest
 import typer
 from document_inputs import NOT_RUN
-from documents import PAGES, PROGRAMS, ROOT, SHELL, Block, Command, blocks, commands, parsed, read, typed
+from documents import PAGES, PROGRAMS, ROOT, SHELL, blocks, commands, parsed, read, typed
 
 import consistency as cs
 from consistency.bench.challenging.worlds import space_of
@@ -36,13 +31,13 @@ from consistency.bench.sweeps.plan import load_sweep, sweep_names
 
 PYTHON = ("python", "python notebook")
 SITE = re.compile(r"\{[\w-]+\}.*")  # directives of the site
-OTHERS = {"openssl", "dask", "export", "for", "done", "my-filter"}  # not ours: only the syntax is checked
+OTHERS = {"c++", "cmake", "ctest", "dask", "done", "export", "for", "my-filter", "openssl"}  # the syntax is checked
 PLACEHOLDER = re.compile(r"[A-Z][A-Z_.:|]*")
 ALL = [command for page in PAGES for command in commands(page)]
 OURS = [command for command in ALL if command.words[0] == "consistency"]
 
 
-def of(program: str) -> list[Command]:
+def of(program):
     found = [command for command in ALL if command.words[0] == program]
     assert found, program
     return found
@@ -52,7 +47,7 @@ def of(program: str) -> list[Command]:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_every_block_is_of_a_known_kind(page: str) -> None:
+def test_every_block_is_of_a_known_kind(page):
     """A new kind needs a check here; what is only printed is fenced as ``text``."""
     require_known(page)
 
@@ -60,14 +55,14 @@ def test_every_block_is_of_a_known_kind(page: str) -> None:
 @pytest.mark.parametrize(
     "text", ["    make it so\n\n    or not\n", "```\nx\n```\n", "```json\n{}\n```\n", "    for (x\n"]
 )
-def test_another_kind_is_refused(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_kind_is_refused(text, tmp_path, monkeypatch):
     monkeypatch.setattr("documents.ROOT", tmp_path)
     (tmp_path / "page.md").write_text(f"# Page\n\n{text}")
     with pytest.raises((AssertionError, subprocess.CalledProcessError)):
         require_known("page.md")
 
 
-def require_known(page: str) -> None:
+def require_known(page):
     for block in blocks(page):
         if block.language in SHELL:
             programs = {re.sub(r"^([A-Z_]+=\S* )+", "", command.text).split()[0] for command in typed(block)}
@@ -83,7 +78,7 @@ def require_known(page: str) -> None:
 
 
 @pytest.mark.parametrize("command", OURS, ids=str)
-def test_the_command_line_takes_it(command: Command) -> None:
+def test_the_command_line_takes_it(command):
     words = command.words[1:]
     if words == ["--help"]:
         return
@@ -91,7 +86,7 @@ def test_the_command_line_takes_it(command: Command) -> None:
     names_exist(name, {key: value for key, value in values.items() if value is not None})
 
 
-def names_exist(name: str, values: dict[str, Any]) -> None:
+def names_exist(name, values):
     """Filters, scenarios, sweeps and findings, unless a placeholder or a file stands for them."""
     filters = [*filter_names(), *(f"{one}+{kind}" for one in filter_names() for kind in KINDS)]
     named = {"scenario": scenario_names(), "rig": scenario_names(), "filters": filters, "filter_name": filters}
@@ -105,7 +100,7 @@ def names_exist(name: str, values: dict[str, Any]) -> None:
 
 
 @cache
-def findings() -> list[str]:
+def findings():
     scripts = experiments()
     return [*scripts, *(finding for module in scripts.values() for finding in module.FINDINGS)]
 
@@ -115,14 +110,14 @@ def findings() -> list[str]:
     "run herath2007-stereo --filter ekf-uvd --out o --run 5", "analise results", "sweep regimes --out o",
     "run herath2007-stereo --filter ekf-uvd --out o --runs N",
     "run herath2007-stereo --filter ekf-uvd", "tune herath2007-stereo --filter ekf"])  # fmt: skip
-def test_the_command_line_does_not_take(words: str) -> None:
+def test_the_command_line_does_not_take(words):
     """Negative control."""
     with pytest.raises((typer.BadParameter.__base__, AssertionError, KeyError)):
         names_exist(*parsed(words.split(), whole=True))
 
 
 @pytest.mark.parametrize("command", of("make"), ids=str)
-def test_make_has_the_target(command: Command) -> None:
+def test_make_has_the_target(command):
     makefile = (ROOT / "Makefile").read_text()
     targets, variables = re.findall(r"^([\w-]+):", makefile, re.MULTILINE), re.findall(r"\$\((\w+)\)", makefile)
     for word in command.words[1:]:
@@ -131,7 +126,7 @@ def test_make_has_the_target(command: Command) -> None:
 
 
 @pytest.mark.parametrize("command", of("pip"), ids=str)
-def test_pip_installs_what_there_is(command: Command) -> None:
+def test_pip_installs_what_there_is(command):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     *_, what = command.words
     name, _, extras = what.partition("[")
@@ -140,7 +135,7 @@ def test_pip_installs_what_there_is(command: Command) -> None:
 
 
 @pytest.mark.parametrize("command", [c for c in ALL if c.words[0] in ("bash", "pre-commit", "pytest")], ids=str)
-def test_other_tools_find_their_files(command: Command) -> None:
+def test_other_tools_find_their_files(command):
     program, *words = command.words
     if program == "pre-commit":
         assert (words, (ROOT / ".pre-commit-config.yaml").exists()) == (["install"], True)
@@ -148,7 +143,7 @@ def test_other_tools_find_their_files(command: Command) -> None:
 
 
 @pytest.mark.parametrize("command", of("python"), ids=str)
-def test_the_script_is_there_and_knows_the_options(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_script_is_there_and_knows_the_options(command, monkeypatch):
     _, script, *words = command.words
     if script == "-m":
         importlib.import_module(words[0])
@@ -170,19 +165,19 @@ def test_the_script_is_there_and_knows_the_options(command: Command, monkeypatch
 EXCERPTS = {"docs/extending.md"}  # held against the code itself by test_extending.py
 
 
-def code(block: Block) -> str:
+def code(block):
     """Its text; an entry of a dictionary is shown with its indentation."""
     return f"{{{block.text}}}" if block.text.startswith(" ") else block.text
 
 
 @pytest.mark.parametrize("block", [b for page in PAGES for b in blocks(page, *PYTHON)], ids=str)
-def test_code_compiles_and_its_names_exist(block: Block) -> None:
+def test_code_compiles_and_its_names_exist(block):
     names_of_the_package(ast.parse(code(block)), block.page not in EXCERPTS)
 
 
-def names_of_the_package(tree: ast.Module, imports: bool = True) -> None:
+def names_of_the_package(tree, imports=True):
     """What is imported of the package, ``cs.NAME``, and the keywords of what is called are there."""
-    known: dict[str, Any] = {"cs": cs}
+    known = {"cs": cs}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "consistency" and imports:
             module = importlib.import_module(node.module or "")
@@ -193,7 +188,7 @@ def names_of_the_package(tree: ast.Module, imports: bool = True) -> None:
             getattr(cs, node.attr)
         if isinstance(node, ast.Call):
             called = node.func
-            function: Any = known.get(called.id) if isinstance(called, ast.Name) else None
+            function = known.get(called.id) if isinstance(called, ast.Name) else None
             if isinstance(called, ast.Attribute) and isinstance(called.value, ast.Name):
                 function = getattr(known.get(called.value.id), called.attr, None)
             keywords = [keyword.arg for keyword in node.keywords if keyword.arg]
@@ -206,7 +201,7 @@ def names_of_the_package(tree: ast.Module, imports: bool = True) -> None:
 @pytest.mark.parametrize("text", ["cs.load_scenarios('a')", "from consistency.testing import assert_consistency",
     "from consistency.nothing import a", "cs.run_trials(s, f, rums=3)",
     "from consistency.bench.challenging.challenge import Plan\nPlan(minute=1)"])  # fmt: skip
-def test_names_that_do_not_exist_are_seen(text: str) -> None:
+def test_names_that_do_not_exist_are_seen(text):
     with pytest.raises((AttributeError, ImportError, AssertionError)):
         names_of_the_package(ast.parse(text))
 
@@ -216,7 +211,7 @@ def test_names_that_do_not_exist_are_seen(text: str) -> None:
 NEW_EFFECT = 'kind = "bias"'  # of docs/extending.md, where test_extending.py adds it
 
 
-def reads_toml(block: Block, folder: Path) -> None:
+def reads_toml(block, folder):
     content = tomllib.loads(block.text)
     path = folder / "mine.toml"
     if "grid" in content:
@@ -237,18 +232,18 @@ def reads_toml(block: Block, folder: Path) -> None:
         raise AssertionError(f"{block}: no reader takes the tables {set(content)}")
 
 
-def reads_workflow(block: Block, folder: Path) -> None:
+def reads_workflow(block, folder):
     pytest.importorskip("yaml", reason="PyYAML (the extra vision) is not installed")
     from action import require_uses
 
     require_uses(block.text)
 
 
-READERS: dict[str, Callable[[Block, Path], None]] = {"toml": reads_toml, "yaml": reads_workflow}
+READERS = {"toml": reads_toml, "yaml": reads_workflow}
 
 
 @pytest.mark.parametrize("block", [b for page in PAGES for b in blocks(page, *READERS)], ids=str)
-def test_a_file_is_read_by_its_reader(block: Block, tmp_path: Path) -> None:
+def test_a_file_is_read_by_its_reader(block, tmp_path):
     READERS[block.language](block, tmp_path)
 
 
@@ -281,7 +276,7 @@ Text with `make test` and
 """
 
 
-def test_the_collector_sees_every_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_collector_sees_every_block(tmp_path, monkeypatch):
     monkeypatch.setattr("documents.ROOT", tmp_path)
     (tmp_path / "page.md").write_text(PAGE)
     assert [(block.line, block.language) for block in blocks("page.md")] == [
@@ -297,7 +292,7 @@ def test_the_collector_sees_every_block(tmp_path: Path, monkeypatch: pytest.Monk
     ]
 
 
-def test_nothing_that_looks_like_a_command_is_missed() -> None:
+def test_nothing_that_looks_like_a_command_is_missed():
     """Every line that begins with the name of the tool, in a block or not, is among the commands."""
     for page in PAGES:
         lines = re.findall(r"^\s*(?:\$ )?(consistency [a-z]+ .*)$", read(page), re.MULTILINE)
@@ -310,7 +305,7 @@ def test_nothing_that_looks_like_a_command_is_missed() -> None:
 
 
 @pytest.mark.parametrize(("page", "begin", "why"), NOT_RUN)
-def test_what_is_not_run_is_still_in_the_documents(page: str, begin: str, why: str) -> None:
+def test_what_is_not_run_is_still_in_the_documents(page, begin, why):
     found = [command.text for command in commands(page)] + [block.text for block in blocks(page, *PYTHON)]
     assert any(text.startswith(begin) for text in found)
     assert all((ROOT / path).exists() for path in re.findall(r"tests/\S+\.py", why))

@@ -11,26 +11,26 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def checkout(tmp_path: Path) -> Path:
+def checkout(tmp_path):
     for name in ("Makefile", "pyproject.toml", "constraints.txt"):
         shutil.copy(ROOT / name, tmp_path)
     return tmp_path
 
 
-def make(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def make(folder, *words):
     return subprocess.run(["make", *words], cwd=folder, capture_output=True, text=True)
 
 
-def extras(folder: Path, target: str) -> list[str]:
+def extras(folder, target):
     return re.findall(r'-e "\.\[(.*)\]"', make(folder, "-n", target).stdout)
 
 
-@pytest.mark.parametrize(("target", "what"), [("reproduce", "bench,report"), ("test", "dev"), (".venv/.done", "dev")])
-def test_a_target_installs_what_it_needs(checkout: Path, target: str, what: str) -> None:
+@pytest.mark.parametrize("target, what", [("reproduce", "bench,report"), ("test", "dev"), (".venv/.done", "dev")])
+def test_a_target_installs_what_it_needs(checkout, target, what):
     assert extras(checkout, target) == [what]
 
 
-def test_the_tests_environment_has_what_reproduce_needs_and_not_the_reverse(checkout: Path) -> None:
+def test_the_tests_environment_has_what_reproduce_needs_and_not_the_reverse(checkout):
     python = checkout / "python"  # makes an environment of nothing
     made = f"mkdir -p .venv/bin && ln -sf {shutil.which('true')} .venv/bin/python"
     python.write_text(f'#!/bin/sh\n[ "$1" = -c ] || {{ {made}; }}\n')
@@ -44,7 +44,7 @@ def test_the_tests_environment_has_what_reproduce_needs_and_not_the_reverse(chec
     assert extras(checkout, "test") == []
 
 
-def test_a_python_without_venv_is_told_in_one_line(checkout: Path) -> None:
+def test_a_python_without_venv_is_told_in_one_line(checkout):
     done = make(checkout, "reproduce", "PYTHON=false")
     assert done.returncode == 2
     assert "false cannot make a virtual environment" in done.stderr.splitlines()[0]

@@ -1,7 +1,5 @@
 """Public names: each stands in a plain module, all of the documents are among them, and they cross processes."""
 
-from __future__ import annotations
-
 import pickle
 import pkgutil
 import re
@@ -19,7 +17,8 @@ NAMES = {  # module -> its public names; also those of CONTRACT.md, of docs/api,
     "consistency": """
         Alarm Control Drive Finding Gaussian Info InputError Log Monitor NoiseModel Observation Record Results Scenario
         Study Trial Tuning Verdict analyse anees anees_interval drive_of filter_names fit_covariance get_filter guarded
-        judge load_scenario nees read read_drives read_log read_results run_trials scenario_names simulate tune""",
+        judge load_scenario monte_carlo nees read read_drives read_log read_results run_trials scenario_names simulate
+        tune""",
     "consistency.challenging": "Challenge Plan challenge",
     "consistency.diagnostics": """
         Alarm Answer Band Comparison Design Difference EProcess EarlyEnds Equivalence Evidence Hotelling Independence
@@ -43,7 +42,8 @@ NAMES = {  # module -> its public names; also those of CONTRACT.md, of docs/api,
         SigmaPoints TrueSensor Truth UvdSensor load_scenario scenario_names scenario_text""",
     "consistency.store": "Log Results StoredResults open_results read_log read_results write_log",
     "consistency.sweeps": "CellResult Regime read_regime",
-    "consistency.testing": "ConsistencyError InsufficientTrials assert_consistent assert_not_worse",
+    "consistency.testing": """
+        ConsistencyError InsufficientTrials assert_consistent assert_not_worse assert_program_consistent""",
     "consistency.tuning": "Factor Setting Tuning tune",
     "consistency.types": "Control Estimates Failure Finding Gaussian Info Map Observation Ratio Trial",
     "consistency.vision": """
@@ -56,13 +56,13 @@ PUBLIC = {f"{module}.{name}" for module, names in NAMES.items() for name in name
 
 
 @pytest.mark.parametrize("module", NAMES)
-def test_a_module_has_its_names_and_no_others(module: str) -> None:
+def test_a_module_has_its_names_and_no_others(module):
     found = import_module(module)
     assert sorted(found.__all__) == sorted(NAMES[module].split())
     assert all(getattr(found, name) is not None for name in found.__all__)
 
 
-def test_stub_and_package_have_the_same_names() -> None:
+def test_stub_and_package_have_the_same_names():
     """``__init__.pyi`` says to type checkers where ``__init__.py`` finds each name."""
     stub = Path(consistency.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
     lines = re.findall(r"^from \.(\S+) import (\w+) as \2$", stub, re.MULTILINE)
@@ -71,7 +71,7 @@ def test_stub_and_package_have_the_same_names() -> None:
         _ = consistency.nonsense  # type: ignore[attr-defined]
 
 
-def written_names(text: str) -> set[str]:
+def written_names(text):
     """Names of the package that a document lists in the reference, imports, or takes from ``cs``."""
     names, module = set(), ""
     for line in text.splitlines():
@@ -88,7 +88,7 @@ def written_names(text: str) -> set[str]:
     return names | set(re.findall(r"`(consistency(?:\.\w+)+)`", text))
 
 
-def is_inside(name: str) -> bool:
+def is_inside(name):
     """Whether a name is that of a root's own code, which whoever extends the bench reads."""
     return name.split(".")[1] in {"bench", "commands", "referee", "stereo"}
 
@@ -98,12 +98,12 @@ PAGES = [path for pattern in ("README.md", "docs/*.md", "docs/api/*.md", "docs/g
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
-def test_names_in_a_document_are_public(page: Path) -> None:
+def test_names_in_a_document_are_public(page):
     names = {name for name in written_names(page.read_text(encoding="utf-8")) if not is_inside(name)}
     assert names - PUBLIC - NAMES.keys() == set()
 
 
-def test_names_in_documents_are_seen() -> None:
+def test_names_in_documents_are_seen():
     text = (
         ".. currentmodule:: consistency.vision\n.. autofunction:: a\n.. autoclass:: consistency.b\n"
         "from consistency.c import (\n    d as e,\n    f,  # why\n)\nfrom consistency.g import h, i  # why\ncs.j(1)\n"
@@ -116,20 +116,20 @@ def test_names_in_documents_are_seen() -> None:
 
 
 @pytest.mark.parametrize("name", ["recording", "reporting", "simulation", "vision.motion", "diagnostics.records"])
-def test_names_of_before_are_not_found(name: str) -> None:
+def test_names_of_before_are_not_found(name):
     with pytest.raises(ModuleNotFoundError):
         import_module(f"consistency.{name}")
 
 
 @pytest.mark.parametrize("name", sorted(PUBLIC))
-def test_a_public_name_has_one_home(name: str) -> None:
+def test_a_public_name_has_one_home(name):
     """A pickle names the module of a class or function, from which another process must get the same object."""
     value = pkgutil.resolve_name(name)
     if callable(value) and not getattr(value, "_is_protocol", False):
         assert pickle.loads(pickle.dumps(value)) is value
 
 
-def test_a_public_module_without_its_packages_names_the_extra() -> None:
+def test_a_public_module_without_its_packages_names_the_extra():
     code = (
         "import sys\nsys.modules |= dict.fromkeys(['joblib'])\n"
         "try:\n    import consistency.runs\nexcept ImportError as error:\n    print(type(error).__name__, error)"

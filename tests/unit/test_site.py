@@ -1,14 +1,11 @@
 """The documentation site: its extensions, the check of what was built, and the tutorial."""
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import re
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
+from types import SimpleNamespace
 
 import nbformat
 import pytest
@@ -21,7 +18,7 @@ from consistency.commands.registry import COMMANDS
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def load(path: str, monkeypatch: pytest.MonkeyPatch | None = None) -> ModuleType:
+def load(path, monkeypatch=None):
     name = Path(path).stem
     spec = importlib.util.spec_from_file_location(name, DOCS / path)
     module = importlib.util.module_from_spec(spec)
@@ -42,7 +39,7 @@ commands, docstrings, figures, outside = (
 # --- what was built ----------------------------------------------------------------------------------
 
 
-def site(folder: Path, body: str, style: str = "") -> Path:
+def site(folder, body, style=""):
     (folder / "index.html").write_text(f'<h1 id="top">Site</h1><link rel="stylesheet" href="a.css">{body}', "utf-8")
     (folder / "other page.html").write_text('<p id="part">text</p><a href="index.html#top">up</a>', "utf-8")
     (folder / "a.css").write_text(style, "utf-8")
@@ -56,12 +53,12 @@ SOUND = (
 )
 
 
-def test_a_sound_site_has_no_fault(tmp_path: Path) -> None:
+def test_a_sound_site_has_no_fault(tmp_path):
     assert check.faults(site(tmp_path, SOUND, "b { background: url('data:image/png;base64,AA') }")) == []
 
 
 @pytest.mark.parametrize(
-    ("body", "style", "fault"),
+    "body, style, fault",
     [
         ('<a href="gone.html">x</a>', "", "index.html: gone.html is not there"),
         ('<a href="other%20page.html#gone">x</a>', "", "index.html: other%20page.html#gone leads to no anchor"),
@@ -77,12 +74,12 @@ def test_a_sound_site_has_no_fault(tmp_path: Path) -> None:
         ("", "b { src: url(gone.woff2) }", "a.css: gone.woff2 is not there"),
     ],
 )
-def test_a_fault_of_the_site_is_named(tmp_path: Path, body: str, style: str, fault: str) -> None:
+def test_a_fault_of_the_site_is_named(tmp_path, body, style, fault):
     (found,) = check.faults(site(tmp_path, SOUND + body, style))
     assert fault in found
 
 
-def test_an_empty_folder_is_no_site(tmp_path: Path) -> None:
+def test_an_empty_folder_is_no_site(tmp_path):
     (found,) = check.faults(tmp_path)
     assert "make docs" in found
 
@@ -91,7 +88,7 @@ def test_an_empty_folder_is_no_site(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "page", "link", "expected"),
+    "source, page, link, expected",
     [
         ("docs/method.md", "docs/method.md", "[a](../scenarios/README.md#keys)", "[a](generated/scenarios.md#keys)"),
         ("docs/method.md", "docs/method.md", "[a](files.md#b)", "[a](files.md#b)"),
@@ -104,12 +101,12 @@ def test_an_empty_folder_is_no_site(tmp_path: Path) -> None:
         ("docs/method.md", "docs/method.md", "[a](../README.md#b)", "[a](generated/readme.md#b)"),
     ],
 )
-def test_links_lead_to_pages_of_the_site(source: str, page: str, link: str, expected: str) -> None:
+def test_links_lead_to_pages_of_the_site(source, page, link, expected):
     root = DOCS.parent
     assert outside.relinked(f"See {link}.", root / source, root / page) == f"See {expected}."
 
 
-def test_every_command_has_a_page_with_its_examples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_command_has_a_page_with_its_examples(tmp_path, monkeypatch):
     monkeypatch.setattr(commands, "FOLDER", tmp_path)
     commands.write_commands(SimpleNamespace())
     pages = {path.stem: path.read_text("utf-8") for path in (tmp_path / "commands").glob("*.md")}
@@ -129,7 +126,7 @@ def test_every_command_has_a_page_with_its_examples(tmp_path: Path, monkeypatch:
 # --- reference ---------------------------------------------------------------------------------------
 
 
-def documented() -> set[str]:
+def documented():
     names = set()
     for page in (DOCS / "api").glob("*.md"):
         module = "consistency"
@@ -143,7 +140,7 @@ def documented() -> set[str]:
     return names
 
 
-def test_every_public_name_stands_in_the_reference() -> None:
+def test_every_public_name_stands_in_the_reference():
     """Once: those of the package stand there under its name, and nowhere else."""
     gates = [name for name, value in vars(testing).items() if getattr(value, "__module__", "") == testing.__name__]
     public = {f"consistency.{name}" for name in consistency.__all__}
@@ -158,7 +155,7 @@ def test_every_public_name_stands_in_the_reference() -> None:
     assert public - documented() == set()
 
 
-def test_what_a_guide_imports_stands_in_the_reference() -> None:
+def test_what_a_guide_imports_stands_in_the_reference():
     """Except for the guide to what is inside."""
     missing = {}
     for page in set(DOCS.glob("*.md")) - {DOCS / "extending.md", DOCS / "architecture.md"}:
@@ -169,13 +166,13 @@ def test_what_a_guide_imports_stands_in_the_reference() -> None:
     assert missing == {}
 
 
-def described(text: str, what: str = "function") -> list[str]:
+def described(text, what="function"):
     lines = inspect.cleandoc(text).split("\n")
     docstrings.describe(None, what, "name", None, None, lines)
     return lines
 
 
-def test_a_parameter_keeps_its_shape_in_the_description() -> None:
+def test_a_parameter_keeps_its_shape_in_the_description():
     lines = described(
         """Title.
 
@@ -204,7 +201,7 @@ def test_a_parameter_keeps_its_shape_in_the_description() -> None:
     assert lines[lines.index(">>> 1") - 2] == "Examples"
 
 
-def test_the_comment_of_a_field_is_its_description() -> None:
+def test_the_comment_of_a_field_is_its_description():
     from sphinx.pycode import parser
 
     pattern, connected = parser.comment_re, []
@@ -218,7 +215,7 @@ def test_the_comment_of_a_field_is_its_description() -> None:
     assert connected == ["describe", "hide", "show"]
 
 
-def test_the_sentence_of_a_field_is_not_taken_apart() -> None:
+def test_the_sentence_of_a_field_is_not_taken_apart():
     for what, between in (("attribute", []), ("property", []), ("function", ["a: b"])):
         lines = ["a: b"]
         docstrings.hide(None, what, "x", None, None, lines)
@@ -230,8 +227,8 @@ def test_the_sentence_of_a_field_is_not_taken_apart() -> None:
 # --- figures -----------------------------------------------------------------------------------------
 
 
-def test_a_figure_is_saved_once(tmp_path: Path) -> None:
-    found: dict[str, Any] = {"figure": Figure()}
+def test_a_figure_is_saved_once(tmp_path):
+    found = {"figure": Figure()}
     block_vars = {"example_globals": found, "image_path_iterator": iter([tmp_path / "a.png"])}
     text = figures.figure_scraper(None, block_vars, {"src_dir": str(tmp_path)})
     assert "a.png" in text
@@ -240,7 +237,7 @@ def test_a_figure_is_saved_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("script", sorted((DOCS / "gallery").glob("plot_*.py")), ids=lambda path: path.stem)
-def test_a_script_stands_by_itself_and_leaves_a_figure(script: Path) -> None:
+def test_a_script_stands_by_itself_and_leaves_a_figure(script):
     """Title, what it shows, public imports alone; the site runs them all."""
     text = script.read_text("utf-8")
     assert re.match(r'"""\n(.+)\n=+\n\n[^"]+\n"""\n', text)
@@ -255,7 +252,7 @@ def test_a_script_stands_by_itself_and_leaves_a_figure(script: Path) -> None:
     assert set(modules) <= public
 
 
-def test_pictures_of_the_readme_are_figures_of_the_gallery() -> None:
+def test_pictures_of_the_readme_are_figures_of_the_gallery():
     shown = set(re.findall(r"\(docs/images/([\w-]+)\.png\)", (DOCS.parent / "README.md").read_text("utf-8")))
     drawn = {name.replace("_", "-") for name in load("pictures.py").PICTURES}
     assert shown <= drawn
@@ -265,7 +262,7 @@ def test_pictures_of_the_readme_are_figures_of_the_gallery() -> None:
 # --- tutorial ----------------------------------------------------------------------------------------
 
 
-def test_the_tutorial_is_stored_as_it_was_executed() -> None:
+def test_the_tutorial_is_stored_as_it_was_executed():
     cells = [cell for cell in nbformat.read(tutorial.NOTEBOOK, as_version=4).cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
     assert {output.output_type for cell in cells for output in cell.outputs} <= {
@@ -277,6 +274,6 @@ def test_the_tutorial_is_stored_as_it_was_executed() -> None:
 
 
 @pytest.mark.slow
-def test_the_tutorial_says_what_it_is_stored_with() -> None:
+def test_the_tutorial_says_what_it_is_stored_with():
     stored = nbformat.read(tutorial.NOTEBOOK, as_version=4)
     assert tutorial.texts(tutorial.executed()) == tutorial.texts(stored)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,12 +22,12 @@ from consistency.bench.runs.findings import read_findings
 from consistency.bench.runs.results_to_records import design_of, longest_run, record_of
 from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
-from consistency.bench.types import outcome
+from consistency.bench.types import OURS, outcome
 from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import plural
-from consistency.referee.document.blocks import Block, Chapter, Document
+from consistency.referee.document.blocks import Chapter, Document
 from consistency.referee.document.wording import listed
 from consistency.referee.errors import InputError
 from consistency.referee.pages.judged import clock_of
@@ -101,62 +102,57 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
     )
 
 
-class Part(NamedTuple):
-    """A chapter about the whole report."""
-
-    anchor: str
-    title: str
-    link: str  # in the contents
-    blocks: tuple[Block, ...]
-
-
 def compose(report: Report) -> Document:
-    """The document that HTML and PDF show: every section that applies."""
-    before = (
-        Part("findings", "Findings: published beside measured", "Findings", exhibits.all_findings(report)),
-        Part("filters", "Filters side by side", "Filters", filters_table(report)),
-        Part("verdicts", "Verdicts", "Verdicts", overview.verdicts(report)),
-    )
+    """The document that HTML and PDF show: every section that applies.
+
+    Of several studies the PDF has the findings and a part of each study; the page has all.
+    """
+    brief = len(report.studies) > 1
     noise, sensor = "What eq. 21 does to Gaussian pixels (fig. 12)", "The stereo sensor: biases and practical issues"
-    after = (
-        Part("distributions", noise, "Stereo noise", stereo_noise(report)),
-        Part("front-end", "Stereo front-end", "Stereo front-end", front_end(report)),
-        Part("sensor-issues", sensor, "Sensor issues", exhibits.shown(report, sensor_issues.EXHIBITS)),
-        Part("images", "The stereo sensor in rendered images", "Rendered images",
-             exhibits.shown(report, images.EXHIBITS)),
-        Part("calibration", "How far the referee can be trusted", "The referee", calibration_rates()),
-        Part("provenance", "Provenance", "Provenance", provenance(report)),
+    sensor_blocks, image_blocks = (exhibits.shown(report, part.EXHIBITS) for part in (sensor_issues, images))
+    only_page = () if brief else None
+    chapters = (
+        Chapter("findings", "Findings: published beside measured", "Findings", exhibits.all_findings(report),
+                on_paper=exhibits.findings_on_paper(report)),
+        Chapter("filters", "Filters side by side", "Filters", filters_table(report)),
+        Chapter("verdicts", "Verdicts", "Verdicts", overview.verdicts(report), on_paper=only_page),
+        *(_study_chapter(index, study, brief) for index, study in enumerate(report.studies)),
+        Chapter("distributions", noise, "Stereo noise", stereo_noise(report)),
+        Chapter("front-end", "Stereo front-end", "Stereo front-end", front_end(report)),
+        Chapter("sensor-issues", sensor, "Sensor issues", sensor_blocks, on_paper=only_page),
+        Chapter("images", "The stereo sensor in rendered images", "Rendered images", image_blocks, on_paper=only_page),
+        Chapter("calibration", "How far the referee can be trusted", "The referee", calibration_rates(), on_paper=()),
+        Chapter("provenance", "Provenance", "Provenance", provenance(report), on_paper=only_page),
     )  # fmt: skip
-    chapters = (*_chapters(before), *map(_study_chapter, range(len(report.studies)), report.studies), *_chapters(after))
-    return Document(report.title, answer(report.studies, report.findings), chapters, overview.opening(report))
+    shown = tuple(chapter for chapter in chapters if chapter.blocks)
+    return Document(report.title, answer(report.studies, report.findings), shown, overview.opening(report))
 
 
-def _chapters(parts: Sequence[Part]) -> list[Chapter]:
-    """Those that have something to show."""
-    return [Chapter(part.anchor, part.title, part.link, part.blocks) for part in parts if part.blocks]
-
-
-def _study_chapter(index: int, study: Study) -> Chapter:
+def _study_chapter(index: int, study: Study, brief: bool) -> Chapter:
     blocks = tuple(block for section in SECTIONS for block in section(study))
-    return Chapter(f"study-{index}", study.name, study.name, blocks, study.summary, study.switches)
+    on_paper = overview.on_paper(study, blocks) if brief else None
+    return Chapter(f"study-{index}", study.name, study.name, blocks, study.summary, study.switches, on_paper)
 
 
 def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:
     """Who is honest and who is not, in one paragraph."""
     pairs = [(track, study) for study in studies for track in study.tracks]
     text = []
+    if len(studies) > 1:
+        text.append(overview.main_sentence(studies))
     if findings:
         text.append(_finding_sentence(findings))
     if pairs:
         text.append(_count_sentence(studies, [track for track, _ in pairs]))
-        text += [sentence for status in STATUSES if (sentence := _status_sentence(status, pairs, len(studies)))]
+        if len(studies) == 1:
+            text += [sentence for status in STATUSES if (sentence := _status_sentence(status, pairs))]
         text.append(_failure_sentence(studies))
     if any(track.innovations_judged and not study.has_truth for track, study in pairs):
         text.append(
             "Where the truth is not known the innovations alone decide, if the filter declares an optimal gain; they "
             "cannot see most pose errors."
         )
-    return " ".join(text) or "This folder holds neither results nor findings."
+    return " ".join(filter(None, text)) or "This folder holds neither results nor findings."
 
 
 def _count_sentence(studies: Sequence[Study], tracks: Sequence[Track]) -> str:
@@ -173,15 +169,18 @@ def _count_sentence(studies: Sequence[Study], tracks: Sequence[Track]) -> str:
         size = f"{plural(studies[0].runs, 'run')} of {plural(len(studies[0].steps), 'step')}"
         count = unknown if nothing else f"{honest} of {plural(len(tracks), 'filter')} {passed}"
         return f"In {studies[0].name} ({size}), {count}."
-    count = unknown if nothing else f"{honest} {passed}"
-    return f"{len(studies)} studies put {len(tracks)} pairs of filter and scenario to the test; {count}."
+    if nothing:
+        return f"{unknown[:1].upper()}{unknown[1:]}."
+    statuses = Counter(track.verdict.status for track in tracks)
+    counts = [f"{statuses[status]} {status}" for status in STATUSES if statuses[status]]
+    return f"In {len(studies)} worlds, of {len(tracks)} verdicts on a filter {listed(counts)}."
 
 
-def _status_sentence(status: str, pairs: list[tuple[Track, Study]], studies: int) -> str:
+def _status_sentence(status: str, pairs: list[tuple[Track, Study]]) -> str:
     names = [track.name for track, _ in pairs if track.verdict.status == status]
     if not names:
         return ""
-    if studies > 1 or len(names) > LISTED:
+    if len(names) > LISTED:
         return f"{len(names)} {'is' if len(names) == 1 else 'are'} {status} ({STATUSES[status]})."
     return f"{status.capitalize()} ({STATUSES[status]}): {listed(names)}."
 
@@ -200,13 +199,14 @@ def _failure_sentence(studies: Sequence[Study]) -> str:
 
 def _finding_sentence(findings: Sequence[dict[str, Any]]) -> str:
     said = [outcome(str(finding["source"] or ""), str(finding["verdict"])) for finding in findings]
-    own = [verdict for verdict in said if verdict in ("holds", "does not hold")]
-    published = [verdict for verdict in said if verdict not in ("holds", "does not hold")]
+    is_own = [str(finding["source"] or "").startswith(OURS) for finding in findings]
+    own = Counter(word for word, ours in zip(said, is_own, strict=True) if ours)
+    published = Counter(word for word, ours in zip(said, is_own, strict=True) if not ours)
     parts = []
     if published:
-        counts = [f"{published.count(verdict)} {verdict}" for verdict in dict.fromkeys(published)]
-        parts.append(f"Of {plural(len(published), 'published finding')}, {listed(counts)}.")
+        counts = [f"{count} {word}" for word, count in published.items()]
+        parts.append(f"Of {plural(published.total(), 'published finding')}, {listed(counts)}.")
     if own:
-        holding = own.count("holds")
-        parts.append(f"Of {plural(len(own), 'finding')} of this project, {holding} hold{'s' * (holding == 1)}.")
+        counts = [f"{count} {'hold' if word == 'holds' else word}" for word, count in own.items()]
+        parts.append(f"Of {plural(own.total(), 'conjecture')} of this project, {listed(counts)}.")
     return " ".join(parts)

@@ -8,6 +8,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from consistency.bench.pages.heat import View, cells_of, heat_figure, results_at, title_of, views, words_of
 from consistency.bench.sweeps import axes as grid
 from consistency.bench.sweeps.cell import CellResult
@@ -30,7 +32,7 @@ from consistency.referee.document.blocks import (
     Text,
     table,
 )
-from consistency.referee.document.colours import COLOURS, Look, style
+from consistency.referee.document.colours import COLOURS, EXPECTED, Look, solid, style
 from consistency.referee.document.wording import listed, number
 from consistency.referee.pages.origin import facts
 from consistency.referee.show.painting import TITLE, add_legend, canvas, dots, log_axis, say, stroke, wrapped
@@ -61,7 +63,11 @@ ROOM = 1.25  # of a log axis is left beyond the first and the last value, as a f
 
 def compose_regime(regime: Regime) -> Document:
     sweep = regime.sweep
-    regions = tuple(figure for name in sweep.filters for figure in _figures(regime, name))
+    sides = _sides(regime)
+    if len(sweep.axes) == len(sides) == 1:
+        regions: tuple[Figure, ...] = (_along(regime, sides[0]),)
+    else:
+        regions = tuple(figure for name in sweep.filters for figure in _figures(regime, name))
     about = Text(method(regime), style="note")
     chapters = [Chapter("filters", "Filters", "Filters", (_summary(regime), about), sweep.summary)]
     if regions:
@@ -184,6 +190,39 @@ def _figures(regime: Regime, name: str) -> tuple[Figure, ...]:
         "where the filter is consistent."
     )
     return (Figure(name, caption, drawings),)
+
+
+def _along(regime: Regime, side: grid.Axis) -> Figure:
+    """Covariance ratio and RMSE of all filters along the one axis of a sweep."""
+
+    def draw() -> Drawing:
+        figure, (ratios, errors) = canvas(2.2, 2, 2)
+        for number_of, name in enumerate(regime.sweep.filters):
+            found = results_at(regime, name, [])
+            x = np.array([float(side.values[cell.indices[0]]) for cell, _ in found])
+            look = solid(style(number_of))
+            quantities = ((ratios, [r.ratio for _, r in found]), (errors, [r.rmse_position for _, r in found]))
+            for axes, values in quantities:
+                axes.plot(x, values, label=name, **stroke(look))
+                for place, value, (_, result) in zip(x, values, found, strict=True):
+                    marker = replace(LOOKS[result.status], colour=look.colour, size=4.5)
+                    axes.plot(place, value, gid=TITLE + words_of(result), **dots(marker))
+        statuses = dict.fromkeys(result.status for result in regime.results.values())
+        for status in statuses:
+            ratios.plot([], [], label=status, **dots(replace(LOOKS[status], colour="#555555", size=4.5)))
+        ratios.axhline(1.0, **stroke(EXPECTED))
+        ratios.set_ylabel("true / stated covariance")
+        errors.set_ylabel("RMSE (m)")
+        for axes in (ratios, errors):
+            _draw_side(axes, "x", side)
+            log_axis(axes, "y")
+        return add_legend(figure)
+
+    caption = (
+        f"True over stated covariance, 1 is right (line), and RMSE of the position along {_short(side.key)}. The shape "
+        "of a marker is the verdict."
+    )
+    return Figure(f"Along {_short(side.key)}", caption, (draw,))
 
 
 def _draw(regime: Regime, name: str, shown: Sequence[View]) -> Drawing:

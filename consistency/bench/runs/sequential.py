@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from itertools import count
 from pathlib import Path
@@ -20,7 +20,7 @@ from consistency.bench.store.journal import Journal
 from consistency.bench.store.results import Results, StoredResults, Tables, open_results
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.judge_record import look, speaks
+from consistency.referee.diagnostics.judge_record import looks, progress_text
 from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
 from consistency.referee.diagnostics.questions.scale import FEW
 from consistency.referee.diagnostics.records.record import Record
@@ -93,34 +93,6 @@ def run_until_decided(
     return results, {name: decided[name] for name in names}
 
 
-def looks(
-    design: Design, filters: Sequence[str], read: Callable[[int, str], Record], decided: dict[str, Verdict]
-) -> Iterator[int]:
-    """Yield the number of runs of each inspection, look when they are there, and end when all ``filters`` are decided.
-
-    Parameters
-    ----------
-    read : record of the first runs of a filter, by their number and its name
-    decided : where verdicts go, by filter
-    """
-    for runs, spent in design.inspections():
-        yield runs
-        for name in [name for name in filters if name not in decided]:
-            verdict = _look(design, read(runs, name), runs, spent)
-            if verdict is not None and (verdict.status != "undecided" or runs == design.max_runs):
-                decided[name] = verdict
-        if len(decided) == len(filters):
-            return
-
-
-def _look(design: Design, record: Record, runs: int, spent: float | None) -> Verdict | None:
-    """What is said after so many runs; None where it is not the time to ask."""
-    some = record.first_runs(runs)
-    if runs != design.max_runs and not speaks(design, some, spent):
-        return None
-    return look(design, some, spent)
-
-
 def _rounds(
     campaign: Campaign, counts: Iterator[int], decided: dict[str, Verdict], names: list[str]
 ) -> Iterator[range]:
@@ -152,11 +124,6 @@ def plan_of(plan: dict[str, Any]) -> Design:
         return sequential_design(**plan)
     except ValueError as error:
         raise refused(error) from None
-
-
-def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:
-    parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
-    return ", ".join(parts + [f"{name} open" for name in filters if name not in decided])
 
 
 # --- pilots: runs that tell how steps depend on each other, from which a number of runs is planned ----------------

@@ -38,6 +38,7 @@ class _Manifest(BaseModel):
     optimal_gain: list[str] = []
     until_decided: dict[str, Any] | None = None
     versions: dict[str, str] = {}
+    date: str | None = None
     wall_time_s: float | None = None
     command: str | None = None
     git_commit: str | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import takewhile
 from typing import TYPE_CHECKING, NamedTuple
@@ -265,6 +265,34 @@ def follow(design: Design, evidence_of: Callable[[int], Record], limit: int | No
     raise AssertionError("unreachable: a design without a last look is endless")
 
 
+def looks(
+    design: Design, filters: Sequence[str], read: Callable[[int, str], Record], decided: dict[str, Verdict]
+) -> Iterator[int]:
+    """Yield the number of runs of each inspection, look when they are there, and end when all ``filters`` are decided.
+
+    Parameters
+    ----------
+    read : record of the first runs of a filter, by their number and its name
+    decided : where verdicts go, by filter
+    """
+    for runs, spent in design.inspections():
+        yield runs
+        for name in [name for name in filters if name not in decided]:
+            verdict = _look_at(design, read(runs, name), runs, spent)
+            if verdict is not None and (verdict.status != "undecided" or runs == design.max_runs):
+                decided[name] = verdict
+        if len(decided) == len(filters):
+            return
+
+
+def _look_at(design: Design, record: Record, runs: int, spent: float | None) -> Verdict | None:
+    """What is said after so many runs; None where it is not the time to ask."""
+    some = record.first_runs(runs)
+    if runs != design.max_runs and not speaks(design, some, spent):
+        return None
+    return look(design, some, spent)
+
+
 def _inspections(design: Design, limit: int | None) -> Iterator[tuple[int, float | None, bool]]:
     """Runs and share of each inspection, and whether it is the last one."""
     if limit is None:
@@ -302,3 +330,8 @@ def _p_of_scale(design: Design, evidence: Record) -> float:
     if sample is None:
         return 1.0
     return ever(e_process(sample.means(), sample.dof).both)
+
+
+def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:
+    parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
+    return ", ".join(parts + [f"{name} open" for name in filters if name not in decided])

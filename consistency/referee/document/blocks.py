@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -205,6 +205,12 @@ class Chapter:
     blocks: tuple[Block, ...]
     summary: str = ""
     switches: tuple[Switch, ...] = ()
+    on_paper: tuple[Block, ...] | None = None  # in place of the blocks; without any the chapter is left out there
+
+    @property
+    def paper(self) -> tuple[Block, ...]:
+        """What the PDF shows of the chapter."""
+        return self.blocks if self.on_paper is None else self.on_paper
 
 
 @dataclass(frozen=True)
@@ -221,6 +227,13 @@ class Document:
     def parts(self) -> tuple[tuple[Block, ...], ...]:
         """Blocks of the opening, then of each chapter."""
         return (self.opening, *(chapter.blocks for chapter in self.chapters))
+
+    @property
+    def paper(self) -> tuple[Chapter, ...]:
+        """Chapters as the PDF shows them."""
+        return tuple(
+            replace(chapter, blocks=chapter.paper, on_paper=None) for chapter in self.chapters if chapter.paper
+        )
 
     @property
     def figures(self) -> tuple[Figure, ...]:

@@ -21,6 +21,11 @@ def plan_lines(planned: dict[str, Any]) -> list[str]:
     ]
     if "lost" in p:
         lines.append(f"{p['lost_runs']} runs, none of them lost, show that at most {percent(p['lost'])} of all are")
+    if "groups" in p:
+        lines.append(
+            f"{p['group_runs']} runs, {p['runs_in_group']} in each of {p['groups']} groups, find that in one group by "
+            f"itself (--by); {p['runs_in_group']} are enough where each run passes through all groups"
+        )
     lines.append(
         f"{p['one_step']} runs would do for a single chi-square test of one step, at the same rates; "
         f"--until-decided asks everything after {', '.join(map(str, p['looks']))}, ... runs and stops when it is clear"

@@ -82,7 +82,7 @@ def planned_dof(record: Record) -> int:
         return min(map(len, record.parts))
     if record.dof or record.nis_dof is None:
         return record.dof
-    return max(1, int(record.nis_dof.sum(axis=1).min()))
+    return max(1, int(np.nansum(record.nis_dof, axis=1).min()))
 
 
 def rate_shares(record: Record) -> int:

@@ -15,6 +15,7 @@ from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
+from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
 from consistency.referee.verdicts.command_settings import settings_of, skip_asked
@@ -43,6 +44,9 @@ def read(
     truth_covariance: str | Path | None = None,
     truth_errors: str | None = None,
     truth_shared: bool = False,
+    by: str | None = None,
+    by_file: str | Path | None = None,
+    bins: int | Sequence[float] | None = None,
     columns: Mapping[str, str] | None = None,
     truth_columns: Mapping[str, str] | None = None,
     world: str | None = None,
@@ -79,6 +83,11 @@ def read(
     truth_errors : how errors of the truth depend on each other: "independent", "per-run", or "common" to all runs; with
         None only what holds under any dependence is said
     truth_shared : the estimator has fused the truth
+    by : column whose values make groups, in each of which the size of the errors is judged, too: words as they are,
+        numbers in quantile bins. It was fixed before the error was: a setting, the environment, time, what had been
+        measured so far
+    by_file : table with the column and ``t`` (s, the last value at or before a step counts), ``run``, or both
+    bins : number of quantile bins of ``by`` (5), or the edges between them
     columns, truth_columns : names of columns here and in the file: ``{"x": "pos_n", "P*": "cov_*"}``
     world, body_axes, truth_world, truth_body_axes : axes of each file, a letter each: "enu" or "ned"; "flu" or "frd".
         A pose maps from its body axes to its world axes
@@ -96,7 +105,8 @@ def read(
     reading = Reading(
         true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
         motions or None, windows, align, lever_arm, split, of_truth, truth_errors,
-        truth_shared or None, columns, truth_columns, world, body_axes, truth_world, truth_body_axes,
+        truth_shared or None, by, None if by_file is None else Path(by_file), bins, columns, truth_columns, world,
+        body_axes, truth_world, truth_body_axes,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates
@@ -122,6 +132,8 @@ def judge(
     truth_covariances: ArrayLike | None = None,
     truth_errors: str | None = None,
     truth_shared: bool = False,
+    by: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    bins: int | Sequence[float] | None = None,
     **settings: Any,
 ) -> Verdict:
     """Judge a record, a file, or arrays: consistent, overconfident, conservative, undecided, ..., with reasons.
@@ -144,6 +156,9 @@ def judge(
     skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
     truth_covariances : (runs, steps, n, n), of the truth itself, beside errors
     truth_errors, truth_shared : of arrays, as for :func:`read`
+    by : (runs, steps), or (runs,), numbers or words whose groups are judged, too, as :func:`read` has them of a column;
+        ``{"n_matches": array}`` names it
+    bins : of ``by``, as for :func:`read`
     settings : ``false_alarm``, ``detect``, ``power``, ``tolerance``, ``allow``, ``lost`` of
         :class:`consistency.diagnostics.Settings`
 
@@ -167,6 +182,8 @@ def judge(
         record = read(record)
     elif not isinstance(record, Record):
         raise InputError("covariances: needed beside errors, (runs, steps, n, n); or deviations, (runs, steps, n)")
+    if by is not None or bins is not None:
+        record = with_groups(record, by, bins)
     record = record.without_first(skip_asked(skip))
     if optimal_gain:
         record = replace(record, optimal_gain=True)

@@ -82,7 +82,7 @@ def _draw_forest(axes: Axes, study: Judged, forest: Forest, labels: tuple[str, .
 def forests(study: Judged) -> tuple[Forest, ...]:
     """Covariance ratio, bias and coverage by axis; those that no filter has are left out."""
     kinds = (
-        ("ratio", "ratio (truth / stated)", 1.0, _ratio_window, True, _ratios),
+        ("ratio", "ratio (truth / stated)", 1.0, ratio_window, True, _ratios),
         ("bias", "mean error (stated sigma)", 0.0, _bias_window, False, _biases),
         ("coverage", "within 2 sigma (%)", 100.0 * TWO_SIGMA, _coverage_window, False, _coverages),
     )
@@ -123,7 +123,7 @@ def _coverages(v: Verdict) -> dict[str, Interval]:
     return {axis: (100.0 * float(share), 100.0 * float(low), 100.0 * float(high)) for axis, share, (low, high) in rows}
 
 
-def _ratio_window(intervals: list[Interval]) -> tuple[float, float]:
+def ratio_window(intervals: list[Interval]) -> tuple[float, float]:
     values = [value for value, _, _ in intervals] + [1.0]
     ends = [end for interval in intervals for end in interval if np.isfinite(end) and end > 0] + [1.0]
     return max(min(ends), min(values) / FAR) / 1.3, min(max(ends), max(values) * FAR) * 1.3

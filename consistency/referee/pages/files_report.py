@@ -13,6 +13,7 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Chapter, Document, Facts, Text
 from consistency.referee.pages import questions, verdicts
 from consistency.referee.pages.by_axis import by_axis
+from consistency.referee.pages.by_group import by_group
 from consistency.referee.pages.judged import Estimator, Judged, clock_of
 from consistency.referee.pages.origin import facts
 from consistency.referee.pages.record_figures import record_figures
@@ -30,7 +31,11 @@ def compose_files(
             f"estimator-{i}",
             name,
             name,
-            (*[Text(f"{name} is {_ended(verdict.reasons[0])}")] * several, *record_figures(named[name], verdict)),
+            (
+                *[Text(f"{name} is {_ended(verdict.reasons[0])}")] * several,
+                *record_figures(named[name], verdict),
+                *by_group(verdict),
+            ),
             _counts(named[name], verdict),
         )
         for i, (name, verdict) in enumerate(judged.items())

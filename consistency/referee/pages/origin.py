@@ -12,6 +12,7 @@ def facts(manifest: dict[str, Any]) -> tuple[tuple[str, str], ...]:
     versions = manifest.get("versions") or {}
     wall, screening = manifest.get("wall_time_s"), manifest.get("screening")
     rows = {
+        "Date": manifest.get("date"),
         "Seed": manifest.get("seed"),
         "Runs": manifest.get("runs"),
         "Scenario hash": manifest.get("scenario_hash"),

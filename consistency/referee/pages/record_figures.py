@@ -18,7 +18,7 @@ from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Figure
-from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SIGMAS, ZERO, Look, style
+from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SIGMAS, ZERO, Look, solid, style
 from consistency.referee.errors import InputError
 from consistency.referee.pages.judged import Clock, clock_of, wide
 from consistency.referee.pages.trajectory import shown_run, trajectory_panel
@@ -49,8 +49,11 @@ DERIVED = {"v": "m/s", "bg": "rad/s", "ba": "m/s^2"}  # velocities and biases, b
 OF_BOTH = "Covariances are those of estimate and truth together."
 SHOWN, OTHERS = replace(style(0), width=1.0), Look("#c0c0c0", width=0.5)
 BOUND = replace(SHOWN, dash=(4.0, 3.0), width=0.8)
+INSIDE = "#e3eef6"  # ground within 2 sigma
+LEAST_REACH = 3.0  # sigma, from 0 to the ends of an axis
 JOINT = Look("#333333", width=1.4)
 EACH = replace(style(0), size=2.0, alpha=0.7)
+WORST = replace(solid(style(1)), size=3.5)
 
 Paint = Callable[["Axes"], None]
 
@@ -63,6 +66,7 @@ class Picture:
     caption: str
     panels: tuple[Paint, ...]
     height: float = 1.3  # inches, of a row of panels
+    is_shared: bool = True  # panels have one axis of time or runs
 
     def figure(self) -> Figure:
         return Figure(self.title, self.caption, (self.draw,))
@@ -70,18 +74,21 @@ class Picture:
     def draw(self) -> Drawing:
         many = len(self.panels)
         columns = rows_of(many)
-        figure, panels = canvas(self.height * -(-many // columns), columns, many, sharex=many > 1)
+        figure, panels = canvas(self.height * -(-many // columns), columns, many, sharex=self.is_shared and many > 1)
         for number, (axes, paint) in enumerate(zip(panels, self.panels, strict=True)):
             paint(axes)
-            if number + columns < many:
+            if self.is_shared and number + columns < many:
                 axes.set_xlabel("")
         return add_legend(figure)
 
 
 def record_figures(record: Record, verdict: Verdict) -> tuple[Figure, ...]:
-    """Errors with their bounds, NEES, trajectory, coverage, and innovations; those that the record has."""
+    """NEES, errors over sigma, the worst run, errors, trajectory, coverage, innovations; those that the record has."""
     both = of_both(record)
-    pictures = (*_pictures(both, verdict), _innovations(both, verdict))
+    pictures = (
+        _nees(both, verdict), _errors_over_sigma(both), _worst_run(both), _errors(both), _trajectory(both),
+        _coverage(both), _innovations(both, verdict),
+    )  # fmt: skip
     note = f" {OF_BOTH}" if record.truth_covariance is not None else ""
     return tuple(
         replace(picture, caption=picture.caption + note).figure() for picture in pictures if picture is not None
@@ -96,7 +103,10 @@ def overview(record: Record, verdict: Verdict | None = None) -> Callable[[], Dra
     InputError
         The record has neither errors nor NEES.
     """
-    pictures = [picture for picture in _pictures(of_both(record), verdict) if picture is not None]
+    both = of_both(record)
+    nees = None if verdict is None else _nees(both, verdict)
+    shown = (_errors(both), nees, _trajectory(both), _coverage(both))
+    pictures = [picture for picture in shown if picture is not None]
     if not pictures:
         raise InputError(f"{record.name}: has neither errors nor NEES to draw; give --truth, or truth= in Python")
     paints = [paint for picture in pictures for paint in picture.panels]
@@ -111,11 +121,6 @@ def overview(record: Record, verdict: Verdict | None = None) -> Callable[[], Dra
         return figure
 
     return draw
-
-
-def _pictures(record: Record, verdict: Verdict | None) -> tuple[Picture | None, ...]:
-    nees = None if verdict is None else _nees(record, verdict)
-    return _errors(record), nees, _trajectory(record), _coverage(record)
 
 
 def has_one_step(record: Record) -> bool:
@@ -207,16 +212,60 @@ def _error_curves(record: Record, clock: Clock, row: int, of: Errors) -> Paint:
             label = ""
         axes.axhline(0.0, **stroke(ZERO))
         draw_bounded(axes, clock.values, of.error[row], of.bound[row], f"run {record.run_numbers[row]}")
-        axes.set_ylabel(of.label)
+        settled = slice(len(record.t) // 10, None)  # at the start errors and bounds may be larger by far
+        reach = 1.1 * max(_most(of.error[:, settled]), _most(of.bound[row, settled]))
+        axes.set(ylabel=of.label, ylim=(-reach, reach) if reach > 0.0 else None)
         clock.name(axes)
 
     return paint
 
 
+def _errors_over_sigma(record: Record) -> Picture | None:
+    """Error of each component over the standard deviation that is stated for it."""
+    if record.error is None or record.covariance is None or has_one_step(record):
+        return None
+    clock, row = clock_of(record.t), shown_run(record)
+    caption = (
+        f"Error over its stated standard deviation, of run {record.run_numbers[row]} and others. Shaded: 2 sigma, "
+        f"inside which honest errors stay about 95 % of the time.{clock.note}"
+    )
+    paints = tuple(_scaled_curves(record, clock, row, i) for i in range(min(len(record.axes), MOST_PANELS)))
+    return Picture("Errors over their stated sigma", caption, paints)
+
+
+def _scaled_curves(record: Record, clock: Clock, row: int, axis: int) -> Paint:
+    assert record.error is not None
+    assert record.covariance is not None
+    sigma = np.sqrt(np.maximum(record.covariance[:, :, axis, axis], 0.0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scaled = record.error[..., axis] / sigma
+    others = np.linspace(0, len(scaled) - 1, MOST_RUNS + 1).astype(int)
+
+    def paint(axes: Axes) -> None:
+        axes.axhspan(-SIGMAS, SIGMAS, color=INSIDE, linewidth=0, zorder=0.4, label="2 sigma")
+        label = "other runs"
+        for other in dict.fromkeys(others[others != row]):
+            curve(axes, clock.values, scaled[other], OTHERS, label)
+            label = ""
+        axes.axhline(0.0, **stroke(ZERO))
+        curve(axes, clock.values, scaled[row], SHOWN, f"run {record.run_numbers[row]}")
+        reach = max(LEAST_REACH, 1.1 * _most(scaled))
+        axes.set(ylabel=f"{record.axes[axis]} / sigma", ylim=(-reach, reach))
+        clock.name(axes)
+
+    return paint
+
+
+def _most(values: Array) -> float:
+    """The largest absolute value but for one in 200."""
+    known = np.abs(values[np.isfinite(values)])
+    return float(np.quantile(known, 0.995)) if len(known) else 0.0
+
+
 def draw_bounded(axes: Axes, x: Array, error: Array, bound: Array, label: str) -> None:
     """An error (T,) with dashed lines at plus and minus its bound, which is shaded."""
     ends = np.column_stack([-bound, bound])
-    band(axes, x, ends, colour="#e3eef6")
+    band(axes, x, ends, colour=INSIDE)
     edges(axes, x, ends, BOUND, "2-sigma bounds")
     curve(axes, x, error, SHOWN, label)
 
@@ -268,6 +317,45 @@ def _nees(record: Record, verdict: Verdict) -> Picture | None:
         f"of a right estimator lies with 95 %, which is not judged.{clock.note}"
     )
     return Picture("NEES", caption, (paint,), height=1.9)
+
+
+def _worst_run(record: Record) -> Picture | None:
+    """Mean NEES of each run, and the NEES over time of the run with the largest."""
+    nees = record.nees
+    if nees is None or record.parts or record.independent or has_one_step(record):
+        return None
+    there = np.isfinite(nees)
+    if len(nees) < 2 or not there.any():
+        return None
+    counts = np.maximum(there.sum(axis=1), 1)
+    means = np.where(there.any(axis=1), np.where(there, nees, 0.0).sum(axis=1) / counts, np.nan)
+    worst, clock = int(np.nanargmax(means)), clock_of(record.t)
+    number = record.run_numbers[worst]
+
+    def paint_runs(axes: Axes) -> None:
+        axes.axhline(float(record.dof), **stroke(EXPECTED), label="expected")
+        points(axes, record.run_numbers.astype(float), means, EACH, "mean of a run")
+        points(axes, np.array([float(number)]), means[[worst]], WORST, f"run {number}")
+        axes.set_ylabel("mean NEES")
+        _span_runs(axes, record)
+        if wide([means]):
+            log_axis(axes, "y")
+
+    def paint_worst(axes: Axes) -> None:
+        ends = [float(distributions.chi2.ppf(q, record.dof)) for q in (0.025, 0.975)]
+        axes.axhspan(*ends, color=BAND, linewidth=0, zorder=0.5)
+        axes.axhline(float(record.dof), **stroke(EXPECTED))
+        curve(axes, clock.values, nees[worst], WORST, "")
+        axes.set_ylabel(f"NEES of run {number}")
+        clock.name(axes)
+        if wide([nees[worst]]):
+            log_axis(axes, "y")
+
+    caption = (
+        f"Mean NEES of each run, and the NEES of run {number}, which has the largest; {record.dof} is expected in the "
+        f"mean (lines). Shaded: where 95 % of the steps of a right estimator lie.{clock.note}"
+    )
+    return Picture("Which run, and when", caption, (paint_runs, paint_worst), height=1.6, is_shared=False)
 
 
 def _single_nees(record: Record) -> Picture | None:

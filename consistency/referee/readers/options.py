@@ -13,6 +13,7 @@ from typing import Any
 from consistency.referee.errors import InputError
 
 COLUMNS = "columns"  # covariance of the truth: of its own file
+GROUPED = ("by", "by_file", "bins")  # options
 MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
 
 
@@ -44,6 +45,13 @@ def _columns(text: str) -> dict[str, str]:
     if uneven := ["=".join(pair) for pair in pairs if ("*" in pair[0]) != ("*" in pair[1])]:
         raise InputError(f"'{uneven[0]}': a * stands in both names or in none")
     return dict(zip(names, (old.strip() for _, old in pairs), strict=True))
+
+
+def _bins(text: str) -> int | list[float]:
+    """A number of bins, or edges, of which a single one ends with a comma; NaN where one is none."""
+    if text.strip().isdecimal():
+        return int(text)
+    return _lengths(text.strip().removesuffix(","))
 
 
 def _option(
@@ -99,6 +107,11 @@ class Reading:
         "How errors of the truth depend on each other: independent, per-run or common to all runs."
     )
     truth_shared: bool | None = _option("The estimator has fused the truth.", flag="--truth-shared/")
+    by: str | None = _option("Judge groups by this column, too: bins of numbers, or words.", "COLUMN")
+    by_file: Path | None = _option("Table with that column and t, run or both.")
+    bins: int | Sequence[float] | None = _option(
+        "Quantile bins of --by [5], or edges between them (40, is one edge).", "N|A,B,C", _bins
+    )
     columns: Mapping[str, str] | None = _option(
         "What columns of the estimates are called: x=pos_n,y=pos_e; P*=cov_* for all that begin alike.",
         "NAME=COLUMN,…",

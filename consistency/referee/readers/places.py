@@ -37,9 +37,13 @@ def exact(value: float) -> str:
     return repr(float(value)).removesuffix(".0")
 
 
-def cut_note(path: Path, line: int) -> str:
+class CutNote(str):
+    """A note that the last line of a text is left out, which a reader of finished files may refuse."""
+
+
+def cut_note(path: Path, line: int) -> CutNote:
     """A note that the last line of a text is left out."""
-    return f"{path}: the last line, {line}, has no end and is left out; it seems to be cut short"
+    return CutNote(f"{path}: the last line, {line}, has no end and is left out; it seems to be cut short")
 
 
 def one_of_each_kind(notes: Iterable[str]) -> tuple[str, ...]:

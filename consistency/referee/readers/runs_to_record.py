@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from consistency.referee.diagnostics.records.large_arrays import of_runs
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.record import Record, arrays_of
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, asymmetric, classify
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
@@ -19,7 +19,7 @@ from consistency.referee.readers.places import Places, listed, refuse
 from consistency.referee.types import Array, Failure, Indices
 
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
-ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path")  # of a track, as in a record
+ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path", "by")  # of a track, as in a record
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,7 @@ class Track:
     t: Array | None = None  # (k,), s; of windows, of their beginnings
     truth_covariance: Array | None = None  # (k, n, n), of the truth itself; NaN where it has none
     path: Array | None = None  # (k, 2, 2 or 3), m, true and estimated positions
+    by: Array | None = None  # (k,), values of the column that makes groups
 
     def part(self, index: Sequence[int]) -> Track:
         assert self.error is not None
@@ -112,6 +113,21 @@ def assemble(
         dof=len(axes) if arrays["error"] is not None else 0, axes=axes, failures=tuple(failures),
         convention=convention, notes=tuple(notes), times=grid("t"), **arrays,
     )  # fmt: skip
+
+
+def with_failed_runs(record: Record, failed: Mapping[int, str]) -> Record:
+    """The record with runs that left no estimates: NaN throughout, and failed in step 1 for the reason given by run."""
+    if not failed:
+        return record
+    numbers = np.append(record.run_numbers, list(failed))
+    order = np.argsort(numbers)
+    arrays: dict[str, Any] = {}
+    for name, array in arrays_of(record).items():
+        nothing = np.full((len(failed), *array.shape[1:]), np.nan)
+        arrays[name] = np.concatenate([array, nothing])[order]
+    failures = [*record.failures, *(Failure(record.name, run, 1, reason) for run, reason in failed.items())]
+    failures.sort(key=lambda failure: failure.run)
+    return replace(record, **arrays, runs=numbers[order], failures=tuple(failures))
 
 
 def _require_different(file: str, tracks: Sequence[Track]) -> None:

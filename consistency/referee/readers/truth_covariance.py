@@ -18,6 +18,7 @@ REFUSED = {
     "relative": ": neighbouring windows share the truth at their common end, so that its errors are in both",
     "motions": ": a motion has the errors of the truth at both ends, whose cross-covariance no file states",
     "split": ": pieces of one log share the truth's errors, in a way that no log shows",
+    "by": ": what the truth's errors have in common with a group is not known",
     "align": ": a frame that is fitted to an uncertain truth takes an unknown share of the truth's errors",
 }
 

@@ -172,6 +172,7 @@ class Poses:
     true_clock: Array | None = None  # (M,), s
     nis: Array | None = None  # (N,)
     nis_dof: Array | None = None  # (N,)
+    by: Array | None = None  # (N,), cells of the column that makes groups, or their values
     open_end: str = ""  # the last row stands in a line without an end: what to note if it is cut short
 
     def known(self, shift: float = 0.0) -> Known:
@@ -241,7 +242,7 @@ class Poses:
         return replace(
             self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
             covariance=self.covariance[rows], stated=self.stated[rows], cross=at(self.cross, rows),
-            clock=at(self.clock, rows), nis=at(self.nis, rows), nis_dof=at(self.nis_dof, rows),
+            clock=at(self.clock, rows), nis=at(self.nis, rows), nis_dof=at(self.nis_dof, rows), by=at(self.by, rows),
         )  # fmt: skip
 
     def beside(self, samples: Indices) -> Poses:
@@ -317,6 +318,8 @@ class Estimator:
     position: int = 0  # leading components of an estimate that are a position in m, to be drawn
     t: Array | None = None  # (steps,), s, of an archive, whose poses are numbered by its steps from 0 on
     innovations_alone: bool = False  # there is no truth
+    failed: Mapping[int, str] = field(default_factory=dict)  # runs without estimates, and why they have none
+    trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 
     @property
     def said(self) -> str:

@@ -33,8 +33,8 @@ def render_pdf(document: blocks.Document, pictures: Pictures | None = None) -> b
     with tempfile.TemporaryDirectory(prefix="consistency-report-") as name:
         folder = Path(name)
         paper = Paper(folder, paint(document) if pictures is None else pictures)
-        parts = ("title", "answer", "opening", "chapters")
-        data = {part: paper.plain(getattr(document, part)) for part in parts}
+        data = {part: paper.plain(getattr(document, part)) for part in ("title", "answer", "opening")}
+        data["chapters"] = paper.plain(document.paper)
         (folder / "data.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8")
         template = resources.files("consistency.referee.show").joinpath("templates").joinpath(TEMPLATE)
         (folder / TEMPLATE).write_text(template.read_text(encoding="utf-8"), encoding="utf-8")

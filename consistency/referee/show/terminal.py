@@ -16,7 +16,7 @@ COLOURS = {
     "consistent": "green", "overconfident": "red", "conservative": "yellow", "biased": "red", "heavy-tailed": "red",
     "inconsistent": "red", "failed": "red", "undecided": "yellow",
     "reproduced": "green", "not reproduced": "yellow", "refuted": "red", "holds": "green",
-    "does not hold": "yellow",
+    "not shown": "yellow",
 }  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,7 @@ def manifest_of(kind: str = "results", **fields: Any) -> dict[str, Any]:
     return {
         "schema_version": SCHEMA_VERSION,
         "kind": kind,
+        "date": datetime.now(timezone.utc).date().isoformat(),
         "versions": dict(_versions()),
         "machines": [this_machine()],
         "command": shlex.join(["consistency" if program == "__main__.py" else program, *sys.argv[1:]]),

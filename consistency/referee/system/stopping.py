@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 Result = TypeVar("Result")
 IS_LINUX = sys.platform == "linux"
+AT_STOP: list[Callable[[], None]] = []  # what is to be ended before a signal ends this process
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -40,6 +40,8 @@ class Baseline:
     failures: dict[str, int]
     axes: dict[str, tuple[str, ...]]  # names of the components of each filter's error
     skip: str | None = None  # first steps that were left out: 20, 2s
+    # of runs of a program: what each was made of, its seed or recorded file and its truth, by run
+    trials: Mapping[int, str] = field(default_factory=dict)
 
     def of_the_trials_of(self, other: Baseline) -> bool:
         """Whether both are of the same trials, so that runs of one number belong together."""
@@ -65,6 +67,7 @@ def baseline(
         A filter has no NEES, or nothing of it is left.
     """
     first, filters, failures, axes = skip_asked(skip), {}, {}, {}
+    of_runs: dict[int, str] = {}
     source = source_of(of)
     if not source.has_truth:
         raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
@@ -72,6 +75,7 @@ def baseline(
         record = source.record(each).without_first(first)
         if record.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
+        of_runs |= record.trials
         failures[each], axes[each] = len(record.failures), tuple(record.axes)
         own = record
         if not record.unshown:
@@ -81,7 +85,7 @@ def baseline(
     trials = source.trials
     if truth is not None:
         trials = (_digest(truth), None)
-    return Baseline(name, source.scenario, trials, filters, failures, axes, _option(first))
+    return Baseline(name, source.scenario, trials, filters, failures, axes, _option(first), of_runs)
 
 
 def _option(skip: Skip | None) -> str | None:
@@ -119,6 +123,7 @@ def write_baseline(base: Baseline, path: Path, overwrite: bool = False) -> None:
         scenario=base.scenario,
         origin=list(base.origin),
         skip=base.skip,
+        trials={str(run): trial for run, trial in base.trials.items()},
         filters={
             name: {key: plain(value) for key, value in vars(s).items()}
             | {"failures": base.failures[name], "axes": list(base.axes[name])}
@@ -164,11 +169,12 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
             raise ValueError("key 'origin': not a list of two")
         if not isinstance(data["filters"], dict):
             raise ValueError("key 'filters': not a table")
+        trials = _trials_of(data.get("trials", {}))  # files written before lack it
         rows = {name: _filter_of(row, f"filters.{name}") for name, row in data["filters"].items()}
     filters, failures, axes = {}, {}, {}
     for name, row in rows.items():
         filters[name], failures[name], axes[name] = row
-    base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, axes, left_out)
+    base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, axes, left_out, trials)
     return require_skip(base, skip)
 
 
@@ -213,6 +219,13 @@ def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]
         axes = list(numbered_axes(len(axes)))
     failures = _whole(table["failures"], f"{place}.failures", 0)
     return RunSummary(np.array(runs, np.int64), dof, *parts), failures, tuple(axes)
+
+
+def _trials_of(table: Any) -> dict[int, str]:
+    """What each run was made of, by run."""
+    if not isinstance(table, dict) or not all(isinstance(trial, str) for trial in table.values()):
+        raise ValueError("key 'trials': not a table of texts")
+    return {int(run): trial for run, trial in table.items()}
 
 
 def _known(table: Any, place: str, keys: Sequence[str], optional: Sequence[str] = ()) -> None:

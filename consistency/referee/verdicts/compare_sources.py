@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, compare
+from consistency.referee.diagnostics.comparison import FEWEST, Comparison, FailedRuns, compare
 from consistency.referee.document.blocks import Block, Document, Text
 from consistency.referee.document.compared_filters import comparison_table
 from consistency.referee.errors import InputError
@@ -24,6 +24,7 @@ class Compared:
     comparison: Comparison
     failures: FailedRuns
     note: str = ""
+    same_runs: bool = True  # failures are of the same trials
 
     @property
     def sentence(self) -> str:
@@ -67,7 +68,9 @@ class Compared:
 
     @property
     def worse(self) -> bool:
-        return self.comparison.worse or (self.comparison.paired and self.failures.a > self.failures.b)
+        if self.comparison.worse or not (self.comparison.paired and self.same_runs):
+            return self.comparison.worse
+        return self.failures.a > self.failures.b
 
 
 def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float = FALSE_ALARM) -> list[Compared]:
@@ -90,12 +93,34 @@ def compare_with(
     if not pairs:
         raise InputError(f"{new.name} and {old.name} have no filter in common; name one with --filter")
     same, note = new.of_the_trials_of(old), ""
-    if not same:
+    if new.trials and old.trials:
+        old, common = _numbered_alike(new, old)
+        same, note = common >= FEWEST, f"{common} of {len(new.trials)} runs have the same seed and truth in both"
+    elif not same:
         which = "Scenario or seed"
         if new.scenario is None and old.scenario is None:
             which = "Log or truth"
         note = f"{which} differ: the trials are not the same"
-    return [replace(_compared(new, a, old, b, same, false_alarm), note=note) for a, b in pairs]
+    found = []
+    for a, b in pairs:
+        one = _compared(new, a, old, b, same, false_alarm)
+        as_many = len(new.filters[a].runs) == len(old.filters[b].runs)
+        found.append(replace(one, note=note, same_runs=as_many or not new.trials))
+    return found
+
+
+def _numbered_alike(new: Baseline, old: Baseline) -> tuple[Baseline, int]:
+    """The old runs of a program with the numbers of the new ones of the same seed and truth, and how many these are.
+
+    Runs without a counterpart have negative numbers.
+    """
+    number = {trial: run for run, trial in new.trials.items()}
+    renamed = {run: number.get(trial, -1 - run) for run, trial in old.trials.items()}
+    filters = {
+        name: replace(rows, runs=np.array([renamed.get(int(run), -1 - int(run)) for run in rows.runs], np.int64))
+        for name, rows in old.filters.items()
+    }
+    return replace(old, filters=filters), sum(run >= 0 for run in renamed.values())
 
 
 def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, false_alarm: float) -> Compared:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from consistency.referee.diagnostics.judge_record import judge
@@ -12,6 +13,7 @@ from consistency.referee.diagnostics.records.skipping import Skip
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
+from consistency.referee.readers.pipeline.kinds import is_program_runs
 from consistency.referee.verdicts.command_settings import settings_of, skip_asked
 
 if TYPE_CHECKING:
@@ -43,6 +45,17 @@ def source_of(of: Source | Sequence[Record]) -> Source:
         return named[name]
 
     return Source(list(named), record)
+
+
+def files_source(path: Path, records: Sequence[Record]) -> Source:
+    """Return records of files as a source, with the looks of a program's runs that went on until decided."""
+    source = source_of(records)
+    if not is_program_runs(path):
+        return source
+    from consistency.referee.readers.pipeline.program_runs import study_in
+
+    study = study_in(path)
+    return replace(source, design=lambda: study.design, unfinished=study.unfinished)
 
 
 def judge_all(

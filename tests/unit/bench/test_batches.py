@@ -6,12 +6,10 @@ import pickle
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +32,7 @@ RUNS = 40
 HERE = {"cpu": "abacus", "blas": "beads"}
 
 
-def result(runs: Sequence[int], **changes: Any) -> BatchResult:
+def result(runs, **changes):
     """Of trials that leave nothing but their number."""
     outcomes = [RunOutcome(run, {}, None, ()) for run in runs]
     return replace(BatchResult(pickle.dumps(outcomes), "host", HERE, remote_batch.versions_here()), **changes)
@@ -52,23 +50,23 @@ class Fake(Executor):
 
     at_a_time = 4
 
-    def __init__(self, killers: Sequence[int] = (), most: int = 1000, **changes: Any) -> None:
+    def __init__(self, killers=(), most=1000, **changes):
         self.killers, self.most, self.changes = set(killers), most, changes
         self.sent: list[tuple[int, ...]] = []
         self.seconds: list[float] = []
         self.waiting: list[tuple[tuple[int, ...], Future[BatchResult]]] = []
         self.together: list[int] = []  # batches that wait, each time that somebody waits for them
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
+    def submit(self, function, /, *arguments, **_):
         assert function is do_batch
         _, runs, seconds, _ = arguments
-        future: Future[BatchResult] = Future()
+        future = Future()
         self.sent.append(runs)
         self.seconds.append(seconds)
         self.waiting.append((runs, future))
         return future
 
-    def work(self) -> None:
+    def work(self):
         self.together.append(len(self.waiting))
         runs, future = self.waiting.pop(0)
         if not self.killers & {*runs}:
@@ -78,11 +76,11 @@ class Fake(Executor):
         if self.waiting:
             self.waiting.pop(0)[1].set_exception(Killed())
 
-    def answer(self, runs: Sequence[int]) -> BatchResult:
+    def answer(self, runs):
         return result(runs, **self.changes)
 
-    def outcomes(self, work: TrialWork) -> Generator[RunOutcome, None, None]:
-        def next_of(finished: Any) -> Any:
+    def outcomes(self, work):
+        def next_of(finished):
             if finished.empty():
                 self.work()
             return finished.get(timeout=5.0)
@@ -93,18 +91,18 @@ class Fake(Executor):
 
 
 @pytest.fixture(scope="module")
-def work(xyz: cs.Scenario) -> TrialWork:
+def work(xyz):
     return TrialWork(Simulated(xyz, 0), Isolation([Still("still")], xyz.belief))
 
 
-def done(executor: Fake, work: TrialWork) -> dict[int, RunOutcome]:
+def done(executor, work):
     """What came of the runs; each came once."""
     outcomes = list(executor.outcomes(work))
     assert sorted(outcome.run for outcome in outcomes) == list(range(RUNS))
     return {outcome.run: outcome for outcome in outcomes}
 
 
-def test_runs_are_sent_in_equal_shares(work: TrialWork) -> None:
+def test_runs_are_sent_in_equal_shares(work):
     executor = Fake()
     outcomes = done(executor, work)
     assert sum(executor.sent, ()) == tuple(range(RUNS))
@@ -112,7 +110,7 @@ def test_runs_are_sent_in_equal_shares(work: TrialWork) -> None:
     assert all(outcome.machine == HERE and not outcome.failures for outcome in outcomes.values())
 
 
-def test_an_executor_says_how_long_a_batch_takes_and_how_many_it_has(work: TrialWork) -> None:
+def test_an_executor_says_how_long_a_batch_takes_and_how_many_it_has(work):
     plain, own = Fake(), Fake()
     own.at_a_time, own.batch_seconds = RUNS, 7.0  # type: ignore[attr-defined]
     done(plain, work)
@@ -122,14 +120,14 @@ def test_an_executor_says_how_long_a_batch_takes_and_how_many_it_has(work: Trial
     assert len(own.sent) == RUNS
 
 
-def test_what_a_batch_leaves_is_done_next(work: TrialWork) -> None:
+def test_what_a_batch_leaves_is_done_next(work):
     executor = Fake(most=2)
     done(executor, work)
     assert executor.sent[executor.at_a_time][0] == 2
 
 
 @pytest.mark.parametrize("killers", [(0,), (17, 18), (3, 39), tuple(range(RUNS))])
-def test_a_run_that_kills_has_failed_and_no_other(work: TrialWork, killers: tuple[int, ...]) -> None:
+def test_a_run_that_kills_has_failed_and_no_other(work, killers):
     executor = Fake(killers)
     outcomes = done(executor, work)
     assert {run for run, outcome in outcomes.items() if outcome.failures} == set(killers)
@@ -139,7 +137,7 @@ def test_a_run_that_kills_has_failed_and_no_other(work: TrialWork, killers: tupl
         assert Counter(executor.sent)[(run,)] >= 2, "by itself, and alone"
 
 
-def test_a_doubtful_run_is_alone(work: TrialWork) -> None:
+def test_a_doubtful_run_is_alone(work):
     executor = Fake([20])
     outcomes = done(executor, work)
     assert max(executor.together) == executor.at_a_time
@@ -149,9 +147,9 @@ def test_a_doubtful_run_is_alone(work: TrialWork) -> None:
     assert executor.together[-len(doubtful) :] == [1] * len(doubtful)
 
 
-def test_bad_input_keeps_what_is_finished(work: TrialWork) -> None:
+def test_bad_input_keeps_what_is_finished(work):
     class Refusing(Fake):
-        def answer(self, runs: Sequence[int]) -> BatchResult:
+        def answer(self, runs):
             kept = [run for run in runs if run < 3]
             return result(kept, refusal="" if len(kept) == len(runs) else "nothing in view")
 
@@ -162,7 +160,7 @@ def test_bad_input_keeps_what_is_finished(work: TrialWork) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "raised", "sentence"),
+    "error, raised, sentence",
     [
         (BrokenExecutor("no more"), cs.InputError, r"^the executor has ended \(BrokenExecutor: no more\)$"),
         (CancelledError(), cs.InputError, r"^the executor has ended \(CancelledError"),
@@ -170,9 +168,9 @@ def test_bad_input_keeps_what_is_finished(work: TrialWork) -> None:
         (cs.InputError("Slurm does not take the jobs"), cs.InputError, "^Slurm does not take the jobs$"),
     ],
 )
-def test_an_executor_that_cannot_go_on(work: TrialWork, error: Exception, raised: Any, sentence: str) -> None:
+def test_an_executor_that_cannot_go_on(work, error, raised, sentence):
     class Ends(Fake):
-        def work(self) -> None:
+        def work(self):
             self.waiting.pop()[1].set_exception(error)
 
     with pytest.raises(raised, match=sentence) as told:
@@ -181,7 +179,7 @@ def test_an_executor_that_cannot_go_on(work: TrialWork, error: Exception, raised
         assert isinstance(told.value.__cause__, OSError)
 
 
-def test_what_is_not_done_is_cancelled(work: TrialWork) -> None:
+def test_what_is_not_done_is_cancelled(work):
     executor = Fake()
     outcomes = executor.outcomes(work)
     assert next(outcomes).run == 0
@@ -191,20 +189,18 @@ def test_what_is_not_done_is_cancelled(work: TrialWork) -> None:
 
 
 @pytest.mark.parametrize("name", ["numpy", "filter-consistency", "Python"])
-def test_other_versions_are_refused(work: TrialWork, name: str) -> None:
+def test_other_versions_are_refused(work, name):
     older = Fake(versions=remote_batch.versions_here() | {name: "0.1"})
     with pytest.raises(cs.InputError, match=rf"the worker on host has {name} 0.1, here it is .*; install the same"):
         done(older, work)
 
 
-def test_all_that_the_bits_depend_on_is_compared() -> None:
+def test_all_that_the_bits_depend_on_is_compared():
     assert set(remote_batch.versions_here()) == {"filter-consistency", "Python", "numpy", "scipy", "numba"}
 
 
-def test_sources_that_the_bits_depend_on_count_and_others_do_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def own() -> str:
+def test_sources_that_the_bits_depend_on_count_and_others_do_not(tmp_path, monkeypatch):
+    def own():
         return str(remote_batch.versions_here.__wrapped__()["filter-consistency"])
 
     assert Path(cs.__file__).parent == remote_batch.PACKAGE
@@ -222,9 +218,9 @@ def test_sources_that_the_bits_depend_on_count_and_others_do_not(
     assert own() == seen[-1]
 
 
-def test_differing_machines_are_said_once(work: TrialWork, capsys: pytest.CaptureFixture[str]) -> None:
+def test_differing_machines_are_said_once(work, capsys):
     class Mixed(Fake):
-        def answer(self, runs: Sequence[int]) -> BatchResult:
+        def answer(self, runs):
             return result(runs, machine={"cpu": f"cpu{runs[0] % 2}", "blas": "b"})
 
     mixed = Mixed()
@@ -239,11 +235,11 @@ def test_differing_machines_are_said_once(work: TrialWork, capsys: pytest.Captur
 # --- the far side ---------------------------------------------------------------------------------
 
 
-def sent(work: TrialWork) -> bytes:
+def sent(work):
     return bytes(pickle.dumps(work))
 
 
-def test_a_worker_does_what_local_threads_do(linear: cs.Scenario) -> None:
+def test_a_worker_does_what_local_threads_do(linear):
     work = TrialWork(Simulated(linear, 5), Isolation([Still("still"), cs.get_filter("kf")], linear.belief))
     expected = {outcome.run: outcome for outcome in LocalThreads(1).outcomes(work, range(4))}
     whole, part = do_batch(sent(work), [3, 1], 1000.0, 0), do_batch(sent(work), [0, 2], 0.0, 1)
@@ -257,17 +253,15 @@ def test_a_worker_does_what_local_threads_do(linear: cs.Scenario) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "refusal", "fault"),
+    "error, refusal, fault",
     [
         (cs.InputError("no"), "no", ""),
         (OSError("no such luck"), "", "OSError: no such luck"),
         (ModuleNotFoundError("No module named 'mine'"), "a worker cannot load the work (No module named 'mine')", ""),
     ],
 )
-def test_an_error_ends_a_batch(
-    linear: cs.Scenario, monkeypatch: pytest.MonkeyPatch, error: Exception, refusal: str, fault: str
-) -> None:
-    def refuse(_: TrialWork, run: int) -> RunOutcome:
+def test_an_error_ends_a_batch(linear, monkeypatch, error, refusal, fault):
+    def refuse(_, run):
         if run == 2:
             raise error
         return RunOutcome(run, {}, None, ())
@@ -283,7 +277,7 @@ def test_an_error_ends_a_batch(
         list(ExecutorWorkers(executor).outcomes(work, [2]))
 
 
-def test_a_failed_run_has_truth_and_a_reason_for_each_filter(work: TrialWork) -> None:
+def test_a_failed_run_has_truth_and_a_reason_for_each_filter(work):
     outcome = failed(work, 7, "lost")
     assert outcome.run == 7
     assert [(f.filter, f.run, f.step, f.reason) for f in outcome.failures] == [("still", 7, 1, "lost")]
@@ -291,7 +285,7 @@ def test_a_failed_run_has_truth_and_a_reason_for_each_filter(work: TrialWork) ->
     assert outcome.truth is not None
 
 
-def test_of_a_log_only_the_trials_of_a_batch_are_sent(linear: cs.Scenario) -> None:
+def test_of_a_log_only_the_trials_of_a_batch_are_sent(linear):
     trials = {run: cs.simulate(linear, run) for run in (3, 5, 8)}
     isolation = Isolation([cs.get_filter("kf")], linear.belief)
     recorded, drawn = TrialWork(Recorded(trials), isolation), TrialWork(Simulated(linear, 0), isolation)
@@ -304,7 +298,7 @@ def test_of_a_log_only_the_trials_of_a_batch_are_sent(linear: cs.Scenario) -> No
 # --- executors of others --------------------------------------------------------------------------
 
 
-def test_any_executor_gives_the_tables_of_threads(linear: cs.Scenario) -> None:
+def test_any_executor_gives_the_tables_of_threads(linear):
     local = cs.run_trials(linear, ["kf", Still("still")], 8, jobs=2)
     with ThreadPoolExecutor(2) as threads, ProcessPoolExecutor(1, get_context("spawn")) as processes:
         for executor in (threads, processes):
@@ -313,7 +307,7 @@ def test_any_executor_gives_the_tables_of_threads(linear: cs.Scenario) -> None:
                 assert getattr(done, name).equals(getattr(local, name)), name
 
 
-def test_a_pool_that_breaks_keeps_what_is_finished(linear: cs.Scenario, tmp_path: Path) -> None:
+def test_a_pool_that_breaks_keeps_what_is_finished(linear, tmp_path):
     import os
 
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
@@ -325,9 +319,7 @@ def test_a_pool_that_breaks_keeps_what_is_finished(linear: cs.Scenario, tmp_path
         list(ExecutorWorkers(executor).outcomes(work, [1]))
 
 
-def test_the_manifest_has_the_machines_that_did_runs(
-    xyz: cs.Scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_manifest_has_the_machines_that_did_runs(xyz, tmp_path, capsys, monkeypatch):
     here, out, still = this_machine(), tmp_path / "out", [Still("still")]
     assert here != HERE
     with ThreadPoolExecutor(1) as executor:
@@ -346,7 +338,7 @@ def test_the_manifest_has_the_machines_that_did_runs(
 # --- the choice -----------------------------------------------------------------------------------
 
 
-def test_a_backend_is_chosen_by_name() -> None:
+def test_a_backend_is_chosen_by_name():
     with executor_for("local", 3) as executor:
         assert executor is None
     for options, sentence in (
@@ -363,7 +355,7 @@ def test_a_backend_is_chosen_by_name() -> None:
             pass
 
 
-def test_without_the_extra_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.delitem(sys.modules, "consistency.bench.runs.backends.dask", raising=False)
     with pytest.raises(cs.InputError, match="needs distributed: pip install "), executor_for("dask"):

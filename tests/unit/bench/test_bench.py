@@ -1,10 +1,7 @@
 """The parts of ``make bench``, on tiny sizes; and what it asserts can fail."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import bench
@@ -35,17 +32,17 @@ TINY = bench.Effort(
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_blas_thread() -> Iterator[None]:
+def one_blas_thread():
     with threadpool_limits(1):
         yield
 
 
 @pytest.fixture(scope="module")
-def case() -> Case:
+def case():
     return steady(12)
 
 
-def test_every_step_sees_exactly_twelve_known_landmarks(case: Case) -> None:
+def test_every_step_sees_exactly_twelve_known_landmarks(case):
     counts = np.diff(case.trial.first)
     assert counts[0] == 57
     assert set(counts[1:]) == {12}
@@ -54,7 +51,7 @@ def test_every_step_sees_exactly_twelve_known_landmarks(case: Case) -> None:
     assert set(case.trial.landmark[case.trial.first[1] :]) == set(range(57)), "all in turn"
 
 
-def test_a_timed_filter_does_what_filters_do() -> None:
+def test_a_timed_filter_does_what_filters_do():
     """The trials are no nonsense: small errors, NIS as it should be (36 degrees of freedom in 200 steps)."""
     case = steady(200)
     for name in ("ekf-uvd", "ukf-uvd"):
@@ -64,7 +61,7 @@ def test_a_timed_filter_does_what_filters_do() -> None:
 
 
 @pytest.mark.parametrize("stride", [1, 3])
-def test_a_growing_map_has_a_constant_number_in_view(stride: int) -> None:
+def test_a_growing_map_has_a_constant_number_in_view(stride):
     trial = growing(20, stride).trial
     assert set(np.diff(trial.first)) == {12}
     assert set(trial.landmark) == set(range(20))
@@ -72,19 +69,19 @@ def test_a_growing_map_has_a_constant_number_in_view(stride: int) -> None:
     assert set(np.diff(grown(20, 4).trial.first)) == {20, 12}
 
 
-def test_the_head_of_a_case_is_its_first_steps(case: Case) -> None:
+def test_the_head_of_a_case_is_its_first_steps(case):
     assert np.array_equal(case.head(5).run("ekf-uvd").pose, case.run("ekf-uvd").pose[:5])
 
 
-def test_a_failed_run_is_no_measurement(case: Case) -> None:
+def test_a_failed_run_is_no_measurement(case):
     trial = case.trial
     broken = cs.Trial(0, trial.start, trial.controls, trial.first, trial.landmark, trial.z * np.nan, 57)
     with pytest.raises(RuntimeError, match="ekf-uvd failed in step 1"):
         Case(broken, case.belief).run("ekf-uvd")
 
 
-@pytest.mark.parametrize(("peer", "other"), [(FilterpyEkf, "ukf-uvd"), (FilterpyUkf, "ekf-uvd")])
-def test_filterpy_says_the_same_and_another_filter_does_not(case: Case, peer: type[FilterpyEkf], other: str) -> None:
+@pytest.mark.parametrize("peer, other", [(FilterpyEkf, "ukf-uvd"), (FilterpyUkf, "ekf-uvd")])
+def test_filterpy_says_the_same_and_another_filter_does_not(case, peer, other):
     said = peer(case, 3)()
     assert require_equal("peer", *said, case.run(peer.filter), WARM) < 1e-11
     with pytest.raises(Unequal, match="peer: differs from ours by"):
@@ -92,20 +89,20 @@ def test_filterpy_says_the_same_and_another_filter_does_not(case: Case, peer: ty
 
 
 @pytest.mark.parametrize("kind", ["ekf", "ukf"])
-def test_stone_soup_says_the_same(case: Case, kind: str) -> None:
+def test_stone_soup_says_the_same(case, kind):
     pytest.importorskip("stonesoup")
     peer = stone_soup(kind, case, 3)
     assert not isinstance(peer, str)
     assert require_equal("peer", *peer(), case.run(f"{kind}-uvd"), WARM) < 1e-11
 
 
-def test_without_stone_soup_there_is_a_reason(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_stone_soup_there_is_a_reason(case, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert "not installed" in str(stone_soup("ekf", case, 3))
 
 
 @pytest.mark.parametrize("what", ["pose", "covariance", "nan"])
-def test_a_difference_is_caught(case: Case, what: str) -> None:
+def test_a_difference_is_caught(case, what):
     ours = case.run("ekf-uvd")
     pose, covariance = ours.pose[WARM:].copy(), ours.covariance[WARM:].copy()
     assert require_equal("peer", pose, covariance, ours, WARM) == 0.0
@@ -118,7 +115,7 @@ def test_a_difference_is_caught(case: Case, what: str) -> None:
 
 
 @pytest.mark.parametrize("group", ["peers", "kernels", "growth", "vision", "program", "memory"])
-def test_a_group_of_rows(group: str) -> None:
+def test_a_group_of_rows(group):
     rows = list(bench.GROUPS[group](TINY))
     assert rows
     assert all(row.value is None or np.isfinite(row.value) for row in rows)
@@ -128,18 +125,16 @@ def test_a_group_of_rows(group: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "at_most", "verdict"),
+    "value, at_most, verdict",
     [(2.0, True, "met"), (2.1, True, "missed"), (2.0, False, "met"), (1.9, False, "missed"), (None, False, "missed"),
      (float("nan"), True, "missed")],
 )  # fmt: skip
-def test_met_and_missed(value: float | None, at_most: bool, verdict: str) -> None:
+def test_met_and_missed(value, at_most, verdict):
     assert bench.Row("g", "w", value, "x", 2.0, at_most).verdict == verdict
     assert bench.Row("g", "w", value, "x").verdict == ""
 
 
-def test_main_writes_what_it_prints(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_main_writes_what_it_prints(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(bench.GROUPS, "start", lambda effort: iter([bench.Row("start", "a row", 1.0, "s", 0.5, True)]))
     bench.main(["--only", "start", "--out", str(tmp_path / "new" / "bench.json")])
     assert "1 of 1 targets missed" in capsys.readouterr().out
@@ -148,7 +143,7 @@ def test_main_writes_what_it_prints(
     assert written["rows"][0]["verdict"] == "missed"
 
 
-def test_the_clock_takes_time_and_goes_away() -> None:
+def test_the_clock_takes_time_and_goes_away():
     original = World.trial
     with whole.Clock().on(World, "trial"):
         assert World.trial is not original
@@ -156,14 +151,14 @@ def test_the_clock_takes_time_and_goes_away() -> None:
     assert 0.0 < whole.share_outside(2, 20, ["ekf-uvd"], 1) < 1.0
 
 
-def test_memory_lies_on_a_line() -> None:
+def test_memory_lies_on_a_line():
     points = [{"runs": 100, "peak_mib": 300.0}, {"runs": 200, "peak_mib": 350.0}]
     assert whole.extrapolated(points, 1000) == pytest.approx(750.0)
     assert whole.extrapolated(points[1:], 200) == 350.0, "measured"
     assert whole.extrapolated([*points, {"runs": 300, "peak_mib": 300.0}], 1000) is None, "no rise, no line"
 
 
-def test_peak_memory_is_the_childs_own() -> None:
+def test_peak_memory_is_the_childs_own():
     """Not the parent's, which the bench has made large before."""
     large = np.ones(100_000_000)  # 800 MB
     code = f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); import bench_whole; print(bench_whole.peak_mib())"
@@ -171,7 +166,7 @@ def test_peak_memory_is_the_childs_own() -> None:
     assert whole.peak_mib() > 700.0
 
 
-def test_a_process_that_breaks_is_no_measurement() -> None:
+def test_a_process_that_breaks_is_no_measurement():
     assert whole.help_seconds(1) > 0.0
     with pytest.raises(RuntimeError, match="exit status 2"):
         whole._process(["-m", "consistency", "nonsense"])

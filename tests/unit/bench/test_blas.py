@@ -1,12 +1,9 @@
 """BLAS as kernels call it, against SciPy; and the covariance of which only one half is kept."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
 import textwrap
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,31 +11,30 @@ import scipy.linalg
 
 from consistency.bench.filters.kernel import blas
 from consistency.bench.filters.kernel.covariance import add_gram_to_state, gather_rows
-from consistency.referee.types import Array
 
 SIZES = [(1, 1), (3, 7), (36, 174), (50, 9)]
 
 
-def padded(A: Array) -> Array:
+def padded(A):
     """A view of A inside a larger array of NaN, as kernels use their work arrays."""
     large = np.full((A.shape[0] + 2, A.shape[1] + 3), np.nan)
     large[: A.shape[0], : A.shape[1]] = A
     return large[: A.shape[0], : A.shape[1]]
 
 
-def upper(A: Array) -> Array:
+def upper(A):
     """The same with NaN below the diagonal."""
     out = padded(A)
     out[np.tril_indices(len(A), -1)] = np.nan
     return out
 
 
-def surroundings_untouched(A: Array) -> bool:
+def surroundings_untouched(A):
     return bool(np.isnan(A.base[A.shape[0] :]).all() and np.isnan(A.base[:, A.shape[1] :]).all())  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize(("m", "n"), SIZES)
-def test_every_routine_against_scipy(m: int, n: int, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("m, n", SIZES)
+def test_every_routine_against_scipy(m, n, rng):
     B, A = rng.normal(size=(m, n)), rng.normal(size=(m, m + 3))
     S = A @ A.T + 0.1 * np.eye(m)
     root = scipy.linalg.cholesky(S)
@@ -65,13 +61,13 @@ def test_every_routine_against_scipy(m: int, n: int, rng: np.random.Generator) -
     assert np.allclose(z, x + B.T @ y[:, 2], rtol=1e-12, atol=1e-12)
 
 
-def test_an_indefinite_matrix_has_no_root(rng: np.random.Generator) -> None:
+def test_an_indefinite_matrix_has_no_root(rng):
     S = np.eye(5)
     S[3, 3] = -1.0
     assert not blas.upper_cholesky(upper(S))
 
 
-def test_rows_of_half_a_covariance(rng: np.random.Generator) -> None:
+def test_rows_of_half_a_covariance(rng):
     A = rng.normal(size=(18, 18))
     P = upper(A @ A.T)
     P[:3, :3] = (A @ A.T)[:3, :3]
@@ -101,7 +97,7 @@ print(root.loaded)
 """
 
 
-def test_a_kernel_on_disk_finds_blas_in_another_process(tmp_path: Path) -> None:
+def test_a_kernel_on_disk_finds_blas_in_another_process(tmp_path):
     """Addresses differ from process to process; names do not."""
     script = tmp_path / "cached_kernel.py"
     script.write_text(textwrap.dedent(KERNEL), encoding="utf-8")

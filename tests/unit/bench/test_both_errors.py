@@ -1,14 +1,12 @@
 """A filter with an error of its own is judged in it, by either way in; the additive error and the map stand beside."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from invariant import Invariant
+from numpy.testing import assert_allclose, assert_array_equal
 from recorded import read_recordings
 
 import consistency as cs
@@ -34,18 +32,18 @@ KEYS = ["run", "step", "t", "x", "y", "heading"]
 
 
 @pytest.fixture(scope="module")
-def results(uvd: cs.Scenario) -> cs.Results:
+def results(uvd):
     return cs.run_trials(uvd, ["ekf-uvd", Invariant()], runs=RUNS, seed=5, jobs=1)
 
 
 @pytest.fixture(scope="module")
-def folder(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(results, tmp_path_factory):
     out = tmp_path_factory.mktemp("own") / "run"
     results.write(out)
     return out
 
 
-def export(results: cs.Results, name: str, out: Path) -> tuple[Path, Path]:
+def export(results, name, out):
     """What a user would write of a filter: its poses with the covariance of its own error, and the truth."""
     rows = results.estimates[results.estimates["filter"] == name]
     own = rows[list(OWN_COVARIANCE)].rename(columns=lambda column: column.removeprefix("own_"))
@@ -55,18 +53,18 @@ def export(results: cs.Results, name: str, out: Path) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def exported(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def exported(results, tmp_path_factory):
     return export(results, "right", tmp_path_factory.mktemp("exported"))
 
 
 # --- both ways in give the same number --------------------------------------------------------------
 
 
-def test_both_ways_in_give_the_same_nees_and_verdict(results: cs.Results, exported: tuple[Path, Path]) -> None:
+def test_both_ways_in_give_the_same_nees_and_verdict(results, exported):
     c = record_of(results, "right")
     [recording] = read_recordings(*exported, error="right")
-    np.testing.assert_allclose(recording.nees, c.nees, rtol=1e-9)
-    np.testing.assert_allclose(recording.error[:, 1:], c.error[:, 1:], rtol=0, atol=1e-12)
+    assert_allclose(recording.nees, c.nees, rtol=1e-9)
+    assert_allclose(recording.error[:, 1:], c.error[:, 1:], rtol=0, atol=1e-12)
     ours, theirs = cs.analyse(results)["right"], analyse([recording])["right"]
     assert (ours.status, ours.convention) == (theirs.status, theirs.convention)
     assert ours.statistic == pytest.approx(theirs.statistic, rel=1e-9)
@@ -75,26 +73,26 @@ def test_both_ways_in_give_the_same_nees_and_verdict(results: cs.Results, export
     assert np.nanmax(np.abs(wrong.nees - c.nees)) > 1.0, "negative control"
 
 
-def test_both_ways_of_the_invariant_filter_of_the_bench(uvd: cs.Scenario, tmp_path: Path) -> None:
+def test_both_ways_of_the_invariant_filter_of_the_bench(uvd, tmp_path):
     results = cs.run_trials(uvd, ["ri-ekf-uvd"], runs=RUNS, seed=5, jobs=1)
     c = record_of(results, "ri-ekf-uvd")
     [recording] = read_recordings(*export(results, "ri-ekf-uvd", tmp_path), error="right")
-    np.testing.assert_allclose(recording.nees, c.nees, rtol=1e-9)
+    assert_allclose(recording.nees, c.nees, rtol=1e-9)
     ours, theirs = cs.analyse(results)["ri-ekf-uvd"], analyse([recording])["ri-ekf-uvd"]
     assert (ours.status, ours.convention) == (theirs.status, "right")
     trial = cs.simulate(uvd, 3, seed=5)
     compiled = run_filter(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
     stepped = step_through(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
-    np.testing.assert_allclose(stepped.own, compiled.own, rtol=1e-7, atol=1e-12)
-    np.testing.assert_array_equal(c.covariance[3, 1:], compiled.own[1:])
+    assert_allclose(stepped.own, compiled.own, rtol=1e-7, atol=1e-12)
+    assert_array_equal(c.covariance[3, 1:], compiled.own[1:])
 
 
-def test_columns_of_own_errors_serve_only_the_filter_that_has_them(folder: Path) -> None:
+def test_columns_of_own_errors_serve_only_the_filter_that_has_them(folder):
     by_name = {
         r.name: r for r in read_recordings(folder / "estimates.parquet", folder / "truth.parquet", error="right")
     }
     c = record_of(open_results(folder), "ekf-uvd")
-    np.testing.assert_array_equal(by_name["ekf-uvd"].covariance[:, 1:], c.covariance[:, 1:])
+    assert_array_equal(by_name["ekf-uvd"].covariance[:, 1:], c.covariance[:, 1:])
     assert not any("own_P" in note for note in by_name["ekf-uvd"].notes)
     assert any("own_P" in note for note in by_name["right"].notes)
 
@@ -102,22 +100,22 @@ def test_columns_of_own_errors_serve_only_the_filter_that_has_them(folder: Path)
 # --- what is judged ---------------------------------------------------------------------------------
 
 
-def test_a_record_holds_both_errors(results: cs.Results, folder: Path) -> None:
+def test_a_record_holds_both_errors(results, folder):
     for source in (results, open_results(folder)):
         c = record_of(source, "right")
         rows = results.estimates.query("filter == 'right' and run == 3")
-        np.testing.assert_array_equal(c.nees[3], rows["own_nees"])
-        np.testing.assert_array_equal(c.covariance[3, :, 0, 2], rows["own_P_xh"])
-        np.testing.assert_array_equal(c.covariance[3, :, 2, 0], rows["own_P_xh"])
-        np.testing.assert_array_equal(c.in_world.nees[3], rows["nees"])
-        np.testing.assert_array_equal(c.in_world.nis[3], rows["nis"])
-        np.testing.assert_array_equal(c.in_world.covariance[3, :, 0, 2], rows["P_xh"])
+        assert_array_equal(c.nees[3], rows["own_nees"])
+        assert_array_equal(c.covariance[3, :, 0, 2], rows["own_P_xh"])
+        assert_array_equal(c.covariance[3, :, 2, 0], rows["own_P_xh"])
+        assert_array_equal(c.in_world.nees[3], rows["nees"])
+        assert_array_equal(c.in_world.nis[3], rows["nis"])
+        assert_array_equal(c.in_world.covariance[3, :, 0, 2], rows["P_xh"])
         assert (c.convention, c.in_world.convention) == ("right", "")
         plain = record_of(source, "ekf-uvd")
         assert (plain.world, plain.in_world, plain.convention) == (None, plain, "")
 
 
-def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results: cs.Results) -> None:
+def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results):
     """Own covariances a quarter of what they should be: the filter is overconfident in its own error alone."""
     columns = list(OWN_COVARIANCE)
     table = results.estimates.copy()
@@ -136,31 +134,31 @@ def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results: cs.Re
     assert "convention" not in plain.statistics
 
 
-def test_run_means_and_baselines_are_of_the_own_error(results: cs.Results) -> None:
+def test_run_means_and_baselines_are_of_the_own_error(results):
     c = record_of(results, "right")
-    np.testing.assert_allclose(run_means(c), np.nanmean(c.nees, axis=1), rtol=1e-12)
+    assert_allclose(run_means(c), np.nanmean(c.nees, axis=1), rtol=1e-12)
     of = baseline(results_source(results)).filters["right"]
-    np.testing.assert_allclose(of.nees, run_means(c) / 3.0, rtol=1e-12)
+    assert_allclose(of.nees, run_means(c) / 3.0, rtol=1e-12)
     world, counted = c.in_world, np.isfinite(c.nees)[..., None]
     square = np.nanmean(np.where(counted, np.square(world.error), np.nan), axis=1)
-    np.testing.assert_allclose(of.squared, square, rtol=1e-12)
+    assert_allclose(of.squared, square, rtol=1e-12)
 
 
-def test_a_gate_has_the_own_error_alone(results: cs.Results) -> None:
+def test_a_gate_has_the_own_error_alone(results):
     record = record_of_filter(results_source(results), "right")
     verdict = judge(record)
     assert (verdict.world, verdict.map, verdict.convention) == (None, None, None)
     assert verdict.scale.mean_anees == analyse(results)["right"].scale.mean_anees
 
 
-def test_a_null_where_the_own_covariance_should_be(results: cs.Results) -> None:
+def test_a_null_where_the_own_covariance_should_be(results):
     table = results.estimates.copy()
     table.loc[table.index[-5], "own_P_xy"] = np.nan
     with pytest.raises(cs.InputError, match=r"estimates of 'right': column 'own_P_xy' is null, but manifest\.json"):
         analyse(replace(results, estimates=table))
 
 
-def test_until_decided_says_both(uvd: cs.Scenario) -> None:
+def test_until_decided_says_both(uvd):
     results, verdicts = run_until_decided(uvd, [Invariant()], max_runs=13, seed=5, jobs=1)
     v = verdicts["right"]
     c = record_of(results, "right")
@@ -171,7 +169,7 @@ def test_until_decided_says_both(uvd: cs.Scenario) -> None:
     assert (again.status, again.statistic, again.world.statistic) == (v.status, v.statistic, v.world.statistic)
 
 
-def test_a_look_scores_the_maps_of_its_own_runs(results: cs.Results) -> None:
+def test_a_look_scores_the_maps_of_its_own_runs(results):
     record, design = record_of(results, "ekf-uvd"), sequential_design(3, max_runs=12)
     v = judge(record, Settings(), design)
     assert (v.runs, v.map.runs) == (12, 12)
@@ -183,7 +181,7 @@ def test_a_look_scores_the_maps_of_its_own_runs(results: cs.Results) -> None:
 # --- the map ----------------------------------------------------------------------------------------
 
 
-def test_a_score_by_hand() -> None:
+def test_a_score_by_hand():
     nan = np.nan
     run, nees = np.array([4, 4, 9, 9, 9, 11]), np.array([3.0, 9.0, nan, 1.5, 1.5, nan])
     score = map_score(run, nees)
@@ -195,7 +193,7 @@ def test_a_score_by_hand() -> None:
     assert np.isnan(nothing.ratio.value)
 
 
-def test_the_score_is_that_of_the_table(results: cs.Results) -> None:
+def test_the_score_is_that_of_the_table(results):
     table = results.map
     means = table[table["filter"] == "ekf-uvd"].groupby("run")["nees"].mean() / 3.0
     v = analyse(results)["ekf-uvd"]
@@ -205,7 +203,7 @@ def test_the_score_is_that_of_the_table(results: cs.Results) -> None:
     assert in_json == [v.map.ratio.value, RUNS, len(table) // 2, 0]
 
 
-def test_the_map_is_no_part_of_the_verdict(results: cs.Results) -> None:
+def test_the_map_is_no_part_of_the_verdict(results):
     bad = results.map.assign(nees=1e6)
     with_map, without = (analyse(replace(results, map=m))["ekf-uvd"] for m in (bad, None))
     assert with_map.map.ratio.value > 1e5
@@ -217,12 +215,12 @@ def test_the_map_is_no_part_of_the_verdict(results: cs.Results) -> None:
 # --- terminal ---------------------------------------------------------------------------------------
 
 
-def printed(capsys: pytest.CaptureFixture[str], *names: str, results: cs.Results) -> list[str]:
+def printed(capsys, *names, results):
     show(*document(analyse(results, list(names)), reasons=False).opening)
     return capsys.readouterr().out.splitlines()
 
 
-def test_the_terminal_names_each_error(results: cs.Results, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_names_each_error(results, capsys):
     head, plain, own, world, *below = printed(capsys, "ekf-uvd", "right", results=results)
     v = analyse(results)["right"]
     assert head.split()[:4] == ["filter", "error", "verdict", "ANEES"]
@@ -236,7 +234,7 @@ def test_the_terminal_names_each_error(results: cs.Results, capsys: pytest.Captu
     assert f"right {v.map.verdict.status}, {map_text(v.map)}" in below[2]
 
 
-def test_without_maps_and_own_errors_nothing_is_added(results: cs.Results, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_maps_and_own_errors_nothing_is_added(results, capsys):
     lines = printed(capsys, "ekf-uvd", results=replace(results, map=None))
     assert len(lines) == 3
     assert lines[2].startswith("ratio of the worst axis: ekf-uvd ")
@@ -246,7 +244,7 @@ def test_without_maps_and_own_errors_nothing_is_added(results: cs.Results, capsy
     assert len(with_map) == 4
 
 
-def test_a_verdict_in_words(results: cs.Results) -> None:
+def test_a_verdict_in_words(results):
     v = analyse(results)["right"]
     text = str(v)
     assert "  error             right: Log(truth estimate^-1) of SE(2), in the world frame" in text
@@ -258,26 +256,26 @@ def test_a_verdict_in_words(results: cs.Results) -> None:
 
 
 @pytest.mark.parametrize(
-    ("score", "text"),
+    "score, text",
     [
         (MapScore(Interval(1.5, 1.1, 2.1), 3, 30, 0), "1.50 [1.10, 2.10]"),
         (MapScore(Interval(1.5, 1.1, 2.1), 3, 30, 2), "1.50 [1.10, 2.10] (2 of 32 landmarks left out)"),
         (MapScore(Interval(np.nan, np.nan, np.nan), 0, 0, 2), "- (2 of 2 landmarks left out)"),
     ],
 )
-def test_a_score_in_words(score: MapScore, text: str) -> None:
+def test_a_score_in_words(score, text):
     assert map_text(score) == text
 
 
-def test_some_runs_have_both_errors_and_their_own_failures(results: cs.Results) -> None:
+def test_some_runs_have_both_errors_and_their_own_failures(results):
     failures = (Failure("right", 3, 2, "NaN"), Failure("right", 11, 2, "NaN"))
     c = replace(record_of(results, "right"), failures=failures)
     some = c.first_runs(10)
-    np.testing.assert_array_equal(some.nees, c.nees[:10])
-    np.testing.assert_array_equal(some.in_world.nees, c.in_world.nees[:10])
-    np.testing.assert_array_equal(some.covariance, c.covariance[:10])
-    np.testing.assert_array_equal(some.in_world.error, c.in_world.error[:10])
-    np.testing.assert_array_equal(some.run_numbers, np.arange(10))
+    assert_array_equal(some.nees, c.nees[:10])
+    assert_array_equal(some.in_world.nees, c.in_world.nees[:10])
+    assert_array_equal(some.covariance, c.covariance[:10])
+    assert_array_equal(some.in_world.error, c.in_world.error[:10])
+    assert_array_equal(some.run_numbers, np.arange(10))
     assert some.failures == failures[:1]
     one = c.of_runs(np.flatnonzero(c.run_numbers == 11))
     assert (one.nis.shape[0], one.failures) == (1, failures[1:])

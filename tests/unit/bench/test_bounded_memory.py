@@ -1,18 +1,16 @@
 """Verdicts on thousands of runs: how much memory each run takes, and that blocks change nothing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
 from consistency.bench.runs.analyse_results import analyse
@@ -28,7 +26,7 @@ STEPS = 200
 RUNS = 4000
 
 
-def evidence(runs: int, steps: int = STEPS, bias: float = 0.3) -> Record:
+def evidence(runs, steps=STEPS, bias=0.3):
     """Errors with a mean, so that every question is asked twice."""
     rng = np.random.default_rng(0)
     P = np.tile(0.2 + np.diag([0.8, 1.8, 2.8]), (runs, steps, 1, 1))
@@ -37,7 +35,7 @@ def evidence(runs: int, steps: int = STEPS, bias: float = 0.3) -> Record:
     return Record("f", error, P, nis=nis, nis_dof=np.full((runs, steps), 2), axes=("x", "y", "heading"))
 
 
-def numbers_a_cell(work: Callable[[Record], object], runs: int = 1400) -> float:
+def numbers_a_cell(work, runs=1400):
     """Most numbers of 8 bytes that ``work`` holds beside what it is given, for each further pair of run and step."""
     most = []
     for count in (runs, 3 * runs):
@@ -51,39 +49,39 @@ def numbers_a_cell(work: Callable[[Record], object], runs: int = 1400) -> float:
 
 
 @pytest.mark.parametrize("settings", [Settings(), Settings(allow="conservative")], ids=["both", "conservative"])
-def test_a_verdict_takes_six_numbers_for_each_step_of_a_run(settings: Settings) -> None:
+def test_a_verdict_takes_six_numbers_for_each_step_of_a_run(settings):
     """Four are kept (whitened errors and NEES), one is on the way; the whole-array copies of before took 15."""
     assert numbers_a_cell(lambda given: judge(given, settings)) < 6.5
 
 
-def test_a_summary_of_runs_takes_hardly_any() -> None:
+def test_a_summary_of_runs_takes_hardly_any():
     nees = np.random.default_rng(0).chisquare(3, (4200, STEPS))
     assert numbers_a_cell(lambda g: summary(nees[: len(np.asarray(g.nis))], 3, g.error, g.covariance)) < 0.5
 
 
-def test_errors_about_their_mean() -> None:
+def test_errors_about_their_mean():
     """With variances 1, 2, 3 alone the NEES about the mean has a closed form."""
     given = evidence(30, 8)
     P = np.tile(np.diag([1.0, 2.0, 3.0]), (30, 8, 1, 1))
     sample = sample_of(replace(given, covariance=P), Settings())
     about = (given.error - given.error.mean(axis=0)) * np.sqrt(30 / 29)
     nees = (np.square(about) / [1.0, 2.0, 3.0]).sum(axis=-1)
-    np.testing.assert_allclose(sample.centred_means(slice(2, None)), nees[:, 2:].mean(axis=1) / 3)
+    assert_allclose(sample.centred_means(slice(2, None)), nees[:, 2:].mean(axis=1) / 3)
     centred = sample.centred()
-    np.testing.assert_allclose(centred.nees, nees)
-    np.testing.assert_allclose(centred.group_means([1]), (np.square(about[..., 1]) / 2.0).mean(axis=1))
+    assert_allclose(centred.nees, nees)
+    assert_allclose(centred.group_means([1]), (np.square(about[..., 1]) / 2.0).mean(axis=1))
 
 
 @pytest.mark.parametrize("n", range(1, 12))
-def test_lengths_and_missing_components(n: int) -> None:
+def test_lengths_and_missing_components(n):
     w = np.random.default_rng(0).standard_normal((6, 7, n))
-    np.testing.assert_array_equal(squared_length(w), np.square(w).sum(axis=-1))
+    assert_array_equal(squared_length(w), np.square(w).sum(axis=-1))
     w[2, 3, n - 1] = np.inf
-    np.testing.assert_array_equal(all_finite(w), np.isfinite(w).all(axis=-1))
+    assert_array_equal(all_finite(w), np.isfinite(w).all(axis=-1))
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def folders(tmp_path_factory):
     """Results of 20 and of 4000 runs of 150 steps with maps, the same few runs again and again."""
     out = tmp_path_factory.mktemp("many")
     scenario = cs.load_scenario("herath2007-stereo").variant("many", truth__steps=150)
@@ -97,12 +95,12 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return out / "few", out / "many"
 
 
-def _again(table: pd.DataFrame, times: int) -> pd.DataFrame:
+def _again(table, times):
     parts = [table.assign(run=table["run"] + 20 * k) for k in range(times)]
     return pd.concat(parts, ignore_index=True)
 
 
-def test_a_filter_read_in_parts_is_judged_as_in_whole(folders: tuple[Path, Path]) -> None:
+def test_a_filter_read_in_parts_is_judged_as_in_whole(folders):
     results = open_results(folders[0])
     whole = {name: judge(record_of(results, name)) for name in results.filters}
     assert whole["ekf-uvd"].map is not None
@@ -133,8 +131,8 @@ WORK = {
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the memory from /proc")
-@pytest.mark.parametrize(("name", "most"), [("analyse", 40), ("report", 40), ("baseline", 45)])
-def test_a_filter_is_read_and_judged_in_bounded_memory(folders: tuple[Path, Path], name: str, most: int) -> None:
+@pytest.mark.parametrize("name, most", [("analyse", 40), ("report", 40), ("baseline", 45)])
+def test_a_filter_is_read_and_judged_in_bounded_memory(folders, name, most):
     """Twelve numbers a cell are read, five are worked out; allocators keep about as much again of so little.
 
     With whole tables or whole-array copies it was 49, 49 and 77.

@@ -1,7 +1,5 @@
 """The experiment on the distance to the batch solution."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,7 @@ from consistency.bench.runs.findings import sibling
 ceiling = sibling(str(Path(consistency.__file__).parents[1] / "experiments" / "e16.py"), "e17_ceiling")
 
 
-def test_the_ratio_and_its_interval(rng: np.random.Generator) -> None:
+def test_the_ratio_and_its_interval(rng):
     best = rng.chisquare(2, 200)
     rmse, ratio, low, high = ceiling.compared(1.21 * best, best)
     assert rmse == pytest.approx(1.1 * np.sqrt(best.mean()))
@@ -25,21 +23,21 @@ def test_the_ratio_and_its_interval(rng: np.random.Generator) -> None:
     assert 0.1 < high - low < 0.4  # about 4 standard deviations of 1 / sqrt(200)
 
 
-def test_without_gtsam_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_gtsam_it_says_so(monkeypatch):
     monkeypatch.setattr(filters, "EXTRAS", {"external.gtsam": ("no_such_package", "smoothing")})
     [finding] = ceiling.main(cs.Study(runs=1, jobs=1))
     assert finding.verdict == "not reproduced"
     assert finding.measured.startswith("not measured: filter 'gtsam-map-uvd' needs no_such_package")
 
 
-def test_it_compares_the_last_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_compares_the_last_poses(monkeypatch):
     pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
     world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=20, truth__landmarks__count=40)
 
     class Cell:
-        def __init__(self, *_: object) -> None: ...
+        def __init__(self, *_): ...
 
-        def scenario(self) -> cs.Scenario:
+        def scenario(self):
             return world
 
     monkeypatch.setattr(ceiling, "Cell", Cell)

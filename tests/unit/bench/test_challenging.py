@@ -6,11 +6,9 @@ import itertools
 import os
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import challenge_rate
 import numpy as np
@@ -30,7 +28,7 @@ from consistency.bench.challenging.search import (
     standard_error,
 )
 from consistency.bench.challenging.world_scores import WORST, ChallengeScorer, Done, score_of_run
-from consistency.bench.challenging.worlds import Choice, LogScale, Point, Space, space_of
+from consistency.bench.challenging.worlds import Choice, LogScale, Point, space_of
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.path import lap_length, planned_path
@@ -41,7 +39,7 @@ STEREO = cs.load_scenario("herath2007-stereo")
 SMALL = ("steps=50:100", "seed=2007", "path=circle", "sensor=1", "odometry=1")
 
 
-def point_with(space: Space, **values: object) -> Point:
+def point_with(space, **values):
     return tuple(values.get(d.name, d.plain) for d in space.dimensions)  # type: ignore[return-value]
 
 
@@ -49,7 +47,7 @@ def point_with(space: Space, **values: object) -> Point:
 
 
 @pytest.mark.parametrize("name", BASES)
-def test_the_plain_point_is_the_base(name: str) -> None:
+def test_the_plain_point_is_the_base(name):
     base = cs.load_scenario(name)
     space = space_of(base)
     assert space.world(space.plain).hash == base.hash
@@ -57,7 +55,7 @@ def test_the_plain_point_is_the_base(name: str) -> None:
     assert ("baseline" in space.values(space.plain)) == (name == "herath2007-stereo")
 
 
-def test_truth_and_belief_change_alike() -> None:
+def test_truth_and_belief_change_alike():
     base = STEREO.variant("told", belief__sensor__disparity=(1.0, 32.0))
     space = space_of(base)
     world = space.world(point_with(space, sensor=2.0, odometry=0.5, baseline=0.18, range=8.0, steps=100, density=0.5))
@@ -72,7 +70,7 @@ def test_truth_and_belief_change_alike() -> None:
 
 
 @pytest.mark.parametrize("shape", ["rounded-rectangle", "figure-of-eight"])
-def test_another_path_is_as_long_and_its_landmarks_as_dense(shape: str) -> None:
+def test_another_path_is_as_long_and_its_landmarks_as_dense(shape):
     space = space_of(STEREO)
     truth = space.world(point_with(space, path=shape)).truth
     assert lap_length(truth.path) == pytest.approx(lap_length(STEREO.truth.path), rel=0.01)
@@ -84,7 +82,7 @@ def test_another_path_is_as_long_and_its_landmarks_as_dense(shape: str) -> None:
     assert margins == pytest.approx(4.0, abs=0.12)
 
 
-def test_a_base_elsewhere_keeps_its_centre_and_a_circle_is_a_circle() -> None:
+def test_a_base_elsewhere_keeps_its_centre_and_a_circle_is_a_circle():
     eight = {"shape": "figure-of-eight", "radius": 2.0, "start": (10.0, -5.0), "heading": 0.0, "speed": 0.5}
     box = {"layout": "uniform", "count": 50, "seed": 1, "x": (4.0, 16.0), "y": (-13.0, 3.0), "z": (-1.0, 1.0)}
     space = space_of(STEREO.variant("there", truth__path=eight, truth__landmarks=box))
@@ -92,7 +90,7 @@ def test_a_base_elsewhere_keeps_its_centre_and_a_circle_is_a_circle() -> None:
     assert (path.shape, path.start) == ("circle", (14.0, -5.0))
 
 
-def test_values_are_rounded_and_their_places_are_right() -> None:
+def test_values_are_rounded_and_their_places_are_right():
     scale = LogScale("range", 4.0, 2.0, 12.0, " m")
     assert (scale.at(0.0), scale.at(1.0)) == (2.0, 12.0)
     assert scale.at(0.37) == 3.9
@@ -104,7 +102,7 @@ def test_values_are_rounded_and_their_places_are_right() -> None:
     assert choice.at(1.0) == "figure-of-eight"
 
 
-def test_bounds_of_the_user() -> None:
+def test_bounds_of_the_user():
     space = space_of(STEREO, ["baseline=0.2:0.3", "path=circle", "range=5"])
     assert space.values(space.plain)["baseline"] == 0.2  # the bound that is nearest to the base
     corner = space.values(space.at(np.ones(len(space.dimensions))))
@@ -113,7 +111,7 @@ def test_bounds_of_the_user() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    "text, complaint",
     [
         ("depth=1:2", "with a NAME out of seed, sensor"),
         ("range", "with a NAME out of"),
@@ -127,7 +125,7 @@ def test_bounds_of_the_user() -> None:
         ("seed=-1", "'-1' is not one"),
     ],
 )
-def test_bounds_that_mean_nothing_are_refused(text: str, complaint: str) -> None:
+def test_bounds_that_mean_nothing_are_refused(text, complaint):
     with pytest.raises(InputError, match=complaint):
         space_of(STEREO, [text])
 
@@ -137,7 +135,7 @@ BIAS = {"u": [-100.0, 100.0], "v": [0.0], "bias_d": [[0.5, -0.5]]}
 
 
 @pytest.mark.parametrize(
-    ("truth", "belief", "complaint"),
+    "truth, belief, complaint",
     [
         (
             {"disparity_growth": GROWTH},
@@ -154,14 +152,14 @@ BIAS = {"u": [-100.0, 100.0], "v": [0.0], "bias_d": [[0.5, -0.5]]}
         ),
     ],
 )
-def test_a_sensor_that_errs_otherwise_than_believed_is_refused(truth: dict, belief: dict, complaint: str) -> None:
+def test_a_sensor_that_errs_otherwise_than_believed_is_refused(truth, belief, complaint):
     keys = {f"truth__sensor__{key}": value for key, value in truth.items()}
     keys |= {f"belief__sensor__{key}": value for key, value in belief.items()}
     with pytest.raises(InputError, match=complaint):
         space_of(STEREO.variant("wrong", **keys))
 
 
-def test_a_sensor_that_errs_as_believed_is_challenged() -> None:
+def test_a_sensor_that_errs_as_believed_is_challenged():
     chosen = {
         "kind": "selection", "count": 6, "forget_steps": 4, "seed": 1, "cells": [4, 3], "near": 6.0,
         "strength": 1.0, "stereo": 1.0, "image": 1.0, "depth": 1.0,
@@ -181,14 +179,14 @@ def test_a_sensor_that_errs_as_believed_is_challenged() -> None:
     assert other.truth.sensor.effects == base.truth.sensor.effects
 
 
-def test_a_scenario_with_listed_landmarks_has_fewer_dimensions() -> None:
+def test_a_scenario_with_listed_landmarks_has_fewer_dimensions():
     base = STEREO.variant("listed", truth__landmarks={"layout": "listed", "points": [(2.0, 0.0, 0.0)]})
     assert [d.name for d in space_of(base).dimensions] == [
         "sensor", "odometry", "steps", "dt", "tilt", "height", "baseline", "range"
     ]  # fmt: skip
 
 
-def test_rates_mounts_and_loops_are_dimensions() -> None:
+def test_rates_mounts_and_loops_are_dimensions():
     """A lap of a tenth of the length, with landmarks as far beyond it and as dense; mounts are believed."""
     space = space_of(STEREO)
     world = space.world(point_with(space, dt=0.5, tilt=40.0, height=1.0, lap=0.1))
@@ -209,7 +207,7 @@ def test_rates_mounts_and_loops_are_dimensions() -> None:
     assert turned.truth.sensor.mount.rotation == (0.1, 0.2, 0.3)
 
 
-def test_bounds_of_a_file(tmp_path: Path) -> None:
+def test_bounds_of_a_file(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text('baseline = 0.09\nrange = [2.0, 8.0]\npath = ["circle", "rounded-rectangle"]\ntilt = [0, 20]\n')
     kept = {d.name: d for d in space_of(STEREO, [str(path), "range=3:5"]).dimensions}
@@ -233,16 +231,16 @@ def test_bounds_of_a_file(tmp_path: Path) -> None:
 class Scripted:
     """Scores of a known mean with noise of 0.5: worst at a long range and few landmarks, of one path."""
 
-    def __init__(self, space: Space, budget: Budget) -> None:
+    def __init__(self, space, budget):
         self.space, self.budget, self.rng = space, budget, np.random.default_rng(5)
         self.rungs: list[tuple[int, int]] = []
 
-    def mean(self, point: Point) -> float:
+    def mean(self, point):
         values = self.space.values(point)
         bad = 4.0 * np.log(float(values["range"]) / 4.0) - np.log(float(values["density"]))
         return float(bad) if values["path"] == "figure-of-eight" else 0.5 * float(bad)
 
-    def __call__(self, candidates: Sequence[ScoredWorld], trials: int) -> None:
+    def __call__(self, candidates, trials):
         self.rungs.append((len(candidates), trials))
         for candidate in candidates:
             more = trials - len(candidate.scores)
@@ -251,7 +249,7 @@ class Scripted:
             self.budget.used += more
 
 
-def searched(trials: int, seed: int) -> tuple[Scripted, dict[Point, ScoredWorld]]:
+def searched(trials, seed):
     space, budget = space_of(STEREO), Budget(trials=trials)
     scripted, tried = Scripted(space, budget), dict[Point, ScoredWorld]()
     search(space, scripted, lambda: budget.left(1.0), np.random.default_rng(seed), tried)
@@ -259,7 +257,7 @@ def searched(trials: int, seed: int) -> tuple[Scripted, dict[Point, ScoredWorld]
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_worst_world_is_found(seed: int) -> None:
+def test_the_worst_world_is_found(seed):
     """The best possible mean is 6.5, and a random world of the first batch has 0.6 on average."""
     scripted, tried = searched(3000, seed)
     best = ranked(tried.values())[0]
@@ -268,7 +266,7 @@ def test_the_worst_world_is_found(seed: int) -> None:
     assert scripted.space.values(best.point)["seed"] != 2007  # those are not usable
 
 
-def test_time_goes_to_the_promising() -> None:
+def test_time_goes_to_the_promising():
     scripted, tried = searched(400, 0)
     assert scripted.rungs[:4] == [(BATCH, 2), *scripted.rungs[1:4]]
     halves = [count for count, _ in scripted.rungs[:4]]
@@ -278,12 +276,12 @@ def test_time_goes_to_the_promising() -> None:
     assert 400 <= scripted.budget.used <= 400 + 2 * BATCH  # ends with the rung in which the budget ends
 
 
-def test_a_space_of_one_world_ends() -> None:
+def test_a_space_of_one_world_ends():
     fixed = ("baseline=0.09", "density=1", "range=4", "steps=500", "lap=1", "dt=0.1", "tilt=0", "height=0", *SMALL[1:])
     space, budget = space_of(STEREO, fixed), Budget(trials=100)
-    tried: dict[Point, ScoredWorld] = {}
+    tried = {}
 
-    def evaluate(candidates: Sequence[ScoredWorld], trials: int) -> None:
+    def evaluate(candidates, trials):
         for candidate in candidates:
             candidate.scores += [0.0] * (trials - len(candidate.scores))
 
@@ -291,7 +289,7 @@ def test_a_space_of_one_world_ends() -> None:
     assert list(tried) == [space.plain]
 
 
-def test_a_lucky_few_do_not_beat_many() -> None:
+def test_a_lucky_few_do_not_beat_many():
     few, many = ScoredWorld((1,), [2.0, 2.0]), ScoredWorld((2,), [1.9] * 16)
     assert few.score < many.score
     assert ranked([few, many]) == [many, few]
@@ -299,7 +297,7 @@ def test_a_lucky_few_do_not_beat_many() -> None:
     assert standard_error([0.0, 2.0]) == pytest.approx(1.0)
 
 
-def test_a_budget_of_time_ends() -> None:
+def test_a_budget_of_time_ends():
     budget = Budget(seconds=1000.0)
     assert budget.left(0.5)
     budget.started -= 600.0
@@ -313,7 +311,7 @@ def test_a_budget_of_time_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    ("status", "anees", "faults", "found"),
+    "status, anees, faults, found",
     [
         ("consistent", 3.1, (), False),
         ("undecided", 3.4, (), False),
@@ -328,15 +326,15 @@ def test_a_budget_of_time_ends() -> None:
         ("failed", float("nan"), (), True),
     ],
 )
-def test_only_errors_that_are_too_large_count(status: str, anees: float, faults: tuple[str, ...], found: bool) -> None:
-    verdict: Any = SimpleNamespace(status=status, inflation=anees / 3.0, faults=faults, failures=())
+def test_only_errors_that_are_too_large_count(status, anees, faults, found):
+    verdict = SimpleNamespace(status=status, inflation=anees / 3.0, faults=faults, failures=())
     assert is_overconfident(verdict) is found
     verdict.failures = ("a run",)
     assert is_overconfident(verdict)  # a breakdown always does
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
+    "changes, complaint",
     [
         ({"minutes": 0.0}, "--minutes must be a positive number"),
         ({"minutes": float("nan")}, "--minutes"),
@@ -349,18 +347,18 @@ def test_only_errors_that_are_too_large_count(status: str, anees: float, faults:
         ({"false_alarm": 0.0}, "--false-alarm"),
     ],
 )
-def test_a_plan_that_cannot_be_is_refused(changes: dict[str, Any], complaint: str) -> None:
+def test_a_plan_that_cannot_be_is_refused(changes, complaint):
     with pytest.raises(InputError, match=complaint):
         Plan(**changes)
 
 
-def test_the_runs_are_those_of_a_planned_verdict_and_the_seeds_differ() -> None:
+def test_the_runs_are_those_of_a_planned_verdict_and_the_seeds_differ():
     assert Plan().runs == 61
     assert Plan(detect=1.2).runs == 301
     assert len({seed for plan in (Plan(), Plan(seed=1)) for seed in plan.seeds}) == 4
 
 
-def test_the_base_fits_the_filter() -> None:
+def test_the_base_fits_the_filter():
     names = {name: base_of(cs.get_filter(name)).name for name in ("ekf-uvd", "ekf-xyz", "kf")}
     assert names == {"ekf-uvd": BASES[0], "ekf-xyz": BASES[0], "kf": BASES[2]}
 
@@ -369,14 +367,14 @@ def test_the_base_fits_the_filter() -> None:
 
 
 @pytest.fixture(scope="module")
-def far() -> Any:
+def far():
     """A search among short worlds of long range; in all of them ekf-uvd is grossly overconfident."""
     return challenge(
         "ekf-uvd", None, Plan(minutes=None, trials=150, jobs=1), [*SMALL, "range=6:9", "baseline=0.05:0.09"]
     )
 
 
-def test_a_wrong_filter_is_found(far: Any) -> None:
+def test_a_wrong_filter_is_found(far):
     """The false alarm of the confirmation does not matter here, and its p value leaves no doubt."""
     assert far.found
     assert far.p_value < 1e-3
@@ -386,7 +384,7 @@ def test_a_wrong_filter_is_found(far: Any) -> None:
     assert challenge_lines(far, Path("a.toml"))[0].startswith("ekf-uvd is overconfident in ")
 
 
-def test_the_file_repeats_the_confirmation(far: Any, tmp_path: Path) -> None:
+def test_the_file_repeats_the_confirmation(far, tmp_path):
     write_scenario(far, tmp_path / "found.toml")
     world = cs.load_scenario(tmp_path / "found.toml")
     assert world.hash == far.world.hash
@@ -397,13 +395,13 @@ def test_the_file_repeats_the_confirmation(far: Any, tmp_path: Path) -> None:
     assert f"--runs 61 --seed {far.plan.seeds[-1]}" in text.splitlines()[0]
 
 
-def test_trials_in_place_of_time_give_the_same_result_on_any_number_of_workers(far: Any) -> None:
+def test_trials_in_place_of_time_give_the_same_result_on_any_number_of_workers(far):
     again = challenge("ekf-uvd", STEREO, replace(far.plan, jobs=2), [*SMALL, "range=6:9", "baseline=0.05:0.09"])
     left = {key: value for key, value in challenge_data(again, Path("a.toml")).items() if key != "seconds"}
     assert left == {key: value for key, value in challenge_data(far, Path("a.toml")).items() if key != "seconds"}
 
 
-def test_what_is_not_found_is_not_called_consistent() -> None:
+def test_what_is_not_found_is_not_called_consistent():
     """A right filter; by chance it would be found in 1 % of seeds, and this seed was the first."""
     outcome = challenge("kf", None, Plan(minutes=None, trials=60, jobs=1, false_alarm=0.01), SMALL)
     assert not outcome.found
@@ -419,22 +417,22 @@ class Breaking:
 
     name = "breaking"
 
-    def init(self, problem: Any) -> Any:
+    def init(self, problem):
         return 0, problem.start
 
-    def predict(self, state: Any, control: Any) -> Any:
+    def predict(self, state, control):
         if state[0] == 2:
             raise ZeroDivisionError("lost")
         return state[0] + 1, state[1]
 
-    def update(self, state: Any, observation: Any) -> Any:
+    def update(self, state, observation):
         return state, None
 
-    def pose(self, state: Any) -> cs.Gaussian:
+    def pose(self, state):
         return cs.Gaussian(state[1], np.eye(3))
 
 
-def test_a_filter_that_breaks_down_is_the_worst() -> None:
+def test_a_filter_that_breaks_down_is_the_worst():
     outcome = challenge(Breaking(), None, Plan(minutes=None, trials=40, jobs=1), SMALL)
     assert outcome.found
     assert outcome.verdict.failures
@@ -447,16 +445,16 @@ class Constant:
 
     filter, workers = SimpleNamespace(name="constant"), 1
 
-    def __init__(self, score: float) -> None:
+    def __init__(self, score):
         self.score, self.seeds = score, list[int]()
 
-    def __call__(self, jobs: Sequence[Any], seed: int, until: float) -> list[Done]:
+    def __call__(self, jobs, seed, until):
         self.seeds.append(seed)
         return [Done((self.score,) * len(runs), 0.0) for _, runs in jobs]
 
 
-def test_the_search_has_most_of_the_budget_and_trials_of_its_own() -> None:
-    bench: Any = Constant(1.0)
+def test_the_search_has_most_of_the_budget_and_trials_of_its_own():
+    bench = Constant(1.0)
     phases = ChallengePhases(bench, space_of(STEREO), Plan(minutes=None, trials=250))
     worst = phases.search()
     assert worst is phases.tried[worst.point]
@@ -465,8 +463,8 @@ def test_the_search_has_most_of_the_budget_and_trials_of_its_own() -> None:
     assert 0.8 * 250 <= phases.budget.used <= 0.8 * 250 + 2 * BATCH
 
 
-def test_worlds_whose_confirmation_takes_too_long_are_passed_over() -> None:
-    bench: Any = Constant(1.0)
+def test_worlds_whose_confirmation_takes_too_long_are_passed_over():
+    bench = Constant(1.0)
     campaign = ChallengePhases(bench, space_of(STEREO), Plan(minutes=1.0))
     slow, fast = ScoredWorld(campaign.space.plain), ScoredWorld(point_with(campaign.space, density=0.5))
     assert campaign.slowest == pytest.approx(0.2 * 60.0 / 61)
@@ -482,15 +480,15 @@ class Invariant:
     name, error = "invariant", "right"
     init, predict, update = (lambda self, *given: (0, given[0])), (lambda self, *given: given[0]), None
 
-    def pose(self, state: Any) -> cs.Gaussian:
+    def pose(self, state):
         return cs.Gaussian(state[1].start, np.eye(3))
 
-    def own_covariance(self, state: Any) -> Any:
+    def own_covariance(self, state):
         return 1e4 * np.eye(3)
 
 
-def test_the_score_is_in_the_error_of_the_filter() -> None:
-    filter_: Any = Invariant()
+def test_the_score_is_in_the_error_of_the_filter():
+    filter_ = Invariant()
     filter_.update = lambda state, observation: (state, None)
     world = require_landmarks_in_view(STEREO)
     with Isolation([filter_], STEREO.belief) as isolation:
@@ -500,10 +498,10 @@ def test_the_score_is_in_the_error_of_the_filter() -> None:
 class Ends(Invariant):
     """Ends its process, or never ends a step."""
 
-    def __init__(self, hangs: bool) -> None:
+    def __init__(self, hangs):
         self.hangs = hangs
 
-    def predict(self, state: Any, control: Any) -> Any:
+    def predict(self, state, control):
         while self.hangs:
             pass
         os._exit(3)
@@ -511,29 +509,29 @@ class Ends(Invariant):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="signals")
 @pytest.mark.parametrize("hangs", [False, True])
-def test_a_filter_that_crashes_or_hangs_fails_its_trials_alone(hangs: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_filter_that_crashes_or_hangs_fails_its_trials_alone(hangs, monkeypatch):
     monkeypatch.setattr(scoring, "PATIENCE", 0.3)
-    filter_: Any = Ends(hangs)
+    filter_ = Ends(hangs)
     with ChallengeScorer(filter_, jobs=2) as bench:
         done = bench([(STEREO, [0]), (STEREO, [1])], 0, until=time.monotonic() + 0.5)
     assert [each.scores for each in done if each is not None] == [(WORST,), (WORST,)]
 
 
-def test_worlds_that_show_nothing_are_left_out() -> None:
+def test_worlds_that_show_nothing_are_left_out():
     """And if there is no other, that is said."""
     blind = STEREO.variant("blind", truth__landmarks__x=(50.0, 60.0))
     with pytest.raises(InputError, match="no world within the bounds"):
         challenge("ekf-uvd", blind, Plan(minutes=None, trials=40, jobs=1), SMALL)
 
 
-def test_no_trial_begins_after_the_time() -> None:
+def test_no_trial_begins_after_the_time():
     short = STEREO.variant("short", truth__steps=20)
     with ChallengeScorer(cs.get_filter("ekf-uvd"), 1) as bench:
         (late,), (done,) = bench([(short, range(3))], 0, until=0.0), bench([(short, range(3))], 0)
     assert (len(late.scores), len(done.scores)) == (0, 3)
 
 
-def test_the_time_is_kept() -> None:
+def test_the_time_is_kept():
     outcome = challenge("ekf-uvd", None, Plan(minutes=0.05, jobs=1), SMALL)
     assert outcome.seconds < 3.0 + 10.0  # the machine may be busy
     assert outcome.trials > 0
@@ -543,7 +541,7 @@ def test_the_time_is_kept() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "complaint"),
+    "arguments, complaint",
     [
         (("ekf-uvx",), "unknown filter 'ekf-uvx'"),
         (("kf", "--scenario", "herath2007-stereo"), "filter 'kf' works on a sensor linear"),
@@ -554,9 +552,7 @@ def test_the_time_is_kept() -> None:
         (("kf", "--fail-on", "nothing"), "--fail-on must be 'found'"),
     ],
 )
-def test_unusable_input_ends_in_one_line_and_status_2(
-    arguments: tuple[str, ...], complaint: str, tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_unusable_input_ends_in_one_line_and_status_2(arguments, complaint, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stop:
         main(["challenge", *arguments])
@@ -567,7 +563,7 @@ def test_unusable_input_ends_in_one_line_and_status_2(
     assert not list(tmp_path.iterdir())
 
 
-def test_dead_reckoning_is_right_in_worlds_with_a_camera() -> None:
+def test_dead_reckoning_is_right_in_worlds_with_a_camera():
     """The filter by which benchmarks/challenge_rate.py counts searches over tilts and heights."""
     outcome = challenge(*challenge_rate.opponents("dead-reckoning"), Plan(None, 40, 3, 1, 1e-4))
     assert outcome.worlds > 5

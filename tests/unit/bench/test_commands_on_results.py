@@ -1,9 +1,6 @@
 """Commands and gates on results of the bench: a folder and results in memory are turned into records by who calls."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,33 +15,31 @@ RUNS = 40
 
 
 @pytest.fixture(scope="module")
-def results() -> cs.Results:
+def results():
     world = cs.load_scenario("linear-gaussian").variant("short", truth__steps=12)
     return cs.run_trials(world, ["kf"], runs=RUNS, seed=11, jobs=1)
 
 
 @pytest.fixture(scope="module")
-def folder(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(results, tmp_path_factory):
     folder = tmp_path_factory.mktemp("results") / "kept"
     results.write(folder)
     return folder
 
 
-def test_results_folder_and_records_have_one_verdict(results: cs.Results, folder: Path) -> None:
+def test_results_folder_and_records_have_one_verdict(results, folder):
     by_source = [analyse(each)["kf"] for each in (results, folder, str(folder), [record_of(results, "kf")])]
     assert {verdict.status for verdict in by_source} == {by_source[0].status}
     assert {verdict.scale.mean_anees for verdict in by_source} == {by_source[0].scale.mean_anees}
     assert cs.analyse is analyse
 
 
-def test_a_verdict_of_a_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_verdict_of_a_folder(folder, capsys):
     out, _ = consistency(capsys, "analyse", str(folder), "--json")
     assert json.loads(out)["kf"]["status"] == analyse(folder)["kf"].status
 
 
-def test_a_baseline_of_a_folder_is_compared_with_it(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_baseline_of_a_folder_is_compared_with_it(folder, tmp_path, capsys):
     kept = tmp_path / "base.json"
     consistency(capsys, "baseline", str(folder), "--out", str(kept))
     assert json.loads(kept.read_text(encoding="utf-8"))["scenario"] == "short"
@@ -54,22 +49,20 @@ def test_a_baseline_of_a_folder_is_compared_with_it(
         assert "every run is the same in both" in out
 
 
-def test_innovations_of_a_folder_are_watched(
-    results: cs.Results, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_innovations_of_a_folder_are_watched(results, folder, capsys):
     out, _ = consistency(capsys, "monitor", str(folder), "--run", "3", "--innovations", "optimal", "--json")
     counted = results.estimates.query("run == 3 and nis_dof > 0")
     assert json.loads(out)["judged"] == len(counted)
     assert "holds more than one run" in refused(capsys, "monitor", str(folder), "--innovations", "optimal")
 
 
-def test_a_plan_like_a_folder_knows_its_filters(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plan_like_a_folder_knows_its_filters(folder, capsys):
     out, _ = consistency(capsys, "plan", "--like", str(folder), "--json")
     assert "kf" in out
     assert "'ukf-uvd'" in refused(capsys, "plan", "--like", str(folder), "--filter", "ukf-uvd")
 
 
-def test_a_gate_takes_results_and_names_what_it_lacks(results: cs.Results) -> None:
+def test_a_gate_takes_results_and_names_what_it_lacks(results):
     loose = {"detect": 4.0, "power": 0.5, "false_alarm": 1e-9}
     assert assert_consistent(results, **loose).status == "consistent"
     assert assert_consistent(results, filter="kf", **loose).status == "consistent"
@@ -78,9 +71,7 @@ def test_a_gate_takes_results_and_names_what_it_lacks(results: cs.Results) -> No
 
 
 @pytest.mark.parametrize("kind", ["in memory", "folder", "text", "file"])
-def test_a_reference_may_be_results_a_folder_or_a_file(
-    kind: str, results: cs.Results, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_reference_may_be_results_a_folder_or_a_file(kind, results, folder, tmp_path, capsys):
     """The same trials: no run differs, so that the candidate is not worse."""
     consistency(capsys, "baseline", str(folder), "--out", str(tmp_path / "base.json"))
     reference = {"in memory": results, "folder": folder, "text": str(folder), "file": tmp_path / "base.json"}[kind]

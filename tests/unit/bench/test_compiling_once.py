@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numba
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 from numba import types
 from numba.core import compiler, ir, targetconfig
 from numba.core.registry import cpu_target
-from numba.core.runtime import context as runtime
 from numba.core.types import functions
 
 import consistency as cs
@@ -22,11 +20,9 @@ from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.trial_work import Simulated, TrialWork
 from consistency.bench.simulation.world import World
 
-Counts = list[Any]
-stack: Any = targetconfig.ConfigStack
-Flags: Any = compiler.Flags
-numba_ir: Any = ir
-Runtime: Any = runtime.NRTContext
+stack = targetconfig.ConfigStack
+Flags = compiler.Flags
+numba_ir = ir
 
 
 class Small(NamedTuple):
@@ -37,12 +33,12 @@ class Other(NamedTuple):
     value: float
 
 
-def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> Counts:
+def counted(monkeypatch, owner, name):
     """Arguments of the calls of a method, as they come."""
-    calls: Counts = []
-    original: Callable[..., Any] = getattr(owner, name)
+    calls = []
+    original = getattr(owner, name)
 
-    def call(*args: Any) -> Any:
+    def call(*args):
         calls.append(args[1:])
         return original(*args)
 
@@ -51,23 +47,23 @@ def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> Counts:
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> Counts:
+def asked(monkeypatch):
     """Calls whose type Numba has looked for."""
     monkeypatch.setattr("consistency.bench.filters.compiler.whole_program._known", {})
     return counted(monkeypatch, functions.BaseFunction, "get_call_type")
 
 
-def type_of(*args: Any, function: Any = operator.add, fastmath: bool = False, error_model: str = "numpy") -> Any:
+def type_of(*args, function=operator.add, fastmath=False, error_model="numpy"):
     """Signature of a function of these types, as a function that is being compiled asks for it."""
     flags = Flags()
     flags.fastmath, flags.error_model = fastmath, error_model
-    context: Any = cpu_target.typing_context
+    context = cpu_target.typing_context
     context.refresh()
     with stack().enter(flags):
         return context.resolve_value_type(function).get_call_type(context, args, {})
 
 
-def test_the_type_of_a_call_is_looked_for_once(asked: Counts) -> None:
+def test_the_type_of_a_call_is_looked_for_once(asked):
     alone = type_of(types.float64, types.int64)
     with remembered_types():
         assert {type_of(types.float64, types.int64) for _ in range(3)} == {alone}
@@ -78,14 +74,14 @@ def test_the_type_of_a_call_is_looked_for_once(asked: Counts) -> None:
     assert len(asked) == 4
 
 
-def test_rules_of_arithmetic_are_not_mixed(asked: Counts) -> None:
+def test_rules_of_arithmetic_are_not_mixed(asked):
     with remembered_types():
         for rules in ({}, {"fastmath": True}, {"error_model": "python"}, {}):
             type_of(types.float64, types.float64, **rules)
     assert len(asked) == 3
 
 
-def test_functions_and_arguments_are_not_mixed() -> None:
+def test_functions_and_arguments_are_not_mixed():
     pairs = [(types.int64, types.int64), (types.int64, types.float64), (types.float64, types.int64)]
     cases = [(function, pair) for function in (operator.add, operator.truediv) for pair in pairs]
     alone = [type_of(*pair, function=function) for function, pair in cases]
@@ -94,8 +90,8 @@ def test_functions_and_arguments_are_not_mixed() -> None:
             assert [type_of(*pair, function=function) for function, pair in cases] == alone
 
 
-def test_who_compiles_nothing_asks_numba(asked: Counts) -> None:
-    context: Any = cpu_target.typing_context
+def test_who_compiles_nothing_asks_numba(asked):
+    context = cpu_target.typing_context
     context.refresh()
     with remembered_types():
         for _ in range(2):
@@ -103,7 +99,7 @@ def test_who_compiles_nothing_asks_numba(asked: Counts) -> None:
     assert len(asked) == 2
 
 
-def test_what_has_no_type_is_looked_for_again(asked: Counts) -> None:
+def test_what_has_no_type_is_looked_for_again(asked):
     with remembered_types():
         for _ in range(2):
             with pytest.raises(numba.TypingError):
@@ -111,7 +107,7 @@ def test_what_has_no_type_is_looked_for_again(asked: Counts) -> None:
     assert len(asked) == 2
 
 
-def test_arguments_of_other_types_are_other_kinds() -> None:
+def test_arguments_of_other_types_are_other_kinds():
     A = np.zeros((3, 4))
     frozen = A.copy()
     frozen.setflags(write=False)
@@ -122,12 +118,12 @@ def test_arguments_of_other_types_are_other_kinds() -> None:
             assert jit._kind(a) != jit._kind(b) or numba.typeof(a) == numba.typeof(b), (a, b)
 
 
-def test_content_is_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_content_is_found_once(monkeypatch):
     class Unknown:
         unknown, key, found = "something", "", 0
         functions: ClassVar[dict[str, int]] = {}
 
-        def __init__(self, function: Any, signature: Any) -> None:
+        def __init__(self, function, signature):
             type(self).found += 1
 
     monkeypatch.setattr(jit, "Content", Unknown)
@@ -142,7 +138,7 @@ def test_content_is_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
         assert Unknown.found == found
 
 
-def test_the_first_trial_is_simulated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_trial_is_simulated_once(monkeypatch):
     world = cs.load_scenario("linear-gaussian").variant("short", truth__steps=5)
     trials = Simulated(world, 3)
     made = counted(monkeypatch, World, "trial")

@@ -1,10 +1,5 @@
 """Whose innovations are judged: those of filters that declare an optimal gain, from the filter to the verdict."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -18,40 +13,38 @@ class Declares:
 
     name = "mine"
 
-    def __init__(self, **attributes: Any) -> None:
+    def __init__(self, **attributes):
         self.inner = cs.get_filter("kf").textbook
         vars(self).update(attributes)
 
-    def init(self, problem: Any) -> Any:
+    def init(self, problem):
         return self.inner.init(problem)
 
-    def predict(self, state: Any, control: cs.Control) -> Any:
+    def predict(self, state, control):
         return self.inner.predict(state, control)
 
-    def update(self, state: Any, observation: cs.Observation) -> Any:
+    def update(self, state, observation):
         return self.inner.update(state, observation)
 
-    def pose(self, state: Any) -> cs.Gaussian:
+    def pose(self, state):
         return self.inner.pose(state)
 
 
-def test_kf_declares_it_and_filters_of_a_nonlinear_sensor_do_not(linear: cs.Scenario, uvd: cs.Scenario) -> None:
+def test_kf_declares_it_and_filters_of_a_nonlinear_sensor_do_not(linear, uvd):
     assert cs.run_trials(linear, ["kf"], runs=1, jobs=1).manifest["optimal_gain"] == ["kf"]
     assert cs.run_trials(uvd, ["ekf-uvd", "ukf-uvd"], runs=1, jobs=1).manifest["optimal_gain"] == []
 
 
 @pytest.mark.parametrize(
-    ("attributes", "declared"),
+    "attributes, declared",
     [({}, False), ({"innovations": "optimal"}, True), ({"innovations": "gated"}, False),
      ({"innovations": np.zeros(3)}, False), ({"innovations": []}, False)],
 )  # fmt: skip
-def test_an_attribute_declares_it_and_whatever_else_it_holds_does_not(
-    attributes: dict[str, Any], declared: bool
-) -> None:
+def test_an_attribute_declares_it_and_whatever_else_it_holds_does_not(attributes, declared):
     assert optimal_gain(Declares(**attributes)) is declared
 
 
-def test_what_is_declared_reaches_the_verdict(linear: cs.Scenario, tmp_path: Path) -> None:
+def test_what_is_declared_reaches_the_verdict(linear, tmp_path):
     silent = cs.run_trials(linear, [Declares()], runs=2, jobs=1)
     kf = cs.run_trials(linear, ["kf"], runs=2, jobs=1, out=tmp_path / "kf")
     for results, name, judged in ((silent, "mine", False), (kf, "kf", True), (cs.read_results(kf.folder), "kf", True)):

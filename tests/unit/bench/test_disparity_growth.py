@@ -1,11 +1,5 @@
 """Noise of a disparity that grows with it: the curve, what the world does, what a file may say, and old hashes."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from scenario_files import load, put
@@ -15,7 +9,6 @@ from consistency.bench.scenario import DisparityGrowth
 from consistency.bench.simulation import World
 from consistency.scenario import scenario_text
 
-Small = Callable[..., cs.Scenario]
 GROWTH = {"disparity": [3.0, 5.0, 12.0], "ratio": [0.5, 1.0, 2.4]}
 WIDE = {"truth__sensor__disparity": (1e-6, 1e6)}
 HASHES = {
@@ -33,7 +26,7 @@ HASHES = {
 
 
 @pytest.mark.parametrize("name", HASHES)
-def test_a_scenario_without_the_new_keys_keeps_its_hash(name: str) -> None:
+def test_a_scenario_without_the_new_keys_keeps_its_hash(name):
     scenario = cs.load_scenario(name)
     assert scenario.hash == HASHES[name]
     content = scenario.model_dump(mode="json")
@@ -42,7 +35,7 @@ def test_a_scenario_without_the_new_keys_keeps_its_hash(name: str) -> None:
 
 
 @pytest.mark.parametrize("half", ["truth", "belief"])
-def test_a_growth_changes_the_hash_and_survives_a_file(small: Small, tmp_path: Path, half: str) -> None:
+def test_a_growth_changes_the_hash_and_survives_a_file(small, tmp_path, half):
     base = cs.load_scenario("herath2007-stereo")
     grown = base.variant("grown", **{f"{half}__sensor__disparity_growth": GROWTH})
     assert grown.hash != base.hash
@@ -51,7 +44,7 @@ def test_a_growth_changes_the_hash_and_survives_a_file(small: Small, tmp_path: P
     assert cs.load_scenario(tmp_path / "grown.toml").hash == grown.hash
 
 
-def test_the_curve_is_linear_between_its_nodes_and_constant_beyond() -> None:
+def test_the_curve_is_linear_between_its_nodes_and_constant_beyond():
     growth = DisparityGrowth.model_validate({"disparity_px": [3.0, 5.0, 12.0], "ratio": [0.5, 1.0, 2.4]})
     d = np.array([[0.1, 3.0, 4.0], [5.0, 8.5, 40.0]])
     assert np.allclose(growth.ratio_at(d), [[0.5, 0.5, 0.75], [1.0, 1.7, 2.4]], rtol=0, atol=1e-15)
@@ -59,7 +52,7 @@ def test_the_curve_is_linear_between_its_nodes_and_constant_beyond() -> None:
 
 
 @pytest.mark.parametrize("noise_on", ["odometry", "motion"])
-def test_the_noise_has_the_same_random_numbers_scaled_at_the_true_disparity(small: Small, noise_on: str) -> None:
+def test_the_noise_has_the_same_random_numbers_scaled_at_the_true_disparity(small, noise_on):
     plain = small("herath2007-stereo", truth__motion__noise_on=noise_on, **WIDE)
     grown = plain.variant("grown", truth__sensor__disparity_growth=GROWTH)
     a, b, world = cs.simulate(plain, 1, 2), cs.simulate(grown, 1, 2), World(plain.truth)
@@ -71,7 +64,7 @@ def test_the_noise_has_the_same_random_numbers_scaled_at_the_true_disparity(smal
     assert np.allclose(b.z[:, 2] - ideal[:, 2], ratio * (a.z[:, 2] - ideal[:, 2]), rtol=0, atol=1e-12)
 
 
-MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
+MISTAKES = {
     "not as many": ({"disparity_px": [1.0, 2.0], "ratio": [1.0]}, r"ratio must have a number for each .*got 1 for 2$"),
     "not increasing": ({"disparity_px": [2.0, 2.0], "ratio": [1.0, 2.0]}, r"disparity must increase .*\[2\.0, 2\.0\]$"),
     "negative": ({"disparity_px": [1.0, 2.0], "ratio": [1.0, -0.1]}, r"\.ratio\.1': .*greater than 0 \(got -0\.1\)$"),
@@ -84,7 +77,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("half", ["truth", "belief"])
 @pytest.mark.parametrize("case", MISTAKES)
-def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str, half: str) -> None:
+def test_a_mistake_is_answered_with_file_and_key(tmp_path, case, half):
     growth, complaint = MISTAKES[case]
     with pytest.raises(
         cs.InputError, match=rf"mine\.toml: key '{half}\.sensor\.disparity_growth" + ".*" + complaint
@@ -93,7 +86,7 @@ def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str, half
     assert "\n" not in str(e.value)
 
 
-def test_points_in_metres_have_no_disparity(tmp_path: Path) -> None:
+def test_points_in_metres_have_no_disparity(tmp_path):
     good = {"disparity_px": [1.0], "ratio": [1.0]}
     with pytest.raises(cs.InputError, match=r"'belief\.sensor': disparity_growth is of a sensor 'uvd', not 'xyz'"):
         load(tmp_path, put("belief.sensor.disparity_growth", good), name="herath2007-xyz")

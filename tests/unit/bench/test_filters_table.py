@@ -1,10 +1,7 @@
 """The table of all filters: its rules, its costs and how a report shows it; and the rates of verdicts on maps."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -24,11 +21,11 @@ ROW = {
 
 
 @pytest.fixture(scope="module")
-def e16() -> ModuleType:
+def e16():
     return experiments()["e16_filters"]
 
 
-def table(*changes: dict[str, Any]) -> pd.DataFrame:
+def table(*changes):
     return pd.DataFrame([ROW | change for change in changes])
 
 
@@ -36,7 +33,7 @@ OVER = {"map_status": "overconfident"}
 
 
 @pytest.mark.parametrize(
-    ("changes", "verdict"),
+    "changes, verdict",
     [
         ([{}], "reproduced"),
         ([{}, {"status": "overconfident", "filter": "b"} | OVER], "reproduced"),
@@ -45,28 +42,28 @@ OVER = {"map_status": "overconfident"}
         ([{"status": "undecided"}], "not reproduced"),
     ],
 )
-def test_the_rule_of_maps(e16: ModuleType, changes: list[dict[str, Any]], verdict: str) -> None:
+def test_the_rule_of_maps(e16, changes, verdict):
     finding = e16.map_finding(Study(2, 0, 1), table(*changes))
     assert (finding.id, finding.verdict) == (e16.FINDINGS[0], verdict)
 
 
 @pytest.mark.parametrize(
-    ("changes", "verdict"),
+    "changes, verdict",
     [
         ([{"cost": 2.0}], "reproduced"),
         ([{"cost": 9.0}, {"cost": 1.9}], "reproduced"),
         ([{"cost": 2.1}, {"cost": 1.0, "status": "biased"}], "not reproduced"),
     ],
 )
-def test_the_rule_of_costs(e16: ModuleType, changes: list[dict[str, Any]], verdict: str) -> None:
+def test_the_rule_of_costs(e16, changes, verdict):
     finding = e16.cost_finding(Study(2, 0, 1), table(*changes))
     assert (finding.id, finding.verdict) == (e16.FINDINGS[1], verdict)
 
 
-def test_costs_are_medians_of_rounds(e16: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_costs_are_medians_of_rounds(e16, monkeypatch):
     clock, runs = [0.0], {"ekf-uvd": 0, "fast": 0, "slow": 0}
 
-    def run_filter(filter_: str, *_: object) -> None:
+    def run_filter(filter_, *_):
         runs[filter_] += 1
         disturbed = 50.0 if runs[filter_] == 3 else 0.0
         clock[0] += {"ekf-uvd": 0.1, "fast": 0.25, "slow": 3.0}[filter_] + disturbed
@@ -81,7 +78,7 @@ def test_costs_are_medians_of_rounds(e16: ModuleType, monkeypatch: pytest.Monkey
     assert cost["slow"] == pytest.approx(30.0)
 
 
-def test_a_row_says_what_the_verdicts_say(e16: ModuleType) -> None:
+def test_a_row_says_what_the_verdicts_say(e16):
     scenario = cs.load_scenario("herath2007-stereo").variant("few", truth__steps=12)
     verdict = cs.analyse(cs.run_trials(scenario, ["ekf-uvd"], runs=5, seed=3, jobs=1))["ekf-uvd"]
     row = e16.row(verdict, 1.25)
@@ -90,8 +87,8 @@ def test_a_row_says_what_the_verdicts_say(e16: ModuleType) -> None:
     assert row["joint_nees"] == verdict.map.verdict.joint.both.value
 
 
-def test_the_report_shows_the_table(tmp_path: Path) -> None:
-    report: Any = SimpleNamespace(folder=tmp_path)
+def test_the_report_shows_the_table(tmp_path):
+    report = SimpleNamespace(folder=tmp_path)
     assert filters_table(report) == ()
     rows = table(
         {}, {"filter": "bound", "realisable": "no", "map_status": "-", "map_nees": np.nan, "joint_nees": np.nan}
@@ -106,7 +103,7 @@ def test_the_report_shows_the_table(tmp_path: Path) -> None:
     assert "world, 20 runs" in shown.caption
 
 
-def test_calibration_rows_of_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calibration_rows_of_maps(monkeypatch):
     """Counted, not judged: 20 gates at 5 % say little of a rate."""
     monkeypatch.syspath_prepend(Path(__file__).parents[3] / "benchmarks")
     import calibration_map

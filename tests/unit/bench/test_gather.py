@@ -8,10 +8,8 @@ import threading
 import time
 import tracemalloc
 import weakref
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
@@ -28,7 +26,6 @@ from consistency.bench.simulation import World
 from consistency.bench.store import parquet
 from consistency.bench.store.results import StoredResults, open_results
 from consistency.bench.store.trial_rows import RunOutcome, outcome_of
-from consistency.bench.types import Trial
 from consistency.referee.document.judged_filters import document
 from consistency.referee.show.as_json import render
 
@@ -41,22 +38,22 @@ class Halts:
 
     name = "halts"
 
-    def init(self, problem: Any) -> dict[str, Any]:
+    def init(self, problem):
         return {"pose": problem.start, "steps": 0, "doomed": False}
 
-    def predict(self, state: dict[str, Any], control: cs.Control) -> dict[str, Any]:
+    def predict(self, state, control):
         return {**state, "steps": state["steps"] + 1}
 
-    def update(self, state: dict[str, Any], observation: cs.Observation) -> tuple[dict[str, Any], None]:
+    def update(self, state, observation):
         if state["steps"] == 1:
             state = {**state, "doomed": int(1e6 * abs(observation.z.sum())) % 2 == 0}
         return state, None
 
-    def pose(self, state: dict[str, Any]) -> cs.Gaussian:
+    def pose(self, state):
         return cs.Gaussian(state["pose"], -np.eye(3) if state["doomed"] and state["steps"] == 5 else np.eye(3))
 
 
-def damage(path: Path) -> None:
+def damage(path):
     """Flip a bit in the middle of the column y."""
     group = pq.ParquetFile(path).metadata.row_group(0)
     column = next(c for c in map(group.column, range(group.num_columns)) if c.path_in_schema == "y")
@@ -66,16 +63,26 @@ def damage(path: Path) -> None:
 
 
 @pytest.fixture
-def few_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_rows(monkeypatch):
     """Row groups that end in the middle of runs."""
     monkeypatch.setattr(parquet, "ROWS", 97)
 
 
+@pytest.fixture(scope="session")
+def run(uvd):
+    """Nine runs of the same study, unless told otherwise."""
+
+    def work(filters=FILTERS, **options):
+        return cs.run_trials(uvd, filters, **{"runs": 9, "seed": 3, "jobs": 1, **options})
+
+    return work
+
+
 @pytest.fixture(scope="module")
-def written(uvd: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(run, tmp_path_factory):
     """Nine runs from memory."""
     folder = tmp_path_factory.mktemp("gather") / "memory"
-    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1).write(folder)
+    run().write(folder)
     return folder
 
 
@@ -83,19 +90,19 @@ def written(uvd: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_streamed_is_what_is_written_from_memory(uvd: cs.Scenario, written: Path, tmp_path: Path, jobs: int) -> None:
-    stored = cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, out=tmp_path / "deep" / "out")
+def test_streamed_is_what_is_written_from_memory(run, written, tmp_path, jobs):
+    stored = run(jobs=jobs, out=tmp_path / "deep" / "out")
     assert isinstance(stored, StoredResults)
     assert content(tmp_path / "deep" / "out") == content(written)
     assert stored.manifest == open_results(tmp_path / "deep" / "out").manifest
-    other = cs.run_trials(uvd, FILTERS, runs=9, seed=4, jobs=jobs, out=tmp_path / "other")
+    other = run(seed=4, jobs=jobs, out=tmp_path / "other")
     assert content(other.folder) != content(written), "negative control"
 
 
 @pytest.mark.usefixtures("few_rows")
-def test_row_groups_do_not_depend_on_the_pieces(uvd: cs.Scenario, tmp_path: Path) -> None:
-    stored = cs.run_trials(uvd, [*FILTERS, Halts()], runs=9, seed=3, jobs=1, out=tmp_path / "streamed")
-    memory = cs.run_trials(uvd, [*FILTERS, Halts()], runs=9, seed=3, jobs=1)
+def test_row_groups_do_not_depend_on_the_pieces(run, tmp_path):
+    stored = run([*FILTERS, Halts()], out=tmp_path / "streamed")
+    memory = run([*FILTERS, Halts()])
     assert 0 < len(memory.failures) < 9
     memory.write(tmp_path / "memory")
     assert content(tmp_path / "streamed") == content(tmp_path / "memory")
@@ -110,7 +117,7 @@ def test_row_groups_do_not_depend_on_the_pieces(uvd: cs.Scenario, tmp_path: Path
 # --- memory ------------------------------------------------------------------------------------------
 
 
-def peak(work: Callable[[], object]) -> float:
+def peak(work):
     """Bytes at the peak, of what Python and NumPy hold."""
     tracemalloc.start()
     try:
@@ -120,7 +127,7 @@ def peak(work: Callable[[], object]) -> float:
         tracemalloc.stop()
 
 
-def test_memory_does_not_grow_with_the_runs(uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_does_not_grow_with_the_runs(uvd, tmp_path, monkeypatch):
     monkeypatch.setattr(parquet, "ROWS", 256)
     few, many = 10, 60
     row = 8 * (len(parquet.COLUMNS["estimates"]) - 1 + len(parquet.COLUMNS["truth"]))
@@ -133,14 +140,14 @@ def test_memory_does_not_grow_with_the_runs(uvd: cs.Scenario, tmp_path: Path, mo
     assert held[1] - held[0] > all_rows, "negative control"
 
 
-def test_few_outcomes_wait_for_their_turn(uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alive: weakref.WeakSet[RunOutcome] = weakref.WeakSet()
-    most: list[int] = []
+def test_few_outcomes_wait_for_their_turn(uvd, tmp_path, monkeypatch):
+    alive = weakref.WeakSet()
+    most = []
 
     class Counted(RunOutcome):
         __hash__ = object.__hash__
 
-    def counted(*arguments: Any) -> RunOutcome:
+    def counted(*arguments):
         outcome = Counted(**vars(outcome_of(*arguments)))
         alive.add(outcome)
         most.append(len(alive))
@@ -153,11 +160,11 @@ def test_few_outcomes_wait_for_their_turn(uvd: cs.Scenario, tmp_path: Path, monk
     assert max(most) <= 2 * 2 + 2, "those ahead, the one that is written, and the next"
 
 
-def test_a_filter_is_read_without_the_others(uvd: cs.Scenario, written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read: list[int] = []
+def test_a_filter_is_read_without_the_others(uvd, written, monkeypatch):
+    read = []
     batches = pq.ParquetFile.iter_batches
 
-    def counted(self: pq.ParquetFile, size: int, groups: list[int], columns: list[str]) -> Any:
+    def counted(self, size, groups, columns):
         if "nees" in columns:
             read.extend(groups)
         return batches(self, size, groups, columns)
@@ -170,7 +177,7 @@ def test_a_filter_is_read_without_the_others(uvd: cs.Scenario, written: Path, mo
 # --- read back ---------------------------------------------------------------------------------------
 
 
-def test_verdicts_from_a_folder_are_those_from_memory(written: Path) -> None:
+def test_verdicts_from_a_folder_are_those_from_memory(written):
     stored, memory = open_results(written), cs.read_results(written)
     assert render(document(cs.analyse(stored))) == render(document(cs.analyse(memory)))
     assert stored.finished_runs(FILTERS) == set(range(9))
@@ -178,7 +185,7 @@ def test_verdicts_from_a_folder_are_those_from_memory(written: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_rows")
-def test_a_folder_that_another_program_wrote(written: Path, tmp_path: Path) -> None:
+def test_a_folder_that_another_program_wrote(written, tmp_path):
     """One row group for all filters, rows of filters in turn; but the steps of each in order."""
     memory = cs.read_results(written)
     memory.write(tmp_path / "out")
@@ -192,7 +199,7 @@ def test_a_folder_that_another_program_wrote(written: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.usefixtures("few_rows")
-def test_a_bad_number_is_found_where_it_is(written: Path, tmp_path: Path) -> None:
+def test_a_bad_number_is_found_where_it_is(written, tmp_path):
     memory = cs.read_results(written)
     estimates = memory.estimates.copy()
     estimates.loc[701, "P_xx"] = np.inf  # of the second filter, in another row group
@@ -206,7 +213,7 @@ def test_a_bad_number_is_found_where_it_is(written: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["estimates", "truth"])
-def test_changed_bytes_are_refused(written: Path, tmp_path: Path, name: str) -> None:
+def test_changed_bytes_are_refused(written, tmp_path, name):
     """Numbers that hardly compress are stored as they are: a flipped bit would be another number."""
     cs.read_results(written).write(tmp_path / "out")
     path = tmp_path / "out" / f"{name}.parquet"
@@ -220,7 +227,7 @@ def test_changed_bytes_are_refused(written: Path, tmp_path: Path, name: str) -> 
         cs.read_results(tmp_path / "out")
 
 
-def test_a_row_of_no_filter_is_refused(written: Path, tmp_path: Path) -> None:
+def test_a_row_of_no_filter_is_refused(written, tmp_path):
     memory = cs.read_results(written)
     memory.write(tmp_path / "out")
     estimates = memory.estimates.copy()
@@ -236,15 +243,13 @@ def test_a_row_of_no_filter_is_refused(written: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_stopped_and_resumed_gives_the_same_bytes(
-    uvd: cs.Scenario, written: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, jobs: int
-) -> None:
+def test_stopped_and_resumed_gives_the_same_bytes(run, written, tmp_path, stop_at, monkeypatch, jobs):
     out = tmp_path / "out"
     stop_at(4, KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
-        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, out=out)
+        run(jobs=jobs, out=out)
     monkeypatch.undo()
-    part = cs.run_trials(uvd, FILTERS, runs=1, seed=3, jobs=jobs, out=out, resume=True)  # writes what is finished
+    part = run(runs=1, jobs=jobs, out=out, resume=True)  # writes what is finished
     finished = part.finished_runs(FILTERS)
     assert finished == {0, 1, 2, 3} or (jobs > 1 and 4 not in finished)  # another worker may be before or behind
     is_whole = finished == set(range(len(finished)))
@@ -253,16 +258,16 @@ def test_stopped_and_resumed_gives_the_same_bytes(
     assert part.manifest["runs"] == max(finished) + 1
     assert open_results(out).manifest == part.manifest
     (out / "notes.txt").write_text("mine")
-    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, previous=part, out=out)
+    run(jobs=jobs, previous=part, out=out)
     assert content(out) == content(written)
     assert (out / "notes.txt").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 @pytest.mark.usefixtures("few_rows")
-def test_resuming_keeps_failures_and_fills_gaps(uvd: cs.Scenario, tmp_path: Path) -> None:
+def test_resuming_keeps_failures_and_fills_gaps(run, uvd, tmp_path):
     filters = [Halts(), "ekf-uvd"]
-    whole = cs.run_trials(uvd, filters, runs=9, seed=3, jobs=1)
+    whole = run(filters)
     whole.write(tmp_path / "whole")
     tables = (("estimates", whole.estimates), ("truth", whole.truth), ("map", whole.map))
     gaps = {n: t[~t["run"].isin([1, 4, 8])] for n, t in tables}
@@ -270,15 +275,15 @@ def test_resuming_keeps_failures_and_fills_gaps(uvd: cs.Scenario, tmp_path: Path
     manifest = whole.manifest | {"complete": False, "finished_runs": 6, "failures": len(failures)}
     part = cs.Results(gaps["estimates"], failures, gaps["truth"], whole.landmarks, manifest, gaps["map"])
     part.write(tmp_path / "out")
-    cs.run_trials(uvd, filters, runs=9, seed=3, jobs=1, previous=open_results(tmp_path / "out"), out=tmp_path / "out")
+    run(filters, previous=open_results(tmp_path / "out"), out=tmp_path / "out")
     assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
-def test_a_filter_without_any_row_is_resumed(uvd: cs.Scenario, tmp_path: Path) -> None:
+def test_a_filter_without_any_row_is_resumed(uvd, tmp_path):
     class Stillborn(Halts):
         name = "stillborn"
 
-        def init(self, problem: Any) -> dict[str, Any]:
+        def init(self, problem):
             raise KeyError("no such map")
 
     filters = [Stillborn(), "ekf-uvd"]
@@ -289,18 +294,16 @@ def test_a_filter_without_any_row_is_resumed(uvd: cs.Scenario, tmp_path: Path) -
         assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
-def test_a_run_that_takes_long_keeps_no_other_from_the_journal(
-    uvd: cs.Scenario, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_takes_long_keeps_no_other_from_the_journal(run, written, tmp_path, monkeypatch):
     trial, kept = World.trial, threading.Event()
     add = gather.Gathered.add
 
-    def last(self: World, run: int, seed: int) -> Trial:
+    def last(self, run, seed):
         ahead = threading.current_thread() is threading.main_thread()  # looks what the first takes
         assert run or ahead or kept.wait(60.0), "the others wait for the first"
         return trial(self, run, seed)
 
-    def counted(self: gather.Gathered, outcome: RunOutcome) -> None:
+    def counted(self, outcome):
         add(self, outcome)
         if self.finished == set(range(1, 9)):
             kept.set()
@@ -308,14 +311,14 @@ def test_a_run_that_takes_long_keeps_no_other_from_the_journal(
     monkeypatch.setattr(World, "trial", last)
     monkeypatch.setattr(TrialWork, "compile", lambda self, run, jobs: None)
     monkeypatch.setattr(gather.Gathered, "add", counted)
-    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=2, out=tmp_path / "out")
+    run(jobs=2, out=tmp_path / "out")
     assert content(tmp_path / "out") == content(written)
 
 
 class Together(SimpleQueue[Any]):
     """Gives nothing before four are there."""
 
-    def get(self, block: bool = True, timeout: float | None = None) -> Any:
+    def get(self, block=True, timeout=None):
         while self.qsize() < 4:
             time.sleep(0.01)
         return super().get(block, timeout)
@@ -328,13 +331,13 @@ class Work:
     failing: tuple[int, ...] = ()
     isolation = nullcontext()
 
-    def __call__(self, run: int) -> int:
+    def __call__(self, run):
         if run in self.failing:
             raise RuntimeError("out of ideas")
         return run
 
 
-def test_what_ends_together_with_an_error_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_ends_together_with_an_error_counts(monkeypatch):
     monkeypatch.setattr(local_threads, "SimpleQueue", Together)
     outcomes = local_threads.LocalThreads(2).outcomes(Work((0, 2)), range(4))  # type: ignore[arg-type]
     assert {next(outcomes), next(outcomes)} == {1, 3}
@@ -342,40 +345,36 @@ def test_what_ends_together_with_an_error_counts(monkeypatch: pytest.MonkeyPatch
         next(outcomes)
 
 
-def test_what_ends_together_leaves_room_for_as_many(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_ends_together_leaves_room_for_as_many(monkeypatch):
     monkeypatch.setattr(local_threads, "SimpleQueue", Together)
     outcomes = local_threads.LocalThreads(2).outcomes(Work(), range(8))  # type: ignore[arg-type]
     assert sorted(map(int, outcomes)) == list(range(8))  # type: ignore[call-overload]
 
 
-def test_rows_out_of_order_are_not_resumed(uvd: cs.Scenario, written: Path) -> None:
+def test_rows_out_of_order_are_not_resumed(run, written):
     memory = cs.read_results(written)
     upside_down = cs.Results(memory.estimates[::-1], memory.failures, memory.truth, memory.landmarks, memory.manifest)
     with pytest.raises(cs.InputError, match="estimates to resume must be in order of the runs"):
-        cs.run_trials(uvd, FILTERS, runs=10, seed=3, jobs=1, previous=upside_down)
+        run(runs=10, previous=upside_down)
 
 
 @pytest.mark.parametrize("name", ["estimates", "truth"])
-def test_what_cannot_be_resumed_is_refused_before_any_work(
-    uvd: cs.Scenario, written: Path, tmp_path: Path, stop_at: Any, name: str
-) -> None:
+def test_what_cannot_be_resumed_is_refused_before_any_work(run, written, tmp_path, stop_at, name):
     out = tmp_path / "out"
     cs.read_results(written).write(out)
     damage(out / f"{name}.parquet")
     accept_changes(out)
     stop_at(9, RuntimeError("work"))
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
-        cs.run_trials(uvd, FILTERS, runs=10, seed=3, jobs=1, previous=open_results(out), out=out)
+        run(runs=10, previous=open_results(out), out=out)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
-def test_ctrl_c_waits_while_the_folder_is_written(
-    uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pressed: list[int] = []
+def test_ctrl_c_waits_while_the_folder_is_written(run, tmp_path, monkeypatch):
+    pressed = []
 
     class Pressed(gather.Writer):
-        def end_group(self) -> None:
+        def end_group(self):
             if not pressed:
                 pressed.append(1)
                 os.kill(os.getpid(), signal.SIGINT)
@@ -384,7 +383,7 @@ def test_ctrl_c_waits_while_the_folder_is_written(
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(gather, "Writer", Pressed)
     with pytest.raises(KeyboardInterrupt):
-        cs.run_trials(uvd, FILTERS, runs=3, seed=3, jobs=1, out=tmp_path / "out")
+        run(runs=3, out=tmp_path / "out")
     signal.signal(signal.SIGINT, before)
     assert open_results(tmp_path / "out").finished_runs(FILTERS) == {0, 1, 2}
 
@@ -393,19 +392,17 @@ def test_ctrl_c_waits_while_the_folder_is_written(
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_in_the_middle_leaves_the_finished_runs(
-    uvd: cs.Scenario, written: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, jobs: int
-) -> None:
+def test_an_error_in_the_middle_leaves_the_finished_runs(run, written, tmp_path, stop_at, monkeypatch, jobs):
     out = tmp_path / "deep" / "out"
     stop_at(5, RuntimeError("out of ideas"))
     with pytest.raises(RuntimeError, match="out of ideas"):
-        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, out=out)
+        run(jobs=jobs, out=out)
     monkeypatch.undo()
     assert [path.name for path in out.parent.iterdir()] == [".out.unfinished"]
-    done: list[int] = []
+    done = []
     trial = World.trial
     monkeypatch.setattr(World, "trial", lambda self, run, seed: (done.append(run), trial(self, run, seed))[1])
-    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=out, resume=True)
+    run(out=out, resume=True)
     assert 5 in done
     # a thread may be ahead, or behind with what is then given up; the system decides
     assert set(done) <= {5, 6, 7, 8} if jobs == 1 else len(set(done)) < 8
@@ -414,50 +411,46 @@ def test_an_error_in_the_middle_leaves_the_finished_runs(
 
 
 @pytest.mark.parametrize("error", [RuntimeError("out of ideas"), KeyboardInterrupt()], ids=["error", "ctrl-c"])
-def test_what_ends_in_the_first_run_leaves_nothing(
-    uvd: cs.Scenario, tmp_path: Path, stop_at: Any, error: BaseException
-) -> None:
+def test_what_ends_in_the_first_run_leaves_nothing(run, tmp_path, stop_at, error):
     stop_at(0, error)
     with pytest.raises(type(error)):
-        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=tmp_path / "deep" / "out")
+        run(out=tmp_path / "deep" / "out")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("where", ["Journal.append", "Writer.add"])
-def test_a_full_disk_keeps_what_was_there(
-    uvd: cs.Scenario, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
-) -> None:
+def test_a_full_disk_keeps_what_was_there(run, written, tmp_path, monkeypatch, where):
     cs.read_results(written).write(tmp_path / "out")
     before = content(tmp_path / "out")
 
-    def full(*_: Any, **__: Any) -> None:
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(getattr(gather, where.split(".")[0]), where.split(".")[1], full)
     kept = "; 3 finished runs are kept, and the same command with --resume goes on" if where == "Writer.add" else ""
     said = rf"--out .*out: cannot be written \(No space left on device\){kept}$"
     with pytest.raises(cs.InputError, match=said):
-        cs.run_trials(uvd, FILTERS, runs=3, seed=4, jobs=2, out=tmp_path / "out", overwrite=True)
+        run(runs=3, seed=4, jobs=2, out=tmp_path / "out", overwrite=True)
     assert content(tmp_path / "out") == before
     assert {path.name for path in tmp_path.iterdir()} == {"out", *[".out.unfinished"] * bool(kept)}
     monkeypatch.undo()
     if kept:  # the disk was freed: what was there is replaced, as was asked for at the beginning
         monkeypatch.setattr(World, "trial", None)
-        cs.run_trials(uvd, FILTERS, runs=3, seed=4, jobs=1, out=tmp_path / "out", resume=True)
+        run(runs=3, seed=4, jobs=1, out=tmp_path / "out", resume=True)
         monkeypatch.undo()
-        cs.run_trials(uvd, FILTERS, runs=3, seed=4, jobs=1, out=tmp_path / "whole")
+        run(runs=3, seed=4, jobs=1, out=tmp_path / "whole")
         assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
-def test_a_folder_that_is_there_is_refused_before_any_work(uvd: cs.Scenario, written: Path, stop_at: Any) -> None:
+def test_a_folder_that_is_there_is_refused_before_any_work(uvd, written, stop_at):
     stop_at(0, RuntimeError("work"))
     with pytest.raises(cs.InputError, match="exists already"):
         cs.run_trials(uvd, FILTERS, runs=3, out=written)
 
 
-def test_a_folder_that_came_meanwhile_is_not_replaced(uvd: cs.Scenario, tmp_path: Path, stop_at: Any) -> None:
+def test_a_folder_that_came_meanwhile_is_not_replaced(uvd, tmp_path, stop_at):
     class Comes(Halts):
-        def init(self, problem: Any) -> dict[str, Any]:
+        def init(self, problem):
             (tmp_path / "out").mkdir(exist_ok=True)
             (tmp_path / "out" / "thesis.txt").write_text("all of it")
             return super().init(problem)
@@ -469,7 +462,7 @@ def test_a_folder_that_came_meanwhile_is_not_replaced(uvd: cs.Scenario, tmp_path
     assert open_results(tmp_path / "out-2").finished_runs(["halts"]) == {0, 1}
 
 
-def test_a_folder_may_be_named_by_text(uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_may_be_named_by_text(uvd, tmp_path, monkeypatch):
     """And by another path when it is gone on with."""
     monkeypatch.chdir(tmp_path)
     before = cs.run_trials(uvd, ["ekf-uvd"], runs=1, jobs=1, out="here")
@@ -478,7 +471,7 @@ def test_a_folder_may_be_named_by_text(uvd: cs.Scenario, tmp_path: Path, monkeyp
     assert after.finished_runs(["ekf-uvd"]) == {0, 1}
 
 
-def test_steps_begin_at_one(uvd: cs.Scenario) -> None:
+def test_steps_begin_at_one(uvd):
     results = cs.run_trials(uvd, ["ekf-uvd"], runs=2, jobs=1)
     shifted = results.estimates.assign(step=results.estimates["step"] - 1)
     with pytest.raises(cs.InputError, match="column 'step' must be at least 1"):

@@ -1,17 +1,14 @@
 """Stereo factors as of GTSAM's examples as a log, of a drive that is known."""
 
-from __future__ import annotations
-
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scripts import experiment
 
 from consistency.bench.store.log import read_log
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
 
 script = experiment("gtsam_log")
 F, B, CENTRE = 721.5377, 0.5, (600.0, 170.0)
@@ -19,7 +16,7 @@ FRAMES, FIRST = 6, 3  # frames are counted from FIRST on
 POINTS = np.random.default_rng(55).uniform((-5, -1, 10), (5, 1, 30), (20, 3))
 
 
-def pose(k: int) -> Array:
+def pose(k):
     """Of the camera, 4 x 4: ahead by 1 m a frame and turning."""
     a = 0.02 * k
     T = np.eye(4)
@@ -29,7 +26,7 @@ def pose(k: int) -> Array:
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> dict[str, Path]:
+def files(tmp_path):
     rows, told = [], []
     for k in range(FRAMES):
         told.append([FIRST + k, *pose(k).ravel()])
@@ -44,7 +41,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
     return out
 
 
-def run(files: dict[str, Path], out: Path, *more: str, truth: bool = True) -> None:
+def run(files, out, *more, truth=True):
     given = [part for name, path in files.items() if truth or name != "truth" for part in (f"--{name}", str(path))]
     old, sys.argv = sys.argv, ["gtsam_log.py", *given, "--out", str(out), *more]
     try:
@@ -53,7 +50,7 @@ def run(files: dict[str, Path], out: Path, *more: str, truth: bool = True) -> No
         sys.argv = old
 
 
-def test_a_drive_becomes_a_log_with_truth_and_without(files: dict[str, Path], tmp_path: Path) -> None:
+def test_a_drive_becomes_a_log_with_truth_and_without(files, tmp_path):
     run(files, tmp_path / "with")
     run(files, tmp_path / "without", truth=False)
     log, blind = (read_log(tmp_path / name) for name in ("with", "without"))
@@ -61,26 +58,26 @@ def test_a_drive_becomes_a_log_with_truth_and_without(files: dict[str, Path], tm
     assert (trial.steps, trial.n_landmarks, len(trial.z)) == (FRAMES - 1, 20, 20 * (FRAMES - 1))
     assert (tmp_path / "with/truth.tum").is_file()
     assert blind.trials[0].truth is None
-    np.testing.assert_allclose(trial.t[-1], 0.104 * (FRAMES - 1), atol=1e-9)
-    np.testing.assert_allclose(blind.trials[0].t[-1], 0.1 * (FRAMES - 1), atol=1e-9)
-    np.testing.assert_allclose(trial.truth[-1, 2], -0.02 * (FRAMES - 1), atol=1e-9)  # type: ignore[index]
+    assert_allclose(trial.t[-1], 0.104 * (FRAMES - 1), atol=1e-9)
+    assert_allclose(blind.trials[0].t[-1], 0.1 * (FRAMES - 1), atol=1e-9)
+    assert_allclose(trial.truth[-1, 2], -0.02 * (FRAMES - 1), atol=1e-9)  # type: ignore[index]
     assert trial.truth[-1, 0] == pytest.approx(FRAMES - 1, rel=0.01)  # type: ignore[index]
-    np.testing.assert_array_equal(blind.trials[0].z, trial.z)
+    assert_array_equal(blind.trials[0].z, trial.z)
     x, y, z = ((POINTS - pose(1)[:3, 3]) @ pose(1)[:3, :3]).T
-    np.testing.assert_allclose(trial.observation(1).z, np.column_stack([F * x / z, F * y / z, F * B / z]), rtol=1e-9)
+    assert_allclose(trial.observation(1).z, np.column_stack([F * x / z, F * y / z, F * B / z]), rtol=1e-9)
     assert (log.belief.sensor.f, log.belief.sensor.B) == (F, B)
 
 
-def test_it_begins_where_it_is_told(files: dict[str, Path], tmp_path: Path) -> None:
+def test_it_begins_where_it_is_told(files, tmp_path):
     run(files, tmp_path / "log", "--first", str(FIRST + 2))
     trial = read_log(tmp_path / "log").trials[0]
     assert trial.steps == FRAMES - 3
     x, _, z = ((POINTS - pose(3)[:3, 3]) @ pose(3)[:3, :3]).T
-    np.testing.assert_allclose(trial.observation(1).z[:, 0], F * x / z, rtol=1e-9)
+    assert_allclose(trial.observation(1).z[:, 0], F * x / z, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    "name, text, said",
     [
         ("factors", None, r"factors\.txt: "),
         ("factors", "1 2 3\n", r"factors\.txt: must hold 8 finite numbers a line, not 3"),
@@ -93,7 +90,7 @@ def test_it_begins_where_it_is_told(files: dict[str, Path], tmp_path: Path) -> N
         ("truth", ("0 " * 13 + "\n") * 4, "--first 0: leaves 1 frames of .*poses"),
     ],
 )
-def test_unusable_files(files: dict[str, Path], tmp_path: Path, name: str, text: str | None, said: str) -> None:
+def test_unusable_files(files, tmp_path, name, text, said):
     files[name].unlink()
     if text is not None:
         files[name].write_text(text)

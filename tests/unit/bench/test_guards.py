@@ -1,13 +1,8 @@
 """Guards: their names, what they remember of tracks, filters of a user's own, and how rejection is scored."""
 
-from __future__ import annotations
-
 import json
 import pickle
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,14 +33,14 @@ WRONG = [{"kind": "wrong-match", "rate": 0.05}]
 
 
 @pytest.fixture(autouse=True)
-def effect() -> Iterator[None]:
+def effect():
     EFFECTS["wrong-match"] = WrongMatch
     yield
     del EFFECTS["wrong-match"]
 
 
 @pytest.fixture
-def wrong(uvd: cs.Scenario) -> cs.Scenario:
+def wrong(uvd):
     return uvd.variant("wrong", truth__sensor__effects=WRONG)
 
 
@@ -54,13 +49,13 @@ class Counter:
 
     name = "counter"
 
-    def init(self, problem: Any) -> dict[str, Any]:
+    def init(self, problem):
         return {"seen": (), "given": ()}
 
-    def predict(self, state: dict[str, Any], control: Any) -> dict[str, Any]:
+    def predict(self, state, control):
         return state
 
-    def update(self, state: dict[str, Any], observation: Observation) -> tuple[dict[str, Any], Info]:
+    def update(self, state, observation):
         labels = observation.landmarks.tolist()
         known = [i for i, label in enumerate(labels) if label in state["seen"]]
         y = observation.z[known].ravel()  # what is expected is zero
@@ -68,18 +63,18 @@ class Counter:
         seen = tuple(dict.fromkeys((*state["seen"], *labels)))
         return {"seen": seen, "given": (*state["given"], tuple(labels))}, info
 
-    def pose(self, state: dict[str, Any]) -> cs.Gaussian:
+    def pose(self, state):
         return cs.Gaussian(np.zeros(3), np.eye(3))
 
 
-def given(filter_: Any, steps: list[dict[int, float]], settings: GuardSettings | None = None) -> list[tuple[int, ...]]:
+def given(filter_, steps, settings=None):
     """Labels that a filter behind ``filter_`` is given in each step, of observations (x, 0, 0) by label."""
 
-    out: list[tuple[int, ...]] = list(after(filter_, steps, settings).inner["given"])
+    out = list(after(filter_, steps, settings).inner["given"])
     return out
 
 
-def after(filter_: Any, steps: list[dict[int, float]], settings: GuardSettings | None) -> Any:
+def after(filter_, steps, settings):
     """The state of ``filter_`` after observations (x, 0, 0) by label in each step."""
 
     class Problem:
@@ -99,7 +94,7 @@ def after(filter_: Any, steps: list[dict[int, float]], settings: GuardSettings |
 @pytest.mark.parametrize(
     "name", ["ekf-uvd+gate", "kf+joint", "ukf-rb+ransac", "parked-ekf-uvd+gate", "submap-ekf-uvd+gate"]
 )
-def test_any_filter_may_carry_a_guard(name: str) -> None:
+def test_any_filter_may_carry_a_guard(name):
     inner, guarded = cs.get_filter(name.partition("+")[0]), cs.get_filter(name)
     assert guarded.name == name
     assert guarded.sensors == inner.sensors
@@ -108,7 +103,7 @@ def test_any_filter_may_carry_a_guard(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
+    "name, message",
     [
         ("ekf-uvd+gates", "filter 'ekf-uvd': unknown guard 'gates'; known: gate, joint, ransac"),
         ("ekf-uvd+", "unknown guard ''"),
@@ -116,12 +111,12 @@ def test_any_filter_may_carry_a_guard(name: str) -> None:
         ("ekf-uv+gate", "unknown filter 'ekf-uv' .did you mean 'ekf-uvd'"),
     ],
 )
-def test_a_wrong_name_is_refused(name: str, message: str) -> None:
+def test_a_wrong_name_is_refused(name, message):
     with pytest.raises(cs.InputError, match=message):
         cs.get_filter(name)
 
 
-def test_smoothers_and_guarded_filters_take_no_guard() -> None:
+def test_smoothers_and_guarded_filters_take_no_guard():
     class Smoother(Counter):
         innovates = False
 
@@ -135,7 +130,7 @@ def test_smoothers_and_guarded_filters_take_no_guard() -> None:
 # --- the belief --------------------------------------------------------------------------------------
 
 
-def test_a_belief_without_the_table_has_the_hash_that_it_had(uvd: cs.Scenario) -> None:
+def test_a_belief_without_the_table_has_the_hash_that_it_had(uvd):
     assert cs.load_scenario("herath2007-stereo").hash == "58509e972cc57274"
     told = uvd.variant("told", belief__guard={"confidence": 0.9})
     assert told.hash != uvd.hash
@@ -144,15 +139,15 @@ def test_a_belief_without_the_table_has_the_hash_that_it_had(uvd: cs.Scenario) -
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
+    "key, value",
     [("confidence", 1.0), ("confidence", 0.0), ("threshold", 0.0), ("min_age", 0), ("forget_after", 0)],
 )
-def test_settings_out_of_range_are_refused(uvd: cs.Scenario, key: str, value: float) -> None:
+def test_settings_out_of_range_are_refused(uvd, key, value):
     with pytest.raises(ValueError, match=key):
         uvd.variant("bad", belief__guard={key: value})
 
 
-def test_a_log_carries_the_settings(wrong: cs.Scenario, tmp_path: Path) -> None:
+def test_a_log_carries_the_settings(wrong, tmp_path):
     settings = {"confidence": 0.9, "min_age": 2}
     simulate_log(wrong.variant("told", belief__guard=settings), 1, 0, tmp_path / "log")
     log = read_log(tmp_path / "log")
@@ -165,23 +160,23 @@ def test_a_log_carries_the_settings(wrong: cs.Scenario, tmp_path: Path) -> None:
 # --- tracks ------------------------------------------------------------------------------------------
 
 
-def test_an_observation_that_is_far_off_is_rejected() -> None:
+def test_an_observation_that_is_far_off_is_rejected():
     steps = [{1: 0.0, 2: 0.0}, {1: 0.5, 2: 9.0}, {1: 9.0, 2: 0.5}]
     assert given(Guarded(Counter(), "gate"), steps) == [(1, 2), (1,), (2,)]
 
 
-def test_a_wider_gate_lets_more_pass() -> None:
+def test_a_wider_gate_lets_more_pass():
     steps = [{1: 0.0}, {1: 3.8}]
     for confidence, expected in ((0.99, ()), (0.999, (1,))):  # quantiles of chi-square: 3.37^2 and 4.03^2
         assert given(Guarded(Counter(), "gate"), steps, GuardSettings(confidence=confidence))[1] == expected
 
 
-def test_a_young_track_neither_begins_a_landmark_nor_updates_one() -> None:
+def test_a_young_track_neither_begins_a_landmark_nor_updates_one():
     steps = [{1: 0.0}, {1: 0.0, 2: 0.0}, {2: 0.0}, {2: 0.0}, {1: 0.0}]
     assert given(Guarded(Counter(), "gate"), steps, GuardSettings(min_age=3)) == [(), (), (), (2,), (1,)]
 
 
-def test_a_landmark_whose_observations_are_rejected_is_given_up() -> None:
+def test_a_landmark_whose_observations_are_rejected_is_given_up():
     far = {1: 9.0}
     steps = [{1: 0.0}, far, {1: 0.0}, far, {1: 0.0}, far, far, {1: 0.0}]
     expected = [(1,), (), (1,), (), (1,), (), ()]
@@ -192,10 +187,10 @@ def test_a_landmark_whose_observations_are_rejected_is_given_up() -> None:
 class Recorder(Counter):
     """Knows where landmarks were seen first, and expects them there."""
 
-    def init(self, problem: Any) -> dict[str, Any]:
+    def init(self, problem):
         return {"at": {}, "given": (), "forgotten": ()}
 
-    def update(self, state: dict[str, Any], observation: Observation) -> tuple[dict[str, Any], Info]:
+    def update(self, state, observation):
         seen = dict(zip(observation.landmarks.tolist(), observation.z, strict=True))
         y = np.array([z - state["at"][label] for label, z in seen.items() if label in state["at"]]).ravel()
         given = (*state["given"], tuple(seen))
@@ -203,19 +198,19 @@ class Recorder(Counter):
 
 
 class Forgetful(Recorder):
-    def forget(self, state: dict[str, Any], landmark: int) -> dict[str, Any]:
+    def forget(self, state, landmark):
         at = {label: z for label, z in state["at"].items() if label != landmark}
         return state | {"at": at, "forgotten": (*state["forgotten"], landmark)}
 
 
-def rejected(filter_: Any, *steps: dict[int, float]) -> tuple[list[bool], Any]:
+def rejected(filter_, *steps):
     """Which observations are rejected by a gate before ``filter_``, and the state that it comes to."""
     guarded = Guarded(filter_, "gate")
     state = after(guarded, list(steps), None)
     return guarded.rejected(state).tolist(), state.inner
 
 
-def test_a_landmark_begins_anew_where_the_second_sighting_does_not_agree_with_the_first() -> None:
+def test_a_landmark_begins_anew_where_the_second_sighting_does_not_agree_with_the_first():
     which, inner = rejected(Forgetful(), {1: 9.0, 2: 0.0}, {1: 0.0, 2: 0.1}, {1: 0.2, 2: 9.0})
     assert which == [True, False, False, False, False, True]
     assert inner["forgotten"] == (1,)
@@ -223,35 +218,35 @@ def test_a_landmark_begins_anew_where_the_second_sighting_does_not_agree_with_th
     assert inner["at"][1][0] == 0.0
 
 
-def test_it_does_so_until_two_agree() -> None:
+def test_it_does_so_until_two_agree():
     which, inner = rejected(Forgetful(), {1: 0.0}, {1: 9.0}, {1: 0.2}, {1: 0.1}, {1: 9.0}, {1: 0.0})
     assert which == [True, True, False, False, True, False]
     assert inner["at"][1][0] == 0.2
 
 
-def test_a_track_that_never_agrees_is_given_up() -> None:
+def test_a_track_that_never_agrees_is_given_up():
     guarded = Guarded(Forgetful(), "gate")
     state = after(guarded, [{1: 9.0 * k} for k in range(6)], GuardSettings(forget_after=3))
     assert state.inner["forgotten"] == (1, 1, 1)
     assert guarded.rejected(state).tolist() == [True, True, True, False, True, True]
 
 
-def test_a_filter_that_cannot_forget_keeps_what_a_landmark_began_with() -> None:
+def test_a_filter_that_cannot_forget_keeps_what_a_landmark_began_with():
     which, inner = rejected(Recorder(), {1: 9.0}, {1: 0.0}, {1: 9.1})
     assert which == [False, True, False]
     assert inner["given"] == ((1,), (), (1,))
 
 
-def test_a_filter_without_innovations_ends_as_a_failed_run(uvd: cs.Scenario) -> None:
+def test_a_filter_without_innovations_ends_as_a_failed_run(uvd):
     class Silent(Counter):
-        def update(self, state: Any, observation: Observation) -> Any:
+        def update(self, state, observation):
             return super().update(state, observation)[0], None
 
     (failure,) = cs.run_trials(uvd, [cs.guarded(Silent(), "gate")], runs=1, jobs=1).failures.itertuples(index=False)
     assert "a guard needs a filter whose update returns Info" in failure.reason
 
 
-def test_a_filter_of_ones_own_is_guarded_like_one_of_the_bench(wrong: cs.Scenario) -> None:
+def test_a_filter_of_ones_own_is_guarded_like_one_of_the_bench(wrong):
     mine = cs.guarded(cs.get_filter("ekf-uvd").textbook, "gate")
     assert pickle.loads(pickle.dumps(mine)).name == "ekf-uvd+gate"  # workers are sent it
     trial = cs.simulate(wrong)
@@ -263,7 +258,7 @@ def test_a_filter_of_ones_own_is_guarded_like_one_of_the_bench(wrong: cs.Scenari
     assert np.abs(ours.pose - compiled.pose).max() < 1e-10
 
 
-def test_small_maps_are_guarded_too(wrong: cs.Scenario) -> None:
+def test_small_maps_are_guarded_too(wrong):
     """The first small map is the EKF's; to a new one a landmark is new, and its observation cannot be judged."""
     trial = cs.simulate(wrong, run=1)
     small, whole = (
@@ -277,7 +272,7 @@ def test_small_maps_are_guarded_too(wrong: cs.Scenario) -> None:
     assert not small.rejected[joined : trial.first[51]].any()
 
 
-def test_what_is_wrong_is_rejected(linear: cs.Scenario, rng: np.random.Generator) -> None:
+def test_what_is_wrong_is_rejected(linear, rng):
     """In a linear world with exact covariances: most of what is wrong, and few of the rest."""
     trial = corrupted(cs.simulate(linear), rng, 0.1)
     rejected = run_filter(cs.guarded(cs.get_filter("kf").textbook, "joint"), trial, linear.belief).rejected
@@ -287,7 +282,7 @@ def test_what_is_wrong_is_rejected(linear: cs.Scenario, rng: np.random.Generator
 # --- scores ------------------------------------------------------------------------------------------
 
 
-def test_shares_and_their_intervals() -> None:
+def test_shares_and_their_intervals():
     score = rejection_score(*(np.array(n) for n in ([100, 200], [10, 10], [12, 18], [6, 9])))
     assert (score.offered, score.spurious, score.rejected, score.runs) == (300, 20, 30, 2)
     assert score.precision.value == 15 / 30
@@ -298,7 +293,7 @@ def test_shares_and_their_intervals() -> None:
     assert nothing.recall[1:] == (0.0, 1.0)
 
 
-def test_of_like_clusters_the_interval_is_the_exact_binomial_one() -> None:
+def test_of_like_clusters_the_interval_is_the_exact_binomial_one():
     """Many clusters without spread: the design effect is 1, and the quantiles of t are those of the normal."""
     value, low, high = clustered_share(np.full(3000, 1), np.full(3000, 4))
     exact = stats.binomtest(3000, 12000).proportion_ci(method="exact")
@@ -306,14 +301,14 @@ def test_of_like_clusters_the_interval_is_the_exact_binomial_one() -> None:
     assert np.allclose((low, high), exact, rtol=0, atol=2e-5)
 
 
-def test_few_clusters_widen_the_interval() -> None:
+def test_few_clusters_widen_the_interval():
     """Ten draws of one each, half of them counted: a design effect of 10 / 9, and so 9 draws that count."""
     value, low, high = clustered_share(np.arange(10) % 2, np.ones(10))
     assert value == 0.5
     assert np.allclose((low, high), (stats.beta.ppf(0.025, 4.5, 5.5), stats.beta.ppf(0.975, 5.5, 4.5)), rtol=1e-9)
 
 
-def test_ends_of_the_scale() -> None:
+def test_ends_of_the_scale():
     assert clustered_share(np.zeros(50), np.full(50, 20))[:2] == (0.0, 0.0)
     assert clustered_share(np.full(50, 20), np.full(50, 20))[0::2] == (1.0, 1.0)
     assert clustered_share(np.array([3]), np.array([9]))[1:] == (0.0, 1.0)  # one run says nothing of the spread
@@ -324,7 +319,7 @@ def test_ends_of_the_scale() -> None:
 FILTERS = ["ekf-uvd", "ekf-uvd+gate"]
 
 
-def test_rejections_are_kept_streamed_and_resumed(wrong: cs.Scenario, tmp_path: Path) -> None:
+def test_rejections_are_kept_streamed_and_resumed(wrong, tmp_path):
     memory = cs.run_trials(wrong, FILTERS, runs=4, seed=1, jobs=1)
     memory.write(tmp_path / "memory")
     stored = cs.run_trials(wrong, FILTERS, runs=4, seed=1, jobs=2, out=tmp_path / "stored")
@@ -343,15 +338,15 @@ def test_rejections_are_kept_streamed_and_resumed(wrong: cs.Scenario, tmp_path: 
         assert (row.offered, row.spurious, row.rejected, row.rejected_spurious) == counts
 
 
-def test_without_a_guard_there_is_no_file(uvd: cs.Scenario, tmp_path: Path) -> None:
+def test_without_a_guard_there_is_no_file(uvd, tmp_path):
     cs.run_trials(uvd, ["ekf-uvd"], runs=1, jobs=1, out=tmp_path / "out")
     assert not (tmp_path / "out" / "rejections.parquet").exists()
     assert cs.read_results(tmp_path / "out").rejections is None
 
 
-def test_a_failed_run_counts_up_to_its_end(uvd: cs.Scenario) -> None:
+def test_a_failed_run_counts_up_to_its_end(uvd):
     class Breaks(Counter):
-        def update(self, state: dict[str, Any], observation: Observation) -> Any:
+        def update(self, state, observation):
             if len(state["given"]) == 3:
                 raise ValueError("enough")
             return super().update(state, observation)
@@ -360,9 +355,7 @@ def test_a_failed_run_counts_up_to_its_end(uvd: cs.Scenario) -> None:
     assert results.rejections["offered"].tolist() == [cs.simulate(uvd).first[3]]
 
 
-def test_verdicts_tell_precision_and_recall(
-    wrong: cs.Scenario, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_verdicts_tell_precision_and_recall(wrong, capsys, tmp_path):
     cs.run_trials(wrong, FILTERS, runs=4, seed=2, jobs=1, out=tmp_path / "out")
     verdicts = cs.analyse(cs.read_results(tmp_path / "out"))
     assert verdicts["ekf-uvd"].rejection is None
@@ -377,7 +370,7 @@ def test_verdicts_tell_precision_and_recall(
     assert "precision" in str(verdicts["ekf-uvd+gate"])
 
 
-def test_a_report_has_a_row_for_each_guard(wrong: cs.Scenario, tmp_path: Path) -> None:
+def test_a_report_has_a_row_for_each_guard(wrong, tmp_path):
     cs.run_trials(wrong, FILTERS, runs=3, seed=1, jobs=1, out=tmp_path / "out")
     study = build_report(tmp_path / "out").studies[0]
     _, table = rejections(study)
@@ -394,7 +387,7 @@ def test_a_report_has_a_row_for_each_guard(wrong: cs.Scenario, tmp_path: Path) -
     assert rejections(replace(study, tracks=study.tracks[:1])) == ()
 
 
-def test_a_clean_world_has_a_share_of_rejections_alone(uvd: cs.Scenario) -> None:
+def test_a_clean_world_has_a_share_of_rejections_alone(uvd):
     verdict = cs.analyse(cs.run_trials(uvd, ["ekf-uvd+gate"], runs=2, jobs=1))["ekf-uvd+gate"]
     assert verdict.rejection.spurious == 0
     assert "precision" not in str(verdict)

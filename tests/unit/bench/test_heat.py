@@ -1,14 +1,9 @@
 """Heat maps of covariance ratios and the table of cells, for sweeps over any axes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes as Panel
 from painted import panels, titles
 
 import consistency as cs
@@ -16,21 +11,20 @@ from consistency.bench.pages import heat, write_regime_reports
 from consistency.bench.pages.heat import colour_of, heat_figure, ink_on
 from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
-from consistency.bench.sweeps.plan import Sweep, load_sweep
+from consistency.bench.sweeps.plan import load_sweep
 from consistency.bench.sweeps.printing import regime_blocks
 from consistency.bench.sweeps.regime import Regime
-from consistency.referee.document.blocks import Figure
 from consistency.referee.show.svg import svg
 from consistency.referee.show.terminal import show
 
 LONG = [{"kind": "mismatch", "rate": 0.05}]
 
 
-def result(ratio: float, status: str = "overconfident") -> CellResult:
+def result(ratio, status="overconfident"):
     return CellResult(status, status, 12, 0, 3.0, 2.5, 3.5, ratio, ratio / 2, np.inf, 0.1, 0.01, 1.0, 20.0)
 
 
-def sweep_over(**values: list[Any]) -> Sweep:
+def sweep_over(**values):
     base = cs.load_scenario("herath2007-stereo")
     effects = [{"kind": "heavy-tails", "rate": 0.1, "sigma": (1.0, 1.0, 1.0)}]
     axes = tuple(Axis(key.replace("__", "."), tuple(some)) for key, some in values.items())
@@ -43,12 +37,12 @@ SPEED = {"truth__path__speed": [0.25, 0.5, 1.0]}
 NOISE = {"belief__motion__sigma_v": [0.1, 0.2]}
 TEXT = {"truth__sensor__effects": [[], LONG]}
 HEADING = {"truth__path__heading": [0.0, 1.0]}
-GRIDS: dict[str, dict[str, list[Any]]] = {
+GRIDS = {
     "one": SPEED, "text": TEXT, "two": SPEED | NOISE, "four": TEXT | SPEED | NOISE | HEADING,
 }  # fmt: skip
 
 
-def regime_of(sweep: Sweep) -> Regime:
+def regime_of(sweep):
     """Ratio of filter a: 1 + number of the cell; infinite in the last one, none in the first of b."""
     cells = sweep.cells
     results = {(cell.number, "a"): result(1.0 + cell.number) for cell in cells}
@@ -57,11 +51,11 @@ def regime_of(sweep: Sweep) -> Regime:
     return Regime(sweep, results, {})
 
 
-def every_panel(figure: Figure) -> list[Panel]:
+def every_panel(figure):
     return [axes for number in range(len(figure.drawings)) for axes in panels(figure, number)]
 
 
-def tiles(axes: Panel) -> dict[tuple[int, int], tuple[str, str]]:
+def tiles(axes):
     """Number and word of each tile by its place."""
     texts = [text for text in axes.texts if text.get_text()]
     pairs = zip(texts[::2], texts[1::2], strict=True)
@@ -71,11 +65,11 @@ def tiles(axes: Panel) -> dict[tuple[int, int], tuple[str, str]]:
     }
 
 
-def ticks(labels: list[Any]) -> list[str]:
+def ticks(labels):
     return [label.get_text() for label in labels]
 
 
-def test_a_tile_stands_where_its_cell_does() -> None:
+def test_a_tile_stands_where_its_cell_does():
     """Speeds from the left, noises from below; the number is that of the cell."""
     (axes,) = every_panel(heat_figure(regime_of(sweep_over(**SPEED, **NOISE)), "a"))
     assert ticks(axes.get_xticklabels()) == ["0.25", "0.5", "1"]
@@ -88,8 +82,8 @@ def test_a_tile_stands_where_its_cell_does() -> None:
     assert axes.patches[0].get_gid() == f"title:{heat.words_of(result(1.0))}"
 
 
-@pytest.mark.parametrize(("name", "many"), [("one", 1), ("text", 1), ("two", 1), ("four", 4)])
-def test_every_cell_is_shown_once(name: str, many: int) -> None:
+@pytest.mark.parametrize("name, many", [("one", 1), ("text", 1), ("two", 1), ("four", 4)])
+def test_every_cell_is_shown_once(name, many):
     regime = regime_of(sweep_over(**GRIDS[name]))
     found = every_panel(heat_figure(regime, "a"))
     assert len(found) == many
@@ -102,7 +96,7 @@ def test_every_cell_is_shown_once(name: str, many: int) -> None:
     assert [text.get_text() for axes in empty for text in axes.texts] == ["no cell is there yet"] * len(empty)
 
 
-def test_axes_that_vary_alone_have_a_map_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_axes_that_vary_alone_have_a_map_each(tmp_path, capsys):
     """Beside the axis of the grid; each map has the cells in which no other axis is away from its base."""
     regime = regime_of(replace(load_sweep("beyond"), filters=("a", "b")))
     sweep, found = regime.sweep, every_panel(heat_figure(regime, "a"))
@@ -131,14 +125,14 @@ def test_axes_that_vary_alone_have_a_map_each(tmp_path: Path, capsys: pytest.Cap
     ]
 
 
-def test_long_values_are_told_apart() -> None:
+def test_long_values_are_told_apart():
     axis = Axis("truth.sensor.effects", tuple([{"kind": "mismatch", "rate": rate}] * 3 for rate in (0.1, 0.2)))
     texts = [heat.said(axis, i) for i in range(2)]
     assert len(set(texts)) == 2
     assert max(map(len, texts)) <= heat.LONGEST
 
 
-def test_colours_say_which_way() -> None:
+def test_colours_say_which_way():
     assert colour_of(1.0) == heat.PAPER
     assert colour_of(heat.FULL) == colour_of(1e9) == colour_of(np.inf) == heat.LARGE.lower()
     assert colour_of(1.0 / heat.FULL) == colour_of(1e-9) == colour_of(0.0) == heat.SMALL.lower()
@@ -149,7 +143,7 @@ def test_colours_say_which_way() -> None:
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_page_and_paper_show_it(name: str, tmp_path: Path) -> None:
+def test_page_and_paper_show_it(name, tmp_path):
     regime = regime_of(sweep_over(**GRIDS[name]))
     page, sheets = write_regime_reports(regime, tmp_path)
     text = page.read_text(encoding="utf-8")
@@ -161,7 +155,7 @@ def test_page_and_paper_show_it(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_a_terminal_has_a_row_a_cell(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_terminal_has_a_row_a_cell(name, capsys):
     regime = regime_of(sweep_over(**GRIDS[name]))
     show(*regime_blocks(regime))
     lines = [line for line in capsys.readouterr().out.splitlines() if line]
@@ -172,12 +166,12 @@ def test_a_terminal_has_a_row_a_cell(name: str, capsys: pytest.CaptureFixture[st
     assert "overconfident ∞" in rows[-1]
 
 
-def test_many_cells_are_counted_only(capsys: pytest.CaptureFixture[str]) -> None:
+def test_many_cells_are_counted_only(capsys):
     show(*regime_blocks(regime_of(replace(load_sweep("regime"), filters=("a", "b")))))
     assert len(capsys.readouterr().out.splitlines()) < 10
 
 
-def test_an_infinite_ratio_is_kept() -> None:
+def test_an_infinite_ratio_is_kept():
     numbers = plain_numbers(result(np.inf))
     assert (numbers["ratio"], plain_numbers(result(np.nan))["ratio"]) == ("inf", None)
     assert result_from(numbers).ratio == np.inf

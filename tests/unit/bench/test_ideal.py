@@ -1,9 +1,6 @@
 """A filter that takes its Jacobians at the truth is marked, is told it, and is refused where there is none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,11 +13,11 @@ from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.log import read_log
 
 
-def test_only_the_ideal_filters_are_marked() -> None:
+def test_only_the_ideal_filters_are_marked():
     assert {name for name in usable_names() if not is_realisable(cs.get_filter(name))} == BOUNDS
 
 
-def test_no_other_filter_is_told_the_truth(uvd: cs.Scenario) -> None:
+def test_no_other_filter_is_told_the_truth(uvd):
     trial = cs.simulate(uvd)
     for name in ("ekf-uvd", "fej-ekf-uvd", "oc-ekf-uvd"):
         assert problem_for(cs.get_filter(name), trial, uvd.belief) == problem_of(trial, uvd.belief)
@@ -30,7 +27,7 @@ def test_no_other_filter_is_told_the_truth(uvd: cs.Scenario) -> None:
 
 
 @pytest.mark.parametrize("table", ["truth", "landmarks"])
-def test_a_log_without_truth_is_refused(uvd: cs.Scenario, tmp_path: Path, table: str) -> None:
+def test_a_log_without_truth_is_refused(uvd, tmp_path, table):
     simulate_log(uvd, runs=1, seed=1, out=tmp_path / "log")
     (tmp_path / "log" / f"{table}.parquet").unlink()
     with pytest.raises(
@@ -39,7 +36,7 @@ def test_a_log_without_truth_is_refused(uvd: cs.Scenario, tmp_path: Path, table:
         run_log(read_log(tmp_path / "log"), ["ideal-ekf-uvd"], jobs=1)
 
 
-def test_measurements_alone_are_refused(uvd: cs.Scenario) -> None:
+def test_measurements_alone_are_refused(uvd):
     trial, filter_ = cs.simulate(uvd), cs.get_filter("ideal-ekf-uvd")
     with pytest.raises(cs.InputError, match="cannot be stepped on measurements alone"):
         filter_.init(problem_of(trial, uvd.belief))
@@ -49,7 +46,7 @@ def test_measurements_alone_are_refused(uvd: cs.Scenario) -> None:
             run(filter_, unknown, uvd.belief)
 
 
-def test_things_that_are_no_landmark_are_refused(uvd: cs.Scenario) -> None:
+def test_things_that_are_no_landmark_are_refused(uvd):
     trial, filter_ = cs.simulate(uvd), cs.get_filter("ideal-ekf-uvd")
     landmark = np.array(trial.landmark)
     landmark[-1] = trial.n_landmarks

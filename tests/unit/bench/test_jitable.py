@@ -1,7 +1,5 @@
 """Functions of models: plain Python until a kernel is compiled."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -12,21 +10,21 @@ from consistency.bench.models import jitable
 
 
 @jitable.jitable
-def doubled(x: float) -> float:
+def doubled(x):
     return 2.0 * x
 
 
-def test_numba_knows_what_is_jitable_once_it_is_told() -> None:
+def test_numba_knows_what_is_jitable_once_it_is_told():
     jitable.register_jitables()
 
     @numba.njit
-    def calls(x: float) -> float:
+    def calls(x):
         return doubled(x)
 
     assert calls(1.5) == doubled(1.5) == 3.0
 
 
-@pytest.mark.parametrize(("module", "loads"), [("runs.results_to_records", False), ("store.trial_rows", True)])
-def test_a_verdict_on_results_loads_no_numba(module: str, loads: bool) -> None:
+@pytest.mark.parametrize("module, loads", [("runs.results_to_records", False), ("store.trial_rows", True)])
+def test_a_verdict_on_results_loads_no_numba(module, loads):
     code = f"import sys, consistency.bench.{module}; sys.exit(('numba' in sys.modules) != {loads})"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,7 +1,5 @@
 """Finished runs survive: the journal, its lock, signals, what cannot be written, and tables that were edited."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -9,9 +7,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,7 +22,6 @@ from consistency.bench.simulation import World
 from consistency.bench.store import journal as journals
 from consistency.bench.store.journal import DATABASE, Journal, Unfinished
 from consistency.bench.store.results import open_results
-from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system import folders
 from consistency.referee.system.progress import progress, say
 
@@ -34,48 +29,66 @@ FILTER = ["ekf-uvd"]
 RUNS = 6
 
 
-def columns(run: int, rows: int = 5) -> dict[str, Any]:
+def columns(run, rows=5):
     numbers = np.random.default_rng(run).standard_normal(rows)
     numbers[0] = np.nan
     return {"run": np.full(rows, run), "x": numbers}
 
 
-def fill(journal: Journal, *runs: int) -> None:
+def fill(journal, *runs):
     for run in runs:
         notes = {"failures": [["f", run, 3, "odd \udce9 letters"]]} if run == 2 else {}
         journal.append(run, {"estimates f": columns(run), "truth": columns(100 + run, 3)}, notes)
 
 
-def held(journal: Journal, part: str = "estimates f") -> dict[int, bytes]:
+def reopened(path):
+    """What a journal holds when it is opened again."""
+    journal = Journal(path)
+    pieces = held(journal)
+    journal.close()
+    return pieces
+
+
+def held(journal, part="estimates f"):
     pieces = {run: b"".join(each.tobytes() for each in piece.values()) for run, piece in journal.pieces(part)}
     assert list(pieces) == sorted(pieces)
     return pieces
 
 
-def expected(*runs: int) -> dict[int, bytes]:
+def expected(*runs):
     return {run: b"".join(each.tobytes() for each in columns(run).values()) for run in sorted(runs)}
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "journal"
 
 
+@pytest.fixture(scope="session")
+def run(uvd):
+    """Six runs of the same study, unless told otherwise."""
+
+    def work(filters=FILTER, **options):
+        return cs.run_trials(uvd, filters, **{"runs": RUNS, "seed": 3, "jobs": 1, **options})
+
+    return work
+
+
 @pytest.fixture(scope="module")
-def whole(uvd: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(run, tmp_path_factory):
     """Results of one go."""
     folder = tmp_path_factory.mktemp("journal") / "whole"
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=folder)
+    run(out=folder)
     return folder
 
 
 @pytest.fixture
-def at_run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+def at_run(monkeypatch):
     """Has something done at the beginning of a run, or of each where its number is ``...``."""
     trial = World.trial
 
-    def arm(number: Any, work: Callable[..., object]) -> None:
-        def worked(self: World, run: int, seed: int) -> Any:
+    def arm(number, work):
+        def worked(self, run, seed):
             if number is ...:
                 work(run)
             elif run == number:
@@ -91,7 +104,7 @@ def at_run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
 # --- the file ------------------------------------------------------------------------------------
 
 
-def test_runs_come_back_in_their_order_with_all_bits(path: Path) -> None:
+def test_runs_come_back_in_their_order_with_all_bits(path):
     journal = Journal(path)
     journal.begin({"seed": 3})
     fill(journal, 4000, 0, 2)  # a set has these in another order
@@ -109,7 +122,7 @@ def test_runs_come_back_in_their_order_with_all_bits(path: Path) -> None:
 
 
 @pytest.mark.parametrize("cut", [0, 1, 7_000])
-def test_what_a_killed_process_leaves_are_whole_runs(path: Path, cut: int) -> None:
+def test_what_a_killed_process_leaves_are_whole_runs(path, cut):
     """Files as SIGKILL leaves them, the last transaction cut as a power cut may leave it."""
     journal = Journal(path)
     fill(journal, 0, 1)
@@ -126,22 +139,20 @@ def test_what_a_killed_process_leaves_are_whole_runs(path: Path, cut: int) -> No
     again.close()
 
 
-def test_an_append_that_fails_leaves_nothing(path: Path) -> None:
+def test_an_append_that_fails_leaves_nothing(path):
     """The first table of the run is written, the second cannot be."""
     journal = Journal(path)
     fill(journal, 0)
-    broken: Any = {"estimates f": columns(1), "truth": {"x": None}}
+    broken = {"estimates f": columns(1), "truth": {"x": None}}
     with pytest.raises(AttributeError):
         journal.append(1, broken)
     assert journal.runs == {0}
     fill(journal, 2)
     journal.close()
-    again = Journal(path)
-    assert held(again) == expected(0, 2)
-    again.close()
+    assert reopened(path) == expected(0, 2)
 
 
-def test_a_full_disk_leaves_whole_runs_and_may_be_freed(path: Path) -> None:
+def test_a_full_disk_leaves_whole_runs_and_may_be_freed(path):
     journal = Journal(path)
     fill(journal, 0)
     (pages,) = journal._database.execute("PRAGMA page_count").fetchone()
@@ -152,12 +163,10 @@ def test_a_full_disk_leaves_whole_runs_and_may_be_freed(path: Path) -> None:
     journal._database.execute("PRAGMA max_page_count = 100000")
     fill(journal, 2)
     journal.close()
-    again = Journal(path)
-    assert held(again) == expected(0, 2)
-    again.close()
+    assert reopened(path) == expected(0, 2)
 
 
-def test_a_damaged_number_is_refused(path: Path) -> None:
+def test_a_damaged_number_is_refused(path):
     journal = Journal(path)
     fill(journal, 0, 1)
     journal.close()
@@ -171,13 +180,13 @@ def test_a_damaged_number_is_refused(path: Path) -> None:
     again.close()
 
 
-def test_a_file_that_is_no_database_is_refused(path: Path) -> None:
+def test_a_file_that_is_no_database_is_refused(path):
     path.write_bytes(b"run:" + bytes(4096))
     with pytest.raises(cs.InputError, match=r"damaged \(file is not a database\)"):
         Journal(path)
 
 
-def test_runs_are_brought_to_disk_now_and_then(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_brought_to_disk_now_and_then(path, monkeypatch):
     """After a checkpoint the database itself, without its log, has the runs."""
     journal = Journal(path)
     fill(journal, 0)
@@ -195,7 +204,7 @@ def test_runs_are_brought_to_disk_now_and_then(path: Path, monkeypatch: pytest.M
 # --- beside an output folder -----------------------------------------------------------------------
 
 
-def test_one_process_at_a_time(tmp_path: Path) -> None:
+def test_one_process_at_a_time(tmp_path):
     out = tmp_path / "out"
     with Unfinished(out) as first:
         fill(first.journal, 0)
@@ -207,7 +216,7 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
         assert second.journal.runs == {0, 1}
 
 
-def test_unfinished_work_is_neither_ignored_nor_dropped_unasked(tmp_path: Path) -> None:
+def test_unfinished_work_is_neither_ignored_nor_dropped_unasked(tmp_path):
     out = tmp_path / "deep" / "out"
     with Unfinished(out) as first:
         fill(first.journal, 0, 1)
@@ -221,17 +230,17 @@ def test_unfinished_work_is_neither_ignored_nor_dropped_unasked(tmp_path: Path) 
     assert list((tmp_path / "deep").iterdir()) == [], "nothing is finished, nothing stays"
 
 
-def test_resume_where_nothing_is(uvd: cs.Scenario, tmp_path: Path) -> None:
+def test_resume_where_nothing_is(run, tmp_path):
     """Nothing at all is refused; a journal that a process was killed in before its first run is begun."""
     with pytest.raises(cs.InputError, match=r"out: there is nothing to resume; leave --resume out"):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=True)
+        run(out=tmp_path / "out", resume=True)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / ".out.unfinished").mkdir()
     Journal(tmp_path / ".out.unfinished" / DATABASE).close()
-    assert cs.run_trials(uvd, FILTER, 1, seed=3, jobs=1, out=tmp_path / "out", resume=True).manifest["complete"]
+    assert run(runs=1, out=tmp_path / "out", resume=True).manifest["complete"]
 
 
-def test_folders_that_were_made_go_with_what_was_for_nothing(tmp_path: Path) -> None:
+def test_folders_that_were_made_go_with_what_was_for_nothing(tmp_path):
     with Unfinished(tmp_path / "a" / "b" / "out"):
         (tmp_path / "a" / "mine.txt").write_text("x")
     assert [path.name for path in tmp_path.rglob("*")] == ["a", "mine.txt"]
@@ -240,20 +249,20 @@ def test_folders_that_were_made_go_with_what_was_for_nothing(tmp_path: Path) -> 
 # --- whatever ends the process -----------------------------------------------------------------------
 
 
-def test_what_a_killed_process_leaves_is_resumed(uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any) -> None:
+def test_what_a_killed_process_leaves_is_resumed(run, whole, tmp_path, at_run):
     """What is on disk in the middle of a run is what SIGKILL would leave."""
     out, left = tmp_path / "first" / "out", tmp_path / "second"
     at_run(4, lambda: shutil.copytree(out.parent, left))
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out)
-    begun: set[int] = set()
+    run(out=out)
+    begun = set()
     at_run(..., begun.add)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=left / "out", resume=True)
+    run(out=left / "out", resume=True)
     assert content(left / "out") == content(whole)
     assert [path.name for path in left.iterdir()] == ["out"]
     assert {4, 5} <= begun <= {3, 4, 5}, "run 3 was finished, but may not have been written yet"
 
 
-def test_unfinished_work_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+def test_unfinished_work_of_an_earlier_version_is_refused(tmp_path):
     out = tmp_path / "out"
     (tmp_path / ".out.unfinished").mkdir()
     (tmp_path / ".out.unfinished" / "journal").write_bytes(b"run:")
@@ -263,80 +272,76 @@ def test_unfinished_work_of_an_earlier_version_is_refused(tmp_path: Path) -> Non
         assert fresh.journal.runs == set()
 
 
-def test_only_what_is_missing_is_done_again(uvd: cs.Scenario, whole: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_only_what_is_missing_is_done_again(run, uvd, whole, tmp_path, monkeypatch):
     with Unfinished(tmp_path / "out") as unfinished:  # another filter's journal
         unfinished.journal.begin({"scenario_hash": uvd.hash, "filters": FILTER, "error": {}, "seed": 4})
         fill(unfinished.journal, 0)
     with pytest.raises(cs.InputError, match="the results to resume have another seed"):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=True)
+        run(out=tmp_path / "out", resume=True)
     with Unfinished(tmp_path / "out", resume=True) as unfinished:
         assert unfinished.journal.runs == {0}, "it is still there"
     monkeypatch.setattr(gather, "Writer", None)
     with pytest.raises(TypeError):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "other")
+        run(out=tmp_path / "other")
     monkeypatch.undo()
     monkeypatch.setattr(World, "trial", None)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "other", resume=True)
+    run(out=tmp_path / "other", resume=True)
     assert content(tmp_path / "other") == content(whole)
 
 
-def test_killed_while_results_were_replaced(uvd: cs.Scenario, whole: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_killed_while_results_were_replaced(run, whole, tmp_path, monkeypatch):
     """The old folder is away and the new one not there: both are found again."""
     out, replace = tmp_path / "out", os.replace
-    cs.run_trials(uvd, FILTER, 3, seed=3, jobs=1, out=out)
+    run(runs=3, out=out)
 
-    def dies(source: Path, target: Path) -> None:
+    def dies(source, target):
         if Path(target) == out:
             raise SystemExit("killed")
         replace(source, target)
 
     monkeypatch.setattr(folders.os, "replace", dies)
     with pytest.raises(SystemExit):
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
+        run(out=out, resume=True)
     monkeypatch.undo()
     assert not out.exists()
     monkeypatch.setattr(World, "trial", None)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
+    run(out=out, resume=True)
     assert content(out) == content(whole)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_killed_before_the_journal_was_removed(uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any) -> None:
+def test_killed_before_the_journal_was_removed(run, whole, tmp_path, at_run):
     """The results are there, and their runs are in the journal, too: they count once."""
     out, unfinished = tmp_path / "out", tmp_path / ".out.unfinished"
     at_run(4, lambda: shutil.copytree(unfinished, tmp_path / "copy"))
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out)
+    run(out=out)
     (tmp_path / "copy").rename(unfinished)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
+    run(out=out, resume=True)
     assert content(out) == content(whole)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_outcomes_in_any_order_give_the_same_bytes(
-    uvd: cs.Scenario, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    outcomes: list[RunOutcome] = []
+def test_outcomes_in_any_order_give_the_same_bytes(run, whole, tmp_path, monkeypatch):
+    outcomes = []
     add, results = Gathered.add, Gathered.results
 
-    def backwards(self: Gathered, *rest: Any) -> Any:
+    def backwards(self, *rest):
         for outcome in reversed(outcomes):
             add(self, outcome)
         return results(self, *rest)
 
     monkeypatch.setattr(Gathered, "add", lambda self, outcome: outcomes.append(outcome))
     monkeypatch.setattr(Gathered, "results", backwards)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out")
+    run(out=tmp_path / "out")
     outcomes.clear()
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1).write(tmp_path / "memory")
+    run().write(tmp_path / "memory")
     assert content(tmp_path / "out") == content(tmp_path / "memory") == content(whole)
 
 
-def test_a_place_that_was_removed_meanwhile_is_made_again(
-    uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any
-) -> None:
+def test_a_place_that_was_removed_meanwhile_is_made_again(run, whole, tmp_path, at_run):
     """The whole folder above is gone, with the journal in it: the work is not."""
     at_run(4, lambda: shutil.rmtree(tmp_path / "deep"))
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "deep" / "out")
+    run(out=tmp_path / "deep" / "out")
     assert content(tmp_path / "deep" / "out") == content(whole)
 
 
@@ -344,7 +349,7 @@ def test_a_place_that_was_removed_meanwhile_is_made_again(
 
 
 @pytest.fixture
-def handled() -> Iterator[None]:
+def handled():
     """Ctrl-C as in a terminal; as it was at the end."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
@@ -353,18 +358,18 @@ def handled() -> Iterator[None]:
 
 @pytest.mark.usefixtures("handled")
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_ctrl_c_loses_nothing(uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any, jobs: int) -> None:
+def test_ctrl_c_loses_nothing(run, whole, tmp_path, at_run, jobs):
     """The trial in progress is done to its end; the journal has all that came before."""
-    ended: list[int] = []
+    ended = []
 
-    def pressed() -> None:
+    def pressed():
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(0.3)
         ended.append(4)
 
     at_run(4, pressed)
     with pytest.raises(KeyboardInterrupt) as stop:
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=jobs, out=tmp_path / "out")
+        run(jobs=jobs, out=tmp_path / "out")
     assert not isinstance(stop.value, Interrupted)
     assert ended == [4]
     assert not (tmp_path / "out").exists()
@@ -373,19 +378,19 @@ def test_ctrl_c_loses_nothing(uvd: cs.Scenario, whole: Path, tmp_path: Path, at_
     assert 4 not in done
     assert jobs == 2 or {0, 1, 2} <= done, "run 3 was finished, but may not have been written yet"
     at_run(4, int)
-    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=bool(done))
+    run(out=tmp_path / "out", resume=bool(done))
     assert content(tmp_path / "out") == content(whole)
 
 
 @pytest.mark.usefixtures("handled")
-def test_ctrl_c_without_a_folder_hands_over_what_is_finished(uvd: cs.Scenario, at_run: Any) -> None:
-    def pressed() -> None:
+def test_ctrl_c_without_a_folder_hands_over_what_is_finished(run, at_run):
+    def pressed():
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(0.3)
 
     at_run(4, pressed)
     with pytest.raises(Interrupted) as stop:
-        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1)
+        run()
     done = stop.value.results.finished_runs(FILTER)
     assert {0, 1, 2} <= done <= {0, 1, 2, 3}, "run 3 was finished, but may not have been handed over yet"
     assert stop.value.results.manifest["finished_runs"] == len(done)
@@ -397,25 +402,25 @@ def test_ctrl_c_without_a_folder_hands_over_what_is_finished(uvd: cs.Scenario, a
 class Gone:
     """A terminal that was closed."""
 
-    def write(self, _: str) -> int:
+    def write(self, _):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    def flush(self) -> None:
+    def flush(self):
         raise BrokenPipeError
 
-    def isatty(self) -> bool:
+    def isatty(self):
         return False
 
 
 class GoneTerminal(Gone):
     encoding = "utf-8"
 
-    def isatty(self) -> bool:
+    def isatty(self):
         return True
 
 
 @pytest.mark.parametrize("stream", [None, Gone(), GoneTerminal()], ids=["closed", "pipe", "terminal"])
-def test_progress_that_nobody_can_read_ends_nothing(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_that_nobody_can_read_ends_nothing(stream, monkeypatch):
     monkeypatch.setattr(sys, "stderr", stream)
     say("one line")
     with progress("runs", 2) as advance:
@@ -426,17 +431,17 @@ def test_progress_that_nobody_can_read_ends_nothing(stream: Any, monkeypatch: py
 # --- manifest ----------------------------------------------------------------------------------------
 
 
-def halved(table: pd.DataFrame) -> pd.DataFrame:
+def halved(table):
     return table[: len(table) // 2]
 
 
-def shifted(table: pd.DataFrame) -> pd.DataFrame:
+def shifted(table):
     return table.assign(x=table["x"] + 1e-9)
 
 
 @pytest.mark.parametrize("edit", [halved, shifted])
 @pytest.mark.parametrize("name", ["estimates", "truth", "map", "landmarks"])
-def test_an_edited_table_is_refused(whole: Path, tmp_path: Path, name: str, edit: Any) -> None:
+def test_an_edited_table_is_refused(whole, tmp_path, name, edit):
     shutil.copytree(whole, tmp_path / "out")
     path = tmp_path / "out" / f"{name}.parquet"
     edit(pd.read_parquet(path)).to_parquet(path, index=False)
@@ -448,13 +453,13 @@ def test_an_edited_table_is_refused(whole: Path, tmp_path: Path, name: str, edit
         assert open_results(tmp_path / "out")
 
 
-def test_a_folder_of_before_has_no_digests(whole: Path, tmp_path: Path) -> None:
+def test_a_folder_of_before_has_no_digests(whole, tmp_path):
     shutil.copytree(whole, tmp_path / "out")
     change_manifest(tmp_path / "out", "contents", "machines")
     assert open_results(tmp_path / "out").finished_runs(FILTER) == set(range(RUNS))
 
 
-def test_another_processor_is_named(uvd: cs.Scenario, whole: Path, tmp_path: Path, capsys: Any) -> None:
+def test_another_processor_is_named(run, whole, tmp_path, capsys):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
     manifest = json.loads((out / "manifest.json").read_text())
@@ -463,9 +468,9 @@ def test_another_processor_is_named(uvd: cs.Scenario, whole: Path, tmp_path: Pat
     assert here["blas"]
     old = {"cpu": "Z80", "blas": "Prescott"}
     capsys.readouterr()
-    cs.run_trials(uvd, FILTER, RUNS + 1, seed=3, jobs=1, out=out, resume=True)
+    run(runs=RUNS + 1, out=out, resume=True)
     assert "last digits" not in capsys.readouterr().err
     change_manifest(out, "contents", machines=[old])
-    cs.run_trials(uvd, FILTER, RUNS + 2, seed=3, jobs=1, out=out, resume=True)
+    run(runs=RUNS + 2, out=out, resume=True)
     assert "Z80 (BLAS: Prescott) computed the runs that are there" in capsys.readouterr().err
     assert open_results(out).manifest["machines"] == [old, here]

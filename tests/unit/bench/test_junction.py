@@ -1,26 +1,19 @@
 """Occlusion junctions: where they are seen, and that they are on the two edges and on no rigid point."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.scenario.effects import Context, Junction
+from consistency.bench.scenario.effects import Context
 from consistency.bench.scenario.effects.junction import Crossings
 from consistency.bench.simulation import World
 from consistency.referee.geometry import rotation
-from consistency.referee.types import Array
 
-Small = Callable[..., cs.Scenario]
 EFFECT = {"kind": "junction", "count": 12, "seed": 5, "behind_m": [1.0, 3.0], "edge_m": 2.0, "far_share": 0.5}
 STEPS = 250
 
 
-def world_of(**changes: Any) -> tuple[World, Junction, Context]:
+def world_of(**changes):
     scenario = cs.load_scenario("herath2007-stereo").variant(
         "with", truth__steps=STEPS, truth__sensor__effects=[EFFECT], **changes
     )
@@ -28,7 +21,7 @@ def world_of(**changes: Any) -> tuple[World, Junction, Context]:
     return world, scenario.truth.sensor.effects[0], world.context(world.reference)
 
 
-def seen_from(pose: Array, edges: Crossings, j: int, sensor: Any) -> tuple[Array, Array] | None:
+def seen_from(pose, edges, j, sensor):
     """(u, v, d) of one crossing from one pose, and the point in the world that has that disparity; None where unseen.
 
     The plane of the camera and the far edge cuts the near one: a linear system for each.
@@ -55,12 +48,12 @@ def seen_from(pose: Array, edges: Crossings, j: int, sensor: Any) -> tuple[Array
 
 
 @pytest.mark.parametrize("tilt", [False, True])
-def test_a_crossing_is_where_a_ray_meets_both_edges(tilted: dict[str, list[float]], tilt: bool) -> None:
+def test_a_crossing_is_where_a_ray_meets_both_edges(tilted, tilt):
     world, effect, context = world_of(**({"truth__sensor__mount": tilted} if tilt else {}))
     edges, sensor = effect.drawn(context), context.sensor
     observed = effect.apply(context.at(np.zeros(0, int), np.zeros(0, int)), np.random.default_rng(0), context)
     table = {(k, label - 120): z for k, label, z in zip(observed.step, observed.landmark, observed.z, strict=True)}
-    points: dict[int, list[Array]] = {}
+    points = {}
     for k in range(1, STEPS + 1):
         for j in range(12):
             expected = seen_from(world.reference[k], edges, j, sensor)
@@ -78,7 +71,7 @@ def test_a_crossing_is_where_a_ray_meets_both_edges(tilted: dict[str, list[float
         assert np.allclose(fixed[2] if edges.by_far[j] else fixed[:2], 0.0, rtol=0, atol=1e-9)  # stays on its edge
 
 
-def test_crossings_are_things_of_every_run_with_labels_and_noise(small: Small) -> None:
+def test_crossings_are_things_of_every_run_with_labels_and_noise(small):
     plain = cs.load_scenario("herath2007-stereo")
     wide = {"truth__sensor__disparity": (1e-6, 1e6), "truth__sensor__effects": [EFFECT | {"far_share": 0.0}]}
     crossed = plain.variant("crossed", **wide)
@@ -95,14 +88,14 @@ def test_crossings_are_things_of_every_run_with_labels_and_noise(small: Small) -
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_the_matcher_takes_one_edge_or_the_other(share: float) -> None:
+def test_the_matcher_takes_one_edge_or_the_other(share):
     _, effect, context = world_of()
     edges = effect.model_copy(update={"far_share": share}).drawn(context)
     assert np.all(edges.by_far == (share == 1.0))
 
 
 @pytest.mark.parametrize(("x", "seen"), [(3.0, True), (1.0, False)])
-def test_the_far_edge_must_be_behind_the_near_one(x: float, seen: bool) -> None:
+def test_the_far_edge_must_be_behind_the_near_one(x, seen):
     _, effect, context = world_of()
     edges = Crossings(np.array([[2.0, 0.0, 0.2]]), np.array([[x, 0.0, 0.3]]), np.array([[0.0, 1.0]]), np.zeros(1, bool))
     standing = Context(context.sensor, context.landmarks, np.zeros((3, 3)), np.zeros((3, 3)))
@@ -111,7 +104,7 @@ def test_the_far_edge_must_be_behind_the_near_one(x: float, seen: bool) -> None:
     assert np.allclose(z[:, 0], [0.0, -150.0 * 0.3 / x, 150.0 * 0.09 / 2.0])
 
 
-def test_edges_are_drawn_as_a_world_is() -> None:
+def test_edges_are_drawn_as_a_world_is():
     """From their own seed, and as far behind each other as the scenario says."""
     _, effect, context = world_of()
     edges, again = effect.drawn(context), effect.drawn(context)

@@ -1,9 +1,6 @@
 """Compiled code on disk: what is damaged or not ours is compiled anew, is never loaded, and fails no run."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,7 +9,7 @@ import pytest
 from consistency.bench.filters.compiler import disk_cache, jit, whole_program
 
 
-def total(n: int) -> float:
+def total(n):
     result = 0.0
     for k in range(n):
         result += k
@@ -20,14 +17,14 @@ def total(n: int) -> float:
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache(tmp_path, monkeypatch):
     """Where kernels of this test are kept."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     disk_cache._say.cache_clear()
     return tmp_path / "cache"
 
 
-def use() -> tuple[bool, int]:
+def use():
     """Whether a kernel, as a new process has it, is ready, and how many signatures it then loads from disk."""
     kernel = jit.Kernel(total)
     ready = kernel.is_ready(5)
@@ -36,33 +33,31 @@ def use() -> tuple[bool, int]:
     return ready, kernel.loaded
 
 
-def code_in(cache: Path) -> Path:
+def code_in(cache):
     (path,) = cache.rglob(f"*{disk_cache.SUFFIX}")
     return path
 
 
-def truncate(path: Path) -> None:
+def truncate(path):
     path.write_bytes(path.read_bytes()[:-7])
 
 
-def empty(path: Path) -> None:
+def empty(path):
     path.write_bytes(b"")
 
 
-def flip(path: Path) -> None:
+def flip(path):
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
 
 
-def open_to_all(path: Path) -> None:
+def open_to_all(path):
     path.chmod(0o666)
 
 
 @pytest.mark.parametrize("damage", [truncate, empty, flip, open_to_all])
-def test_damaged_code_is_compiled_anew_and_said_once(
-    cache: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None]
-) -> None:
+def test_damaged_code_is_compiled_anew_and_said_once(cache, capsys, damage):
     assert use() == (False, 0)
     damage(code_in(cache))
     assert capsys.readouterr().err == ""
@@ -75,9 +70,7 @@ def test_damaged_code_is_compiled_anew_and_said_once(
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owners on this system")
-def test_code_of_another_owner_is_neither_loaded_nor_overwritten(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_code_of_another_owner_is_neither_loaded_nor_overwritten(cache, monkeypatch, capsys):
     use()
     before = code_in(cache).read_bytes()
     monkeypatch.setattr(os, "getuid", lambda: code_in(cache).stat().st_uid + 1)
@@ -89,18 +82,16 @@ def test_code_of_another_owner_is_neither_loaded_nor_overwritten(
     assert code_in(cache).read_bytes() == before
 
 
-def test_a_cache_that_cannot_be_written_fails_nothing(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cache_that_cannot_be_written_fails_nothing(cache, capsys):
     cache.write_text("a file where the cache would be", encoding="utf-8")
     assert use() == (False, 0)
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_code_that_cannot_be_kept_serves_its_process(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_code_that_cannot_be_kept_serves_its_process(cache, monkeypatch, capsys):
     """A full disk."""
 
-    def full(*_: object) -> None:
+    def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
@@ -109,7 +100,7 @@ def test_code_that_cannot_be_kept_serves_its_process(
     assert capsys.readouterr().err.count("No space left on device; compiled code is not kept") == 1
 
 
-def test_what_was_not_used_for_longest_is_removed_first(tmp_path: Path) -> None:
+def test_what_was_not_used_for_longest_is_removed_first(tmp_path):
     for age, name in enumerate("abcd"):
         path = tmp_path / f"{name}{disk_cache.SUFFIX}"
         path.write_bytes(bytes(100))
@@ -122,7 +113,7 @@ def test_what_was_not_used_for_longest_is_removed_first(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == [".new", "a.kernel", "b.kernel"]
 
 
-def test_an_untried_numba_compiles_as_it_does(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_untried_numba_compiles_as_it_does(cache, monkeypatch):
     monkeypatch.setattr(whole_program, "numba", SimpleNamespace(__version__="99.1"))
     assert not whole_program.is_supported()
     assert use() == (False, 0)

@@ -1,12 +1,7 @@
 """A sweep that is ended within a cell, and processes that work on one: nothing is lost, done twice or mixed."""
 
-from __future__ import annotations
-
 import threading
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -15,13 +10,12 @@ import consistency as cs
 from consistency.bench.runs.trial_work import TrialWork as Runs
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.store.trial_rows import RunOutcome
 from consistency.bench.sweeps import cell as cells
 from consistency.bench.sweeps import running
 from consistency.bench.sweeps.cell import cost_of
-from consistency.bench.sweeps.plan import Sweep, load_sweep
+from consistency.bench.sweeps.plan import load_sweep
 from consistency.bench.sweeps.running import run_sweep
-from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
+from consistency.bench.sweeps.sweep_folder import SweepFolder
 
 GRID = """
 summary = "Three densities in a linear world"
@@ -42,7 +36,7 @@ class Killed(BaseException):
 
 
 @pytest.fixture
-def at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def at(tmp_path, monkeypatch):
     text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
     (tmp_path / "small.toml").write_text(text.replace("steps = 500", "steps = 30"))
     (tmp_path / "grid.toml").write_text(GRID)
@@ -52,13 +46,13 @@ def at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def stop_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], list[int]]:
+def stop_after(monkeypatch):
     """What is raised in the place of a run after so many; gives the list of the runs that are done."""
 
-    def arm(count: int, error: BaseException) -> list[int]:
+    def arm(count, error):
         one, done = Runs.__call__, list[int]()
 
-        def stopped(self: Runs, number: int) -> RunOutcome:
+        def stopped(self, number):
             if len(done) == count:
                 raise error
             done.append(number)
@@ -70,27 +64,25 @@ def stop_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException]
     return arm
 
 
-def content(out: Path) -> dict[str, bytes]:
+def content(out):
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("runs.csv"))}
 
 
-def hidden(out: Path) -> list[str]:
+def hidden(out):
     return [path.name for path in out.rglob(".*")]
 
 
-def grid(at: Path, old: str = "", new: str = "") -> Sweep:
+def grid(at, old="", new=""):
     assert old in GRID
     (at / "grid.toml").write_text(GRID.replace(old, new))
     return load_sweep(at / "grid.toml")
 
 
-def test_what_is_left_of_a_cell_that_was_just_written_goes(
-    at: Path, stop_after: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_left_of_a_cell_that_was_just_written_goes(at, stop_after, monkeypatch):
     run_sweep(grid(at), at / "whole", jobs=1)
     with monkeypatch.context() as patched:
 
-        def killed(self: Unfinished, *_: object) -> None:
+        def killed(self, *_):
             self._leave()
             raise Killed
 
@@ -106,9 +98,7 @@ def test_what_is_left_of_a_cell_that_was_just_written_goes(
 
 
 @pytest.mark.parametrize("error", [Killed(), KeyboardInterrupt()], ids=["killed", "ctrl-c"])
-def test_a_sweep_goes_on_within_a_cell(
-    at: Path, stop_after: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException
-) -> None:
+def test_a_sweep_goes_on_within_a_cell(at, stop_after, monkeypatch, error):
     whole = run_sweep(grid(at), at / "whole", jobs=1)
     assert hidden(at / "whole") == []
     stop_after(14 + 9, error)
@@ -126,11 +116,9 @@ def test_a_sweep_goes_on_within_a_cell(
 
 
 @pytest.mark.parametrize(
-    ("old", "new"), [("max_runs = 14", "max_runs = 15"), ("seed = 3", "seed = 4"), ("1e-6", "1e-5"), ("", "code")]
+    "old, new", [("max_runs = 14", "max_runs = 15"), ("seed = 3", "seed = 4"), ("1e-6", "1e-5"), ("", "code")]
 )
-def test_runs_of_other_inputs_are_dropped(
-    at: Path, stop_after: Any, monkeypatch: pytest.MonkeyPatch, old: str, new: str
-) -> None:
+def test_runs_of_other_inputs_are_dropped(at, stop_after, monkeypatch, old, new):
     stop_after(9, Killed())
     with pytest.raises(Killed):
         run_sweep(grid(at), at / "out", jobs=1)
@@ -147,10 +135,10 @@ def test_runs_of_other_inputs_are_dropped(
     assert content(at / "out") == content(at / "whole")
 
 
-def test_what_the_system_refuses_is_no_result(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_system_refuses_is_no_result(at, monkeypatch):
     append, count = Journal.append, [0]
 
-    def full(self: Journal, *arguments: Any) -> None:
+    def full(self, *arguments):
         count[0] += 1
         if count[0] > 14 + 9:
             raise OSError(28, "No space left on device")
@@ -169,7 +157,7 @@ def test_what_the_system_refuses_is_no_result(at: Path, monkeypatch: pytest.Monk
     assert content(at / "out") == content(at / "whole")
 
 
-def others_cell(at: Path, place: int) -> tuple[SweepFolder, CellWork]:
+def others_cell(at, place):
     """A cell, by its place in the order in which they are done."""
     folder = SweepFolder(grid(at), at / "out")
     folder.begin()
@@ -177,19 +165,19 @@ def others_cell(at: Path, place: int) -> tuple[SweepFolder, CellWork]:
 
 
 @pytest.mark.parametrize("is_done", [True, False], ids=["done by the other", "left by the other"])
-def test_a_cell_that_another_process_works_on(at: Path, monkeypatch: pytest.MonkeyPatch, is_done: bool) -> None:
+def test_a_cell_that_another_process_works_on(at, monkeypatch, is_done):
     """Others are done first; it is come back to, and done only if the other has not."""
     folder, first = others_cell(at, 0)
     run_sweep(grid(at), at / "whole", jobs=1)
     run_cell, done, free = cells.run_cell, list[str](), threading.Event()
 
-    def counted(sweep: Sweep, cell: Any, *rest: Any, **how: Any) -> Any:
+    def counted(sweep, cell, *rest, **how):
         done.append(cell.name)
         if len(done) == 2:
             free.set()
         return run_cell(sweep, cell, *rest, **how)
 
-    def other() -> None:
+    def other():
         with folder.at_work(first) as journal:
             held.set()
             assert free.wait(60.0)
@@ -209,12 +197,12 @@ def test_a_cell_that_another_process_works_on(at: Path, monkeypatch: pytest.Monk
     assert hidden(at / "out") == []
 
 
-def test_a_cell_that_was_done_after_the_sweep_began(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cell_that_was_done_after_the_sweep_began(at, monkeypatch):
     """Another process has finished the last cell when it is its turn."""
     folder, last = others_cell(at, -1)
     run_cell, done = cells.run_cell, list[str]()
 
-    def meanwhile(sweep: Sweep, cell: Any, *rest: Any, **how: Any) -> Any:
+    def meanwhile(sweep, cell, *rest, **how):
         if not done:
             folder.write(last, run_cell(folder.sweep, last.cell, "kf", jobs=1), 1.0)
         done.append(cell.name)
@@ -225,11 +213,11 @@ def test_a_cell_that_was_done_after_the_sweep_began(at: Path, monkeypatch: pytes
     assert len(done) == 2
 
 
-def test_the_executor_does_the_runs(at: Path) -> None:
-    done: list[int] = []
+def test_the_executor_does_the_runs(at):
+    done = []
 
     class Noted(ThreadPoolExecutor):
-        def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+        def submit(self, function, /, *arguments, **options):
             done.extend(arguments[1])
             return super().submit(function, *arguments, **options)
 
@@ -238,13 +226,13 @@ def test_the_executor_does_the_runs(at: Path) -> None:
     assert done == [*range(14)] * 3
 
 
-def test_a_filter_that_fails_apart_is_not_timed_here(uvd: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_filter_that_fails_apart_is_not_timed_here(uvd, monkeypatch):
     """It is not run in this process, which it could end."""
 
     class Crashes:
         name = "crashes"
 
-        def init(self, problem: Any) -> Any:
+        def init(self, problem):
             raise AssertionError("run here")
 
         predict = update = pose = init

@@ -1,7 +1,5 @@
 """What kernels must keep to: module level, no allocation in a step, one BLAS thread."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import os
@@ -9,7 +7,6 @@ import pkgutil
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -26,7 +23,7 @@ from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.models.point import to_robot
 
 
-def test_no_kernel_is_a_closure() -> None:
+def test_no_kernel_is_a_closure():
     """Closures that two processes have cached can be linked to each other."""
     found = [trial_kernel.function.__qualname__]
     for module in pkgutil.walk_packages(consistency.bench.filters.__path__, "consistency.bench.filters."):
@@ -39,7 +36,7 @@ def test_no_kernel_is_a_closure() -> None:
         inner(lambda x: x)
 
 
-def allocations(steps: int, scenario: cs.Scenario, name: str) -> int:
+def allocations(steps, scenario, name):
     """Arrays that a compiled trial of so many steps makes."""
     trial = cs.simulate(scenario.variant("shorter", truth__steps=steps))
     cs.get_filter(name).run(trial, scenario.belief)  # compiled before counting
@@ -49,13 +46,13 @@ def allocations(steps: int, scenario: cs.Scenario, name: str) -> int:
 
 
 @pytest.mark.parametrize("name", ["ekf-uvd", "ekf-xyz", "ukf-uvd"])
-def test_no_step_allocates(uvd: cs.Scenario, name: str) -> None:
+def test_no_step_allocates(uvd, name):
     _nrt_python.memsys_enable_stats()
     assert 0 < allocations(20, uvd, name) == allocations(60, uvd, name)
 
 
 @pytest.mark.parametrize("name", ["ekf-xyz", "ri-ekf-xyz"])
-def test_a_covariance_that_loses_its_rank_ends_the_run(small: Callable[..., cs.Scenario], name: str) -> None:
+def test_a_covariance_that_loses_its_rank_ends_the_run(small, name):
     """A landmark known exactly, from a pose known exactly, seen again: the pose is certain but for one direction."""
     belief = small("herath2007-xyz", belief__sensor__sigma=(1e-13,) * 3).belief
     controls = np.array([[0.0, 0.0, 0.0]] + 4 * [[0.1, 1.0, 0.2]])  # no time passes in step 1
@@ -73,7 +70,7 @@ def test_a_covariance_that_loses_its_rank_ends_the_run(small: Callable[..., cs.S
         assert np.isnan(array[3:]).all()
 
 
-def test_a_direct_run_is_that_of_run_trials(uvd: cs.Scenario) -> None:
+def test_a_direct_run_is_that_of_run_trials(uvd):
     """One BLAS thread in both: with two the last bits could differ."""
     direct = cs.get_filter("ekf-uvd").run(cs.simulate(uvd), uvd.belief)
     among = cs.run_trials(uvd, ["ekf-uvd"], runs=1, jobs=1).estimates
@@ -91,7 +88,7 @@ print(hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest())
 """
 
 
-def test_lent_arrays_live_as_long_as_the_trial() -> None:
+def test_lent_arrays_live_as_long_as_the_trial():
     """The loop uses what it passes by reference to the end; a C library that overwrites freed memory changes no bit."""
     source = inspect.getsource(trial_kernel.function)
     passed = re.findall(r"\bby_reference\((\w+)\)", source)
@@ -106,8 +103,8 @@ def test_lent_arrays_live_as_long_as_the_trial() -> None:
     assert found[0].stdout == found[1].stdout
 
 
-def test_the_limit_on_blas_threads_ends_with_the_last_trial() -> None:
-    def threads() -> list[int]:
+def test_the_limit_on_blas_threads_ends_with_the_last_trial():
+    def threads():
         return [entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"]
 
     before = threads()

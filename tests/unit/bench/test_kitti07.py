@@ -1,7 +1,5 @@
 """The conversion of recorded stereo tracks, on tracks small enough to check by hand, and on the recording."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scripts import experiment
 
 import consistency as cs
@@ -16,7 +15,6 @@ from consistency.bench.models.stereo import project
 from consistency.bench.store.log import read_log, write_log
 from consistency.bench.types import Trial
 from consistency.referee.system.provenance import manifest_of
-from consistency.referee.types import Array
 
 ROOT = Path(__file__).parents[3]
 KITTI = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # right, down, forward <- forward, left, up
@@ -27,7 +25,7 @@ experiment = experiment("e09_kitti07")
 conversion = experiment.conversion
 
 
-def recording(pixels: dict[int, list[tuple[float, float, float] | None]], frames: int, poses: Array | None = None):
+def recording(pixels, frames, poses=None):
     """Tracks given as (u, v, d) from frame 0 on, None where not seen; a robot that stands still."""
     features = np.full((4, max(pixels, default=0) + 1, frames), -1.0)
     for track, rows in pixels.items():
@@ -42,19 +40,19 @@ def recording(pixels: dict[int, list[tuple[float, float, float] | None]], frames
     )  # fmt: skip
 
 
-def moving(steps: int, d: float = 20.0, u: float = 0.0) -> list[tuple[float, float, float] | None]:
+def moving(steps, d=20.0, u=0.0):
     """A track that is never an exact copy of itself."""
     return [(u + 0.01 * step, 5.0, d) for step in range(steps)]
 
 
-def test_a_point_to_the_right_and_below_has_positive_u_v_and_disparity() -> None:
+def test_a_point_to_the_right_and_below_has_positive_u_v_and_disparity():
     seen = project(10.0, -1.0, -0.5, F, B)  # forward, left, up
     assert min(seen) > 0
     rows = conversion.fresh_observations(recording({0: [seen]}, 1))
-    np.testing.assert_allclose(rows[["z0", "z1", "z2"]].to_numpy(), [seen])
+    assert_allclose(rows[["z0", "z1", "z2"]].to_numpy(), [seen])
 
 
-def test_track_ends_at_a_stale_copy_of_all_four_numbers() -> None:
+def test_track_ends_at_a_stale_copy_of_all_four_numbers():
     slipped = [*moving(3), moving(3)[2], (9.0, 9.0, 30.0), (9.1, 9.0, 30.0)]
     half = [(1.0, 5.0, 20.0), (1.0, 5.0, 21.0), (1.0, 5.0, 22.0)]  # u and v stay, the right camera's u does not
     rows = conversion.fresh_observations(recording({0: slipped, 1: half}, 6))
@@ -62,7 +60,7 @@ def test_track_ends_at_a_stale_copy_of_all_four_numbers() -> None:
     assert rows[rows["track"] == 1]["step"].tolist() == [0, 1, 2]
 
 
-def test_a_gap_starts_a_new_piece_and_small_disparities_are_left_out() -> None:
+def test_a_gap_starts_a_new_piece_and_small_disparities_are_left_out():
     gap = [*moving(2), None, *moving(5)[3:]]
     far = moving(5, d=conversion.MIN_DISPARITY - 0.1)
     rows = conversion.fresh_observations(recording({0: gap, 1: far}, 5))
@@ -70,7 +68,7 @@ def test_a_gap_starts_a_new_piece_and_small_disparities_are_left_out() -> None:
     assert rows.groupby("piece")["step"].apply(list).tolist() == [[0, 1], [3, 4]]
 
 
-def test_a_track_that_leaves_the_common_motion_is_cut_there_and_only_there() -> None:
+def test_a_track_that_leaves_the_common_motion_is_cut_there_and_only_there():
     """By the screening that any log may have: the robot stands still, and the last of nine tracks jumps by 10 px."""
     still = {track: moving(6, u=40.0 * track) for track in range(8)}
     still[8] = [(300.0 + 10.0 * (step >= 4), 5.0 + 0.01 * step, 20.0) for step in range(6)]
@@ -82,13 +80,13 @@ def test_a_track_that_leaves_the_common_motion_is_cut_there_and_only_there() -> 
     assert lives[False] == [[1, 2, 3, 4, 5]] * 9
 
 
-def table(lives: dict[int, tuple[int, int, float]]) -> pd.DataFrame:
+def table(lives):
     """Pieces: number -> (first step, observations, u)."""
     rows = [(p, a + i, u, 0.0, 20.0) for p, (a, n, u) in lives.items() for i in range(n)]
     return pd.DataFrame(rows, columns=["piece", "step", "z0", "z1", "z2"])
 
 
-def test_no_landmark_is_older_than_the_age_cut_and_cuts_are_staggered() -> None:
+def test_no_landmark_is_older_than_the_age_cut_and_cuts_are_staggered():
     seen = conversion.thinned(table(dict.fromkeys(range(4), (1, 40, 0.0))))
     ages = seen.groupby("landmark").size()
     assert ages.loc[[0, 1, 2, 3]].tolist() == [6, 12, 6, 12]
@@ -96,7 +94,7 @@ def test_no_landmark_is_older_than_the_age_cut_and_cuts_are_staggered() -> None:
     assert seen.groupby("landmark")["step"].apply(lambda s: (s.diff().dropna() == 1).all()).all()
 
 
-def test_slots_are_filled_from_all_columns_and_by_life_without_chance() -> None:
+def test_slots_are_filled_from_all_columns_and_by_life_without_chance():
     lives = {p: (1, 3 + p % 2, u) for p, u in enumerate([-500.0, -490, -480, -470, -460, -450, 0, 10, 500])}
     rows = table(lives)
     seen = conversion.thinned(rows)
@@ -108,14 +106,14 @@ def test_slots_are_filled_from_all_columns_and_by_life_without_chance() -> None:
     assert (conversion.thinned(rows, slots=2).groupby("step").size() <= 2).all()
 
 
-def test_step_0_and_single_sights_are_not_used() -> None:
+def test_step_0_and_single_sights_are_not_used():
     seen = conversion.thinned(table({0: (0, 3, 0.0), 1: (2, 1, 0.0)}))
     assert seen["step"].tolist() == [1, 2]
     with pytest.raises(cs.InputError, match="no track"):
         conversion.thinned(table({0: (2, 1, 0.0)}))
 
 
-def test_planar_truth_of_a_left_turn_on_a_slope() -> None:
+def test_planar_truth_of_a_left_turn_on_a_slope():
     heading = np.linspace(0.3, 0.3 + 4.0, 30)  # beyond pi: not wrapped
     flat = np.column_stack([np.cumsum(np.cos(heading)), np.cumsum(np.sin(heading)), np.zeros(30)])
     slope = conversion.rotation(0.05, -0.1, 0.0)
@@ -129,10 +127,10 @@ def test_planar_truth_of_a_left_turn_on_a_slope() -> None:
     data = dataclasses.replace(recording({}, 30, poses), lever=lever)
     truth = conversion.planar_truth(data)
     moved = (flat - flat[0]) @ conversion.rotation(0.0, 0.0, 0.3)
-    np.testing.assert_allclose(truth, np.column_stack([moved[:, :2], heading - 0.3]), atol=1e-9)
+    assert_allclose(truth, np.column_stack([moved[:, :2], heading - 0.3]), atol=1e-9)
 
 
-def test_unlinked_steps_and_the_floor_they_leave() -> None:
+def test_unlinked_steps_and_the_floor_they_leave():
     # landmark 0 in steps 1-2, 1 in 2-3, 2 in 4: nothing links 4 to 3, nor 1 to the start, nor 5 to 4
     controls = np.tile([0.1, 1.0, 0.0], (5, 1))
     trial = Trial(
@@ -149,7 +147,7 @@ ARRAYS = {
 }  # fmt: skip
 
 
-def test_any_drive_is_read_with_the_poses_of_kitti_or_times_before_them(tmp_path: Path) -> None:
+def test_any_drive_is_read_with_the_poses_of_kitti_or_times_before_them(tmp_path):
     np.savez(tmp_path / "0034.npz", **ARRAYS)
     poses = np.arange(24.0).reshape(2, 12)
     for columns in (poses, np.column_stack([[0.1, 0.2], poses])):
@@ -157,7 +155,7 @@ def test_any_drive_is_read_with_the_poses_of_kitti_or_times_before_them(tmp_path
         for at in (tmp_path, tmp_path / "0034.npz"):
             tracks, truth = conversion.find_recording(at)
             data = conversion.read_recording(tracks, truth)
-            np.testing.assert_array_equal(data.poses.reshape(2, 12), poses)
+            assert_array_equal(data.poses.reshape(2, 12), poses)
             assert data.features.shape == (4, 2, 2)  # the last frame has no truth
             assert data.size == (1241, 376)
             assert experiment.name_of(tracks) == "0034"
@@ -165,7 +163,7 @@ def test_any_drive_is_read_with_the_poses_of_kitti_or_times_before_them(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    "changes, said",
     [
         ({"time_stamps": None}, r"0034\.npz: array 'time_stamps' is missing"),
         (
@@ -177,15 +175,15 @@ def test_any_drive_is_read_with_the_poses_of_kitti_or_times_before_them(tmp_path
         ({"K": 500.0 * np.eye(3)}, r"0034\.npz: array 'K': no rectified camera of KITTI has f = 500 px; they have 721"),
     ],
 )
-def test_a_drive_with_other_arrays(tmp_path: Path, changes: dict[str, Array | None], said: str) -> None:
+def test_a_drive_with_other_arrays(tmp_path, changes, said):
     np.savez(tmp_path / "0034.npz", **{k: v for k, v in (ARRAYS | changes).items() if v is not None})
     np.savetxt(tmp_path / "02.txt", np.zeros((2, 12)))
     with pytest.raises(cs.InputError, match=said):
         conversion.read_recording(*conversion.find_recording(tmp_path))
 
 
-def test_unusable_data_is_told_in_one_line(tmp_path: Path) -> None:
-    def refused(said: str, *more: str) -> None:
+def test_unusable_data_is_told_in_one_line(tmp_path):
+    def refused(said, *more):
         with pytest.raises(cs.InputError, match=said) as told:
             experiment.command(["--data", str(tmp_path), "--out", str(tmp_path / "out"), *more])
         assert "\n" not in str(told.value)
@@ -204,7 +202,7 @@ def test_unusable_data_is_told_in_one_line(tmp_path: Path) -> None:
     refused(r"holds 0027\.npz, second\.npz; --data FILE")
 
 
-def recorded() -> Path:
+def recorded():
     folder = Path(os.environ.get("CONSISTENCY_DATA", ROOT.parent / "shared" / "data")) / "ece276a_stereo_tracks"
     if not (folder / "0027.npz").is_file():
         pytest.skip("the KITTI 07 tracks are not here (not shipped: CC BY-NC-SA); set CONSISTENCY_DATA to their folder")
@@ -212,7 +210,7 @@ def recorded() -> Path:
 
 
 @pytest.mark.slow
-def test_the_recording_becomes_a_log_that_is_read_back(tmp_path: Path) -> None:
+def test_the_recording_becomes_a_log_that_is_read_back(tmp_path):
     data = conversion.read_recording(*conversion.find_recording(recorded()))
     log = experiment.logs_of(data, seed=0)[experiment.MAIN]
     trial, belief = log.trials[0], log.belief
@@ -222,13 +220,13 @@ def test_the_recording_becomes_a_log_that_is_read_back(tmp_path: Path) -> None:
     assert path == pytest.approx(692.0, abs=1.0)
     write_log(tmp_path / "log", [trial], belief, None, manifest_of(kind="log"), view=(data.size, tuple(data.centre)))
     back = read_log(tmp_path / "log")
-    np.testing.assert_array_equal(back.trials[0].z, trial.z)
-    np.testing.assert_array_equal(back.trials[0].landmark, trial.landmark)
+    assert_array_equal(back.trials[0].z, trial.z)
+    assert_array_equal(back.trials[0].landmark, trial.landmark)
     assert back.belief == belief
 
 
 @pytest.mark.slow
-def test_the_noise_of_the_twin_is_what_the_filter_believes() -> None:
+def test_the_noise_of_the_twin_is_what_the_filter_believes():
     # with truth given, whitened noise has variance 1; 5 standard errors, so a false alarm in 1e6 a number
     data = conversion.read_recording(*conversion.find_recording(recorded()))
     trial, belief = conversion.log_of(data)
@@ -238,8 +236,8 @@ def test_the_noise_of_the_twin_is_what_the_filter_believes() -> None:
     assert np.hypot(*(loud.truth - trial.truth)[-1, :2]) < 1.0  # the unicycle model fits the drive
 
 
-def test_consistency_bought_by_a_larger_error_is_no_improvement() -> None:
-    def of(nees: float, largest: float) -> object:
+def test_consistency_bought_by_a_larger_error_is_no_improvement():
+    def of(nees, largest):
         return experiment.Measured(nees, 0, np.ones(3), [0, 0, 0], 1.0, 1.0, 0.1, 1.0, largest)
 
     cut = [of(3.0, 7.0), of(15.0, 20.0)]
@@ -249,7 +247,7 @@ def test_consistency_bought_by_a_larger_error_is_no_improvement() -> None:
     assert not experiment.are_better(cut[::-1], of(29.0, 58.0))
 
 
-def test_the_log_says_which_disparities_are_reported(tmp_path: Path) -> None:
+def test_the_log_says_which_disparities_are_reported(tmp_path):
     """A filter that allows for the search range takes it from sensor.toml."""
     data = recording({0: moving(30), 1: moving(30, u=150.0)}, 30)
     trial, belief = conversion.log_of(data)

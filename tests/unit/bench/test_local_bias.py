@@ -1,14 +1,8 @@
 """Bias maps and what makes them: a table over the image, an effect, a belief, and the distortion of two cameras."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
-from scenario_files import Edit, load, put
+from scenario_files import load, put
 from scipy.interpolate import RegularGridInterpolator
 
 import consistency as cs
@@ -17,11 +11,8 @@ from consistency.bench.scenario import BiasMap
 from consistency.bench.scenario.effects import Distortion, LocalBias
 from consistency.bench.simulation import World
 from consistency.bench.store.log import read_log
-from consistency.bench.types import Trial
-from consistency.referee.types import Array
 from consistency.scenario import scenario_text
 
-Small = Callable[..., cs.Scenario]
 U, V = [-150.0, -40.0, 30.0, 160.0], [-100.0, 10.0, 90.0]
 D = [[0.5, -1.0, 0.2, 2.0], [0.0, 0.3, -0.4, 1.0], [-2.0, 0.7, 0.1, -0.6]]
 W = [[0.1, 0.0, 0.0, -0.3], [0.2, 0.4, 0.0, 0.0], [0.0, 0.0, -0.5, 0.0]]
@@ -30,11 +21,11 @@ BIAS = {"kind": "local-bias", **MAP}
 WIDE = {"truth__sensor__disparity": (1e-6, 1e6)}
 
 
-def ideal_of(scenario: cs.Scenario, trial: Trial) -> Array:
+def ideal_of(scenario, trial):
     return World(scenario.truth).context(trial.truth).measure(trial.step, trial.landmark)
 
 
-def test_a_map_is_bilinear_between_its_nodes_and_constant_beyond(rng: np.random.Generator) -> None:
+def test_a_map_is_bilinear_between_its_nodes_and_constant_beyond(rng):
     """SciPy's interpolation on a regular grid is the oracle."""
     bias = BiasMap.model_validate(MAP)
     u, v = rng.uniform(-220.0, 220.0, (2, 40, 5))
@@ -45,13 +36,13 @@ def test_a_map_is_bilinear_between_its_nodes_and_constant_beyond(rng: np.random.
     assert np.allclose(bias.at(np.float64(30.0), np.float64(500.0)), [0.0, -0.5, 0.1])
 
 
-def test_one_node_is_a_constant() -> None:
+def test_one_node_is_a_constant():
     bias = BiasMap.model_validate({"u_px": [0.0], "v_px": [-10.0, 10.0], "bias_d_px": [[1.0], [3.0]]})
     assert np.allclose(bias.at(np.array([-99.0, 99.0]), np.array([0.0, 5.0])), [[0, 0, 2.0], [0, 0, 2.5]])
 
 
 @pytest.mark.parametrize("noise_on", ["odometry", "motion"])
-def test_the_effect_adds_the_bias_of_the_ideal_pixel(small: Small, noise_on: str) -> None:
+def test_the_effect_adds_the_bias_of_the_ideal_pixel(small, noise_on):
     plain = small("herath2007-stereo", truth__motion__noise_on=noise_on, **WIDE)
     biased = plain.variant("biased", truth__sensor__effects=[BIAS])
     a, b = cs.simulate(plain, 1), cs.simulate(biased, 1)
@@ -65,13 +56,13 @@ def test_the_effect_adds_the_bias_of_the_ideal_pixel(small: Small, noise_on: str
     assert b.source is None
 
 
-def test_an_effect_gives_the_map_that_a_belief_holds(small: Small) -> None:
+def test_an_effect_gives_the_map_that_a_belief_holds(small):
     effect = LocalBias.model_validate(BIAS)
     scenario = small("herath2007-stereo", belief__sensor__bias=effect.map())
     assert scenario.belief.sensor.bias == BiasMap.model_validate(MAP)
 
 
-def test_a_believed_map_goes_through_files(small: Small, tmp_path: Path) -> None:
+def test_a_believed_map_goes_through_files(small, tmp_path):
     scenario = small("herath2007-stereo", belief__sensor__bias=MAP)
     assert scenario.hash != small("herath2007-stereo").hash
     (tmp_path / "mine.toml").write_text(scenario_text(scenario), encoding="utf-8")
@@ -80,7 +71,7 @@ def test_a_believed_map_goes_through_files(small: Small, tmp_path: Path) -> None
     assert read_log(tmp_path / "log").belief == scenario.belief
 
 
-MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
+MISTAKES = {
     "a row too few": ({"bias_d_px": D[:2]}, r"bias_d must have 3 rows.* of 4 numbers.*; got 2 of 4$"),
     "a column too many": ({"bias_v_px": [[*row, 0.0] for row in W]}, r"bias_v must have 3 rows.*; got 3 of 5$"),
     "ragged": ({"bias_d_px": [D[0], D[1], D[2][:3]]}, r"bias_d must have .*; got 3 of 3 and 4$"),
@@ -94,7 +85,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("half", ["truth", "belief"])
 @pytest.mark.parametrize("case", MISTAKES)
-def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str, half: str) -> None:
+def test_a_mistake_is_answered_with_file_and_key(tmp_path, case, half):
     change, complaint = MISTAKES[case]
     where = r"truth\.sensor\.effects\.0" if half == "truth" else r"belief\.sensor\.bias"
     with pytest.raises(cs.InputError, match=rf"mine\.toml: key '{where}" + ".*" + complaint) as e:
@@ -102,13 +93,13 @@ def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str, half
     assert "\n" not in str(e.value)
 
 
-def given(half: str, table: dict[str, Any]) -> Edit:
+def given(half, table):
     if half == "belief":
         return put("belief.sensor.bias", table)
     return put("truth.sensor.effects", [{"kind": "local-bias", **table}])
 
 
-def test_points_in_metres_have_no_pixel(tmp_path: Path) -> None:
+def test_points_in_metres_have_no_pixel(tmp_path):
     with pytest.raises(cs.InputError, match=r"'belief\.sensor': bias is of a sensor 'uvd', not 'xyz'"):
         load(tmp_path, given("belief", MAP), name="herath2007-xyz")
     with pytest.raises(
@@ -123,14 +114,14 @@ LEFT, RIGHT = [0.005, -0.002], [-0.004, 0.001]
 DISTORTION = {"kind": "distortion", "left": LEFT, "right": RIGHT}
 
 
-def test_both_cameras_are_distorted_as_opencv_does_it(small: Small, rng: np.random.Generator) -> None:
+def test_both_cameras_are_distorted_as_opencv_does_it(small, rng):
     """The oracle is cv2.projectPoints on the points themselves, a camera at a time."""
     cv2 = pytest.importorskip("cv2")
     f, B = 150.0, 0.09
     x, y, up = rng.uniform([0.5, -1.5, -1.0], [5.0, 1.5, 1.0], (50, 3)).T
     K = np.array([[f, 0, 0], [0, f, 0], [0, 0, 1.0]])
 
-    def pixels(y: Array, k: list[float]) -> Array:
+    def pixels(y, k):
         points = np.column_stack([-y, -up, x])  # to the right, down, ahead
         return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array([*k, 0.0, 0.0]))[0][:, 0]
 
@@ -146,7 +137,7 @@ def test_both_cameras_are_distorted_as_opencv_does_it(small: Small, rng: np.rand
     assert np.allclose(b.z - a.z, effect.distorted(ideal, f) - ideal, rtol=0, atol=1e-12)
 
 
-def test_a_belief_may_hold_the_map_of_a_distortion() -> None:
+def test_a_belief_may_hold_the_map_of_a_distortion():
     """Exact at its nodes and disparity; at first order k1 = -+ k biases d by 2 k r^2 u less what d itself adds."""
     effect = Distortion(left=(0.005, 0.0), right=(-0.005, 0.0))
     u, v, f = np.linspace(-160.0, 160.0, 9), np.linspace(-120.0, 120.0, 7), 150.0

@@ -1,10 +1,7 @@
 """Log folders: what is simulated is read back to the bit, and damage is answered with file, column and row."""
 
-from __future__ import annotations
-
 import shutil
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,37 +13,34 @@ import consistency as cs
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.log import read_log
 
-Edit = Callable[[pd.DataFrame], pd.DataFrame]
-Small = Callable[..., cs.Scenario]
-
 
 @pytest.fixture(scope="module")
-def written(uvd: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(uvd, tmp_path_factory):
     folder = tmp_path_factory.mktemp("log") / "log"
     simulate_log(uvd, runs=2, seed=1, out=folder)
     return folder
 
 
 @pytest.fixture
-def folder(written: Path, tmp_path: Path) -> Path:
+def folder(written, tmp_path):
     """A copy to be damaged."""
     return Path(shutil.copytree(written, tmp_path / "copy"))
 
 
-def change(folder: Path, name: str, edit: Edit) -> None:
+def change(folder, name, edit):
     path = folder / f"{name}.parquet"
     edit(pd.read_parquet(path)).to_parquet(path, index=False)
 
 
-def change_sensor(folder: Path, **values: object) -> None:
+def change_sensor(folder, **values):
     """Set keys of sensor.toml; None drops the key."""
     path = folder / "sensor.toml"
     data = tomllib.loads(path.read_text()) | values
     path.write_text(tomli_w.dumps({key: value for key, value in data.items() if value is not None}))
 
 
-def put(column: str, row: int, value: float) -> Edit:
-    def edit(table: pd.DataFrame) -> pd.DataFrame:
+def put(column, row, value):
+    def edit(table):
         table[column] = table[column].astype(float)
         table.loc[row, column] = value
         return table
@@ -54,7 +48,7 @@ def put(column: str, row: int, value: float) -> Edit:
     return edit
 
 
-def same_trial(a: cs.Trial, b: cs.Trial) -> bool:
+def same_trial(a, b):
     """Equal to the bit; landmarks that were never seen are not in a log."""
     same = all(np.array_equal(getattr(a, f), getattr(b, f)) for f in ("start", "controls", "first", "z", "truth"))
     return same and len(a.landmark) == len(b.landmark)
@@ -64,7 +58,7 @@ def same_trial(a: cs.Trial, b: cs.Trial) -> bool:
 
 
 @pytest.mark.parametrize("name", ["herath2007-stereo", "herath2007-xyz", "linear-gaussian"])
-def test_read_gives_back_what_was_simulated(small: Small, name: str, tmp_path: Path) -> None:
+def test_read_gives_back_what_was_simulated(small, name, tmp_path):
     scenario = small(name)
     simulate_log(scenario, runs=3, seed=4, out=tmp_path / "log")
     log = read_log(tmp_path / "log")
@@ -77,7 +71,7 @@ def test_read_gives_back_what_was_simulated(small: Small, name: str, tmp_path: P
         assert not same_trial(trial, cs.simulate(scenario, trial.run, seed=5))  # negative control
 
 
-def test_belief_with_a_mount_and_other_sigma_points_comes_back(small: Small, tilted: dict, tmp_path: Path) -> None:
+def test_belief_with_a_mount_and_other_sigma_points_comes_back(small, tilted, tmp_path):
     scenario = small(
         "herath2007-stereo",
         truth__sensor__mount=tilted,
@@ -88,14 +82,14 @@ def test_belief_with_a_mount_and_other_sigma_points_comes_back(small: Small, til
     assert read_log(tmp_path / "log").belief == scenario.belief
 
 
-def test_a_log_gives_the_estimates_of_the_scenario(uvd: cs.Scenario, written: Path) -> None:
+def test_a_log_gives_the_estimates_of_the_scenario(uvd, written):
     direct = cs.run_trials(uvd, ["ekf-uvd"], runs=2, seed=1, jobs=1)
     logged = run_log(read_log(written), ["ekf-uvd"], jobs=1)
     pd.testing.assert_frame_equal(logged.estimates, direct.estimates, check_exact=True)
     pd.testing.assert_frame_equal(logged.truth, direct.truth, check_exact=True)
 
 
-def test_order_of_rows_does_not_matter(written: Path, folder: Path) -> None:
+def test_order_of_rows_does_not_matter(written, folder):
     for name in ("controls", "observations", "truth"):
         change(folder, name, lambda table: table.sample(frac=1.0, random_state=3))
     for a, b in zip(read_log(written).trials, read_log(folder).trials, strict=True):
@@ -108,7 +102,7 @@ def test_order_of_rows_does_not_matter(written: Path, folder: Path) -> None:
             assert np.array_equal(seen.z, shuffled.z[order])
 
 
-def test_without_truth_there_is_no_nees_but_a_nis(folder: Path) -> None:
+def test_without_truth_there_is_no_nees_but_a_nis(folder):
     (folder / "truth.parquet").unlink()
     (folder / "landmarks.parquet").unlink()
     log = read_log(folder)
@@ -121,7 +115,7 @@ def test_without_truth_there_is_no_nees_but_a_nis(folder: Path) -> None:
     assert "no truth" in cs.analyse(results)["ekf-uvd"].reasons[0]
 
 
-def test_start_is_taken_from_the_sensor_file_or_the_truth_or_is_zero(folder: Path) -> None:
+def test_start_is_taken_from_the_sensor_file_or_the_truth_or_is_zero(folder):
     change_sensor(folder, start={"x": 1.0, "y": 2.0, "heading_deg": 90.0})
     assert np.allclose(read_log(folder).trials[0].start, [1.0, 2.0, np.pi / 2])
     change_sensor(folder, start=None)
@@ -131,7 +125,7 @@ def test_start_is_taken_from_the_sensor_file_or_the_truth_or_is_zero(folder: Pat
     assert np.array_equal(read_log(folder).trials[0].start, np.zeros(3))
 
 
-def test_runs_may_have_any_number_and_length(folder: Path) -> None:
+def test_runs_may_have_any_number_and_length(folder):
     for name in ("controls", "observations", "truth"):
         change(folder, name, lambda t: t[(t["run"] == 0) | (t["step"] <= 20)].replace({"run": {1: 41}}))
     log = read_log(folder)
@@ -144,18 +138,18 @@ def test_runs_may_have_any_number_and_length(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["controls.parquet", "observations.parquet", "sensor.toml"])
-def test_file_missing(folder: Path, name: str) -> None:
+def test_file_missing(folder, name):
     (folder / name).unlink()
     with pytest.raises(cs.InputError, match=rf"{name}: (missing|cannot be read)"):
         read_log(folder)
 
 
-def test_folder_missing(tmp_path: Path) -> None:
+def test_folder_missing(tmp_path):
     with pytest.raises(cs.InputError, match=r"--log .*nowhere: no such folder"):
         read_log(tmp_path / "nowhere")
 
 
-DAMAGE: dict[str, tuple[str, Edit, str]] = {
+DAMAGE = {
     "NaN": ("observations", put("z1", 7, np.nan), r"column 'z1', row 7: not a finite number"),
     "infinite control": ("controls", put("v", 3, np.inf), r"column 'v', row 3: not a finite number"),
     "no column": ("observations", lambda t: t.drop(columns="z2"), r"column 'z2' is missing; needed: run, step"),
@@ -185,7 +179,7 @@ DAMAGE: dict[str, tuple[str, Edit, str]] = {
 
 
 @pytest.mark.parametrize("case", DAMAGE)
-def test_damage_is_answered_with_file_and_place(folder: Path, case: str) -> None:
+def test_damage_is_answered_with_file_and_place(folder, case):
     name, edit, complaint = DAMAGE[case]
     change(folder, name, edit)
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: {complaint}") as error:
@@ -194,14 +188,14 @@ def test_damage_is_answered_with_file_and_place(folder: Path, case: str) -> None
     assert str(folder) in str(error.value)
 
 
-def test_linear_world_needs_its_landmarks(linear: cs.Scenario, tmp_path: Path) -> None:
+def test_linear_world_needs_its_landmarks(linear, tmp_path):
     simulate_log(linear, runs=1, seed=0, out=tmp_path / "log")
     (tmp_path / "log" / "landmarks.parquet").unlink()
     with pytest.raises(cs.InputError, match=r"landmarks\.parquet: missing; a linear world needs"):
         read_log(tmp_path / "log")
 
 
-SENSOR: dict[str, tuple[dict[str, object], str]] = {
+SENSOR = {
     "unknown key": ({"colour": 1}, r"key 'colour': unknown key; allowed here: model, sigma"),
     "unknown model": ({"model": "lidar"}, r".*model.*'xyz', 'uvd', 'linear', 'relative-xy' or 'range-bearing'"),
     "no baseline": ({"B": None}, r".*needs f \(px\) and B \(m\)"),
@@ -213,7 +207,7 @@ SENSOR: dict[str, tuple[dict[str, object], str]] = {
 
 
 @pytest.mark.parametrize("case", SENSOR)
-def test_bad_sensor_file(folder: Path, case: str) -> None:
+def test_bad_sensor_file(folder, case):
     values, complaint = SENSOR[case]
     change_sensor(folder, **values)
     with pytest.raises(cs.InputError, match=rf"sensor\.toml: {complaint}") as error:
@@ -225,10 +219,8 @@ def test_bad_sensor_file(folder: Path, case: str) -> None:
 # --- writing -------------------------------------------------------------------------------------
 
 
-def test_an_error_while_writing_leaves_nothing(
-    uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*args: object, **options: object) -> None:
+def test_an_error_while_writing_leaves_nothing(uvd, tmp_path, monkeypatch):
+    def full(*args, **options):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
@@ -240,13 +232,13 @@ def test_an_error_while_writing_leaves_nothing(
 @pytest.mark.parametrize(
     ("runs", "seed", "complaint"), [(0, 0, "runs must be at least 1"), (1, -1, "seed must not be")]
 )
-def test_counts_are_checked(uvd: cs.Scenario, tmp_path: Path, runs: int, seed: int, complaint: str) -> None:
+def test_counts_are_checked(uvd, tmp_path, runs, seed, complaint):
     with pytest.raises(cs.InputError, match=complaint):
         simulate_log(uvd, runs, seed, tmp_path / "log")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_raw_pixels_are_refused(folder: Path) -> None:
+def test_raw_pixels_are_refused(folder):
     """Columns and rows of the image instead of pixels from the principal point."""
     path = folder / "observations.parquet"
     table = pd.read_parquet(path)

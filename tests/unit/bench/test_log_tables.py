@@ -1,10 +1,5 @@
 """Logs as CSV: written with --format csv, read wherever a log is, the same to the last bit, refused in one sentence."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -20,7 +15,7 @@ NAMES = ("controls", "observations", "truth", "landmarks")
 
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def logs(tmp_path_factory):
     """Folders parquet and csv of the same trials."""
     folder = tmp_path_factory.mktemp("logs")
     world = cs.load_scenario("herath2007-xyz").variant("tiny", truth__steps=25)
@@ -30,14 +25,14 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def log(logs: Path, tmp_path: Path) -> Path:
+def log(logs, tmp_path):
     """A copy of the log as CSV."""
     for file in (logs / "csv").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     return tmp_path
 
 
-def test_a_log_as_csv_is_the_same_to_the_last_bit(logs: Path) -> None:
+def test_a_log_as_csv_is_the_same_to_the_last_bit(logs):
     assert {file.name for file in (logs / "csv").iterdir()} == {
         "manifest.json", "sensor.toml", *(f"{name}.csv" for name in NAMES),
     }  # fmt: skip
@@ -52,8 +47,8 @@ def test_a_log_as_csv_is_the_same_to_the_last_bit(logs: Path) -> None:
     assert not is_log(logs)
 
 
-def test_the_commands_write_and_read_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def done(*arguments: str) -> object:
+def test_the_commands_write_and_read_it(tmp_path, capsys):
+    def done(*arguments):
         with pytest.raises(SystemExit) as end:
             main(list(arguments))
         return end.value.code
@@ -66,7 +61,7 @@ def test_the_commands_write_and_read_it(tmp_path: Path, capsys: pytest.CaptureFi
     assert not (tmp_path / "other").exists()
 
 
-def test_a_table_of_each_form_will_do(logs: Path, log: Path) -> None:
+def test_a_table_of_each_form_will_do(logs, log):
     (log / "truth.csv").unlink()
     (log / "truth.parquet").write_bytes((logs / "parquet/truth.parquet").read_bytes())
     (log / "landmarks.csv").unlink()
@@ -75,18 +70,18 @@ def test_a_table_of_each_form_will_do(logs: Path, log: Path) -> None:
     assert found.trials[0].truth is not None
 
 
-def edit(change: Callable[[list[str]], list[str]], name: str = "controls") -> Callable[[Path], None]:
+def edit(change, name="controls"):
     """Change the lines of a table."""
 
-    def apply(folder: Path) -> None:
+    def apply(folder):
         path = folder / f"{name}.csv"
         path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
 
     return apply
 
 
-def cell(row: int, column: int, value: str, name: str = "controls") -> Callable[[Path], None]:
-    def change(lines: list[str]) -> list[str]:
+def cell(row, column, value, name="controls"):
+    def change(lines):
         fields = lines[row + 1].split(",")
         fields[column] = value
         lines[row + 1] = ",".join(fields)
@@ -95,16 +90,16 @@ def cell(row: int, column: int, value: str, name: str = "controls") -> Callable[
     return edit(change, name)
 
 
-def both(folder: Path) -> None:
+def both(folder):
     (folder / "controls.parquet").write_bytes(b"")
 
 
-def folder_in_its_place(folder: Path) -> None:
+def folder_in_its_place(folder):
     (folder / "controls.csv").unlink()
     (folder / "controls.csv").mkdir()
 
 
-REFUSED: dict[str, tuple[Callable[[Path], None], str]] = {
+REFUSED = {
     "missing column": (edit(lambda lines: [line.rsplit(",", 1)[0] for line in lines]), "column 'omega' is missing"),
     "column twice": (
         edit(lambda lines: [f"{lines[0]},dt", *(f"{line},1" for line in lines[1:])]),
@@ -127,7 +122,7 @@ REFUSED: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_wrong_with_a_table_is_said(name: str, log: Path) -> None:
+def test_what_is_wrong_with_a_table_is_said(name, log):
     change, match = REFUSED[name]
     read_log(log)
     change(log)

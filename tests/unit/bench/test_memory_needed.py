@@ -1,10 +1,5 @@
 """How many workers have memory for a run, and the refusal of a run whose covariance exceeds the machine's."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 
 import consistency as cs
@@ -17,18 +12,16 @@ from consistency.referee.errors import InputError
 
 
 @pytest.fixture
-def has(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+def has(monkeypatch):
     """Let the machine have so many bytes."""
     return lambda size: monkeypatch.setattr(module, "memory_here", lambda: int(size))
 
 
-def covariance_bytes(trial: cs.Trial) -> int:
+def covariance_bytes(trial):
     return 8 * (3 + 3 * len(set(trial.landmark.tolist()))) ** 2
 
 
-def test_workers_that_have_room(
-    linear: cs.Scenario, has: Callable[[float], None], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_workers_that_have_room(linear, has, capsys):
     trial = cs.simulate(linear)
     run = 4 * covariance_bytes(trial)
     has(20 * run)
@@ -44,7 +37,7 @@ def test_workers_that_have_room(
         workers_that_fit([trial], 8)
 
 
-def test_all_runs_of_a_log_count(linear: cs.Scenario, has: Callable[[float], None]) -> None:
+def test_all_runs_of_a_log_count(linear, has):
     wide = linear.variant("wide", truth__sensor__range=(0.0, 50.0), truth__steps=5)
     small, large = cs.simulate(linear.variant("short", truth__steps=2)), cs.simulate(wide, 1)
     work = TrialWork(Recorded({0: small, 1: large}), Isolation([cs.get_filter("kf")], linear.belief))
@@ -55,9 +48,7 @@ def test_all_runs_of_a_log_count(linear: cs.Scenario, has: Callable[[float], Non
         LocalThreads().prepare(work, 0)
 
 
-def test_jobs_that_were_asked_for_are_not_made_fewer(
-    linear: cs.Scenario, has: Callable[[float], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jobs_that_were_asked_for_are_not_made_fewer(linear, has, monkeypatch):
     monkeypatch.setattr(TrialWork, "compile", lambda *_: None)
     monkeypatch.setattr("joblib.cpu_count", lambda: 8)
     trial = cs.simulate(linear)
@@ -68,7 +59,7 @@ def test_jobs_that_were_asked_for_are_not_made_fewer(
         assert local._workers == workers
 
 
-def test_the_limit_of_a_container_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_limit_of_a_container_counts(monkeypatch, tmp_path):
     limit = tmp_path / "memory.max"
     monkeypatch.setattr(module, "CONTAINER_LIMIT", limit)
     machine = memory_here()

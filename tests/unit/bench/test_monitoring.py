@@ -1,25 +1,20 @@
 """Recorded innovations: what is read, which run is chosen, and what is shown of the monitor."""
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib import image
+from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import innovations_of
 from consistency.referee.document.alarms import monitor_document
-from consistency.referee.document.blocks import Document
 from consistency.referee.errors import InputError
 from consistency.referee.pages.nis_over_time import POINTS, averaged, monitor_drawing
 from consistency.referee.pages.write_pages import plotted, require_plot
@@ -27,23 +22,23 @@ from consistency.referee.readers.formats.innovation_files import NisLog
 from consistency.referee.show.as_json import render
 from consistency.referee.show.svg import drawn, saved, svg
 from consistency.referee.show.terminal import show
-from consistency.referee.verdicts.monitor_sources import Watched, make_monitor, read_innovations, watch, watch_lines
+from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch, watch_lines
 
 NIS = [1.0, 2.5, math.nan, 0.25, 7.0]
 DOF = [2, 2, 0, 1, 3]
 
 
-def table(**columns: Any) -> pd.DataFrame:
+def table(**columns):
     return pd.DataFrame({"nis": NIS, "nis_dof": DOF} | columns)
 
 
-def write(folder: Path, data: pd.DataFrame, kind: str) -> Path:
+def write(folder, data, kind):
     path = folder / f"log.{kind}"
     data.to_csv(path, index=False) if kind == "csv" else data.to_parquet(path)
     return path
 
 
-def changed(ratio: float = 4.0, **options: Any) -> Watched:
+def changed(ratio=4.0, **options):
     """Steps 11 to 410, right up to step 210."""
     nis = np.where(np.arange(400) < 200, 3.0, 3.0 * ratio)
     log = NisLog("$odd$", np.arange(11.0, 411), np.arange(400) / 10, nis, np.full(400, 3.0))
@@ -54,26 +49,26 @@ def changed(ratio: float = 4.0, **options: Any) -> Watched:
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_columns_of_a_table(kind: str, tmp_path: Path) -> None:
+def test_columns_of_a_table(kind, tmp_path):
     log = read_innovations(write(tmp_path, table(t=[0.1, 0.2, 0.3, 0.4, 0.5], other="x"), kind))
     assert log.name == "log"
-    np.testing.assert_array_equal(log.step, [1, 2, 3, 4, 5])
-    np.testing.assert_array_equal(log.t, [0.1, 0.2, 0.3, 0.4, 0.5])
-    np.testing.assert_array_equal(log.nis, NIS)
-    np.testing.assert_array_equal(log.dof, DOF)
+    assert_array_equal(log.step, [1, 2, 3, 4, 5])
+    assert_array_equal(log.t, [0.1, 0.2, 0.3, 0.4, 0.5])
+    assert_array_equal(log.nis, NIS)
+    assert_array_equal(log.dof, DOF)
 
 
-def test_rows_are_taken_in_the_order_of_their_steps(tmp_path: Path) -> None:
+def test_rows_are_taken_in_the_order_of_their_steps(tmp_path):
     log = read_innovations(write(tmp_path, table(step=[3, 1, 2, 9, 7]), "csv"))
-    np.testing.assert_array_equal(log.step, [1, 2, 3, 7, 9])
-    np.testing.assert_array_equal(log.nis, [2.5, math.nan, 1.0, 7.0, 0.25])
+    assert_array_equal(log.step, [1, 2, 3, 7, 9])
+    assert_array_equal(log.nis, [2.5, math.nan, 1.0, 7.0, 0.25])
     assert np.isnan(log.t).all()
 
 
-def test_one_run_of_one_filter_is_chosen(tmp_path: Path) -> None:
+def test_one_run_of_one_filter_is_chosen(tmp_path):
     rows = table(filter=["a", "a", "b", "b", "b"], run=[0, 0, 0, 4, 4])
     path = write(tmp_path, rows, "csv")
-    np.testing.assert_array_equal(read_innovations(path, "b", 4).nis, [0.25, 7.0])
+    assert_array_equal(read_innovations(path, "b", 4).nis, [0.25, 7.0])
     assert read_innovations(path, "a").name == "a"
     for given, said in (
         ((None, None), r"holds more than one filter \(a, b\); choose with --filter"),
@@ -88,24 +83,24 @@ def test_one_run_of_one_filter_is_chosen(tmp_path: Path) -> None:
         read_innovations(plain, None, 1)
 
 
-def test_an_archive(tmp_path: Path) -> None:
+def test_an_archive(tmp_path):
     path = tmp_path / "log.npz"
     np.savez(path, nis=[NIS, [9.0] * 5], nis_dof=2, t=np.arange(5.0), lengths=[5, 3], errors=np.zeros(3))
     log = read_innovations(path, None, 1)
-    np.testing.assert_array_equal(log.nis, [9.0] * 3)
-    np.testing.assert_array_equal(log.dof, [2.0] * 3)
-    np.testing.assert_array_equal(log.t, [0.0, 1.0, 2.0])
-    np.testing.assert_array_equal(log.step, [1, 2, 3])
+    assert_array_equal(log.nis, [9.0] * 3)
+    assert_array_equal(log.dof, [2.0] * 3)
+    assert_array_equal(log.t, [0.0, 1.0, 2.0])
+    assert_array_equal(log.step, [1, 2, 3])
     with pytest.raises(InputError, match=r"more than one run \(0, 1\)"):
         read_innovations(path)
     np.savez(path, nis=NIS, nis_dof=DOF)
-    np.testing.assert_array_equal(read_innovations(path).nis, NIS)
+    assert_array_equal(read_innovations(path).nis, NIS)
     with pytest.raises(InputError, match="--filter a: does not go with"):
         read_innovations(path, "a")
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    "arrays, said",
     [
         ({"nis": NIS}, "'nis_dof' is missing; needed are nis and nis_dof, there are: nis"),
         ({"nis": ["a"], "nis_dof": [1]}, "key 'nis' holds <U1, not numbers"),
@@ -115,14 +110,14 @@ def test_an_archive(tmp_path: Path) -> None:
         ({"nis": [1.0, -1.0], "nis_dof": 1}, "run 0, step 2: nis -1 with nis_dof 1"),
     ],
 )
-def test_refused_archives(arrays: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_refused_archives(arrays, said, tmp_path):
     np.savez(tmp_path / "log.npz", **arrays)
     with pytest.raises(InputError, match=said):
         read_innovations(tmp_path / "log.npz")
 
 
 @pytest.mark.parametrize(
-    ("columns", "said"),
+    "columns, said",
     [
         ({"nis": [1.0, -2.0, 1.0, 1.0, 1.0]}, "line 3: nis -2 with nis_dof 2; nis must be 0 or more and finite"),
         ({"nis": [1.0, np.inf, 1.0, 1.0, 1.0]}, "line 3: nis inf"),
@@ -134,13 +129,13 @@ def test_refused_archives(arrays: dict[str, Any], said: str, tmp_path: Path) -> 
         ({"t": [1, 2, 1.5, 3, 4]}, "t 1.5 is less than the one before"),
     ],
 )
-def test_refused_tables(columns: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_refused_tables(columns, said, tmp_path):
     path = write(tmp_path, table(**columns), "csv")
     with pytest.raises(InputError, match=said):
         read_innovations(path)
 
 
-def test_refused_files(tmp_path: Path) -> None:
+def test_refused_files(tmp_path):
     wide = pd.DataFrame({f"c{k}": [1.0] for k in range(20)})
     for name, data, said in (
         ("a.csv", wide.assign(nis=1.0), "'nis_dof' is missing"),
@@ -159,15 +154,15 @@ def test_refused_files(tmp_path: Path) -> None:
     assert read_innovations(write(tmp_path, empty, "csv")).dof.tolist() == [2, 0, 1, 3]
 
 
-def test_results_of_a_run(tmp_path: Path) -> None:
+def test_results_of_a_run(tmp_path):
     scenario = cs.load_scenario("linear-gaussian").variant("short", truth__steps=30)
     results = cs.run_trials(scenario, ["kf"], runs=2, seed=1)
     results.write(tmp_path / "out")
     log = innovations_of(tmp_path / "out", "kf", 1)
     rows = results.estimates.query("run == 1")
-    np.testing.assert_array_equal(log.nis, rows["nis"])
-    np.testing.assert_array_equal(log.dof, rows["nis_dof"])
-    np.testing.assert_array_equal(log.step, np.arange(1, 31))
+    assert_array_equal(log.nis, rows["nis"])
+    assert_array_equal(log.dof, rows["nis_dof"])
+    assert_array_equal(log.step, np.arange(1, 31))
     assert log.name == "kf"
     with pytest.raises(InputError, match=r"holds more than one run \(0, 1\)"):
         innovations_of(tmp_path / "out", None, None)
@@ -179,7 +174,7 @@ def test_results_of_a_run(tmp_path: Path) -> None:
 # --- watching ------------------------------------------------------------------------------------------
 
 
-def test_an_alarm_has_the_steps_and_times_of_the_file() -> None:
+def test_an_alarm_has_the_steps_and_times_of_the_file():
     watched = changed()
     alarm, monitor = watched.alarm, watched.monitor
     assert alarm.since == 211
@@ -189,10 +184,10 @@ def test_an_alarm_has_the_steps_and_times_of_the_file() -> None:
     assert watched.evidence[-1] == monitor.evidence
     first = int(np.flatnonzero(watched.evidence >= 1000)[0])
     assert watched.step[first] == alarm.step
-    np.testing.assert_array_equal(watched.nis_over_dof, np.where(np.arange(400) < 200, 1.0, 4.0))
+    assert_array_equal(watched.nis_over_dof, np.where(np.arange(400) < 200, 1.0, 4.0))
 
 
-def test_rows_without_a_nis_are_rejections_if_there_is_a_gate() -> None:
+def test_rows_without_a_nis_are_rejections_if_there_is_a_gate():
     log = NisLog("f", np.arange(1.0, 6), np.full(5, np.nan), np.array(NIS), np.array([2.0, 2, 2, 1, 3]))
     assert watch(log, make_monitor("optimal", gate=0.99)).monitor.rejections == 1
     assert watch(log, make_monitor("optimal")).monitor.rejections == 0
@@ -201,16 +196,16 @@ def test_rows_without_a_nis_are_rejections_if_there_is_a_gate() -> None:
     assert np.isnan(watch(none, make_monitor("optimal")).nis_over_dof[2])
 
 
-def lines(text: str, read: list[int]) -> Iterator[str]:
+def lines(text, read):
     """The lines of a stream; ``read`` counts those that were asked for."""
     for line in text.splitlines(keepends=True):
         read.append(1)
         yield line
 
 
-def test_lines_are_judged_as_they_come() -> None:
-    read: list[int] = []
-    at: list[int] = []
+def test_lines_are_judged_as_they_come():
+    read = []
+    at = []
     rows = "".join(f"{k};{3.0 if k < 50 else 12.0};3\n" for k in range(200))
     watched = watch_lines(
         lines("# a log\nk;nis;nis_dof\n\n" + rows, read), "stdin", make_monitor("optimal"),
@@ -222,7 +217,7 @@ def test_lines_are_judged_as_they_come() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    "text, said",
     [
         ("", "stdin: is empty"),
         ("nis,dof\n1,2\n", "stdin: 'nis_dof' is missing"),
@@ -233,12 +228,12 @@ def test_lines_are_judged_as_they_come() -> None:
         ("nis,nis_dof\n1,2\n1,2.5\n", "stdin, line 3: dof must be a whole number"),
     ],
 )
-def test_refused_lines(text: str, said: str) -> None:
+def test_refused_lines(text, said):
     with pytest.raises(InputError, match=said):
         watch_lines(lines(text, []), "stdin", make_monitor("optimal"), lambda alarm: None)
 
 
-def test_empty_fields_of_a_line_are_a_step_without_an_innovation() -> None:
+def test_empty_fields_of_a_line_are_a_step_without_an_innovation():
     watched = watch_lines(["nis,nis_dof\n", "1,2\n", ",\n", ",0\n"], "s", make_monitor("optimal"), lambda alarm: None)
     assert (watched.monitor.steps, watched.monitor.innovations) == (3, 1)
 
@@ -246,11 +241,11 @@ def test_empty_fields_of_a_line_are_a_step_without_an_innovation() -> None:
 # --- showing -------------------------------------------------------------------------------------------
 
 
-def document_of(w: Watched) -> Document:
+def document_of(w):
     return monitor_document(w.name, w.monitor, w.alarm, w.alarm_t, w.since_t)
 
 
-def test_the_terminal_shows_numbers_and_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_shows_numbers_and_a_sentence(capsys):
     show(*document_of(changed(gate=0.99, tolerance=1.0)).opening)  # a NIS of 12 is above the gate
     out = capsys.readouterr().out
     assert "rejected" in out
@@ -272,7 +267,7 @@ def test_the_terminal_shows_numbers_and_a_sentence(capsys: pytest.CaptureFixture
     assert "no alarm" in capsys.readouterr().out
 
 
-def test_json_has_every_number() -> None:
+def test_json_has_every_number():
     watched = changed()
     data = json.loads(render(document_of(watched)))
     assert data["alarm"]["since"] == 211
@@ -286,21 +281,21 @@ def test_json_has_every_number() -> None:
     assert json.loads(render(document_of(changed(1.0))))["alarm"] is None
 
 
-def test_many_innovations_are_averaged_before_they_are_drawn() -> None:
+def test_many_innovations_are_averaged_before_they_are_drawn():
     step, ratio = np.arange(1.0, 3002), np.tile([1.0, np.nan, 3.0], 1001)[:3001]
     x, y, together = averaged(step, ratio)
     assert len(y) <= POINTS
     assert together == 4
-    np.testing.assert_allclose(y[:-1], 2.0)
+    assert_allclose(y[:-1], 2.0)
     assert (x[-1], y[-1]) == (3001.0, 1.0)  # one is left over
-    np.testing.assert_allclose(x[0], np.mean([1, 3, 4, 6]))
+    assert_allclose(x[0], np.mean([1, 3, 4, 6]))
     x, y, together = averaged(step[:30], ratio[:30])
     assert together == 1
-    np.testing.assert_array_equal(y, [1.0, 3.0] * 10)
+    assert_array_equal(y, [1.0, 3.0] * 10)
 
 
 @pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
-def test_the_plot(kind: str, tmp_path: Path) -> None:
+def test_the_plot(kind, tmp_path):
     path = tmp_path / f"plot.{kind}"
     require_plot(path, overwrite=False)
     plotted(partial(monitor_drawing, changed()), path)
@@ -315,17 +310,17 @@ def test_the_plot(kind: str, tmp_path: Path) -> None:
         require_plot(tmp_path / "plot.jpg", overwrite=True)
 
 
-def test_a_run_without_any_innovation_can_be_drawn() -> None:
+def test_a_run_without_any_innovation_can_be_drawn():
     log = NisLog("f", np.arange(1.0, 6), np.full(5, np.nan), np.full(5, np.nan), np.zeros(5))
     assert svg(partial(monitor_drawing, watch(log, make_monitor("optimal"))))
 
 
-def test_evidence_is_drawn_with_its_threshold_and_alarm() -> None:
+def test_evidence_is_drawn_with_its_threshold_and_alarm():
     watched = changed()
     threshold = watched.monitor.threshold
     axes = drawn(partial(monitor_drawing, watched)).axes[1]
     line = axes.lines[-1]
-    np.testing.assert_array_equal(line.get_ydata(), watched.evidence[np.searchsorted(watched.t, line.get_xdata())])
+    assert_array_equal(line.get_ydata(), watched.evidence[np.searchsorted(watched.t, line.get_xdata())])
     assert line.get_ydata().max() == watched.evidence.max()
     assert [line.get_ydata()[0] for line in axes.lines if list(line.get_xdata()) == [0, 1]] == [threshold]
     assert axes.get_yscale() == "log"
@@ -339,7 +334,7 @@ def test_evidence_is_drawn_with_its_threshold_and_alarm() -> None:
     assert not drawn(partial(monitor_drawing, quiet)).axes[1].patches
 
 
-def test_innovations_with_their_covariances(tmp_path: Path) -> None:
+def test_innovations_with_their_covariances(tmp_path):
     rng = np.random.default_rng(3)
     v, S = rng.normal(size=(2, 40, 2)), np.broadcast_to([[2.0, 0.5], [0.5, 1.0]], (2, 40, 2, 2)).copy()
     v[1, 5] = np.nan

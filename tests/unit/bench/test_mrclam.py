@@ -1,7 +1,5 @@
 """MRCLAM as a log: what the calibration finds in a recording whose faults are known."""
 
-from __future__ import annotations
-
 import gzip
 import shutil
 import sys
@@ -12,7 +10,6 @@ import pytest
 
 import consistency as cs
 from consistency.bench.runs.findings import sibling
-from consistency.referee.types import Array
 
 SCRIPTS = Path(__file__).parents[3] / "experiments"
 conversion = sibling(str(SCRIPTS / "e15_mrclam.py"), "mrclam_log")
@@ -21,13 +18,13 @@ LANDMARKS = np.array([[2.0, 0.0], [-2.0, 1.0], [0.0, 3.0]])
 CODES = (63, 81, 7)
 
 
-def rates(t: Array) -> tuple[Array, Array]:
+def rates(t):
     """True speed and turn rate."""
     return 0.08 + 0.0 * t, 0.3 * np.sin(0.7 * t)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """One robot of 400 s: odometry ahead of it, too fast and turning; late stamps of the camera; a wrong barcode."""
     at, rng = tmp_path_factory.mktemp("MRCLAM_Dataset0"), np.random.default_rng(0)
     t = np.arange(0.0, 400.0, 0.01)
@@ -53,7 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return at
 
 
-def test_the_calibration_finds_scale_bias_and_lag(folder: Path) -> None:
+def test_the_calibration_finds_scale_bias_and_lag(folder):
     found = conversion.calibrate(conversion.read_robot(folder, 1))
     assert found.lag == pytest.approx(LAG)
     assert found.scale_v == pytest.approx(SCALE, abs=2e-3)
@@ -63,7 +60,7 @@ def test_the_calibration_finds_scale_bias_and_lag(folder: Path) -> None:
     assert np.abs(found.bias).max() < 0.02
 
 
-def test_the_log_is_the_drive_after_the_calibration(folder: Path) -> None:
+def test_the_log_is_the_drive_after_the_calibration(folder):
     data = conversion.read_robot(folder, 1)
     trial, belief, _, dropped = conversion.log_of(data)
     assert belief.sensor.model == "range-bearing"
@@ -78,7 +75,7 @@ def test_the_log_is_the_drive_after_the_calibration(folder: Path) -> None:
     assert np.abs(np.diff(driven) - trial.controls[:, 2] * conversion.DT).max() < 2e-3
 
 
-def test_files_may_be_gzipped_or_not(folder: Path, tmp_path: Path) -> None:
+def test_files_may_be_gzipped_or_not(folder, tmp_path):
     for path in folder.iterdir():
         unpacked = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
         (tmp_path / path.name.removesuffix(".gz")).write_bytes(unpacked)
@@ -90,7 +87,7 @@ def test_files_may_be_gzipped_or_not(folder: Path, tmp_path: Path) -> None:
         conversion.read_robot(tmp_path, 1)
 
 
-def test_what_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
+def test_what_is_missing_is_named(folder, tmp_path):
     with pytest.raises(cs.InputError, match=r"Robot2_Odometry.dat: is missing; it must be a file of UTIAS MRCLAM"):
         conversion.read_robot(folder, 2)
     experiment = sibling(str(SCRIPTS / "e15_mrclam.py"), "e15_mrclam")

@@ -13,7 +13,7 @@ from painted import lines, panels
 import consistency as cs
 from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.sections import overview
-from consistency.bench.pages.sections.report_input import Report
+from consistency.bench.pages.sections.report_input import STEREO, Report
 from consistency.referee.document.blocks import Figure, Name, Status, Table
 from consistency.referee.document.wording import written
 from consistency.referee.show import pdf
@@ -34,7 +34,7 @@ def report(uvd, tmp_path_factory) -> Report:
 
 
 def opening(report: Report) -> tuple[Figure, Table]:
-    picture, verdicts = overview.opening(report)
+    _, picture, verdicts = overview.opening(report)
     assert isinstance(picture, Figure)
     assert isinstance(verdicts, Table)
     return picture, verdicts
@@ -109,13 +109,49 @@ def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> N
 def test_the_opening_is_printed(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pdf.typst, "compile", lambda path, **_: Path(path).with_name("data.json").read_bytes())
     data = json.loads(pdf.render_pdf(compose(report)))
-    assert [block["kind"] for block in data["opening"]] == ["Figure", "Table"]
-    assert pdf.soft(overview.TITLE) == data["opening"][0]["title"]
+    assert [block["kind"] for block in data["opening"]] == ["Text", "Figure", "Table"]
+    assert pdf.soft(overview.TITLE) == data["opening"][1]["title"]
+
+
+@pytest.fixture
+def of_paper(report: Report) -> Report:
+    """The same with the sensor of the paper as its first world."""
+    first, second = report.studies
+    manifest = report.manifest | {"date": "2026-01-02", "command": "consistency reproduce", "git_commit": "abc"}
+    return replace(report, manifest=manifest, studies=(replace(first, name=STEREO), second))
+
+
+def test_the_first_page_has_question_answer_curves_and_origin(of_paper: Report) -> None:
+    made = compose(of_paper)
+    question, curves, origin, picture, _ = made.opening
+    assert "Herath, Kodagoda and Dissanayake (2007)" in question.text
+    assert curves.title == "NEES over time at a baseline of 9 cm"
+    assert origin.text == "command: consistency reproduce; date: 2026-01-02; git commit: abc."
+    assert picture.title == overview.TITLE
+    statuses = {track.name: track.verdict.status for track in of_paper.studies[0].tracks}
+    assert made.answer.startswith("At a baseline of 9 cm, ")
+    assert all(name in made.answer and status in made.answer for name, status in statuses.items())
+
+
+def test_of_several_studies_the_paper_has_verdicts_and_their_first_figure(of_paper: Report) -> None:
+    made = compose(of_paper)
+    on_paper = {chapter.anchor: chapter.blocks for chapter in made.paper}
+    assert list(on_paper) == ["study-0", "study-1"]
+    assert [type(block).__name__ for block in on_paper["study-0"]] == ["Table", "Reasons", "Figure"]
+    assert not any(entry.others for entry in on_paper["study-0"][1].entries)
+    whole = {chapter.anchor: chapter.blocks for chapter in made.chapters}
+    assert {"verdicts", "calibration", "provenance"} < set(whole)
+    assert on_paper["study-0"][2] in whole["study-0"]
+
+
+def test_one_study_is_printed_whole_but_for_the_rates_of_the_referee(report: Report) -> None:
+    made = compose(replace(report, studies=report.studies[:1]))
+    assert {chapter.anchor for chapter in made.chapters} - {chapter.anchor for chapter in made.paper} == {"calibration"}
 
 
 def test_the_answer_counts_where_the_table_names(report: Report) -> None:
     text = answer(report.studies, ())
-    assert "2 studies put 3 pairs of filter and scenario to the test" in text
+    assert "In 2 worlds, of 3 verdicts on a filter " in text
     assert "ekf-uvd" not in text
     assert "ekf-uvd" in answer(report.studies[:1], ())
 

@@ -1,24 +1,19 @@
 """Pilots of a plan are the runs that were asked for."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
-import pytest
 
 from consistency.bench.runs import sequential
 from consistency.diagnostics import Record
 
 
-def test_a_pilot_runs_what_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Any] = []
+def test_a_pilot_runs_what_it_is_told(monkeypatch):
+    asked = []
 
-    def run_trials(scenario: Any, *rest: Any) -> str:
+    def run_trials(scenario, *rest):
         asked.append((scenario.name, *rest))
         return "results"
 
-    def records_of(results: Any, filters: Any) -> list[Record]:
+    def records_of(results, filters):
         asked.append((results, filters))
         return [Record("kf", nees=np.full((40, 5), 6.0), dof=3, t=np.arange(5.0))]
 

@@ -1,8 +1,5 @@
 """Sensors of landmarks in the plane: models, scenarios, logs, maps."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,21 +25,19 @@ from consistency.bench.store.log import read_log, write_log
 from consistency.bench.store.trial_rows import is_flat
 from consistency.diagnostics import map_score
 from consistency.referee.system.provenance import manifest_of
-from consistency.referee.types import Array
 
-Small = Callable[..., cs.Scenario]
 STEP = 1e-6
 POINTS = np.array([[2.0, 0.5], [-1.5, 0.8], [-1.2, -2.0], [0.3, -0.4]])
 
 
-def slope(function: Callable[[Array], Array], at: Array) -> Array:
+def slope(function, at):
     """Jacobian by central differences."""
     steps = STEP * np.eye(len(at))
     return np.column_stack([(function(at + d) - function(at - d)) / (2.0 * STEP) for d in steps])
 
 
 @pytest.mark.parametrize("point", POINTS)
-def test_range_and_bearing_have_these_jacobians(point: Array) -> None:
+def test_range_and_bearing_have_these_jacobians(point):
     there = np.array(planar.range_bearing(*point))
     assert np.allclose(planar.at_range_bearing(*there), point, rtol=0, atol=1e-15)
     J = np.reshape(planar.range_bearing_jacobian(*point), (2, 2))
@@ -53,7 +48,7 @@ def test_range_and_bearing_have_these_jacobians(point: Array) -> None:
 
 
 @pytest.mark.parametrize("world", ["esde-xy", "range-bearing"])
-def test_a_sensor_locates_what_it_measures(world: str) -> None:
+def test_a_sensor_locates_what_it_measures(world):
     sensor = sensor_of(cs.load_scenario(world).belief, uvd=False)
     for x, y in POINTS:
         z = np.array(measure(sensor, x, y, 7.0))
@@ -67,7 +62,7 @@ def test_a_sensor_locates_what_it_measures(world: str) -> None:
         assert not J[:, 2].any()
 
 
-def test_a_bearing_is_taken_by_the_shorter_way_round() -> None:
+def test_a_bearing_is_taken_by_the_shorter_way_round():
     sensor = sensor_of(cs.load_scenario("range-bearing").belief, uvd=False)
     z = np.array([2.0, 3.1])
     wrap_residual(sensor, z, np.array([5.0, -3.1]))
@@ -78,7 +73,7 @@ def test_a_bearing_is_taken_by_the_shorter_way_round() -> None:
 
 
 @pytest.mark.parametrize("method", PLANAR)
-def test_full_turns_of_a_bearing_change_nothing(small: Small, method: str) -> None:
+def test_full_turns_of_a_bearing_change_nothing(small, method):
     """The twin, step by step; its kernel has the same numbers (tests/oracle/test_combinations.py)."""
     scenario = small("range-bearing", truth__steps=40)
     trial, twin = cs.simulate(scenario), cs.get_filter(f"{method}-rb").textbook
@@ -93,7 +88,7 @@ def test_full_turns_of_a_bearing_change_nothing(small: Small, method: str) -> No
 # --- scenarios -------------------------------------------------------------------------------------
 
 
-def test_landmarks_on_a_circle_and_in_rings(small: Small) -> None:
+def test_landmarks_on_a_circle_and_in_rings(small):
     circle = draw_landmarks(cs.load_scenario("esde-xy").truth)
     assert circle.shape == (15, 3)
     assert np.allclose(np.hypot(*(circle[:, :2] - [0.1251, 3.3318]).T), 4.3333)
@@ -107,7 +102,7 @@ def test_landmarks_on_a_circle_and_in_rings(small: Small) -> None:
     assert not np.allclose(rings, other)
 
 
-def test_range_and_bearing_of_the_truth_without_noise(small: Small) -> None:
+def test_range_and_bearing_of_the_truth_without_noise(small):
     scenario = small("range-bearing", truth__sensor__sigma=(1e-12, 1e-12))
     trial = cs.simulate(scenario)
     pose = trial.truth[trial.step]
@@ -137,7 +132,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_a_planar_sensor_cannot_have(small: Small, case: str) -> None:
+def test_what_a_planar_sensor_cannot_have(small, case):
     changes, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         small("esde-xy", **changes)
@@ -147,7 +142,7 @@ def test_what_a_planar_sensor_cannot_have(small: Small, case: str) -> None:
 
 
 @pytest.mark.parametrize("world", ["esde-xy", "range-bearing"])
-def test_a_log_keeps_two_values_of_each_observation(tmp_path: Path, small: Small, world: str) -> None:
+def test_a_log_keeps_two_values_of_each_observation(tmp_path, small, world):
     scenario = small(world)
     trial = cs.simulate(scenario)
     write_log(tmp_path / "log", [trial], scenario.belief, None, manifest_of(kind="log"))
@@ -161,7 +156,7 @@ def test_a_log_keeps_two_values_of_each_observation(tmp_path: Path, small: Small
         read_log(tmp_path / "log")
 
 
-def test_a_landmark_of_the_plane_has_two_degrees_of_freedom() -> None:
+def test_a_landmark_of_the_plane_has_two_degrees_of_freedom():
     run = np.arange(4)
     assert map_score(run, np.full(4, 2.0), 2).ratio.value == pytest.approx(1.0)
     assert map_score(run, np.full(4, 3.0)).ratio.value == pytest.approx(1.0)
@@ -178,7 +173,7 @@ PEERS = sibling(str(Path(__file__).parents[3] / "experiments" / "e13_consistent.
 
 
 @pytest.mark.parametrize("s", [0.01, 0.02, 0.03])
-def test_the_worlds_of_esde_have_its_noise(s: float) -> None:
+def test_the_worlds_of_esde_have_its_noise(s):
     (world,) = PEERS.worlds(f"esde-xy-{s}")
     for table in (world.truth.motion, world.belief.motion):
         assert table.sigma_v == pytest.approx(s / np.sqrt(2.0))
@@ -187,7 +182,7 @@ def test_the_worlds_of_esde_have_its_noise(s: float) -> None:
     assert (world.truth.motion.sigma_v == pytest.approx(shipped.sigma_v)) == (s == 0.02)
 
 
-def test_a_number_between_those_of_maps_is_no_distance_away() -> None:
+def test_a_number_between_those_of_maps_is_no_distance_away():
     assert PEERS.distance(pd.Series([-2.0, 0.5, 3.0])) == 0.0
     assert PEERS.distance(pd.Series([2.0, 0.5, 3.0])) == 0.5
     assert PEERS.distance(pd.Series([-4.0])) == -4.0

@@ -118,12 +118,22 @@ def printed(report: Report) -> bytes:
     return pdf.render_pdf(compose(report))
 
 
+def without_studies(folder: Path) -> Report:
+    """What a folder holds beside its studies, which take most of the time to draw."""
+    return replace(build_report(folder), studies=())
+
+
 def axis_caption(study: Study) -> str:
     return by_axis.axis_caption(study, by_axis.forests(study))
 
 
 def with_tracks(report, *tracks: Track):
     return replace(report, studies=(replace(report.studies[0], tracks=tracks),))
+
+
+@pytest.fixture(scope="module")
+def page_of_results(report: Report) -> str:
+    return shown(report)
 
 
 @pytest.fixture
@@ -756,18 +766,18 @@ def test_html_loads_nothing_and_is_small(reproduced):
     assert page.tags.count("h1") == 1
 
 
-def test_a_page_allows_its_own_script_and_no_other(report):
+def test_a_page_allows_its_own_script_and_no_other(report, page_of_results):
     """By its hash, as Content Security Policy Level 3 takes it."""
-    source = shown(report)
+    source = page_of_results
     (script,) = re.findall(r"<script>(.*?)</script>", source, re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}';" in source
     assert "script-src 'none'" in as_html.render(replace(compose(report), chapters=()))
 
 
-def test_clips_of_a_page_have_names_of_their_own(report):
+def test_clips_of_a_page_have_names_of_their_own(page_of_results):
     """Equal ones would clip a figure by the panel of another."""
-    clips = re.findall(r'<clipPath id="(\w+)"', shown(report))
+    clips = re.findall(r'<clipPath id="(\w+)"', page_of_results)
     assert len(clips) > 10
     assert len(set(clips)) == len(clips)
 
@@ -775,10 +785,10 @@ def test_clips_of_a_page_have_names_of_their_own(report):
 def test_a_long_study_takes_half_a_megabyte_of_a_page(results, tmp_path):
     results.write(tmp_path / "run")
     report = build_report(tmp_path / "run")
-    steps = 20_000
+    steps = 4_000
     rng = np.random.default_rng(0)
     peak = rng.random(steps)
-    peak[7_777] = 99.0
+    peak[777] = 99.0
 
     def long(track: Track) -> Track:
         scale = replace(track.verdict.scale, anees=peak, band=np.tile([2.0, 4.0], (steps, 1)))
@@ -802,7 +812,7 @@ def test_a_long_study_takes_half_a_megabyte_of_a_page(results, tmp_path):
 
 
 def test_findings_and_distributions(reproduced):
-    report = build_report(reproduced)
+    report = without_studies(reproduced)
     assert "1 reproduced" in compose(report).answer
     narrow, wide = stereo_noise.read(report)
     # first order: sigma_x = x^2 sigma_d / (f B)
@@ -862,7 +872,7 @@ def front_end_tables(folder: Path) -> dict[str, pd.DataFrame]:
 
 def test_the_front_end_is_what_its_tables_hold(reproduced):
     front_end_tables(reproduced)
-    report = build_report(reproduced)
+    report = without_studies(reproduced)
     depths, registrations, cells = (read(report) for read in (front_end.shares, front_end.scenes, front_end.cells_of))
     np.testing.assert_array_equal(depths.depth, [2.0, 4.0])
     np.testing.assert_array_equal(depths.share, [0.95, 0.8])
@@ -948,14 +958,14 @@ def test_the_map_shows_truth_and_estimates(report):
 def test_a_table_of_the_front_end_alone(reproduced, alone):
     for name in set(front_end_tables(reproduced)) - {alone}:
         (reproduced / f"{name}.parquet").unlink()
-    report = build_report(reproduced)
+    report = without_studies(reproduced)
     assert 'id="front-end"' in shown(report)
     (chapter,) = [chapter for chapter in compose(report).chapters if chapter.anchor == "front-end"]
     assert len(chapter.blocks) == 1
 
 
 def test_without_its_tables_there_is_no_front_end(reproduced):
-    report = build_report(reproduced)
+    report = without_studies(reproduced)
     assert "front-end" not in shown(report)
     assert "front-end" not in {chapter.anchor for chapter in compose(report).chapters}
 

@@ -1,12 +1,9 @@
 """Result folders: written whole or not at all, read back to the bit, and refused clearly when damaged."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,24 +25,24 @@ TABLES = ("estimates", "failures", "truth", "landmarks", "map")
 class Sleepy(Still):
     """Stays where it started, and breaks in step 5."""
 
-    def pose(self, state: Any) -> Gaussian:
+    def pose(self, state):
         return Gaussian(state, np.eye(3) if self.step < 5 else -np.eye(3))
 
 
 @pytest.fixture(scope="module")
-def results(xyz: cs.Scenario) -> cs.Results:
+def results(xyz):
     return cs.run_trials(xyz, ["ekf-xyz", Sleepy("sleepy")], runs=4, seed=2, jobs=1)
 
 
 @pytest.fixture(scope="module")
-def written(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(results, tmp_path_factory):
     folder = tmp_path_factory.mktemp("results") / "out"
     results.write(folder)
     return folder
 
 
 @pytest.fixture
-def folder(written: Path, tmp_path: Path) -> Path:
+def folder(written, tmp_path):
     """A copy to be damaged."""
     return Path(shutil.copytree(written, tmp_path / "copy"))
 
@@ -53,7 +50,7 @@ def folder(written: Path, tmp_path: Path) -> Path:
 # --- round trip ----------------------------------------------------------------------------------
 
 
-def test_read_gives_back_what_was_written(xyz: cs.Scenario, results: cs.Results, written: Path) -> None:
+def test_read_gives_back_what_was_written(xyz, results, written):
     back = cs.read_results(written)
     assert back.scenario == xyz
     for name in TABLES:
@@ -66,7 +63,7 @@ def test_read_gives_back_what_was_written(xyz: cs.Scenario, results: cs.Results,
     assert back.filters == ["ekf-xyz", "sleepy"]
 
 
-def test_files_have_the_columns_of_the_contract(written: Path) -> None:
+def test_files_have_the_columns_of_the_contract(written):
     for name in TABLES:
         parquet = pq.ParquetFile(written / f"{name}.parquet")
         assert parquet.schema_arrow.names == [*COLUMNS[name], *(["joint_nees"] if name == "map" else [])]
@@ -76,7 +73,7 @@ def test_files_have_the_columns_of_the_contract(written: Path) -> None:
     assert list(COLUMNS["estimates"]) == contract.split()
 
 
-def test_manifest_says_where_the_numbers_come_from(written: Path, xyz: cs.Scenario) -> None:
+def test_manifest_says_where_the_numbers_come_from(written, xyz):
     manifest = json.loads((written / "manifest.json").read_text())
     assert manifest["schema_version"] == 1
     assert manifest["versions"]["numpy"] == np.__version__
@@ -86,14 +83,14 @@ def test_manifest_says_where_the_numbers_come_from(written: Path, xyz: cs.Scenar
     assert {"command", "git_commit", "wall_time_s", "scenario"} <= set(manifest)
 
 
-def test_a_failed_run_has_no_rows_from_the_failed_step_on(results: cs.Results) -> None:
+def test_a_failed_run_has_no_rows_from_the_failed_step_on(results):
     rows = results.estimates.query("filter == 'sleepy'")
     assert list(rows["step"]) == [1, 2, 3, 4] * 4
     assert list(results.failures["step"]) == [5] * 4
     assert set(results.failures["reason"]) == {"the pose covariance is not positive definite"}
 
 
-def test_nees_is_null_only_while_the_pose_is_not_of_full_rank(results: cs.Results) -> None:
+def test_nees_is_null_only_while_the_pose_is_not_of_full_rank(results):
     table = results.estimates.query("filter == 'ekf-xyz'")
     null = table.loc[table["nees"].isna(), "step"]
     assert set(null) == {1}
@@ -105,7 +102,7 @@ def test_nees_is_null_only_while_the_pose_is_not_of_full_rank(results: cs.Result
         assert row.nees == pytest.approx(e @ np.linalg.inv(P) @ e, rel=1e-6)
 
 
-def test_a_record_puts_every_row_in_its_place(results: cs.Results) -> None:
+def test_a_record_puts_every_row_in_its_place(results):
     c = record_of(results, "sleepy")
     assert c.nees.shape == (4, 60)
     assert np.array_equal(np.isfinite(c.nees), np.broadcast_to(np.arange(60) < 4, (4, 60)))
@@ -125,7 +122,7 @@ def test_a_record_puts_every_row_in_its_place(results: cs.Results) -> None:
 
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("keep", [0, 3, 200])
-def test_file_cut_short(folder: Path, name: str, keep: int) -> None:
+def test_file_cut_short(folder, name, keep):
     path = folder / f"{name}.parquet"
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short") as error:
@@ -134,14 +131,14 @@ def test_file_cut_short(folder: Path, name: str, keep: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["estimates", "failures", "truth", "landmarks"])
-def test_a_table_that_was_written_and_is_gone(folder: Path, name: str) -> None:
+def test_a_table_that_was_written_and_is_gone(folder, name):
     """Without its truth an overconfident filter would pass by the NIS."""
     (folder / f"{name}.parquet").unlink()
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: missing"):
         cs.read_results(folder)
 
 
-def test_results_do_not_replace_a_log(folder: Path, uvd: cs.Scenario, tmp_path: Path) -> None:
+def test_results_do_not_replace_a_log(folder, uvd, tmp_path):
     simulate_log(uvd, 1, 0, tmp_path / "log")
     with pytest.raises(cs.InputError, match="holds log, not results"):
         cs.read_results(folder).write(tmp_path / "log", overwrite=True)
@@ -157,7 +154,7 @@ MANIFESTS = {
 
 
 @pytest.mark.parametrize("case", MANIFESTS)
-def test_bad_manifest(folder: Path, case: str) -> None:
+def test_bad_manifest(folder, case):
     text, complaint = MANIFESTS[case]
     (folder / "manifest.json").write_text(text)
     with pytest.raises(cs.InputError, match=complaint) as error:
@@ -165,7 +162,7 @@ def test_bad_manifest(folder: Path, case: str) -> None:
     assert str(folder) in str(error.value)
 
 
-def test_no_manifest_and_no_folder(folder: Path, tmp_path: Path) -> None:
+def test_no_manifest_and_no_folder(folder, tmp_path):
     (folder / "manifest.json").unlink()
     with pytest.raises(cs.InputError, match=r"manifest\.json: missing"):
         cs.read_results(folder)
@@ -181,11 +178,11 @@ class DiskFull(OSError):
 
 
 @pytest.fixture
-def full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+def full_disk(monkeypatch):
     """The second table does not fit any more."""
     write, calls = pq.ParquetWriter.write_table, []
 
-    def write_table(self: pq.ParquetWriter, *args: Any, **kwargs: Any) -> Any:
+    def write_table(self, *args, **kwargs):
         calls.append(1)
         if len(calls) > 1:
             raise DiskFull(28, "No space left on device")
@@ -195,7 +192,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("full_disk")
-def test_an_error_while_overwriting_keeps_the_old_folder(results: cs.Results, folder: Path) -> None:
+def test_an_error_while_overwriting_keeps_the_old_folder(results, folder):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     for out in (folder, folder.parent / "new"):
         with pytest.raises((DiskFull, cs.InputError), match="No space left"):
@@ -204,7 +201,7 @@ def test_an_error_while_overwriting_keeps_the_old_folder(results: cs.Results, fo
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 
-def test_overwrite_replaces_the_whole_folder(results: cs.Results, folder: Path) -> None:
+def test_overwrite_replaces_the_whole_folder(results, folder):
     (folder / "stale.txt").write_text("old")
     results.write(folder, overwrite=True)
     assert not (folder / "stale.txt").exists()
@@ -212,7 +209,7 @@ def test_overwrite_replaces_the_whole_folder(results: cs.Results, folder: Path) 
     assert len(cs.read_results(folder).estimates) == len(results.estimates)
 
 
-def test_existing_folder_is_refused(folder: Path) -> None:
+def test_existing_folder_is_refused(folder):
     with pytest.raises(cs.InputError, match=r"--out .*copy: exists already; .* --overwrite"):
         require_free(folder, overwrite=False)
     require_free(folder, overwrite=True)
@@ -223,7 +220,7 @@ def test_existing_folder_is_refused(folder: Path) -> None:
         require_free(folder.parent / "link", overwrite=False)
 
 
-def test_overwrite_refuses_what_is_not_ours(tmp_path: Path) -> None:
+def test_overwrite_refuses_what_is_not_ours(tmp_path):
     photos, file = tmp_path / "photos", tmp_path / "notes.txt"
     photos.mkdir()
     (photos / "cat.jpg").write_bytes(b"x")
@@ -235,7 +232,7 @@ def test_overwrite_refuses_what_is_not_ours(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ['{"name": "some web page", "icons": []}', "{", "[]"])
-def test_overwrite_refuses_the_manifest_of_something_else(tmp_path: Path, text: str) -> None:
+def test_overwrite_refuses_the_manifest_of_something_else(tmp_path, text):
     site = tmp_path / "site"
     site.mkdir()
     (site / "manifest.json").write_text(text)
@@ -243,13 +240,13 @@ def test_overwrite_refuses_the_manifest_of_something_else(tmp_path: Path, text: 
         require_free(site, overwrite=True)
 
 
-def test_place_that_cannot_be_written(tmp_path: Path) -> None:
+def test_place_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(cs.InputError, match=r"--out .*: cannot be written \("):
         require_free(tmp_path / "file" / "below", overwrite=False)
 
 
-def test_a_square_is_not_negative() -> None:
+def test_a_square_is_not_negative():
     squares = pd.Series([1.0, np.nan, -2.0], name="nees")
     with pytest.raises(cs.InputError, match="column 'nees', row 12: negative"):
         check_column(Path("map.parquet"), squares, "float64", 10)

@@ -1,14 +1,11 @@
 """Scenario files: what is read, and what every kind of mistake is answered with."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from scenario_files import Edit, drop, load, put
+from scenario_files import drop, load, put
 
 import consistency as cs
 from consistency.bench.scenario import scenario_text
@@ -25,20 +22,20 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize("name", sorted(EXPECTED))
-def test_every_built_in_scenario_loads_and_shows_a_landmark(name: str) -> None:
+def test_every_built_in_scenario_loads_and_shows_a_landmark(name):
     scenario = cs.load_scenario(name)
     assert scenario.name == name
     assert scenario.summary
     assert len(cs.simulate(scenario.variant("short", truth__steps=30)).z) > 0
 
 
-def test_by_path_a_scenario_is_named_after_its_file(tmp_path: Path) -> None:
+def test_by_path_a_scenario_is_named_after_its_file(tmp_path):
     scenario = load(tmp_path)
     assert scenario.name == "mine"
     assert scenario.truth == cs.load_scenario("herath2007-stereo").truth
 
 
-def test_units_become_si(tmp_path: Path) -> None:
+def test_units_become_si(tmp_path):
     degrees = load(tmp_path)
     assert degrees.truth.motion.sigma_omega == pytest.approx(np.deg2rad(5.0), rel=1e-15)
     assert degrees.truth.path.heading == pytest.approx(np.pi / 2)
@@ -51,7 +48,7 @@ def test_units_become_si(tmp_path: Path) -> None:
     assert radians.truth == degrees.truth
 
 
-def test_degrees_reach_into_lists(tmp_path: Path) -> None:
+def test_degrees_reach_into_lists(tmp_path):
     mount = {"position_m": [0.1, 0.0, 0.2], "rotation_deg": [0.0, -10.0, 90.0]}
     scenario = load(tmp_path, put("belief.sensor.mount", mount))
     assert np.allclose(scenario.belief.sensor.mount.rotation, np.deg2rad([0.0, -10.0, 90.0]))
@@ -60,7 +57,7 @@ def test_degrees_reach_into_lists(tmp_path: Path) -> None:
 # --- identity ------------------------------------------------------------------------------------
 
 
-def test_hash_follows_content_only(tmp_path: Path) -> None:
+def test_hash_follows_content_only(tmp_path):
     base = cs.load_scenario("herath2007-stereo")
     assert load(tmp_path, put("summary", "told differently")).hash == base.hash
     assert base.variant("renamed").hash == base.hash
@@ -74,16 +71,16 @@ def test_hash_follows_content_only(tmp_path: Path) -> None:
     assert re.fullmatch("[0-9a-f]{16}", base.hash)
 
 
-def test_hash_does_not_depend_on_the_order_or_the_unit_of_keys(tmp_path: Path) -> None:
+def test_hash_does_not_depend_on_the_order_or_the_unit_of_keys(tmp_path):
     base = cs.load_scenario("herath2007-stereo")
 
-    def reverse(data: dict) -> None:
+    def reverse(data):
         data["truth"] = dict(reversed(data["truth"].items()))
 
     assert load(tmp_path, reverse).hash == base.hash
 
 
-def test_variant_changes_what_is_named_and_nothing_else() -> None:
+def test_variant_changes_what_is_named_and_nothing_else():
     base = cs.load_scenario("herath2007-stereo")
     far = base.variant("far", truth__sensor__range=(0.5, 8.0))
     assert far.name == "far"
@@ -93,17 +90,17 @@ def test_variant_changes_what_is_named_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("key", ["truth__sensor__rnage", "truth__nothing__here", "truth__motion__sigma_v__x"])
-def test_variant_refuses_a_path_that_is_not_there(key: str) -> None:
+def test_variant_refuses_a_path_that_is_not_there(key):
     with pytest.raises((ValidationError, KeyError, TypeError, ValueError)):
         cs.load_scenario("herath2007-stereo").variant("typo", **{key: 1.0})
 
 
-def test_variant_is_validated() -> None:
+def test_variant_is_validated():
     with pytest.raises(ValueError, match="sigma_v"):
         cs.load_scenario("herath2007-stereo").variant("bad", truth__motion__sigma_v=-1.0)
 
 
-def test_scenario_is_frozen() -> None:
+def test_scenario_is_frozen():
     scenario = cs.load_scenario("herath2007-stereo")
     with pytest.raises(ValidationError, match="frozen"):
         scenario.truth.steps = 3  # type: ignore[misc]
@@ -125,7 +122,7 @@ UNKNOWN = {
 
 
 @pytest.mark.parametrize("key", UNKNOWN)
-def test_unknown_key_is_named_with_what_is_allowed_there(tmp_path: Path, key: str) -> None:
+def test_unknown_key_is_named_with_what_is_allowed_there(tmp_path, key):
     with pytest.raises(cs.InputError) as error:
         load(tmp_path, put(key, 1))
     text = str(error.value)
@@ -137,12 +134,12 @@ def test_unknown_key_is_named_with_what_is_allowed_there(tmp_path: Path, key: st
 
 
 @pytest.mark.parametrize("where", ["truth.sensor.mount", "belief.sensor.mount", "belief.sigma_points"])
-def test_unknown_key_in_a_nested_table(tmp_path: Path, where: str) -> None:
+def test_unknown_key_in_a_nested_table(tmp_path, where):
     with pytest.raises(cs.InputError, match=rf"mine\.toml: key '{where}\.colour': unknown key; allowed here: "):
         load(tmp_path, put(where, {"colour": 1}))
 
 
-BAD: dict[str, tuple[tuple[Edit, ...], str]] = {
+BAD = {
     "negative motion noise": ((put("truth.motion.sigma_v", -0.1),), r"'truth\.motion\.sigma_v'.*greater than or equal"),
     "negative belief": ((put("belief.motion.sigma_v", -0.1),), r"'belief\.motion\.sigma_v'"),
     "zero sensor noise": ((put("belief.sensor.sigma_px", [0.0, 1.0, 1.0]),), r"'belief\.sensor\.sigma\.0'.*greater"),
@@ -192,7 +189,7 @@ BAD: dict[str, tuple[tuple[Edit, ...], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str) -> None:
+def test_mistake_is_answered_with_file_and_key(tmp_path, case):
     edits, pattern = BAD[case]
     with pytest.raises(cs.InputError, match=pattern) as error:
         load(tmp_path, *edits)
@@ -202,40 +199,40 @@ def test_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str) -> Non
 
 
 @pytest.mark.parametrize(
-    ("name", "edit", "complaint"),
+    "name, edit, complaint",
     [
         ("linear-gaussian", put("truth.motion.noise_on", "odometry"), "noise_on = 'motion'"),
         ("herath2007-xyz", drop("truth.sensor.f_px"), r"'truth\.sensor'.*image needs f"),
     ],
 )
-def test_what_another_world_needs(tmp_path: Path, name: str, edit: Edit, complaint: str) -> None:
+def test_what_another_world_needs(tmp_path, name, edit, complaint):
     with pytest.raises(cs.InputError, match=complaint):
         load(tmp_path, edit, name=name)
 
 
 @pytest.mark.parametrize(
-    ("content", "complaint"),
+    "content, complaint",
     [
         (b"summary = 'x'\n[truth\n", "not valid TOML.*line 2"),
         (b"\xff\xfe\x00\x01", "not valid TOML"),
         (None, r"cannot be read \(No such file"),
     ],
 )
-def test_a_file_that_is_no_table(tmp_path: Path, content: bytes | None, complaint: str) -> None:
+def test_a_file_that_is_no_table(tmp_path, content, complaint):
     if content is not None:
         (tmp_path / "broken.toml").write_bytes(content)
     with pytest.raises(cs.InputError, match=rf"broken\.toml: {complaint}"):
         cs.load_scenario(tmp_path / "broken.toml")
 
 
-def test_unknown_name_with_a_suggestion() -> None:
+def test_unknown_name_with_a_suggestion():
     with pytest.raises(cs.InputError, match=r"unknown scenario 'herath2007-stero' \(did you mean 'herath2007-stereo'"):
         cs.load_scenario("herath2007-stero")
     with pytest.raises(cs.InputError, match="unknown scenario 'zzz'; known: esde-xy, herath2007-bias, "):
         cs.load_scenario("zzz")
 
 
-def test_effects_are_told_the_search_range_of_a_stereo_sensor_alone() -> None:
+def test_effects_are_told_the_search_range_of_a_stereo_sensor_alone():
     stereo, xyz = (cs.load_scenario(name).truth.sensor for name in ("herath2007-stereo", "herath2007-xyz"))
     assert stereo.search_range == stereo.disparity
     assert stereo.search_range[0] < stereo.search_range[1]
@@ -243,14 +240,14 @@ def test_effects_are_told_the_search_range_of_a_stereo_sensor_alone() -> None:
 
 
 @pytest.mark.parametrize("name", cs.scenario_names())
-def test_a_written_scenario_is_read_as_the_same(name: str, tmp_path: Path) -> None:
+def test_a_written_scenario_is_read_as_the_same(name, tmp_path):
     scenario = cs.load_scenario(name)
     (tmp_path / "again.toml").write_text(scenario_text(scenario, "two\nlines"), encoding="utf-8")
     again = cs.load_scenario(tmp_path / "again.toml")
     assert (again.hash, again.summary, again.name) == (scenario.hash, scenario.summary, "again")
 
 
-def test_every_kind_of_path_landmarks_and_mount_is_written(tmp_path: Path) -> None:
+def test_every_kind_of_path_landmarks_and_mount_is_written(tmp_path):
     """Lists in lists, a mount, and a key that is not given."""
     scenario = cs.load_scenario("herath2007-stereo").variant(
         "odd",

@@ -1,16 +1,11 @@
 """Feature management: which tracks are chosen, how many, and when they are forgotten."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.scenario.effects import Context, FieldOfView, Observations, Selection
+from consistency.bench.scenario.effects import FieldOfView, Selection
 from consistency.bench.simulation import World
-from consistency.referee.types import Array
 
 EFFECT = {
     "kind": "selection", "count": 6, "forget_steps": 4, "seed": 11, "cells": [4, 3], "near_px": 6.0,
@@ -19,33 +14,33 @@ EFFECT = {
 STEPS = 120
 
 
-def world(**changes: Any) -> Context:
+def world(**changes):
     dense = {"truth__steps": STEPS, "truth__landmarks__count": 400}
     world = World(cs.load_scenario("herath2007-stereo").variant("dense", **{**dense, **changes}).truth)
     return world.context(world.reference)
 
 
-def observed(context: Context) -> Observations:
+def observed(context):
     return FieldOfView().apply(context.ideal(), np.random.default_rng(0), context)
 
 
-def flickering(context: Context) -> Observations:
+def flickering(context):
     """With gaps of one to a few steps in tracks."""
     everything = observed(context)
     gone = np.random.default_rng(3).random((7, everything.ids))[everything.step // 3 % 7, everything.landmark] < 0.3
     return everything.keep(~gone)
 
 
-def kept(effect: Selection, observations: Observations, context: Context) -> set[tuple[int, int]]:
+def kept(effect, observations, context):
     chosen = effect.apply(observations, np.random.default_rng(0), context)
     return set(zip(chosen.step.tolist(), chosen.landmark.tolist(), strict=True))
 
 
-def plainly(effect: Selection, observations: Observations, context: Context) -> set[tuple[int, int]]:
+def plainly(effect, observations, context):
     """The same rules, one step and one feature at a time."""
     strength = np.random.default_rng(effect.seed).random(observations.ids)
     (width, height), (columns, rows), high = context.sensor.image, effect.cells, context.sensor.disparity[1]
-    unseen: dict[int, int] = {}
+    unseen = {}
     out = set()
     for k in range(1, context.steps + 1):
         here = np.flatnonzero(observations.step == k)
@@ -55,7 +50,7 @@ def plainly(effect: Selection, observations: Observations, context: Context) -> 
             if unseen[label] >= effect.forget_steps:
                 del unseen[label]
 
-        def cell(label: int, z: dict[int, Array] = z) -> tuple[int, int]:
+        def cell(label, z=z):
             return int((z[label][0] + width / 2) * columns // width), int((z[label][1] + height / 2) * rows // height)
 
         while len(unseen) < effect.count and (left := [label for label in z if label not in unseen]):
@@ -76,7 +71,7 @@ def plainly(effect: Selection, observations: Observations, context: Context) -> 
 
 
 @pytest.mark.parametrize("weights", [(1, 0, 0, 0), (0, 1, 0, 0), (0.1, 0, 1, 0), (0.1, 0, 0, 1), (1.0, 0.7, 0.9, 0.8)])
-def test_a_selection_is_that_of_plain_rules(weights: tuple[float, ...]) -> None:
+def test_a_selection_is_that_of_plain_rules(weights):
     names = dict(zip(("strength", "stereo", "image", "depth"), map(float, weights), strict=True))
     effect, context = Selection.model_validate(EFFECT | names), world()
     observations = flickering(context)
@@ -84,7 +79,7 @@ def test_a_selection_is_that_of_plain_rules(weights: tuple[float, ...]) -> None:
     assert kept(effect, observations, context) == plainly(effect, observations, context)
 
 
-def test_there_are_never_more_tracks_than_places() -> None:
+def test_there_are_never_more_tracks_than_places():
     effect, context = Selection.model_validate(EFFECT), world()
     steps = [step for step, _ in kept(effect, observed(context), context)]
     assert np.bincount(steps).max() == 6
@@ -92,7 +87,7 @@ def test_there_are_never_more_tracks_than_places() -> None:
     assert len(kept(everything, observed(context), context)) == len(observed(context))
 
 
-def test_a_track_is_kept_while_it_is_seen_and_over_short_gaps() -> None:
+def test_a_track_is_kept_while_it_is_seen_and_over_short_gaps():
     """One landmark is best, is gone for some steps, and comes back to find its place or another in it."""
     context = world(truth__landmarks={"layout": "listed", "points": [[3.9, 3.0, 0.0], [4.1, 3.0, 0.0]]})
     strong = int(np.random.default_rng(11).random(2).argmax())
@@ -107,15 +102,15 @@ def test_a_track_is_kept_while_it_is_seen_and_over_short_gaps() -> None:
         assert not {step for step, _ in rows if 4 < step < 8}
 
 
-def test_weights_do_what_they_say() -> None:
+def test_weights_do_what_they_say():
     context = world()
 
-    def chosen(**weights: float) -> Array:
+    def chosen(**weights):
         none = {"strength": 0.05, "stereo": 0.0, "image": 0.0, "depth": 0.0}
         effect = Selection.model_validate(EFFECT | none | weights)
         return effect.apply(observed(context), np.random.default_rng(0), context).z
 
-    def cells(z: Array) -> float:
+    def cells(z):
         return len(set(zip(z[:, 0] // 80, z[:, 1] // 80, strict=True)))
 
     plain, near = chosen(), chosen(stereo=2.0)
@@ -126,7 +121,7 @@ def test_weights_do_what_they_say() -> None:
     assert cells(chosen(image=2.0)) >= cells(plain)
 
 
-def test_what_is_chosen_does_not_depend_on_the_noise_and_is_done_once() -> None:
+def test_what_is_chosen_does_not_depend_on_the_noise_and_is_done_once():
     scenario = cs.load_scenario("herath2007-stereo").variant(
         "chosen", truth__steps=STEPS, truth__sensor__effects=[EFFECT], truth__sensor__disparity=(1e-6, 1e6)
     )
@@ -138,7 +133,7 @@ def test_what_is_chosen_does_not_depend_on_the_noise_and_is_done_once() -> None:
     assert 0 < len(a.z) < len(plain.z)
 
 
-def test_apparent_features_compete_with_real_ones() -> None:
+def test_apparent_features_compete_with_real_ones():
     junction = {"kind": "junction", "count": 9, "seed": 5, "behind_m": [1.0, 3.0], "edge_m": 2.0, "far_share": 0.5}
     base = cs.load_scenario("herath2007-stereo").variant("both", truth__sensor__effects=[junction, EFFECT])
     after = cs.load_scenario("herath2007-stereo").variant("other", truth__sensor__effects=[EFFECT, junction])

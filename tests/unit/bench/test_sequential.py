@@ -1,10 +1,6 @@
 """Looks while the runs come."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from itertools import islice
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,17 +8,16 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.diagnostics import Design, Record, follow, look, sequential_design
-from consistency.referee.types import Array
+from consistency.diagnostics import Record, follow, look, sequential_design
 
 SHORT = {"truth__steps": 60}
 
 
-def first(design: Design, count: int) -> list[tuple[int, float | None]]:
+def first(design, count):
     return list(islice(design.inspections(), count))
 
 
-def test_a_design_spends_its_rate_once() -> None:
+def test_a_design_spends_its_rate_once():
     """1/2 + 1/6 + 1/12 + ... adds to 1; looks double, and the scale is looked at four times on the way."""
     inspections = first(sequential_design(3), 41)
     looks = [(runs, spent) for runs, spent in inspections if spent is not None]
@@ -33,7 +28,7 @@ def test_a_design_spends_its_rate_once() -> None:
 
 
 @pytest.mark.parametrize("last", [1, 12, 13, 24, 40, 42])
-def test_max_runs_is_the_last_look_and_asks_everything(last: int) -> None:
+def test_max_runs_is_the_last_look_and_asks_everything(last):
     cut = list(sequential_design(3, max_runs=last).inspections())
     whole = [(runs, spent) for runs, spent in first(sequential_design(3), 20) if runs < last]
     assert cut[:-1] == whole
@@ -43,16 +38,16 @@ def test_max_runs_is_the_last_look_and_asks_everything(last: int) -> None:
 
 
 @pytest.mark.parametrize("options", [{"max_runs": 0}, {"dof": 0}, {"detect": 1.0}, {"false_alarm": 2.0}])
-def test_a_design_that_cannot_be_is_refused(options: dict[str, Any]) -> None:
+def test_a_design_that_cannot_be_is_refused(options):
     with pytest.raises(ValueError, match="must"):
         sequential_design(**{"dof": 3, **options})
 
 
-def nees(values: Array) -> Callable[[int], Record]:
+def nees(values):
     return lambda runs: Record("f", nees=values[:runs], dof=3)
 
 
-def test_consistent_is_said_at_a_look_and_a_fault_at_once() -> None:
+def test_consistent_is_said_at_a_look_and_a_fault_at_once():
     """Run means as chi-square(60) / 60 has them, at its quantiles; a false alarm at 1e-6, or a miss, has no chance."""
     quantiles = stats.chi2.ppf((np.random.default_rng(3).permutation(200) + 0.5) / 200, 60) / 20
     values = np.repeat(quantiles[:, None], 20, axis=1)
@@ -73,7 +68,7 @@ def test_consistent_is_said_at_a_look_and_a_fault_at_once() -> None:
     assert (stopped.status, used) == ("undecided", 15)
 
 
-def test_an_early_decision_stands() -> None:
+def test_an_early_decision_stands():
     """What later runs would say does not matter: the last of these would take the fault back."""
     values = np.full((96, 20), 3.0)
     values[:12] = 9.0
@@ -83,7 +78,7 @@ def test_an_early_decision_stands() -> None:
     assert follow(sequential_design(3), nees(values), limit=96)[0].status == "overconfident"
 
 
-def test_other_questions_are_asked_at_looks_only() -> None:
+def test_other_questions_are_asked_at_looks_only():
     rng = np.random.default_rng()
     error = rng.standard_normal((18, 5, 3)) + np.array(
         [9.0, 0.0, 0.0]
@@ -93,7 +88,7 @@ def test_other_questions_are_asked_at_looks_only() -> None:
     assert look(sequential_design(3), evidence, None).faults == ()
 
 
-def test_runs_are_those_of_a_plain_run_and_the_plan_is_kept() -> None:
+def test_runs_are_those_of_a_plain_run_and_the_plan_is_kept():
     scenario = cs.load_scenario("linear-gaussian").variant("short", **SHORT)
     results, verdicts = run_until_decided(scenario, ["kf"], detect=1.05, false_alarm=1e-6, max_runs=20)
     assert verdicts["kf"].status == "undecided"
@@ -109,7 +104,7 @@ FAULTY, OPEN = "ekf-xyz", "ekf-uvd"  # points from stereo as Gaussian: a gross f
 PLAN = {"false_alarm": 1e-6, "max_runs": 40, "seed": 11}
 
 
-def test_an_early_decision_is_kept_while_another_filter_is_open() -> None:
+def test_an_early_decision_is_kept_while_another_filter_is_open():
     """The verdict is that of the runs at which the filter was decided, as if it had been alone.
 
     Which runs are drawn does not depend on the filters or looks, so there is no chance in the comparison.

@@ -1,7 +1,5 @@
 """The map that comes with the package."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -11,13 +9,13 @@ from consistency.bench.sweeps.regime import read_regime
 from consistency.referee.errors import InputError
 
 
-def test_without_a_map_it_is_said_how_to_make_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_map_it_is_said_how_to_make_one(monkeypatch):
     monkeypatch.setattr(maps, "SHIPPED", "none.json")
     with pytest.raises(InputError, match="make one with 'consistency sweep regime --out regime'"):
         read_regime()
 
 
-def test_the_table_of_docs_is_the_shipped_map() -> None:
+def test_the_table_of_docs_is_the_shipped_map():
     """docs/regime.md names the cheapest filter that is consistent in all cells of a baseline and a range."""
     table = read_regime().table
     rows = table.assign(right=table["status"] == "consistent").groupby(["baseline", "range", "filter"])

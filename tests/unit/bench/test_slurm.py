@@ -1,9 +1,6 @@
 """Runs in jobs of Slurm, here processes of this machine by the local executor of submitit."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import pytest
 from misbehaving import Deadly, is_gone
@@ -16,7 +13,6 @@ from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.local_threads import LocalThreads
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.trial_work import Simulated, TrialWork
-from consistency.bench.store.trial_rows import RunOutcome
 
 pytestmark = [
     pytest.mark.skipif(os.name == "nt", reason="signals"),
@@ -27,18 +23,18 @@ LOCAL = {"cluster": "local", "time": 10}
 
 
 @pytest.fixture(autouse=True)
-def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+def soon(monkeypatch):
     monkeypatch.setattr(slurm, "GLANCE", 0.2)
 
 
-def on_jobs(folder: Path, work: TrialWork, jobs: int, runs: int = RUNS) -> dict[int, RunOutcome]:
+def on_jobs(folder, work, jobs, runs=RUNS):
     with SlurmExecutor(folder, LOCAL, jobs) as executor:
         outcomes = {outcome.run: outcome for outcome in ExecutorWorkers(executor).outcomes(work, range(runs))}
     assert sorted(outcomes) == list(range(runs))
     return outcomes
 
 
-def require_same(outcomes: dict[int, RunOutcome], work: TrialWork) -> None:
+def require_same(outcomes, work):
     """Bit by bit, those that have not failed."""
     for expected in LocalThreads(1).outcomes(work, range(len(outcomes))):
         outcome = outcomes[expected.run]
@@ -46,7 +42,7 @@ def require_same(outcomes: dict[int, RunOutcome], work: TrialWork) -> None:
             assert outcome.failures or values.tobytes() == expected.estimates["kf"][column].tobytes()
 
 
-def test_the_bytes_are_those_of_local_runs(linear: cs.Scenario, tmp_path: Path) -> None:
+def test_the_bytes_are_those_of_local_runs(linear, tmp_path):
     local = run_trials(linear, ["kf"], RUNS, jobs=1, out=tmp_path / "local")
     with SlurmExecutor(tmp_path / "jobs", LOCAL, jobs=2) as executor:
         jobs = run_trials(linear, ["kf"], RUNS, out=tmp_path / "slurm", executor=executor)
@@ -56,9 +52,7 @@ def test_the_bytes_are_those_of_local_runs(linear: cs.Scenario, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_job_that_dies_once_is_done_again(
-    linear: cs.Scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_job_that_dies_once_is_done_again(linear, tmp_path, capsys):
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
     fuse = tmp_path / "fuse"
     fuse.touch()
@@ -69,7 +63,7 @@ def test_a_job_that_dies_once_is_done_again(
 
 
 @pytest.mark.slow
-def test_a_run_that_kills_its_job_has_failed(linear: cs.Scenario, tmp_path: Path) -> None:
+def test_a_run_that_kills_its_job_has_failed(linear, tmp_path):
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
     outcomes = on_jobs(tmp_path / "jobs", TrialWork(Deadly(trials, (1,), os.getpid()), isolation), 1, 2)
     assert [failure.reason for failure in outcomes[1].failures] == ["its worker died (UncompletedJobError)"]
@@ -77,15 +71,13 @@ def test_a_run_that_kills_its_job_has_failed(linear: cs.Scenario, tmp_path: Path
     require_same(outcomes, TrialWork(trials, isolation))
 
 
-def test_an_end_in_the_middle_leaves_nothing(
-    linear: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_end_in_the_middle_leaves_nothing(linear, tmp_path, monkeypatch):
     monkeypatch.setattr(SlurmExecutor, "batch_seconds", 0.0)
-    pids: list[int] = []
+    pids = []
     submit_array = slurm.submitit.AutoExecutor.submit_array
 
-    def noted(*arguments: object) -> list[object]:
-        jobs: list[object] = submit_array(*arguments)
+    def noted(*arguments):
+        jobs = submit_array(*arguments)
         pids.extend(int(job.job_id) for job in jobs)  # type: ignore[attr-defined]
         return jobs
 
@@ -100,13 +92,13 @@ def test_an_end_in_the_middle_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_waits_is_sent_as_one_array(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes: list[int] = []
+def test_what_waits_is_sent_as_one_array(tmp_path, monkeypatch):
+    sizes = []
     submit_array = slurm.submitit.AutoExecutor.submit_array
 
-    def noted(self: object, calls: list[object]) -> list[object]:
+    def noted(self, calls):
         sizes.append(len(calls))
-        jobs: list[object] = submit_array(self, calls)
+        jobs = submit_array(self, calls)
         return jobs
 
     monkeypatch.setattr(slurm.submitit.AutoExecutor, "submit_array", noted)
@@ -120,20 +112,18 @@ def test_what_waits_is_sent_as_one_array(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
+    "options, sentence",
     [
         ({}, "--backend slurm: .*srun"),
         ({"cluster": "local", "colour": "red"}, "--backend slurm: .*Unknown argument 'colour'"),
         ({"cluster": "abacus"}, "--backend slurm: .*abacus"),
     ],
 )
-def test_what_submitit_does_not_know_is_said(
-    linear: cs.Scenario, tmp_path: Path, options: dict[str, object], sentence: str
-) -> None:
+def test_what_submitit_does_not_know_is_said(linear, tmp_path, options, sentence):
     with pytest.raises(cs.InputError, match=f"^{sentence}"):
         run_trials(linear, ["kf"], RUNS, out=tmp_path / "out", executor=SlurmExecutor(tmp_path / "jobs", options))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_options_are_numbers_or_words() -> None:
+def test_options_are_numbers_or_words():
     assert options_of(["partition=short", "time=60", "mem=2GB"]) == {"partition": "short", "time": 60, "mem": "2GB"}

@@ -1,11 +1,5 @@
 """Results folders that were changed: refused unless every run of every filter is there, step by step, each once."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,47 +9,45 @@ from mutations import copied
 
 import consistency as cs
 
-Edit = Callable[[pd.DataFrame], pd.DataFrame]
-
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sound") / "results"
     write_results(folder, np.random.default_rng(4))
     return folder
 
 
 @pytest.fixture
-def folder(written: Path, tmp_path: Path) -> Path:
+def folder(written, tmp_path):
     return copied(written, tmp_path / "copy")
 
 
-def change(folder: Path, name: str, edit: Edit) -> None:
+def change(folder, name, edit):
     path = folder / f"{name}.parquet"
     edit(pd.read_parquet(path)).to_parquet(path, index=False)
 
 
-def only(condition: str) -> Edit:
+def only(condition):
     return lambda table: table.query(condition)
 
 
-def value(condition: str, column: str, new: Any) -> Edit:
-    def edit(table: pd.DataFrame) -> pd.DataFrame:
+def value(condition, column, new):
+    def edit(table):
         table.loc[table.query(condition).index, column] = new
         return table
 
     return edit
 
 
-def twice(table: pd.DataFrame) -> pd.DataFrame:
+def twice(table):
     return table.iloc[[0, *range(len(table))]]
 
 
-def test_what_was_written_is_accepted(folder: Path) -> None:
+def test_what_was_written_is_accepted(folder):
     assert cs.read_results(folder).filters == ["one", "two"]
 
 
-TABLES: list[tuple[str, Edit, str]] = [
+TABLES = [
     ("estimates", twice, r"estimates\.parquet: step 1 of run 0 of 'one' is not what comes next"),
     ("estimates", only("run != 4 or filter != 'two'"), r"estimates\.parquet: run 4 of 'two' is missing"),
     ("estimates", only("filter == 'one'"), r"run 0 of 'two' is missing"),
@@ -93,13 +85,13 @@ TABLES: list[tuple[str, Edit, str]] = [
 
 
 @pytest.mark.parametrize(("name", "edit", "said"), TABLES)
-def test_a_changed_table_is_refused(folder: Path, name: str, edit: Edit, said: str) -> None:
+def test_a_changed_table_is_refused(folder, name, edit, said):
     change(folder, name, edit)
     with pytest.raises(cs.InputError, match=said):
         cs.read_results(folder)
 
 
-def singular_start(table: pd.DataFrame) -> pd.DataFrame:
+def singular_start(table):
     """Each run begins as those of the bench do: known exactly, without a NEES."""
     names = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]
     table.loc[table["step"] == 1, names] = 0.0
@@ -107,7 +99,7 @@ def singular_start(table: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-NUMBERS: list[tuple[Edit, str]] = [
+NUMBERS = [
     (value("filter == 'one' and run == 3", "nees", np.nan), r"'one', run 3: column 'nees' is null or NaN"),
     (value("filter == 'one' and run == 8 and step == 7", "nees", None), r"'one', run 8: column 'nees'"),
     (value("filter == 'one' and run == 2 and step == 12", "nees", np.nan), r"'one', run 2: column 'nees'"),
@@ -118,7 +110,7 @@ NUMBERS: list[tuple[Edit, str]] = [
 
 
 @pytest.mark.parametrize(("edit", "said"), NUMBERS)
-def test_a_missing_nees_or_nis_is_refused(folder: Path, edit: Edit, said: str) -> None:
+def test_a_missing_nees_or_nis_is_refused(folder, edit, said):
     """A run without a NEES would otherwise count as one that was never judged."""
     change(folder, "estimates", singular_start)
     assert set(cs.analyse(cs.read_results(folder))) == {"one", "two"}
@@ -127,8 +119,8 @@ def test_a_missing_nees_or_nis_is_refused(folder: Path, edit: Edit, said: str) -
         cs.analyse(cs.read_results(folder), ["one"])
 
 
-def test_a_run_that_is_never_uncertain_has_no_nees(folder: Path) -> None:
-    def exact(table: pd.DataFrame) -> pd.DataFrame:
+def test_a_run_that_is_never_uncertain_has_no_nees(folder):
+    def exact(table):
         table.loc[table["run"] == 3, [*(name for name in table if name.startswith("P_")), "nis_dof"]] = 0.0
         table.loc[table["run"] == 3, ["nees", "nis"]] = np.nan
         return table.astype({"nis_dof": int})
@@ -137,7 +129,7 @@ def test_a_run_that_is_never_uncertain_has_no_nees(folder: Path) -> None:
     assert cs.analyse(cs.read_results(folder), ["one"])["one"].runs == RUNS
 
 
-MANIFESTS: list[tuple[dict[str, Any], str]] = [
+MANIFESTS = [
     ({"filters": "one"}, r"key 'filters': Input should be a valid list"),
     ({"filters": []}, r"key 'filters': "),
     ({"filters": ["one", "one"]}, r"key 'filters': .*a name is there twice"),
@@ -166,14 +158,14 @@ MANIFESTS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("edit", "said"), MANIFESTS, ids=lambda value: str(value)[:40])
-def test_a_changed_manifest_is_refused(folder: Path, edit: dict[str, Any], said: str) -> None:
+def test_a_changed_manifest_is_refused(folder, edit, said):
     change_manifest(folder, **edit)
     with pytest.raises(cs.InputError, match=said):
         cs.read_results(folder)
 
 
 @pytest.mark.parametrize("key", ["filters", "tables", "runs", "failures", "complete", "seed", "kind"])
-def test_a_manifest_without_a_key_is_refused(folder: Path, key: str) -> None:
+def test_a_manifest_without_a_key_is_refused(folder, key):
     change_manifest(folder, key)
     with pytest.raises(
         cs.InputError, match="holds no estimates" if key == "filters" else f"key '{key}': Field required"
@@ -181,7 +173,7 @@ def test_a_manifest_without_a_key_is_refused(folder: Path, key: str) -> None:
         cs.read_results(folder)
 
 
-def test_a_log_without_truth_has_runs_of_any_length(written: Path, folder: Path) -> None:
+def test_a_log_without_truth_has_runs_of_any_length(written, folder):
     """Of a log nothing but its filters says how long a run is."""
     tables = ["estimates", "failures", "map"]
     change_manifest(folder, scenario=None, scenario_hash=None, log="drive", tables=tables)

@@ -3,11 +3,6 @@
 Statistical tests have a false-alarm rate of at most 1e-6 each.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from scenario_files import load, put
@@ -18,8 +13,6 @@ from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.scenario.effects import Drift, Observations
 from consistency.bench.simulation import World
 from consistency.bench.store.log import read_log
-from consistency.bench.types import Trial
-from consistency.referee.types import Array
 from consistency.scenario import scenario_text
 
 ALARM = 1e-6
@@ -27,17 +20,17 @@ WIDE = {"truth__sensor__disparity": (1e-6, 1e6), "truth__sensor__range": (0.5, 3
 SEED = int(np.random.SeedSequence().entropy) % 2**32  # of this test run; every assertion holds for almost all of them
 
 
-def pair(*effects: dict[str, Any], run: int = 0, **changes: Any) -> tuple[Trial, Trial]:
+def pair(*effects, run=0, **changes):
     """A trial of 500 steps without the effects and with them; nothing falls out of the search range."""
     print(f"SEED = {SEED}")
     plain = cs.load_scenario("herath2007-stereo").variant("plain", **{**WIDE, **changes})
     return cs.simulate(plain, run, SEED), cs.simulate(plain.variant("with", truth__sensor__effects=effects), run, SEED)
 
 
-def tracks_of(step: Array, landmark: Array) -> list[list[int]]:
+def tracks_of(step, landmark):
     """Rows of each track, one row after the other."""
-    tracks: dict[int, list[int]] = {}
-    done: list[list[int]] = []
+    tracks = {}
+    done = []
     for row, (k, label) in enumerate(zip(step, landmark, strict=True)):
         if label in tracks and step[tracks[label][-1]] == k - 1:
             tracks[label].append(row)
@@ -47,16 +40,16 @@ def tracks_of(step: Array, landmark: Array) -> list[list[int]]:
     return done
 
 
-def as_often(hits: int, of: int, rate: float) -> bool:
+def as_often(hits, of, rate):
     """Whether the number of hits is one that a rate gives, but for the false-alarm rate."""
     return bool(stats.binomtest(hits, of, rate).pvalue > ALARM)
 
 
-def is_like(values: Array, distribution: Any) -> bool:
+def is_like(values, distribution):
     return bool(stats.kstest(values, distribution.cdf).pvalue > ALARM)
 
 
-def test_a_track_is_what_is_seen_in_consecutive_steps(rng: np.random.Generator) -> None:
+def test_a_track_is_what_is_seen_in_consecutive_steps(rng):
     step, landmark = np.nonzero(rng.random((40, 7)) < 0.7)
     track, age = Observations(step + 1, landmark, np.zeros((len(step), 3)), 7).tracks()
     for rows in tracks_of(step, landmark):
@@ -70,7 +63,7 @@ def test_a_track_is_what_is_seen_in_consecutive_steps(rng: np.random.Generator) 
 # --- errors of landmarks --------------------------------------------------------------------------------
 
 
-def test_heavy_tails_are_a_second_error_of_some() -> None:
+def test_heavy_tails_are_a_second_error_of_some():
     rate = 0.2
     sigma = np.array([5.0, 4.0, 0.4])
     plain, trial = pair({"kind": "heavy-tails", "rate": rate, "sigma_px": sigma.tolist()})
@@ -83,7 +76,7 @@ def test_heavy_tails_are_a_second_error_of_some() -> None:
     assert trial.source is None
 
 
-def test_a_log_may_hold_gross_errors(tmp_path: Path) -> None:
+def test_a_log_may_hold_gross_errors(tmp_path):
     """Some pixels outside the image do not mean that pixels are counted from its corner."""
     effect = {"kind": "heavy-tails", "rate": 0.05, "sigma_px": [200.0, 200.0, 0.0]}
     scenario = cs.load_scenario("herath2007-stereo").variant("tails", truth__sensor__effects=[effect])
@@ -92,7 +85,7 @@ def test_a_log_may_hold_gross_errors(tmp_path: Path) -> None:
     assert (np.abs(trial.z[:, 0]) > 175.0).any()
 
 
-def test_the_error_of_a_track_is_a_stationary_gauss_markov_process() -> None:
+def test_the_error_of_a_track_is_a_stationary_gauss_markov_process():
     c = 0.8
     sigma = np.array([1.0, 2.0, 0.3])
     plain, trial = pair({"kind": "track-error", "sigma_px": sigma.tolist(), "correlation": c})
@@ -107,7 +100,7 @@ def test_the_error_of_a_track_is_a_stationary_gauss_markov_process() -> None:
     assert trial.source is None
 
 
-def test_after_a_gap_the_error_is_another_one() -> None:
+def test_after_a_gap_the_error_is_another_one():
     """Almost constant along a track, so that a gap of a landmark shows."""
     plain, trial = pair({"kind": "track-error", "sigma_px": [1.0, 1.0, 0.3], "correlation": 0.999999})
     error, tracks = trial.z - plain.z, tracks_of(plain.step, plain.landmark)
@@ -123,7 +116,7 @@ def test_after_a_gap_the_error_is_another_one() -> None:
 
 
 @pytest.mark.parametrize("disparity", [None, (4.0, 9.0)])
-def test_a_mismatch_has_a_disparity_of_nothing(disparity: tuple[float, float] | None) -> None:
+def test_a_mismatch_has_a_disparity_of_nothing(disparity):
     rate = 0.1
     effect = {"kind": "mismatch", "rate": rate} | ({} if disparity is None else {"disparity_px": list(disparity)})
     plain, trial = pair(effect, truth__sensor__disparity=(1e-6, 40.0))
@@ -138,7 +131,7 @@ def test_a_mismatch_has_a_disparity_of_nothing(disparity: tuple[float, float] | 
     assert is_like(trial.z[hit, 2], stats.uniform(low, high - low))
 
 
-def test_a_swap_carries_another_of_the_same_step() -> None:
+def test_a_swap_carries_another_of_the_same_step():
     rate = 0.1
     plain, trial = pair({"kind": "swap", "rate": rate})
     step, hit = plain.step, trial.spurious
@@ -156,7 +149,7 @@ def test_a_swap_carries_another_of_the_same_step() -> None:
     assert stats.chisquare(np.bincount(chosen, minlength=4)).pvalue > ALARM  # each of four as often
 
 
-def test_all_are_swapped_that_have_another() -> None:
+def test_all_are_swapped_that_have_another():
     plain, trial = pair({"kind": "swap", "rate": 1.0})
     alone = np.bincount(plain.step)[plain.step] == 1
     assert alone.any()
@@ -164,13 +157,13 @@ def test_all_are_swapped_that_have_another() -> None:
     assert len(trial.things) == 0 or np.all(trial.things < len(trial.landmarks))
 
 
-def test_a_mismatch_that_is_swapped_is_still_of_no_landmark() -> None:
+def test_a_mismatch_that_is_swapped_is_still_of_no_landmark():
     _, trial = pair({"kind": "mismatch", "rate": 1.0}, {"kind": "swap", "rate": 1.0})
     assert np.all(trial.source == -1)
 
 
-@pytest.mark.parametrize(("rate", "speed"), [(0.03, 2.0), (0.2, 15.0), (1.0, 0.001)])
-def test_a_drifting_track_slides_until_it_ends_or_leaves_the_image(rate: float, speed: float) -> None:
+@pytest.mark.parametrize("rate, speed", [(0.03, 2.0), (0.2, 15.0), (1.0, 0.001)])
+def test_a_drifting_track_slides_until_it_ends_or_leaves_the_image(rate, speed):
     plain, trial = pair({"kind": "drift", "rate": rate, "speed_px": speed})
     at = {key: row for row, key in enumerate(zip(trial.step, trial.landmark, strict=True))}
     step, angles, begun, could, left = plain.step, [], 0, 0, 0
@@ -205,7 +198,7 @@ def test_a_drifting_track_slides_until_it_ends_or_leaves_the_image(rate: float, 
     assert left > 0 or speed < 10.0
 
 
-def test_a_track_that_has_slid_out_of_the_image_does_not_come_back() -> None:
+def test_a_track_that_has_slid_out_of_the_image_does_not_come_back():
     """Until it is a new track: after a gap of the landmark."""
     world = World(cs.load_scenario("herath2007-stereo").truth)
     u = np.array([158.0, 162.0, 155.0, 150.0])
@@ -220,7 +213,7 @@ def test_a_track_that_has_slid_out_of_the_image_does_not_come_back() -> None:
 # --- what is not seen -----------------------------------------------------------------------------------------
 
 
-def test_images_come_after_so_many_steps_in_turn() -> None:
+def test_images_come_after_so_many_steps_in_turn():
     plain, trial = pair({"kind": "frames", "every": [1, 2, 4]})
     images = sorted({each for k in range(0, 500, 7) for each in (k + 1, k + 3, k + 7) if each <= 500})
     kept = np.isin(plain.step, images)
@@ -228,7 +221,7 @@ def test_images_come_after_so_many_steps_in_turn() -> None:
     assert trial.landmark.tolist() == plain.landmark[kept].tolist()
 
 
-def test_walls_hide_what_is_behind_them_from_where_the_sensor_is() -> None:
+def test_walls_hide_what_is_behind_them_from_where_the_sensor_is():
     wall, mount = (3.0, -2.0, 5.0, 3.0), {"position": (0.4, -0.6, 0.0), "rotation": (0.0, 0.0, 0.0)}
     plain, trial = pair({"kind": "occlusion", "walls": [wall]}, truth__sensor__mount=mount)
     step = plain.step
@@ -247,7 +240,7 @@ def test_walls_hide_what_is_behind_them_from_where_the_sensor_is() -> None:
 
 # --- mistakes -------------------------------------------------------------------------------------------------
 
-GOOD: dict[str, dict[str, Any]] = {
+GOOD = {
     "heavy-tails": {"rate": 0.1, "sigma_px": [1.0, 1.0, 1.0]},
     "track-error": {"sigma_px": [1.0, 1.0, 1.0], "correlation": 0.5},
     "mismatch": {"rate": 0.1},
@@ -261,7 +254,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "frames": {"every": [1, 2]},
     "occlusion": {"walls_m": [[0.0, 0.0, 1.0, 1.0]]},
 }  # fmt: skip
-MISTAKES: list[tuple[str, dict[str, Any], str]] = [
+MISTAKES = [
     *(
         (kind, {"rate": 1.5}, r"\.rate': .*less than or equal to 1 \(got 1\.5\)$")
         for kind in GOOD
@@ -287,10 +280,8 @@ MISTAKES: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "change", "complaint"), MISTAKES)
-def test_a_mistake_is_answered_with_file_and_key(
-    tmp_path: Path, kind: str, change: dict[str, Any], complaint: str
-) -> None:
+@pytest.mark.parametrize("kind, change, complaint", MISTAKES)
+def test_a_mistake_is_answered_with_file_and_key(tmp_path, kind, change, complaint):
     table = {"kind": kind, **GOOD[kind]}
     if "sigma_m" in change:
         del table["sigma_px"]
@@ -300,7 +291,7 @@ def test_a_mistake_is_answered_with_file_and_key(
 
 
 @pytest.mark.parametrize("kind", GOOD)
-def test_a_file_is_read_as_it_is_written(tmp_path: Path, kind: str) -> None:
+def test_a_file_is_read_as_it_is_written(tmp_path, kind):
     scenario = load(tmp_path, put("truth.sensor.effects", [{"kind": kind, **GOOD[kind]}]))
     (tmp_path / "again.toml").write_text(scenario_text(scenario), encoding="utf-8")
     assert cs.load_scenario(tmp_path / "again.toml").hash == scenario.hash

@@ -1,9 +1,5 @@
 """The closed forms of e18_static_limit.py: against figures from elsewhere, and against the filters."""
 
-from __future__ import annotations
-
-from types import ModuleType
-
 import numpy as np
 import pytest
 from scripts import experiment
@@ -26,11 +22,11 @@ PIXELS = np.array([1.34, 1.53, 0.65])  # px, of herath2007-stereo
 
 
 @pytest.fixture(scope="module")
-def script() -> ModuleType:
+def script():
     return experiment("e18_static_limit")
 
 
-def test_closed_forms_are_the_figures_from_elsewhere(script: ModuleType) -> None:
+def test_closed_forms_are_the_figures_from_elsewhere(script):
     depth, ratio, growth, fourth = FIGURES.T
     rho = 0.65 * depth / 13.5
     assert script.limit_ratio(rho, lateral=False) == pytest.approx(ratio, abs=1e-6)
@@ -44,9 +40,7 @@ def test_closed_forms_are_the_figures_from_elsewhere(script: ModuleType) -> None
 
 
 @pytest.mark.parametrize("lateral", [False, True])
-def test_ekf_xyz_is_the_weighted_mean_of_the_points(
-    script: ModuleType, lateral: bool, rng: np.random.Generator
-) -> None:
+def test_ekf_xyz_is_the_weighted_mean_of_the_points(script, lateral, rng):
     """W_i = D_i' R^-1 D_i at the measured point, from which the closed forms follow."""
     still = {f"belief__motion__{key}": 0.0 for key in ("sigma_v", "sigma_omega")}
     belief = cs.load_scenario("herath2007-stereo").variant("still", **still).belief
@@ -61,7 +55,7 @@ def test_ekf_xyz_is_the_weighted_mean_of_the_points(
     assert said.covariance[0] @ W.sum(axis=0) == pytest.approx(np.eye(3), abs=1e-7)
 
 
-def test_findings_hold_and_their_rule_can_fail(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_findings_hold_and_their_rule_can_fail(script, monkeypatch):
     """With a false-failure rate of 1e-3 for each of six comparisons."""
     monkeypatch.setattr(script, "OBSERVATIONS", 400)
     findings = script.main(cs.Study(runs=12))

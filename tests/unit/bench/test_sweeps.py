@@ -1,13 +1,9 @@
 """Sweeps: the grid, the folder that goes on, the map; small linear worlds, a few runs of a Kalman filter."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +18,7 @@ from consistency.bench.sweeps import running
 from consistency.bench.sweeps import sweep_folder as folders
 from consistency.bench.sweeps.axes import QUANTITIES
 from consistency.bench.sweeps.cell import CellResult, cost_of, run_cell
-from consistency.bench.sweeps.plan import Sweep, load_sweep, number_of_points, sweep_names
+from consistency.bench.sweeps.plan import load_sweep, number_of_points, sweep_names
 from consistency.bench.sweeps.regime import Regime, ranked_by_cost, read_regime, regime_of, write_regime
 from consistency.bench.sweeps.running import run_sweep
 from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder, describe, sweep_from
@@ -43,7 +39,7 @@ density = [0.5, 1.0]
 
 
 @pytest.fixture
-def at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def at(tmp_path, monkeypatch):
     """A folder with ``small.toml``, a linear world of 30 steps, and ``grid.toml``, four cells of it."""
     text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
     (tmp_path / "small.toml").write_text(text.replace("steps = 500", "steps = 30"))
@@ -52,7 +48,7 @@ def at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def edited(at: Path, old: str, new: str, name: str = "other.toml") -> Path:
+def edited(at, old, new, name="other.toml"):
     """The sweep with a part of its text replaced."""
     assert old in LINEAR
     (at / name).write_text(LINEAR.replace(old, new))
@@ -62,7 +58,7 @@ def edited(at: Path, old: str, new: str, name: str = "other.toml") -> Path:
 # --- the grid -----------------------------------------------------------------------------------
 
 
-def test_a_grid_changes_truth_and_belief_alike() -> None:
+def test_a_grid_changes_truth_and_belief_alike():
     sweep = load_sweep("regime")
     assert len(sweep.cells) == 150
     base, cell = sweep.base, next(c for c in sweep.cells if c.indices == (4, 2, 0, 0))
@@ -77,7 +73,7 @@ def test_a_grid_changes_truth_and_belief_alike() -> None:
     assert cell.text.startswith("baseline 0.6 m, range of landmarks 5 m, density of landmarks ×0.25")
 
 
-def test_keys_of_the_scenario_are_axes_too(at: Path) -> None:
+def test_keys_of_the_scenario_are_axes_too(at):
     path = edited(at, "odometry = [1.0, 2.0]", 'truth.path.radius = [3.0, 4.0]\n"motion.sigma_v" = [0.1]')
     sweep = load_sweep(path)
     assert [axis.key for axis in sweep.axes] == ["truth.path.radius", "motion.sigma_v", "density"]
@@ -88,7 +84,7 @@ def test_keys_of_the_scenario_are_axes_too(at: Path) -> None:
         load_sweep(edited(at, "density = [0.5, 1.0]", "motion.sigma_v = [0.1]"))
 
 
-def test_a_key_may_end_in_its_unit_and_hold_lists(at: Path) -> None:
+def test_a_key_may_end_in_its_unit_and_hold_lists(at):
     keys = "truth.path.heading_deg = [0, 90]\ntruth.sensor.range = [[0.5, 3.0], [0.5, 4.0]]"
     path = edited(at, "density = [0.5, 1.0]", keys)
     sweep = load_sweep(path)
@@ -98,7 +94,7 @@ def test_a_key_may_end_in_its_unit_and_hold_lists(at: Path) -> None:
     assert len({c.name for c in sweep.cells}) == 8
 
 
-def test_a_cell_depends_on_nothing_but_itself(at: Path) -> None:
+def test_a_cell_depends_on_nothing_but_itself(at):
     """Neither the order of values, nor other cells, nor other filters change seed and place of a cell."""
     whole = load_sweep(at / "grid.toml")
     part = load_sweep(edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "density = [1.0]\nodometry = [2.0]"))
@@ -109,7 +105,7 @@ def test_a_cell_depends_on_nothing_but_itself(at: Path) -> None:
     assert replace(whole, seed=4).seed_of(same) != whole.seed_of(same)
 
 
-def test_built_in_sweeps_are_fine() -> None:
+def test_built_in_sweeps_are_fine():
     assert {"regime", "small"} <= set(sweep_names())
     assert all(load_sweep(name).cells for name in sweep_names())
 
@@ -117,7 +113,7 @@ def test_built_in_sweeps_are_fine() -> None:
 # --- axes that vary alone -----------------------------------------------------------------------
 
 
-def test_axes_that_vary_alone_are_no_product(at: Path) -> None:
+def test_axes_that_vary_alone_are_no_product(at):
     """At each point of the grid its own cell, and one for each other value of each axis; the base's value is added."""
     path = edited(at, "density = [0.5, 1.0]", "[alone]\ntruth.dt = [0.2, 0.4]\ndensity = [1.0, 0.5]")
     sweep = load_sweep(path)
@@ -138,7 +134,7 @@ def test_axes_that_vary_alone_are_no_product(at: Path) -> None:
     assert sweep_from({"sweep": json.loads(json.dumps(describe(sweep)))}, at) == sweep
 
 
-def test_a_sweep_without_a_grid_starts_from_its_base(at: Path) -> None:
+def test_a_sweep_without_a_grid_starts_from_its_base(at):
     path = edited(at, "[grid]\nodometry = [1.0, 2.0]\ndensity", "[alone]\ndensity")
     sweep = load_sweep(path)
     assert [cell.name for cell in sweep.cells] == ["base", "density-0.5"]
@@ -150,17 +146,17 @@ def test_a_sweep_without_a_grid_starts_from_its_base(at: Path) -> None:
 
 
 @pytest.mark.parametrize("name", QUANTITIES)
-def test_the_own_value_of_a_base_changes_nothing(name: str) -> None:
+def test_the_own_value_of_a_base_changes_nothing(name):
     base = cs.load_scenario("herath2007-stereo")
     quantity = QUANTITIES[name]
     assert with_changes(base, "same", "", quantity.changes(base, quantity.own(base))).hash == base.hash
 
 
-def test_worlds_of_the_axes() -> None:
+def test_worlds_of_the_axes():
     """A slower rate is the same drive in fewer steps; loops are shorter laps of the same drive, as dense."""
     base = cs.load_scenario("herath2007-stereo")
 
-    def made(name: str, value: float) -> cs.Scenario:
+    def made(name, value):
         return with_changes(base, "made", "", QUANTITIES[name].changes(base, value))
 
     slow = made("dt", 0.5).truth
@@ -210,7 +206,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_sweeps(at: Path, case: str) -> None:
+def test_bad_sweeps(at, case):
     """One sentence that names the file and the key; nothing is run or written."""
     old, new, expected = BAD[case]
     path = edited(at, old, new)
@@ -223,11 +219,11 @@ def test_bad_sweeps(at: Path, case: str) -> None:
 # --- the folder ---------------------------------------------------------------------------------
 
 
-def numbers(folder: SweepFolder) -> dict[tuple[int, str], CellResult]:
+def numbers(folder):
     return dict(folder.results())
 
 
-def test_a_cell_has_the_verdict_of_a_run_until_decided(at: Path) -> None:
+def test_a_cell_has_the_verdict_of_a_run_until_decided(at):
     sweep = load_sweep(at / "grid.toml")
     folder = run_sweep(sweep, at / "out", jobs=1)
     cell = sweep.cells[2]
@@ -246,12 +242,12 @@ def test_a_cell_has_the_verdict_of_a_run_until_decided(at: Path) -> None:
     assert runs["reason"].isna().all()
 
 
-def test_a_sweep_that_is_stopped_while_a_cell_writes_goes_on(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sweep_that_is_stopped_while_a_cell_writes_goes_on(at, monkeypatch):
     """What is finished stays, and all numbers are those of one go."""
     sweep = load_sweep(at / "grid.toml")
     whole = run_sweep(sweep, at / "whole", jobs=1)
 
-    def stops_while_writing(self: SweepFolder, work: CellWork, outcome: Any, wall: float) -> None:
+    def stops_while_writing(self, work, outcome, wall):
         if len(list((at / "out").rglob("runs.csv"))) == 2:
             with monkeypatch.context() as patch:
                 patch.setattr(pd.DataFrame, "to_csv", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -267,7 +263,7 @@ def test_a_sweep_that_is_stopped_while_a_cell_writes_goes_on(at: Path, monkeypat
     hidden = [path.name for path in (at / "out").rglob(".*") if path.is_dir()]
     assert hidden == [".kf.unfinished"]  # the runs of the cell; nothing else is half written
     kept = {path: path.read_bytes() for path in (at / "out").rglob("runs.csv")}
-    done: list[Any] = []
+    done = []
     monkeypatch.setattr(running, "run_cell", lambda *a, **o: (done.append(a), run_cell(*a, **o))[1])
     folder = run_sweep(sweep, at / "out", jobs=1)
     assert len(done) == 2
@@ -275,9 +271,9 @@ def test_a_sweep_that_is_stopped_while_a_cell_writes_goes_on(at: Path, monkeypat
     assert repr(numbers(folder)) == repr(numbers(whole))
 
 
-def test_more_values_and_filters_go_into_the_same_folder(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_values_and_filters_go_into_the_same_folder(at, monkeypatch):
     run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
-    done: list[str] = []
+    done = []
     monkeypatch.setattr(running, "run_cell", lambda *a, **o: (done.append(a[2]), run_cell(*a, **o))[1])
     more = load_sweep(edited(at, "odometry = [1.0, 2.0]", "odometry = [1.0, 1.5, 2.0]"))
     folder = run_sweep(more, at / "out", jobs=1)
@@ -288,9 +284,7 @@ def test_more_values_and_filters_go_into_the_same_folder(at: Path, monkeypatch: 
     ("old", "new", "what"),
     [("max_runs = 12", "max_runs = 13", "max_runs"), ("seed = 3", "seed = 4", "seed"), ("seed", "seed", "source code")],
 )
-def test_changed_inputs_are_refused_or_run_again(
-    at: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, what: str
-) -> None:
+def test_changed_inputs_are_refused_or_run_again(at, monkeypatch, old, new, what):
     run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
     before = {path: path.read_bytes() for path in (at / "out").rglob("*.*") if path.is_file()}
     if what == "source code":
@@ -304,7 +298,7 @@ def test_changed_inputs_are_refused_or_run_again(
     assert len(folder.results()) == 4
 
 
-def test_a_changed_world_is_refused(at: Path) -> None:
+def test_a_changed_world_is_refused(at):
     run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
     text = (at / "small.toml").read_text()
     (at / "small.toml").write_text(text.replace("steps = 30", "steps = 31"))
@@ -312,7 +306,7 @@ def test_a_changed_world_is_refused(at: Path) -> None:
         run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
 
 
-def test_a_folder_of_something_else_is_refused(at: Path) -> None:
+def test_a_folder_of_something_else_is_refused(at):
     (at / "mine").mkdir()
     (at / "mine" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="is not a folder of 'consistency sweep'"):
@@ -323,7 +317,7 @@ def test_a_folder_of_something_else_is_refused(at: Path) -> None:
         run_sweep(load_sweep(at / "grid.toml"), at / "results")
 
 
-def test_a_cell_that_raises_is_a_result(at: Path) -> None:
+def test_a_cell_that_raises_is_a_result(at):
     """Nothing is in view in one cell, and the filter fails in no other."""
     path = edited(at, "density = [0.5, 1.0]", "truth.sensor.range = [[0.001, 0.002], [0.5, 4.0]]")
     folder = run_sweep(load_sweep(path), at / "out", jobs=1)
@@ -333,8 +327,8 @@ def test_a_cell_that_raises_is_a_result(at: Path) -> None:
     assert np.isnan(broken[0].rmse_position)
 
 
-def test_any_exception_is_a_result(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def breaks(*_: Any, **__: Any) -> Any:
+def test_any_exception_is_a_result(at, monkeypatch):
+    def breaks(*_, **__):
         raise ZeroDivisionError("by nothing")
 
     monkeypatch.setattr(cells, "run_until_decided", breaks)
@@ -342,7 +336,7 @@ def test_any_exception_is_a_result(at: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert {r.diagnosis for r in folder.results().values()} == {"failed: ZeroDivisionError: by nothing"}
 
 
-def test_a_damaged_cell_is_named(at: Path) -> None:
+def test_a_damaged_cell_is_named(at):
     folder = run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
     path = next((at / "out").rglob("kf")) / "manifest.json"
     data = json.loads(path.read_text())
@@ -352,12 +346,12 @@ def test_a_damaged_cell_is_named(at: Path) -> None:
         folder.results()
 
 
-def test_the_cost_is_the_least_of_three_by_turns(uvd: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cost_is_the_least_of_three_by_turns(uvd, monkeypatch):
     """In CPU time of the thread in which a trial runs, whatever other threads do."""
     seconds = {"ekf-uvd": iter([0.03, 0.01, 0.02]), "ukf-uvd": iter([0.04, 0.06, 0.05])}
     clock, order = [0.0], list[str]()
 
-    def run_filter(filter_: Any, *_: Any) -> Any:
+    def run_filter(filter_, *_):
         order.append(filter_.name)
         clock[0] += next(seconds[filter_.name])
         return SimpleNamespace(failure=None)
@@ -371,7 +365,7 @@ def test_the_cost_is_the_least_of_three_by_turns(uvd: cs.Scenario, monkeypatch: 
     assert microseconds == pytest.approx(1e6 * 0.04 / uvd.truth.steps)
 
 
-def test_the_cost_is_that_of_a_step(uvd: cs.Scenario) -> None:
+def test_the_cost_is_that_of_a_step(uvd):
     cost, microseconds = cost_of("ekf-uvd", "ekf-uvd", uvd, 0)
     assert cost == 1.0
     assert 0.1 < microseconds < 1e4
@@ -380,11 +374,11 @@ def test_the_cost_is_that_of_a_step(uvd: cs.Scenario) -> None:
 # --- the map ------------------------------------------------------------------------------------
 
 
-def result(status: str = "consistent", rmse: float = 0.1, cost: float = 1.0) -> CellResult:
+def result(status="consistent", rmse=0.1, cost=1.0):
     return CellResult(status, status, 48, 0, 3.0, 2.5, 3.5, 1.0, 0.9, 1.1, rmse, 0.01, cost, 20.0)
 
 
-def test_a_map_is_the_same_from_its_files(at: Path) -> None:
+def test_a_map_is_the_same_from_its_files(at):
     sweep = load_sweep(at / "grid.toml")
     folder = run_sweep(sweep, at / "out", jobs=1)
     regime = regime_of(folder)
@@ -405,12 +399,12 @@ def test_a_map_is_the_same_from_its_files(at: Path) -> None:
             read_regime(at / f"{bad}.json")
 
 
-def test_filters_are_ranked_by_rmse_and_then_cost() -> None:
+def test_filters_are_ranked_by_rmse_and_then_cost():
     found = {"slow": result(rmse=0.1000, cost=3.0), "fast": result(rmse=0.1005), "worse": result(rmse=0.2, cost=0.5)}
     assert [name for name, _ in ranked_by_cost(found)] == ["fast", "slow", "worse"]
 
 
-def test_only_consistent_filters_are_trusted() -> None:
+def test_only_consistent_filters_are_trusted():
     sweep = replace(load_sweep("small"), filters=("ekf-uvd", "ukf-uvd", "ckf-uvd"))
     pairs = (("ekf-uvd", result("overconfident")), ("ukf-uvd", result()), ("ckf-uvd", result("undecided")))
     regime = Regime(sweep, {(0, name): r for name, r in pairs}, {})
@@ -418,7 +412,7 @@ def test_only_consistent_filters_are_trusted() -> None:
     assert regime.missing == 9
 
 
-def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
+def test_a_report_shows_every_filter_and_cell(at):
     from consistency.bench.pages.maps_of_worlds import LOOKS, compose_regime
     from consistency.referee.show.as_html import render
     from consistency.referee.show.pdf import render_pdf
@@ -444,12 +438,29 @@ def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
     assert "not finished: 5 of 8" in unfinished.answer
 
 
-def test_a_map_without_numbers_on_its_axes_has_heat_maps_alone(at: Path) -> None:
+def test_a_sweep_of_one_axis_has_one_figure_of_all_filters(at):
+    from painted import panels
+
+    from consistency.bench.pages.maps_of_worlds import LOOKS, compose_regime
+
+    sweep = load_sweep(edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "odometry = [1.0, 2.0]"))
+    found = {(0, "kf"): result(rmse=0.1), (1, "kf"): result("overconfident", rmse=0.3)}
+    document = compose_regime(Regime(sweep, found, {}))
+    along, _ = document.figures
+    ratios, errors = panels(along)
+    assert along.title == "Along odometry"
+    line, *markers = errors.get_lines()
+    assert line.get_xydata().tolist() == [[1.0, 0.1], [2.0, 0.3]]
+    assert [marker.get_marker() for marker in markers] == [LOOKS[s].marker for s in ("consistent", "overconfident")]
+    assert ratios.get_ylabel() == "true / stated covariance"
+
+
+def test_a_map_without_numbers_on_its_axes_has_heat_maps_alone(at):
     from consistency.bench.pages.maps_of_worlds import compose_regime
     from consistency.referee.show.as_html import render
 
     path = edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "truth.sensor.range = [[0.5, 3.0], [0.5, 4.0]]")
-    sweep: Sweep = load_sweep(path)
+    sweep = load_sweep(path)
     document = compose_regime(Regime(sweep, {(0, "kf"): result(), (1, "kf"): result()}, {}))
     assert [figure.title for figure in document.figures] == ["kf"]
     assert "range [0.5, 3.0]" in render(document)

@@ -1,14 +1,11 @@
 """Bags of ROS 1 and ROS 2, written by rosbags and judged."""
 
-from __future__ import annotations
-
 import contextlib
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from command import consistency
+from numpy.testing import assert_allclose
 from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
@@ -26,7 +23,7 @@ P = np.diag(SIGMA**2)
 class Drive:
     """A winding drive at 10 Hz with its truth at 50 Hz, as arrays of poses."""
 
-    def __init__(self, seed: int = 5) -> None:
+    def __init__(self, seed=5):
         rng = np.random.default_rng(seed)
         self.true_t = 0.02 * np.arange(5 * STEPS + 10)
         heading = 0.3 * self.true_t
@@ -41,43 +38,41 @@ class Drive:
 
 
 @pytest.mark.parametrize("ros", [1, 2])
-@pytest.mark.parametrize(("kind", "topic", "truth"), [("pose", "/pose", "/vicon"), ("odometry", "/odom", "map:body")])
-def test_a_bag_is_read_to_the_last_digits(tmp_path: Path, ros: int, kind: str, topic: str, truth: str) -> None:
+@pytest.mark.parametrize("kind, topic, truth", [("pose", "/pose", "/vicon"), ("odometry", "/odom", "map:body")])
+def test_a_bag_is_read_to_the_last_digits(tmp_path, ros, kind, topic, truth):
     drive = Drive()
     bag = write(tmp_path / ("drive.bag" if ros == 1 else "drive"), ros, kind, drive)
     [r] = read_recordings(bag, topic=topic, truth_topic=truth)
-    np.testing.assert_allclose(r.error[0], drive.error, atol=1e-6)
-    np.testing.assert_allclose(r.covariance[0], np.broadcast_to(P, (STEPS, 6, 6)))
-    np.testing.assert_allclose(r.t, START + drive.t)  # the stamps, not the times of writing
+    assert_allclose(r.error[0], drive.error, atol=1e-6)
+    assert_allclose(r.covariance[0], np.broadcast_to(P, (STEPS, 6, 6)))
+    assert_allclose(r.t, START + drive.t)  # the stamps, not the times of writing
     assert r.convention == "so3"
     [alone] = read_recordings(bag, truth_topic=truth)  # one topic has covariances
     assert np.array_equal(alone.error, r.error)  # type: ignore[arg-type]
 
 
-def test_one_command_from_bag_to_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_command_from_bag_to_picture(tmp_path, capsys):
     bag = write(tmp_path / "drive.bag", 1, "pose", Drive())
     out, _ = consistency(capsys, "analyse", bag, "--truth-topic", "/vicon", "--report", tmp_path / "out")
     assert "drive is " in out
     assert "Errors and stated bounds" in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_a_folder_of_bags_has_a_run_in_each(tmp_path: Path) -> None:
+def test_a_folder_of_bags_has_a_run_in_each(tmp_path):
     (tmp_path / "bags").mkdir()
     for seed in range(4):
         write(tmp_path / "bags" / f"{seed}.bag", 1, "pose", Drive(seed))
     [r] = read_recordings(tmp_path / "bags", truth_topic="/vicon")
     assert r.runs.tolist() == [0, 1, 2, 3]
     for seed in range(4):
-        np.testing.assert_allclose(r.error[seed], Drive(seed).error, atol=1e-6)
+        assert_allclose(r.error[seed], Drive(seed).error, atol=1e-6)
     assert cs.read(tmp_path / "bags", truth_topic="/vicon", axes=["x", "yaw"]).axes == ("x", "yaw")
 
 
 @pytest.mark.parametrize(
-    ("variances", "unstated"), [((0.2, 1e-3, 1e-3), ""), ((0.0, 1e-3, 1e-3), "z"), ((2e9, 0.1, 0.1), "z")]
+    "variances, unstated", [((0.2, 1e-3, 1e-3), ""), ((0.0, 1e-3, 1e-3), "z"), ((2e9, 0.1, 0.1), "z")]
 )
-def test_a_robot_in_the_plane_is_judged_in_the_plane(
-    tmp_path: Path, variances: tuple[float, float, float], unstated: str
-) -> None:
+def test_a_robot_in_the_plane_is_judged_in_the_plane(tmp_path, variances, unstated):
     """By the rule of all other files, also where some variances are not stated."""
     drive = Drive()
     drive.true[:, 2], drive.own[:, 2] = 0.0, 0.0
@@ -94,16 +89,16 @@ def test_a_robot_in_the_plane_is_judged_in_the_plane(
     assert any(f"the variances of {unstated} are 0, -1" in note for note in r.notes) == bool(unstated)
 
 
-def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path: Path) -> None:
+def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path):
     drive = Drive()
     drive.t = drive.t.copy()
     drive.t[5] = drive.t[4]
     [r] = read_recordings(write(tmp_path / "drive.bag", 1, "pose", drive), truth_topic="/vicon")
-    np.testing.assert_allclose(r.error[0], np.delete(drive.error, 5, axis=0), atol=1e-6)
+    assert_allclose(r.error[0], np.delete(drive.error, 5, axis=0), atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         ({}, r"needs --truth-topic, of poses or PARENT:CHILD of /tf; there are: PARENT:CHILD of /tf"),
         (
@@ -116,18 +111,19 @@ def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path: Path) -> None
             r"--topic /tf: is not there with poses and cov.*there are: /odom",
         ),
         ({"truth_topic": "map:body", "state": ["x"]}, r"--state: does not go with"),
+        ({"truth_topic": "map:body", "truth": "drive.bag"}, r"--truth: does not go with .*drive\.bag"),
         ({"truth_topic": "map:body", "error": "so2"}, r"--error so2: for a trajectory in space it is one of"),
         ({"truth_topic": "map:body", "axes": ["w"]}, r"--axes w: 'w' is not one of"),
         ({"truth_topic": "map:body", "time_offset": 900.0}, r"no estimate has a truth within 0.01 s"),
     ],
 )
-def test_what_a_bag_does_not_hold(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+def test_what_a_bag_does_not_hold(tmp_path, options, message):
     bag = write(tmp_path / "drive.bag", 1, "odometry", Drive())
     with pytest.raises(cs.InputError, match=message):
         read_recordings(bag, **options)
 
 
-def test_damaged_bags_are_refused(tmp_path: Path) -> None:
+def test_damaged_bags_are_refused(tmp_path):
     rng = np.random.default_rng()
     whole = write(tmp_path / "drive.bag", 1, "pose", Drive()).read_bytes()
     bad = tmp_path / "bad.bag"
@@ -154,12 +150,12 @@ def test_damaged_bags_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".db3", ".mcap"])
-def test_a_file_of_ros_2_without_its_metadata(tmp_path: Path, suffix: str) -> None:
+def test_a_file_of_ros_2_without_its_metadata(tmp_path, suffix):
     drive = Drive()
     [file] = write(tmp_path / "drive", 2, "pose", drive, suffix).glob(f"*{suffix}")
     alone = file.rename(tmp_path / f"flight{suffix}")
     [r] = read_recordings(alone, truth_topic="/vicon")
-    np.testing.assert_allclose(r.error[0], drive.error, atol=1e-6)  # type: ignore[index]
+    assert_allclose(r.error[0], drive.error, atol=1e-6)  # type: ignore[index]
     (tmp_path / "parts").mkdir()
     for k in range(2):
         (tmp_path / "parts" / f"flight_{k}{suffix}").write_bytes(alone.read_bytes())
@@ -167,7 +163,7 @@ def test_a_file_of_ros_2_without_its_metadata(tmp_path: Path, suffix: str) -> No
         read_recordings(tmp_path / "parts", truth_topic="/vicon")
 
 
-def test_fixes_against_fixes(tmp_path: Path) -> None:
+def test_fixes_against_fixes(tmp_path):
     """NEES in the plane of the first true place; without a fix a message does not count."""
     from test_fixes import flight, plane
 
@@ -182,14 +178,14 @@ def test_fixes_against_fixes(tmp_path: Path) -> None:
     turns = axes_at(place[0]) @ np.swapaxes(axes_at(off[kept]), 1, 2)
     stated = turns @ C[kept] @ np.swapaxes(turns, 1, 2)
     nees = [each @ np.linalg.solve(M, each) for each, M in zip(e, stated, strict=True)]
-    np.testing.assert_allclose(r.nees[0], nees, rtol=1e-6)
+    assert_allclose(r.nees[0], nees, rtol=1e-6)
     assert any("/fix read as positions by satellite, 11 of 12 messages with a fix" in note for note in r.notes)
     assert any(
         "the body is 'base' on /fix, but 'gps' on /rtk; the poses must be of one body" in note for note in r.notes
     )
 
 
-def test_the_type_of_a_covariance_counts(tmp_path: Path) -> None:
+def test_the_type_of_a_covariance_counts(tmp_path):
     from test_fixes import flight
 
     place, C = flight()
@@ -197,38 +193,38 @@ def test_the_type_of_a_covariance_counts(tmp_path: Path) -> None:
     [r] = read_recordings(write_fixes(tmp_path / "a.bag", 2, off, place, C), topic="/fix", truth_topic="/rtk")
     assert r.parts == ((0,), (1,), (2,))
     stated = np.asarray(r.covariance[0])
-    np.testing.assert_allclose(stated, C * np.eye(3), atol=1e-3 * stated.max())  # what is beside the diagonal is not
+    assert_allclose(stated, C * np.eye(3), atol=1e-3 * stated.max())  # what is beside the diagonal is not
     bag = write_fixes(tmp_path / "b.bag", 0, off, place, C)
     with pytest.raises(cs.InputError, match=r"b\.bag: states no covariance: its variances are 0, -1"):
         read_recordings(bag, topic="/fix", truth_topic="/rtk")
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1e9])
-def test_blocks_that_are_not_stated_are_not_judged(tmp_path: Path, value: float) -> None:
+def test_blocks_that_are_not_stated_are_not_judged(tmp_path, value):
     drive = Drive()
     drive.P = P.copy()
     drive.P[3:, 3:] = value * np.eye(3)
     bag = write(tmp_path / "a.bag", 1, "pose", drive)
     [r] = read_recordings(bag, truth_topic="/vicon")
     assert r.axes == ("x", "y", "z")
-    np.testing.assert_allclose(r.nees[0], (drive.error[:, :3] ** 2 / SIGMA[:3] ** 2).sum(axis=1), rtol=1e-6)
+    assert_allclose(r.nees[0], (drive.error[:, :3] ** 2 / SIGMA[:3] ** 2).sum(axis=1), rtol=1e-6)
     said = "the variances of roll,pitch,yaw are 0, -1 or 1e+09 in every message, so not stated and not judged"
     assert any(said in note for note in r.notes)
 
 
-def test_other_frames_are_named(tmp_path: Path) -> None:
+def test_other_frames_are_named(tmp_path):
     [r] = read_recordings(write(tmp_path / "a.bag", 1, "odometry", Drive()), truth_topic="map:body")
     assert any("the body is 'base' on /odom, but 'body' on map:body" in note for note in r.notes)
     assert not any("the world is" in note for note in r.notes)
 
 
-def test_the_covariance_of_a_true_message(tmp_path: Path) -> None:
+def test_the_covariance_of_a_true_message(tmp_path):
     from test_fixes import flight
 
     place, C = flight()
     bag = write_fixes(tmp_path / "a.bag", 3, place + np.array([1e-7, 1e-7, 0.01]), place, C)
     [r] = read_recordings(bag, topic="/fix", truth_topic="/rtk", truth_covariance="columns")
-    np.testing.assert_allclose(r.truth_covariance[0], C, rtol=1e-3, atol=1e-6)  # axes at places 100 m apart
+    assert_allclose(r.truth_covariance[0], C, rtol=1e-3, atol=1e-6)  # axes at places 100 m apart
     [r] = read_recordings(bag, topic="/fix", truth_topic="/rtk")
     assert any("/rtk" not in note and "which counts as 0" in note for note in r.notes)
     drive = write(tmp_path / "b.bag", 1, "odometry", Drive())

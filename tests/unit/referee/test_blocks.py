@@ -1,22 +1,18 @@
 """A verdict does not depend on the blocks it is worked out in, and needs little more memory than its arrays."""
 
-from __future__ import annotations
-
 import tracemalloc
-from typing import Any
 
 import numpy as np
 import pytest
 from referee import judge
 
-from consistency.diagnostics import Verdict
 from consistency.referee.diagnostics.records import large_arrays
-from consistency.referee.types import Array, Failure
+from consistency.referee.types import Failure
 
 RUNS, STEPS = 61, 23
 
 
-def sample(rng: np.random.Generator, runs: int, steps: int, bias: float = 0.0) -> dict[str, Array]:
+def sample(rng, runs, steps, bias=0.0):
     """Errors with about the stated covariance, (runs, steps, 3), and an NIS."""
     A = np.eye(3) + 0.3 * rng.standard_normal((runs, steps, 3, 3))
     P = A @ np.swapaxes(A, -1, -2)
@@ -25,7 +21,7 @@ def sample(rng: np.random.Generator, runs: int, steps: int, bias: float = 0.0) -
     return {"error": error, "covariance": P, "nis": rng.chisquare(nis_dof), "nis_dof": nis_dof}
 
 
-def equal(a: Any, b: Any, where: str = "") -> None:
+def equal(a, b, where=""):
     """The same figures to rounding."""
     assert type(a) is type(b), where
     if isinstance(a, dict):
@@ -42,18 +38,16 @@ def equal(a: Any, b: Any, where: str = "") -> None:
         assert a == b, where
 
 
-def verdicts(arrays: dict[str, Array], **options: Any) -> list[Verdict]:
+def verdicts(arrays, **options):
     return [judge("f", **arrays, **options), judge("f", **arrays, allow="conservative", **options)]
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.4])
 @pytest.mark.parametrize("gaps", [False, True])
 @pytest.mark.parametrize("size", [1, 40, 100_000])
-def test_blocks_do_not_change_the_verdict(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, bias: float, gaps: bool, size: int
-) -> None:
+def test_blocks_do_not_change_the_verdict(rng, monkeypatch, bias, gaps, size):
     arrays = sample(rng, RUNS, STEPS, bias)
-    failures: tuple[Failure, ...] = ()
+    failures = ()
     if gaps:
         failures = (Failure("f", 3, 1, "x"), Failure("f", 40, 12, "x"))
         for failure in failures:
@@ -69,7 +63,7 @@ def test_blocks_do_not_change_the_verdict(
     assert all(np.array_equal(before[name], array, equal_nan=True) for name, array in arrays.items())
 
 
-def test_what_is_left_out_by_name_counts_nowhere(rng: np.random.Generator) -> None:
+def test_what_is_left_out_by_name_counts_nowhere(rng):
     """Errors of a step without NEES: any other value there gives the same verdict."""
     arrays = sample(rng, RUNS, STEPS)
     nees = np.full((RUNS, STEPS), np.nan)
@@ -81,9 +75,7 @@ def test_what_is_left_out_by_name_counts_nowhere(rng: np.random.Generator) -> No
     assert judge("f", **arrays, nees=nees).statistic > 10 * a.statistic, "negative control"
 
 
-def test_a_verdict_needs_less_memory_than_its_arrays_hold(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_verdict_needs_less_memory_than_its_arrays_hold(rng, monkeypatch):
     """Error, covariance, NIS and its degrees of freedom are 112 bytes a run and step."""
     arrays = sample(rng, 400, 100)
     judge("f", **arrays)  # loads modules, which are not measured
@@ -100,8 +92,8 @@ def test_a_verdict_needs_less_memory_than_its_arrays_hold(
     assert peaks[0] < 112.0 < peaks[1]
 
 
-@pytest.mark.parametrize(("count", "each"), [(0, 5), (1, 5), (10, 0), (10, 3), (10, 10**9)])
-def test_slices_cover_everything_once(monkeypatch: pytest.MonkeyPatch, count: int, each: int) -> None:
+@pytest.mark.parametrize("count, each", [(0, 5), (1, 5), (10, 0), (10, 3), (10, 10**9)])
+def test_slices_cover_everything_once(monkeypatch, count, each):
     monkeypatch.setattr(large_arrays, "ROWS", 7)
     slices = list(large_arrays.block_slices(count, each))
     assert slices

@@ -1,14 +1,11 @@
 """What readers of each kind refuse or take as it is, which the fuzzer would not find again soon; one sentence each."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import tracemalloc
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,26 +19,25 @@ from recorded import read_recordings
 import consistency as cs
 from consistency.bench.store.parquet import read_parquet
 from consistency.bench.sweeps.plan import load_sweep
-from consistency.diagnostics import Record
 from consistency.referee.parsing import one_line, read_json, read_text, read_toml, reading, require_room
 from consistency.referee.system.shipped import data_folder
 from consistency.referee.verdicts.baselines import read_baseline
 
 
-def read(path: Path, **options: Path) -> Record:
+def read(path, **options):
     """The recording of the first estimator."""
     return read_recordings(Path(path), **options)[0]
 
 
 @pytest.fixture(scope="module")
-def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def valid(tmp_path_factory):
     folder = tmp_path_factory.mktemp("boundary")
     write_all(folder)
     return folder
 
 
 @pytest.fixture
-def files(valid: Path, tmp_path: Path) -> Path:
+def files(valid, tmp_path):
     return Path(shutil.copytree(valid, tmp_path / "files"))
 
 
@@ -49,7 +45,7 @@ def files(valid: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("value", ["1e308", "-1e308", "3e30", "inf"])
-def test_an_estimate_beyond_all_measure_is_a_failed_run(files: Path, value: str) -> None:
+def test_an_estimate_beyond_all_measure_is_a_failed_run(files, value):
     path = files / "table" / "est.csv"
     table = pd.read_csv(path, dtype=str)
     table.loc[5, "x"] = value
@@ -60,7 +56,7 @@ def test_an_estimate_beyond_all_measure_is_a_failed_run(files: Path, value: str)
     assert np.nanmax(recording.nees) < 1e6
 
 
-def test_a_truth_beyond_all_measure_is_refused(files: Path) -> None:
+def test_a_truth_beyond_all_measure_is_refused(files):
     path = files / "table" / "truth.csv"
     table = pd.read_csv(path, dtype=str)
     table.loc[5, "x"] = "1e308"
@@ -69,7 +65,7 @@ def test_a_truth_beyond_all_measure_is_refused(files: Path) -> None:
         read(files / "table" / "est.csv", truth=path)
 
 
-def test_large_numbers_of_a_trajectory(files: Path) -> None:
+def test_large_numbers_of_a_trajectory(files):
     path = files / "tum" / "cov.txt"
     lines = path.read_text(encoding="utf-8").splitlines()
     lines[4] = " ".join([lines[4].split()[0], *["1e308"] * 36])
@@ -82,7 +78,7 @@ def test_large_numbers_of_a_trajectory(files: Path) -> None:
 # --- Parquet ----------------------------------------------------------------------------------------
 
 
-def test_notes_of_other_programs_change_nothing(files: Path) -> None:
+def test_notes_of_other_programs_change_nothing(files):
     """They may make a column the index of the table, or give it another type."""
     path = files / "results" / "truth.parquet"
     before = read_parquet(path.parent, "truth")
@@ -93,7 +89,7 @@ def test_notes_of_other_programs_change_nothing(files: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("column", "said"),
+    "column, said",
     [
         (pa.array([2**60 + 1] * 117), r"column 'run', row 0: not a whole number"),
         (pa.array([True] * 117), r"column 'run' cannot be read as numbers \(bool\)"),
@@ -103,7 +99,7 @@ def test_notes_of_other_programs_change_nothing(files: Path) -> None:
     ],
     ids=["large", "bool", "bool with gaps", "list", "time"],
 )
-def test_a_column_of_runs_is_of_whole_numbers(files: Path, column: pa.Array, said: str) -> None:
+def test_a_column_of_runs_is_of_whole_numbers(files, column, said):
     path = files / "results" / "truth.parquet"
     table = pq.read_table(path)
     pq.write_table(table.set_column(0, "run", column), path)
@@ -114,13 +110,13 @@ def test_a_column_of_runs_is_of_whole_numbers(files: Path, column: pa.Array, sai
 # --- archives ---------------------------------------------------------------------------------------
 
 
-def test_a_small_archive_of_a_gigabyte_is_refused_before_it_is_read(files: Path) -> None:
+def test_a_small_archive_of_a_gigabyte_is_refused_before_it_is_read(files):
     bomb(files / "archive" / "est.npz", np.random.default_rng(0))
     with pytest.raises(cs.InputError, match=r"est\.npz: would take 0\.625 GiB in memory"):
         read(files / "archive" / "est.npz")
 
 
-def test_an_array_that_claims_more_than_it_holds_is_refused(files: Path) -> None:
+def test_an_array_that_claims_more_than_it_holds_is_refused(files):
     for seed in range(8):
         path = shutil.copy(files / "archive" / "nees.npz", files / "copy.npz")
         claimed(Path(path), np.random.default_rng(seed))
@@ -129,7 +125,7 @@ def test_an_array_that_claims_more_than_it_holds_is_refused(files: Path) -> None
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_a_packed_archive_holds_the_same(files: Path, method: int) -> None:
+def test_a_packed_archive_holds_the_same(files, method):
     path = files / "archive" / "nees.npz"
     with zipfile.ZipFile(path) as old, zipfile.ZipFile(files / "packed.npz", "w", method) as new:
         for name in old.namelist():
@@ -138,7 +134,7 @@ def test_a_packed_archive_holds_the_same(files: Path, method: int) -> None:
 
 
 @pytest.mark.parametrize("key", ["errors", "covariances", "nis", "nis_dof"])
-def test_complex_numbers_are_refused(files: Path, key: str) -> None:
+def test_complex_numbers_are_refused(files, key):
     path = files / "archive" / "est.npz"
     with np.load(path) as archive:
         data = dict(archive)
@@ -150,7 +146,7 @@ def test_complex_numbers_are_refused(files: Path, key: str) -> None:
 # --- cameras ----------------------------------------------------------------------------------------
 
 
-def test_a_singular_matrix_of_a_camera_is_named(files: Path) -> None:
+def test_a_singular_matrix_of_a_camera_is_named(files):
     from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
 
     path = files / "kitti" / "calib.txt"
@@ -160,7 +156,7 @@ def test_a_singular_matrix_of_a_camera_is_named(files: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    "text, said",
     [
         ("[" * 20_000, "nested too deep"),
         ("%YAML:1.0\n---\nK1: " + "[" * 1_000_000, "nested too deep"),
@@ -173,7 +169,7 @@ def test_a_singular_matrix_of_a_camera_is_named(files: Path) -> None:
     ],
     ids=["brackets", "OpenCV", "lists", "aliases", "twice", "date", "number", "large"],
 )  # fmt: skip
-def test_yaml_that_is_hostile(tmp_path: Path, text: str, said: str) -> None:
+def test_yaml_that_is_hostile(tmp_path, text, said):
     pytest.importorskip("yaml")
     pytest.importorskip("cv2")
     from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
@@ -188,7 +184,7 @@ def test_yaml_that_is_hostile(tmp_path: Path, text: str, said: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    "key, value, said",
     [
         ("runs", [2**63, 1], "filters.one.runs.0"),
         ("runs", [0] * 9, "a run is there twice"),
@@ -201,7 +197,7 @@ def test_yaml_that_is_hostile(tmp_path: Path, text: str, said: str) -> None:
     ],
     ids=str,
 )
-def test_a_changed_baseline_is_refused(files: Path, key: str, value: object, said: str) -> None:
+def test_a_changed_baseline_is_refused(files, key, value, said):
     path = files / "baseline" / "base.json"
     data = json.loads(path.read_text(encoding="utf-8"))
     assert len(read_baseline(path).filters["one"].runs) == len(data["filters"]["one"]["nees"])
@@ -211,7 +207,7 @@ def test_a_changed_baseline_is_refused(files: Path, key: str, value: object, sai
         read_baseline(path)
 
 
-def test_a_grid_of_more_cells_than_there_is_room_for(files: Path) -> None:
+def test_a_grid_of_more_cells_than_there_is_room_for(files):
     path = files / "sweep" / "sweep.toml"
     values = ", ".join(str(k / 1000) for k in range(1, 301))
     text = path.read_text(encoding="utf-8").split("[grid]")[0]
@@ -220,7 +216,7 @@ def test_a_grid_of_more_cells_than_there_is_room_for(files: Path) -> None:
         load_sweep(path)
 
 
-def test_one_bad_step_sizes_nothing(files: Path) -> None:
+def test_one_bad_step_sizes_nothing(files):
     path = files / "results" / "estimates.parquet"
     table = pd.read_parquet(path)
     table.loc[STEPS - 1, "step"] = 10**12
@@ -232,7 +228,7 @@ def test_one_bad_step_sizes_nothing(files: Path) -> None:
 # --- results ----------------------------------------------------------------------------------------
 
 
-def edited(files: Path, column: str, new: float) -> Path:
+def edited(files, column, new):
     """Results in which one number of a step was changed."""
     path = files / "results" / "estimates.parquet"
     table = pd.read_parquet(path).astype({column: float})
@@ -242,7 +238,7 @@ def edited(files: Path, column: str, new: float) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("column", "new", "said"),
+    "column, new, said",
     [
         ("x", 1e61, "column 'x', row 40: too large a number"),
         ("P_xx", -1e300, "column 'P_xx', row 40: too large a number"),
@@ -253,13 +249,13 @@ def edited(files: Path, column: str, new: float) -> Path:
         ("P_yy", 1e-200, "estimates of 'one', run 3, step 5: the NEES is not that of the error"),
     ],
 )
-def test_numbers_whose_squares_would_overflow_are_refused(files: Path, column: str, new: float, said: str) -> None:
+def test_numbers_whose_squares_would_overflow_are_refused(files, column, new, said):
     folder = edited(files, column, new)
     with pytest.raises(cs.InputError, match=said):
         cs.analyse(cs.read_results(folder))
 
 
-def test_large_numbers_that_go_together_are_judged(files: Path) -> None:
+def test_large_numbers_that_go_together_are_judged(files):
     """Without a warning, as the whole suite treats them as errors; the verdict is on what is there."""
     with np.errstate(all="raise", under="ignore"):
         verdict = cs.analyse(cs.read_results(edited(files, "nees", 1e60)))["one"]
@@ -267,7 +263,7 @@ def test_large_numbers_that_go_together_are_judged(files: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["est.npz", "nees.npz"])
-def test_degrees_of_freedom_beyond_whole_numbers_are_refused(files: Path, name: str) -> None:
+def test_degrees_of_freedom_beyond_whole_numbers_are_refused(files, name):
     path = files / "archive" / name
     with np.load(path) as archive:
         arrays = dict(archive)
@@ -278,7 +274,7 @@ def test_degrees_of_freedom_beyond_whole_numbers_are_refused(files: Path, name: 
             read(path)
 
 
-def test_counts_of_rows_that_disagree_are_refused(files: Path) -> None:
+def test_counts_of_rows_that_disagree_are_refused(files):
     """The number of rows of a group, which no checksum is over, is one less: a row would be passed over."""
     path = files / "results" / "truth.parquet"
     content = path.read_bytes()
@@ -290,7 +286,7 @@ def test_counts_of_rows_that_disagree_are_refused(files: Path) -> None:
         read_parquet(path.parent, "truth")
 
 
-def varint(value: int) -> bytes:
+def varint(value):
     """A whole number as the compact protocol of Thrift has it."""
     coded, out = 2 * value, b""
     while coded > 127:
@@ -298,7 +294,7 @@ def varint(value: int) -> bytes:
     return out + bytes([coded])
 
 
-def test_a_number_of_a_grid_that_no_float_holds_is_refused(files: Path) -> None:
+def test_a_number_of_a_grid_that_no_float_holds_is_refused(files):
     path = files / "sweep" / "sweep.toml"
     text = path.read_text(encoding="utf-8").replace("odometry = [", f"odometry = [\n    {10**400},")
     path.write_text(text, encoding="utf-8")
@@ -310,7 +306,7 @@ def test_a_number_of_a_grid_that_no_float_holds_is_refused(files: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("raised", "said"),
+    "raised, said",
     [
         (KeyError("a"), r"f\.x: damaged \('a'\)"),
         (RecursionError("deep\nly"), r"f\.x: damaged \(nested too deep\)"),
@@ -322,28 +318,28 @@ def test_a_number_of_a_grid_that_no_float_holds_is_refused(files: Path) -> None:
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_what_a_parser_raises_is_one_sentence(raised: Exception, said: str) -> None:
+def test_what_a_parser_raises_is_one_sentence(raised, said):
     with pytest.raises(cs.InputError, match=f"^{said}$"), reading("f.x", "damaged"):
         raise raised
 
 
-def test_ctrl_c_is_no_damage() -> None:
+def test_ctrl_c_is_no_damage():
     with pytest.raises(KeyboardInterrupt), reading("f.x"):
         raise KeyboardInterrupt
 
 
-def test_a_line_is_short_and_printable() -> None:
+def test_a_line_is_short_and_printable():
     assert one_line("a\n\x1b[31mb\tc") == "a [31mb c"
     assert len(one_line("x" * 10_000)) == 160
 
 
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe.toml")
     with pytest.raises(cs.InputError, match=r"pipe\.toml: is a device, not a file"):
         read_toml(tmp_path / "pipe.toml")
 
 
-def test_a_folder_and_a_large_file_are_no_text(tmp_path: Path) -> None:
+def test_a_folder_and_a_large_file_are_no_text(tmp_path):
     with pytest.raises(cs.InputError, match="is a folder, not a file"):
         read_text(tmp_path, "no text")
     (tmp_path / "large.json").write_bytes(b" " * 5000)
@@ -358,7 +354,7 @@ def test_a_folder_and_a_large_file_are_no_text(tmp_path: Path) -> None:
      "a = {" + ".".join(["b"] * 20_000) + " = 1}"],
     ids=["key", "table", "list", "inline"],
 )  # fmt: skip
-def test_toml_that_is_nested_20000_deep_takes_no_memory(tmp_path: Path, text: str) -> None:
+def test_toml_that_is_nested_20000_deep_takes_no_memory(tmp_path, text):
     (tmp_path / "deep.toml").write_text(text, encoding="utf-8")
     cs.load_scenario("herath2007-xyz")  # what is imported does not count
     tracemalloc.start()
@@ -371,20 +367,20 @@ def test_toml_that_is_nested_20000_deep_takes_no_memory(tmp_path: Path, text: st
     assert peak < 20 * 2**20
 
 
-def test_keys_of_64_parts_and_long_words_are_toml(tmp_path: Path) -> None:
+def test_keys_of_64_parts_and_long_words_are_toml(tmp_path):
     path = tmp_path / "long.toml"
     path.write_text(".".join("a" * 64) + f' = 1\ns = "{"x" * 100_000} {". " * 1000}"\n', encoding="utf-8")
     assert len(read_toml(path)["s"]) == 102_001
 
 
 @pytest.mark.parametrize("text", ['{"a": 1, "a": 2}', "[" * 20_000, "\ufeff{}", '{"a": 1' + "0" * 5000 + "}"])
-def test_json_with_a_key_twice_or_worse(tmp_path: Path, text: str) -> None:
+def test_json_with_a_key_twice_or_worse(tmp_path, text):
     (tmp_path / "m.json").write_text(text, encoding="utf-8")
     with pytest.raises(cs.InputError, match=r"m\.json: not valid JSON \("):
         read_json(tmp_path / "m.json")
 
 
-def test_room_is_in_proportion_to_the_file(tmp_path: Path) -> None:
+def test_room_is_in_proportion_to_the_file(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(bytes(1000))
     require_room(path, 2**29)
@@ -395,7 +391,7 @@ def test_room_is_in_proportion_to_the_file(tmp_path: Path) -> None:
 # --- what a scenario may size ------------------------------------------------------------------------
 
 
-def scenario(tmp_path: Path, old: str, new: str) -> Path:
+def scenario(tmp_path, old, new):
     text = (data_folder("scenarios") / "herath2007-xyz.toml").read_text(encoding="utf-8")
     key = next(line for line in text.splitlines() if line.split("=")[0].strip() in (old, f"{old}_s"))
     path = tmp_path / "world.toml"
@@ -404,7 +400,7 @@ def scenario(tmp_path: Path, old: str, new: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    "key, value, said",
     [
         ("steps", 2**63 - 1, r"key 'truth\.steps': Input should be less than or equal to 1000000"),
         ("steps", "1" + "0" * 400, r"key 'truth\.steps': "),
@@ -413,12 +409,12 @@ def scenario(tmp_path: Path, old: str, new: str) -> Path:
         ("dt", 1e308, r"key 'truth\.dt': Input should be less than or equal to 10{30} "),
     ],
 )
-def test_a_number_of_a_scenario_sizes_no_arrays(tmp_path: Path, key: str, value: Any, said: str) -> None:
+def test_a_number_of_a_scenario_sizes_no_arrays(tmp_path, key, value, said):
     with pytest.raises(cs.InputError, match=said):
         cs.load_scenario(scenario(tmp_path, key, value))
 
 
-def test_a_name_that_no_file_can_have(tmp_path: Path) -> None:
+def test_a_name_that_no_file_can_have(tmp_path):
     for name in ("x" * 300, "x" * 300 + ".toml", "a\0.toml"):
         with pytest.raises(cs.InputError):
             cs.load_scenario(str(tmp_path / name))

@@ -1,7 +1,5 @@
 """What is said where optional packages are missing: by commands, names, arguments and filters; help of commands."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
@@ -39,12 +37,12 @@ SENTENCE = re.compile(r"consistency: .* needs? [\w>=., -]+: pip install \S.*\n")
 
 
 @pytest.fixture
-def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+def nowhere(monkeypatch):
     """The package is not known to come from anywhere."""
     monkeypatch.setattr(extras, "_from_origin", lambda _: [])
 
 
-def without(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
+def without(monkeypatch, *modules):
     """The packages are neither found nor imported."""
     for name in modules:
         monkeypatch.setitem(sys.modules, name, None)
@@ -52,16 +50,16 @@ def without(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
 
 
 @pytest.fixture(autouse=True)
-def forgotten() -> None:
+def forgotten():
     extras.is_installed.cache_clear()
 
 
 # --- the extras ------------------------------------------------------------------------------------
 
 
-def listed(extra: str) -> set[tuple[str, str]]:
+def listed(extra):
     """Packages and floors of an extra in pyproject.toml, those of the extras that it includes too."""
-    pairs: set[tuple[str, str]] = set()
+    pairs = set()
     for line in PROJECT["optional-dependencies"][extra]:
         name, _, floor = line.partition(">=")
         included = name.removeprefix("filter-consistency").strip("[]").split(",")
@@ -70,24 +68,24 @@ def listed(extra: str) -> set[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("extra", PROJECT["optional-dependencies"])
-def test_an_extra_brings_what_the_project_lists(extra: str) -> None:
+def test_an_extra_brings_what_the_project_lists(extra):
     """Also a check of the installation: one that is stale is mended by ``pip install -e .``."""
     assert set(requirements(extra)) == listed(extra), "the installation is stale: pip install -e ."
 
 
-def test_several_extras_bring_each_package_once() -> None:
+def test_several_extras_bring_each_package_once():
     assert requirements("plot", "report").count(("matplotlib", "3.9")) == 1
     assert requirements() == requirements("nonsense") == []
 
 
-def test_names_of_imports_that_differ_are_known() -> None:
+def test_names_of_imports_that_differ_are_known():
     """Of all packages that are installed here, so that no package is missed that is there."""
     packages = {package for package, _ in requirements("all")}
     assert set(IMPORT_NAMES) <= packages
     assert [each.package for each in requirements("all") if not each.is_found and not _is_absent(each.package)] == []
 
 
-def _is_absent(package: str) -> bool:
+def _is_absent(package):
     try:
         metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -95,18 +93,18 @@ def _is_absent(package: str) -> bool:
     return False
 
 
-def test_a_checkout_that_is_not_installed_knows_no_extras(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checkout_that_is_not_installed_knows_no_extras(monkeypatch):
     monkeypatch.setattr(extras, "DISTRIBUTION", "no-such-distribution")
     assert requirements("bench") == []
     assert explained(ModuleNotFoundError(name="numba"), "this") is None
 
 
-def test_the_core_is_small() -> None:
+def test_the_core_is_small():
     assert {re.split("[>=]", r)[0] for r in PROJECT["dependencies"]} == {"numpy", "scipy", "typer", "rich"}
 
 
 @pytest.mark.usefixtures("nowhere")
-def test_a_sentence_names_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sentence_names_what_is_missing(monkeypatch):
     require("this", "bench", "report")
     without(monkeypatch, "numba", "tomli_w", "typst")
     with pytest.raises(MissingPackageError) as refusal:
@@ -119,38 +117,36 @@ def test_a_sentence_names_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.usefixtures("nowhere")
-def test_a_package_that_is_too_old_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_that_is_too_old_is_missing(monkeypatch):
     versions = dict(requirements("bench")) | {"numpy": "1.26.4", "scipy": "1.16.0rc1", "rich": "14.1.0"}
     monkeypatch.setattr(metadata, "version", versions.__getitem__)
     assert missing("bench") == ["numpy>=2.0"]
     assert remedy("bench") == "numpy>=2.0: pip install 'numpy>=2.0'"
 
 
-def test_the_python_that_the_bench_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_that_the_bench_needs(monkeypatch):
     without(monkeypatch, "numba")
     monkeypatch.setattr(sys, "version_info", (3, 10, 13))
     assert remedy("vision") == "Python 3.11 or later; this is 3.10"
     assert "Python" not in remedy("plot")
 
 
-@pytest.mark.parametrize(("version", "floor", "is_met"), [
+@pytest.mark.parametrize("version, floor, is_met", [
     ("2.4.40", "2.4.40", True), ("2.4.39", "2.4.40", False), ("2.10", "2.9", True), ("3", "2.9", True),
     ("2025.11.1", "2025.1", True), ("1.16.0rc1", "1.16", True), ("1.15.9", "1.16", False), ("unknown", "1.0", False),
 ])  # fmt: skip
-def test_versions_are_compared_as_numbers(
-    version: str, floor: str, is_met: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_versions_are_compared_as_numbers(version, floor, is_met, monkeypatch):
     monkeypatch.setattr(metadata, "version", lambda _: version)
     assert extras.Requirement("numpy", floor).is_met == is_met
 
 
 @pytest.mark.usefixtures("nowhere")
-def test_a_package_that_is_there_and_cannot_be_loaded_is_named() -> None:
+def test_a_package_that_is_there_and_cannot_be_loaded_is_named():
     assert remedy("ulog", package="pyulog") == "pyulog: pip install pyulog"
 
 
 @pytest.mark.parametrize(
-    ("record", "expected"),
+    "record, expected",
     [
         ({"url": "file://{at}", "dir_info": {}}, ["{at}[bench,plot]"]),
         ({"url": "file://{at}", "dir_info": {"editable": True}}, ["-e", "{at}[bench,plot]"]),
@@ -168,9 +164,7 @@ def test_a_package_that_is_there_and_cannot_be_loaded_is_named() -> None:
         (None, []),
     ],
 )
-def test_the_place_that_it_came_from(
-    record: dict[str, object] | None, expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_place_that_it_came_from(record, expected, tmp_path, monkeypatch):
     place = tmp_path / "a place"
     place.mkdir()
     (place / "pyproject.toml").touch()
@@ -180,7 +174,7 @@ def test_the_place_that_it_came_from(
     class Installed:
         requires = installed(extras.DISTRIBUTION).requires
 
-        def read_text(self, name: str) -> str | None:
+        def read_text(self, name):
             assert name == "direct_url.json"
             return (
                 None if record is None else json.dumps(record).replace("{at}", place.as_uri().removeprefix("file://"))
@@ -195,7 +189,7 @@ def test_the_place_that_it_came_from(
     assert shlex.split(remedy("report")) == ["typst:", "pip", "install", *expected]
 
 
-def test_no_text_installs_from_an_index() -> None:
+def test_no_text_installs_from_an_index():
     """A name with an extra stands only in pyproject.toml, and before " @ " and a place."""
     files = [
         *(path for folder in ("consistency", "docs", "tests", "benchmarks", "experiments", "scenarios", ".github")
@@ -213,7 +207,7 @@ def test_no_text_installs_from_an_index() -> None:
 
 
 @pytest.mark.usefixtures("nowhere")
-def test_a_name_of_the_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_of_the_bench(monkeypatch):
     code = """
 import sys
 sys.modules |= dict.fromkeys(["pandas", "numba"])
@@ -234,7 +228,7 @@ print(cs.anees.__name__, "run_trials" in dir(cs))
     assert (other, here) == ("ImportError", "anees True")
 
 
-def test_a_failed_import_is_explained_by_the_extra_that_has_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_import_is_explained_by_the_extra_that_has_the_package(monkeypatch):
     """Not by one that collects others."""
     monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
     for module, package, extra in (("joblib", "joblib", "bench"), ("yaml", "pyyaml", "vision")):
@@ -245,13 +239,13 @@ def test_a_failed_import_is_explained_by_the_extra_that_has_the_package(monkeypa
         monkeypatch.setattr(extras, "_from_origin", lambda names: [f"here[{','.join(names)}]"])
 
 
-def test_who_needs_no_extra_does_not_wait_for_the_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_needs_no_extra_does_not_wait_for_the_metadata(monkeypatch):
     monkeypatch.setattr(metadata, "requires", lambda _: pytest.fail("the metadata were read"))
     require("this")
     assert requirements() == []
 
 
-def test_another_module_that_is_missing_is_not_explained() -> None:
+def test_another_module_that_is_missing_is_not_explained():
     assert explained(ModuleNotFoundError(name="no_such_module"), "this") is None
     assert explained(ModuleNotFoundError(), "this") is None
     assert explained(ModuleNotFoundError(name="numba.no_such_module"), "this") is None  # numba is there
@@ -261,9 +255,7 @@ def test_another_module_that_is_missing_is_not_explained() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name, row in COMMANDS.items() if row.extras])
-def test_a_command_without_its_packages(
-    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_without_its_packages(name, monkeypatch, capsys):
     """Whatever its options are; its help is there."""
     module = "typst" if name == "report" else "numba"
     without(monkeypatch, module)
@@ -276,7 +268,7 @@ def test_a_command_without_its_packages(
         assert re.match(rf"Usage: .* {name} ", out)
 
 
-def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_marks_what_is_missing(monkeypatch, capsys):
     before, _ = consistency(capsys, "--help")
     assert "[bench]" not in before
     without(monkeypatch, "numba", "typst")
@@ -292,9 +284,7 @@ def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pyt
 
 
 @pytest.mark.parametrize("words", [["plan", "linear-gaussian", "--filter", "kf"], ["analyse", "results"]])
-def test_arguments_that_need_the_bench(
-    words: list[str], inside: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_arguments_that_need_the_bench(words, inside, monkeypatch, capsys):
     (inside / "results").mkdir()
     (inside / "results" / "manifest.json").write_text("{}")
     loaded = {
@@ -311,7 +301,7 @@ def test_arguments_that_need_the_bench(
     assert err.startswith(f"consistency: '{words[0]}' with these arguments needs pandas: pip install ")
 
 
-def test_only_the_called_command_is_loaded() -> None:
+def test_only_the_called_command_is_loaded():
     code = """
 import sys
 from consistency.commands import main
@@ -326,7 +316,7 @@ print(*sorted(name for name in sys.modules if name.startswith("consistency.comma
     assert done.stdout.splitlines()[-2:] == ["None", " ".join(f"consistency.commands.{name}" for name in names)]
 
 
-def test_a_command_is_a_row_and_a_function() -> None:
+def test_a_command_is_a_row_and_a_function():
     commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     assert len(commands) == len(COMMANDS)
     for name in COMMANDS:
@@ -337,7 +327,7 @@ def test_a_command_is_a_row_and_a_function() -> None:
 # --- list ------------------------------------------------------------------------------------------
 
 
-def test_the_list_says_what_the_files_say() -> None:
+def test_the_list_says_what_the_files_say():
     listed = summaries()
     assert listed["scenarios"] == {name: cs.load_scenario(name).summary for name in cs.scenario_names()}
     assert listed["sweeps"] == {name: load_sweep(name).summary for name in listed["sweeps"]}
@@ -346,7 +336,7 @@ def test_the_list_says_what_the_files_say() -> None:
     assert len(listed["experiments"]) > 20
 
 
-def test_the_list_on_the_core(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_on_the_core(monkeypatch, capsys):
     before, silent = consistency(capsys, "list")
     without(monkeypatch, "numba", "pandas")
     after, err = consistency(capsys, "list")
@@ -365,18 +355,18 @@ LINES = [line for row in COMMANDS.values() for line in row.examples]
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_an_example_parses(line: str) -> None:
+def test_an_example_parses(line):
     name, values = parsed(shlex.split(line))
     assert line in SUBCOMMANDS[name].epilog
     assert values
 
 
-def test_every_command_that_takes_something_has_an_example() -> None:
+def test_every_command_that_takes_something_has_an_example():
     assert {name for name, row in COMMANDS.items() if not row.examples} == {"list"}
 
 
 @pytest.mark.parametrize("name", sorted(SUBCOMMANDS))
-def test_help_is_for_people(name: str) -> None:
+def test_help_is_for_people(name):
     with COMMAND_LINE.make_context("consistency", [name]) as root:
         context = SUBCOMMANDS[name].make_context(name, [], parent=root, resilient_parsing=True)
         text = SUBCOMMANDS[name].get_help(context)
@@ -384,13 +374,13 @@ def test_help_is_for_people(name: str) -> None:
     assert "-h, --help" in text
 
 
-def test_completion_is_offered() -> None:
+def test_completion_is_offered():
     options = {option for parameter in COMMAND_LINE.params for option in parameter.opts}
     assert {"--install-completion", "--show-completion"} <= options
 
 
 @pytest.mark.parametrize("name", ["run", "analyse", "tune"])
-def test_help_alone_is_that_of_typer(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_alone_is_that_of_typer(name, capsys):
     shown = []
     for words in ([name, "--help"], [name, "--help", "--help"]):  # the second goes through typer
         shown.append(consistency(capsys, *words)[0])
@@ -398,11 +388,11 @@ def test_help_alone_is_that_of_typer(name: str, capsys: pytest.CaptureFixture[st
     assert [text.partition(f" {name} ")[2] for text in shown] == [shown[0].partition(f" {name} ")[2]] * 2
 
 
-def test_help_of_no_command_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_no_command_is_refused(capsys):
     refused(capsys, "runn", "--help")
 
 
-def test_help_imports_nothing_that_checks_values() -> None:
+def test_help_imports_nothing_that_checks_values():
     code = "import sys; sys.argv[1:] = ['run', '-h']; from consistency.commands.app import _show_help; \
 _show_help(None) or sys.exit(3); sys.exit('pydantic' in sys.modules or 'numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
@@ -412,12 +402,12 @@ _show_help(None) or sys.exit(3); sys.exit('pydantic' in sys.modules or 'numpy' i
 
 
 @pytest.fixture
-def lacking(monkeypatch: pytest.MonkeyPatch) -> None:
+def lacking(monkeypatch):
     monkeypatch.setattr(filters, "EXTRAS", {"external.gtsam": ("no_such_package", "smoothing")})
 
 
 @pytest.mark.usefixtures("lacking")
-def test_without_its_library_a_filter_is_refused() -> None:
+def test_without_its_library_a_filter_is_refused():
     remedy = "'gtsam-map-uvd' needs no_such_package: pip install "
     with pytest.raises(cs.InputError, match=remedy):
         cs.get_filter("gtsam-map-uvd")
@@ -428,7 +418,7 @@ def test_without_its_library_a_filter_is_refused() -> None:
 
 
 @pytest.mark.usefixtures("lacking")
-def test_what_does_not_fit_a_sensor_is_said_without_it(xyz: cs.Scenario) -> None:
+def test_what_does_not_fit_a_sensor_is_said_without_it(xyz):
     with pytest.raises(cs.InputError, match="works on a sensor uvd, not 'xyz'; filters that fit: ekf-xyz") as refusal:
         cs.run_trials(xyz, ["ekf-uvd"], runs=1)
     assert "gtsam" not in str(refusal.value)

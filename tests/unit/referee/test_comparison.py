@@ -1,7 +1,5 @@
 """Filters against each other, and against a baseline."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from recorded import read_recordings
 from scipy import optimize, special, stats
 
@@ -18,7 +17,6 @@ from consistency.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.referee.diagnostics.statistics.log_ratio import Contrast, contrast, margin
 from consistency.referee.gating.session import needed_at
 from consistency.referee.gating.watch import RunningTest, watching
-from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
 from consistency.referee.verdicts.compare_sources import Compared, compare_filters, compare_with
 from consistency.testing import InsufficientTrials, assert_not_worse
@@ -26,35 +24,35 @@ from consistency.testing import InsufficientTrials, assert_not_worse
 RATE = 1e-5  # false-failure rate of each statistical assertion below
 
 
-def of_runs(means: Array, runs: Array | None = None) -> RunSummary:
+def of_runs(means, runs=None):
     empty = np.empty((len(means), 0))
     return RunSummary(np.arange(len(means)) if runs is None else runs, 3, means, empty, empty)
 
 
-def gamma(rng: np.random.Generator, size: int, ratio: float) -> Array:
+def gamma(rng, size, ratio):
     return rng.gamma(5.0, ratio / 5.0, size)
 
 
-def test_summary_by_hand() -> None:
+def test_summary_by_hand():
     error = np.array([[[1.0, 0.0], [3.0, 1.0]], [[0.0, 2.0], [np.nan, np.nan]]])
     P = np.broadcast_to(np.eye(2), (2, 2, 2, 2))
     nees = np.square(error).sum(axis=-1)
     s = summary(nees, 2, error, P)
-    np.testing.assert_allclose(s.nees, [(1 + 10) / 4, 4 / 2])
-    np.testing.assert_allclose(s.squared, [[5.0, 0.5], [0.0, 4.0]])
-    np.testing.assert_allclose(s.covered, [[0.5, 1.0], [1.0, 1.0]])
+    assert_allclose(s.nees, [(1 + 10) / 4, 4 / 2])
+    assert_allclose(s.squared, [[5.0, 0.5], [0.0, 4.0]])
+    assert_allclose(s.covered, [[0.5, 1.0], [1.0, 1.0]])
 
 
-def test_paired_ratio_is_the_t_interval_of_the_influence() -> None:
+def test_paired_ratio_is_the_t_interval_of_the_influence():
     rng = np.random.default_rng()
     a, b = gamma(rng, 30, 2.0), gamma(rng, 30, 1.0)
     d = compare(of_runs(a), of_runs(b)).differences[0]
     z = a / a.mean() - b / b.mean()
     half = stats.t.ppf(0.975, 29) * z.std(ddof=1) / np.sqrt(30) * np.exp(0.5 * np.sqrt(2 / 29))  # to the safe side
-    np.testing.assert_allclose([d.low, d.high], np.exp(np.log(a.mean() / b.mean()) + np.array([-half, half])))
+    assert_allclose([d.low, d.high], np.exp(np.log(a.mean() / b.mean()) + np.array([-half, half])))
 
 
-def test_a_coverage_in_which_no_run_differs_has_an_interval() -> None:
+def test_a_coverage_in_which_no_run_differs_has_an_interval():
     """A share of runs of 1 - .025^(1/21) is missing among 21 runs with probability 2.5 %; never beyond [-1, 1]."""
     nees, inside = gamma(np.random.default_rng(6), 21, 2.0), np.ones((21, 1))
     a = RunSummary(np.arange(21), 1, nees, nees[:, None], inside)
@@ -66,7 +64,7 @@ def test_a_coverage_in_which_no_run_differs_has_an_interval() -> None:
 
 
 @pytest.mark.parametrize("largest", [1.0, 0.2])
-def test_runs_that_are_missing_may_differ_as_much_as_those_that_are_not(largest: float) -> None:
+def test_runs_that_are_missing_may_differ_as_much_as_those_that_are_not(largest):
     """One of 21 runs differs by ``largest``: Student's t alone would give 2.1 / 21 of that, and miss too often."""
     nees, inside = gamma(np.random.default_rng(6), 21, 2.0), np.ones((21, 1))
     less = inside - largest * (np.arange(21) == 4)[:, None]
@@ -77,8 +75,8 @@ def test_runs_that_are_missing_may_differ_as_much_as_those_that_are_not(largest:
         assert (d.difference, d.low, d.high) == pytest.approx((gap, gap - missing, gap + missing))
 
 
-@pytest.mark.parametrize(("of_a", "of_b"), [(4.0, 1.0), (0.25, 1.0), (4.0, 0.5)])
-def test_farther_from_consistent_is_worse_on_either_side(of_a: float, of_b: float) -> None:
+@pytest.mark.parametrize("of_a, of_b", [(4.0, 1.0), (0.25, 1.0), (4.0, 0.5)])
+def test_farther_from_consistent_is_worse_on_either_side(of_a, of_b):
     """Missed with probability below 1e-6: the distance is at least 7 standard errors."""
     rng = np.random.default_rng()
     a, b = gamma(rng, 100, of_a), gamma(rng, 100, of_b)
@@ -89,22 +87,22 @@ def test_farther_from_consistent_is_worse_on_either_side(of_a: float, of_b: floa
 # --- the test of 'worse' ---------------------------------------------------------------------------
 
 
-def slow(rng: np.random.Generator, runs: int, n: int) -> Array:
+def slow(rng, runs, n):
     """Mean NEES over n of runs with one error in all their steps."""
     return rng.chisquare(n, runs) / n
 
 
-def mixed(rng: np.random.Generator, runs: int, n: int) -> Array:
+def mixed(rng, runs, n):
     """Mean NEES over n of runs of 100 independent steps."""
     return rng.chisquare(100 * n, runs) / (100 * n)
 
 
-def now_and_then(rng: np.random.Generator, runs: int, n: int) -> Array:
+def now_and_then(rng, runs, n):
     """Three runs in ten are slow."""
     return np.where(rng.random(runs) < 0.3, slow(rng, runs, n), mixed(rng, runs, n))
 
 
-def same_trials(rng: np.random.Generator, runs: int, n: int) -> tuple[Array, Array]:
+def same_trials(rng, runs, n):
     """Two slow filters with errors that are correlated 0.9."""
     e, d = rng.standard_normal((2, runs, n))
     return np.square(e).mean(axis=1), np.square(0.9 * e + np.sqrt(0.19) * d).mean(axis=1)
@@ -121,10 +119,8 @@ EQUALLY_CONSISTENT = {
 
 
 @pytest.mark.parametrize("world", EQUALLY_CONSISTENT)
-@pytest.mark.parametrize(("runs", "n", "paired"), [(8, 1, True), (12, 3, True), (30, 1, True), (20, 1, False)])
-def test_no_more_false_alarms_than_stated(
-    rng: np.random.Generator, world: str, runs: int, n: int, paired: bool
-) -> None:
+@pytest.mark.parametrize("runs, n, paired", [(8, 1, True), (12, 3, True), (30, 1, True), (20, 1, False)])
+def test_no_more_false_alarms_than_stated(rng, world, runs, n, paired):
     """400 comparisons at 5 and 1 % of two filters that are equally far from consistent."""
     of_a, of_b, scale_a, scale_b = EQUALLY_CONSISTENT[world]
     pairs = [(scale_a * of_a(rng, runs, n), scale_b * of_b(rng, runs, n)) for _ in range(400)]
@@ -133,7 +129,7 @@ def test_no_more_false_alarms_than_stated(
         assert (p <= rate).sum() <= stats.binom.isf(RATE, 400, rate)
 
 
-def test_calibration_rows_count_false_alarms(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calibration_rows_count_false_alarms(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parents[3] / "benchmarks")
     import calibration_compare
 
@@ -150,7 +146,7 @@ def test_calibration_rows_count_false_alarms(monkeypatch: pytest.MonkeyPatch) ->
     assert {r["found"] for r in always if r["stated"] == 0.01} == {0}
 
 
-def test_the_p_value_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_p_value_by_hand(monkeypatch):
     """Of each side the larger p value counts, of both sides the smaller, twice."""
     table = {
         # one-sided p of log a - log b above and below 0, the same of log a + log b -> p
@@ -176,7 +172,7 @@ def test_the_p_value_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("paired", [True, False])
-def test_a_contrast_by_hand(rng: np.random.Generator, sign: float, paired: bool) -> None:
+def test_a_contrast_by_hand(rng, sign, paired):
     """Slope by a numerical derivative, gamma shape by its equation; limits are the terms of order 1 / runs."""
     runs_a, runs_b = 3000, 3000 if paired else 1500
     a, b = now_and_then(rng, runs_a, 1), now_and_then(rng, runs_b, 1)  # the moments hide a good part of the spread
@@ -185,7 +181,7 @@ def test_a_contrast_by_hand(rng: np.random.Generator, sign: float, paired: bool)
     assert c.value == pytest.approx(np.log(a.mean()) + sign * np.log(b.mean()))
     assert c.freedom == runs_b - 1
 
-    def value_and_variance(of_a: Array, of_b: Array) -> tuple[float, float]:
+    def value_and_variance(of_a, of_b):
         mean_a, mean_b = (np.average(x, weights=w) for x, w in ((a, of_a), (b, of_b)))
         x, y = a / mean_a - 1.0, sign * (b / mean_b - 1.0)
         if paired:
@@ -199,7 +195,7 @@ def test_a_contrast_by_hand(rng: np.random.Generator, sign: float, paired: bool)
     (up, v_up), (down, v_down) = (value_and_variance(1.0 + k * of_a, 1.0 + k * of_b) for k in (1.0, -1.0))
     assert c.slope == pytest.approx(np.log(v_up / v_down) / (up - down), rel=0.01, abs=0.02)
 
-    def spread_of_gamma(means: Array) -> float:
+    def spread_of_gamma(means):
         gap = np.log(means.mean()) - np.log(means).mean()
         return 1.0 / float(optimize.brentq(lambda shape: np.log(shape) - special.digamma(shape) - gap, 1e-3, 1e3))
 
@@ -211,7 +207,7 @@ def test_a_contrast_by_hand(rng: np.random.Generator, sign: float, paired: bool)
     assert factor > 1.05
 
 
-def test_the_slope_of_a_few_runs_by_hand(rng: np.random.Generator) -> None:
+def test_the_slope_of_a_few_runs_by_hand(rng):
     """Against a reference without spread: Fisher's k-statistic k3 / s^4, less what the division by the mean adds."""
     a = rng.gamma(1.0, 1.0, 9)
     x = a / a.mean()
@@ -221,7 +217,7 @@ def test_the_slope_of_a_few_runs_by_hand(rng: np.random.Generator) -> None:
             assert contrast(a, np.ones(9), sign, paired).slope == pytest.approx(wanted)
 
 
-def test_student_and_what_makes_it_safe() -> None:
+def test_student_and_what_makes_it_safe():
     c = Contrast(value=-0.6, variance=0.04, slope=1.5, freedom=9.0)
     t = -0.6 / (0.2 * np.exp(0.5 * (1.5 * 0.6 + np.sqrt(2 / 9))))  # the hypothesis lies 0.6 above
     assert c.p_values == pytest.approx((stats.t.sf(t, 9), stats.t.cdf(t, 9)))
@@ -235,7 +231,7 @@ def test_student_and_what_makes_it_safe() -> None:
     assert margin(8.0) == 0.5
 
 
-def test_runs_without_spread_and_runs_of_zeros(rng: np.random.Generator) -> None:
+def test_runs_without_spread_and_runs_of_zeros(rng):
     one = np.ones(10)
     assert compare(of_runs(2.0 * one), of_runs(one)).p_value == 0.0
     assert compare(of_runs(one), of_runs(2.0 * one)).p_value == 1.0
@@ -248,7 +244,7 @@ def test_runs_without_spread_and_runs_of_zeros(rng: np.random.Generator) -> None
         compare(of_runs(one), of_runs(0.0 * one))
 
 
-def test_common_runs_are_paired_and_others_left_out() -> None:
+def test_common_runs_are_paired_and_others_left_out():
     rng = np.random.default_rng()
     a, b = gamma(rng, 20, 1.0), gamma(rng, 20, 1.0)
     a[3] = np.nan
@@ -264,7 +260,7 @@ def test_common_runs_are_paired_and_others_left_out() -> None:
     assert (mixed_up.standard_error, mixed_up.differences[0].low) == pytest.approx((c.standard_error, d.low))
 
 
-def test_refusals() -> None:
+def test_refusals():
     a = of_runs(np.ones(20))
     with pytest.raises(ValueError, match="at least 8 runs"):
         compare(a, of_runs(np.ones(5)))
@@ -275,15 +271,15 @@ def test_refusals() -> None:
 # --- the runs that it takes ------------------------------------------------------------------------
 
 
-def together(rng: np.random.Generator, runs: int) -> tuple[Array, Array]:
+def together(rng, runs):
     return same_trials(rng, runs, 8)
 
 
-def test_a_plan_by_hand() -> None:
+def test_a_plan_by_hand():
     c = Comparison(50, True, (), 0.0, 0.1, 1.0, 0.05)
     n = c.needed_runs(1.5, 0.9)
 
-    def size(runs: int) -> float:
+    def size(runs):
         z = stats.t.isf(0.025, runs - 1) + stats.t.isf(0.05, runs - 1)
         return float(z * 0.1 * np.sqrt(50 / runs) * np.exp(np.sqrt(2 / (runs - 1))))
 
@@ -299,13 +295,13 @@ def test_a_plan_by_hand() -> None:
     assert replace(c, at_most=0.0).needed_runs(3.0) == c.needed_runs(3.0) < 50
 
 
-def test_worse_is_a_p_value_up_to_the_rate() -> None:
+def test_worse_is_a_p_value_up_to_the_rate():
     c = Comparison(50, True, (), 0.0, 0.1, 0.05, 0.05)
     assert c.worse
     assert not replace(c, p_value=0.0501).worse
 
 
-def test_worse_on_the_conservative_side_says_what_it_rests_on() -> None:
+def test_worse_on_the_conservative_side_says_what_it_rests_on():
     wiggle = 1.0 + 0.1 * np.linspace(-1.0, 1.0, 20)
     sentences = [Compared("a", "b", compare(of_runs(ratio * wiggle), of_runs(wiggle)), (0, 0)) for ratio in (0.5, 2.0)]
     low, high = sentences
@@ -318,7 +314,7 @@ def test_worse_on_the_conservative_side_says_what_it_rests_on() -> None:
     assert "rare runs" not in high.sentence
 
 
-def test_limits_of_the_distance_by_hand() -> None:
+def test_limits_of_the_distance_by_hand():
     """With next to no spread the limits are the distance and the reference themselves."""
     wiggle = 1.0 + 1e-6 * np.linspace(-1.0, 1.0, 20)
     for of_a, of_b in ((3.0, 2.0), (2.0, 3.0), (0.2, 0.5), (0.5, 0.2), (3.0, 0.5), (0.5, 3.0), (0.2, 2.0), (1.0, 1.0)):
@@ -330,7 +326,7 @@ def test_limits_of_the_distance_by_hand() -> None:
         assert c.worse == (distance > 1e-4)
 
 
-def test_runs_that_show_that_nothing_is_lost_are_enough(rng: np.random.Generator) -> None:
+def test_runs_that_show_that_nothing_is_lost_are_enough(rng):
     """Another rounding of the same filter needs no more runs; a filter that could be farther off does."""
     nees = rng.chisquare(3, (10, 1))
     rounded = nees * (1.0 + 1e-12 * rng.standard_normal((10, 1)))
@@ -348,7 +344,7 @@ def test_runs_that_show_that_nothing_is_lost_are_enough(rng: np.random.Generator
         assert_not_worse(nees_a=rng.chisquare(3, (10, 1)), nees_b=rng.chisquare(3, (10, 1)), dof=3, false_alarm=1e-9)
 
 
-def test_what_few_runs_leave_open_is_said(rng: np.random.Generator) -> None:
+def test_what_few_runs_leave_open_is_said(rng):
     c = compare(of_runs(rng.chisquare(3, 10)), of_runs(rng.chisquare(3, 10)))
     assert not c.worse
     assert c.at_most > np.log(1.5)
@@ -361,7 +357,7 @@ def test_what_few_runs_leave_open_is_said(rng: np.random.Generator) -> None:
     assert "no difference" not in Compared("f", "g", worse, (0, 0)).sentence
 
 
-def test_the_end_of_a_session_plans_as_the_gate_did(rng: np.random.Generator) -> None:
+def test_the_end_of_a_session_plans_as_the_gate_did(rng):
     entries = []
     a, b = together(rng, 400)
     for scale in (1.0, 2.0):
@@ -375,12 +371,12 @@ def test_the_end_of_a_session_plans_as_the_gate_did(rng: np.random.Generator) ->
 
 
 @pytest.fixture(scope="module")
-def results() -> cs.Results:
+def results():
     scenario = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
     return cs.run_trials(scenario, ["ekf-xyz", "ekf-uvd"], runs=12, seed=3)
 
 
-def test_two_filters_of_the_same_trials(results: cs.Results) -> None:
+def test_two_filters_of_the_same_trials(results):
     (compared,) = compare_filters(baseline(results_source(results)), ["ekf-xyz", "ekf-uvd"])
     assert compared.comparison.paired
     assert compared.sentence.startswith("ekf-xyz is ")
@@ -390,7 +386,7 @@ def test_two_filters_of_the_same_trials(results: cs.Results) -> None:
     assert "2-sigma coverage x" in names
 
 
-def test_a_baseline_read_back_is_the_same(results: cs.Results, tmp_path: Path) -> None:
+def test_a_baseline_read_back_is_the_same(results, tmp_path):
     write_baseline(baseline(results_source(results)), tmp_path / "base.json")
     for compared in compare_with(baseline(results_source(results)), read_baseline(tmp_path / "base.json"), []):
         assert compared.comparison.paired
@@ -399,14 +395,14 @@ def test_a_baseline_read_back_is_the_same(results: cs.Results, tmp_path: Path) -
         assert "every run is the same" in compared.sentence
 
 
-def test_other_trials_are_not_paired(results: cs.Results) -> None:
+def test_other_trials_are_not_paired(results):
     other = cs.run_trials(results.scenario, ["ekf-uvd"], runs=12, seed=4)
     (compared,) = compare_with(baseline(results_source(results)), baseline(results_source(other)), [])
     assert not compared.comparison.paired
     assert "not the same" in compared.sentence
 
 
-def test_bad_baselines_are_refused(results: cs.Results, tmp_path: Path) -> None:
+def test_bad_baselines_are_refused(results, tmp_path):
     path, base = tmp_path / "base.json", baseline(results_source(results))
     write_baseline(base, path)
     with pytest.raises(cs.InputError, match="exists already"):
@@ -429,7 +425,7 @@ def test_bad_baselines_are_refused(results: cs.Results, tmp_path: Path) -> None:
         compare_filters(base, ["ekf-uvd"])
 
 
-def test_files_whose_truth_is_not_known_are_other_trials(tmp_path) -> None:
+def test_files_whose_truth_is_not_known_are_other_trials(tmp_path):
     """Archives hold errors alone: runs of one number need not belong together."""
     rng = np.random.default_rng(515)
     for name in ("a", "b"):

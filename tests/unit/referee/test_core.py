@@ -1,9 +1,6 @@
 """What judges files loads arrays, statistics and the command line alone: in a process where nothing else is found."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import forks
 import numpy as np
@@ -26,7 +23,7 @@ assert not rooms & {"filters", "models", "scenario", "simulation", "runs"}, room
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("core")
     rng = np.random.default_rng(1)
     for name, scale in (("est", 1.0), ("old", 1.0), ("bold", 3.0)):
@@ -41,14 +38,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def said(folder: Path, code: str) -> str:
+def said(folder, code):
     """Standard output of code where the heavy packages are not found."""
     done = forks.done(WITHOUT, code, "-c", cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def test_commands_on_files(folder: Path) -> None:
+def test_commands_on_files(folder):
     code = """
 from consistency.commands import main
 
@@ -68,7 +65,7 @@ print("runs" in run("plan", "--dof", "3"))
     assert others == ["True"] * 4
 
 
-def test_a_verdict_loads_what_it_needs(folder: Path) -> None:
+def test_a_verdict_loads_what_it_needs(folder):
     """Not readers of other files, nor questions that are not asked."""
     code = """
 from consistency.commands import main
@@ -88,7 +85,7 @@ print(*(name.removeprefix("consistency.referee.") for name in sys.modules if nam
     }  # fmt: skip
 
 
-def test_gates_and_records(folder: Path) -> None:
+def test_gates_and_records(folder):
     code = """
 import numpy as np
 import consistency as cs
@@ -104,7 +101,7 @@ print(monitor.update(1.0, 2))
     assert said(folder, code + LOADED).split() == ["consistent", "None"]
 
 
-def test_parquet_without_its_reader(folder: Path) -> None:
+def test_parquet_without_its_reader(folder):
     (folder / "est.parquet").write_bytes(b"PAR1")
     code = """
 from consistency.referee.errors import InputError
@@ -129,7 +126,7 @@ print(status, err.getvalue().splitlines()[-1])
 """
 
 
-def test_a_report_without_its_packages(folder: Path) -> None:
+def test_a_report_without_its_packages(folder):
     status, _, line = said(folder, REPORT.format(out="look") + LOADED).partition(" ")
     assert status == "1"
     told = "consistency: pictures and the PDF need matplotlib, typst: pip install "
@@ -145,14 +142,14 @@ def test_a_report_without_its_packages(folder: Path) -> None:
     assert "<figure" not in page
 
 
-def test_a_picture_needs_matplotlib_alone(folder: Path) -> None:
+def test_a_picture_needs_matplotlib_alone(folder):
     said(folder, 'del sys.modules["matplotlib"]\n' + REPORT.format(out="shown") + LOADED)
     page = (folder / "shown" / "report.html").read_text("utf-8")
     assert page.count('<div class="chart"') >= 3
     assert "pip install" not in page
 
 
-def test_a_plot_says_what_it_needs(folder: Path) -> None:
+def test_a_plot_says_what_it_needs(folder):
     code = """
 import consistency as cs
 verdict = cs.judge(cs.read("est.csv", truth="truth.csv"))

@@ -1,22 +1,18 @@
 """Flight logs of ArduPilot through the monitor, written message by message with pymavlink."""
 
-from __future__ import annotations
-
 import json
 import sys
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
 from command import consistency, refused
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.ardupilot_log import read_ratios
-from consistency.referee.types import Array
 from consistency.referee.verdicts.monitor_sources import read_innovations
 
 pytest.importorskip("pymavlink", reason="needs the extra 'ardupilot'")
@@ -33,9 +29,7 @@ GATES = {
 }
 
 
-def flight(
-    path: Path, ratios: Mapping[str, Sequence[float] | Array], message: str = "XKF4", gates: Mapping[str, float] = GATES
-) -> Path:
+def flight(path, ratios, message="XKF4", gates=GATES):
     """Test ratios by field."""
     log = Flight(message).set(gates)
     for k, row in enumerate(zip(*ratios.values(), strict=True)):
@@ -43,18 +37,18 @@ def flight(
     return log.write(path)
 
 
-def test_ratios_by_sensor_with_the_gates_of_the_log(tmp_path: Path) -> None:
+def test_ratios_by_sensor_with_the_gates_of_the_log(tmp_path):
     heights = [0.0, 0.1, 0.0, 1.5, 0.99, 1.01]
     ratios, notes = read_ratios(flight(tmp_path / "a.bin", {"SH": heights, "SM": [0.2] * 6}))
     assert [(each.sensor, each.gate, each.components) for each in ratios] == [("hgt", 2.0, 1), ("mag", 2.5, 4)]
-    np.testing.assert_allclose(ratios[0].ratio, heights[1:])  # before the first it is not fused
-    np.testing.assert_allclose(ratios[0].t, 10.1 + 0.1 * np.arange(5))
+    assert_allclose(ratios[0].ratio, heights[1:])  # before the first it is not fused
+    assert_allclose(ratios[0].t, 10.1 + 0.1 * np.arange(5))
     assert ratios[0].above(1.0) == pytest.approx(0.4)
     assert notes == [f"{tmp_path / 'a.bin'}: read as test ratios of XKF4, 6 messages"]
 
 
 @pytest.mark.parametrize("components", [1, 3])
-def test_a_right_filter_stays_within_its_shares(components: int) -> None:
+def test_a_right_filter_stays_within_its_shares(components):
     """Whether the ratio is the largest of the components or the root of a mean, by quantiles and not by chance.
 
     The shares are of 2e5 draws: an excess of 6 standard deviations has a chance of 1e-9.
@@ -69,14 +63,14 @@ def test_a_right_filter_stays_within_its_shares(components: int) -> None:
     assert GateRatios("hgt", e[:, 0], e[:, 0], 2.0, 1).rejected == pytest.approx(stats.chi2.sf(4.0, 1))
 
 
-def test_shares_over_time() -> None:
+def test_shares_over_time():
     of = GateRatios("hgt", np.array([0.0, 1.0, 2.0, 9.0, 10.0]), np.array([0.1, 2.0, 2.0, 0.3, 2.0]), 5.0, 1)
     begin, share = of.over_time(1.0)
-    np.testing.assert_allclose(begin, np.arange(10.0))
-    np.testing.assert_array_equal(share, [0.0, 1.0, 1.0, *[np.nan] * 6, 0.5])
+    assert_allclose(begin, np.arange(10.0))
+    assert_array_equal(share, [0.0, 1.0, 1.0, *[np.nan] * 6, 0.5])
 
 
-def test_older_filters_cores_and_gates_that_are_missing(tmp_path: Path) -> None:
+def test_older_filters_cores_and_gates_that_are_missing(tmp_path):
     """EKF2 without the number of a core; its SVT is no airspeed; a gate below 1 sigma counts as 1; cores are chosen."""
     path = tmp_path / "old.BIN"
     fields = {"SV": [0.5, 0.1], "SP": [0.3, 0.3], "SVT": [0.7, 0.7]}
@@ -97,7 +91,7 @@ def test_older_filters_cores_and_gates_that_are_missing(tmp_path: Path) -> None:
         read_ratios(path, "sonar", 0)
 
 
-def test_the_nis_of_innovations_with_their_variances(tmp_path: Path) -> None:
+def test_the_nis_of_innovations_with_their_variances(tmp_path):
     rng = np.random.default_rng()
     own, variance = rng.normal(size=(30, 3)), np.exp(rng.normal(size=(30, 3)))
     own[7], variance[7] = own[6], variance[6]
@@ -111,14 +105,14 @@ def test_the_nis_of_innovations_with_their_variances(tmp_path: Path) -> None:
     path = log.write(tmp_path / "a.bin")
     odometry, beacon = (read_innovations(path, sensor) for sensor in ("odometry", "beacon"))
     there = np.arange(30) != 7
-    np.testing.assert_allclose(odometry.nis[there], (own**2 / variance).sum(axis=1)[there], rtol=1e-5)
+    assert_allclose(odometry.nis[there], (own**2 / variance).sum(axis=1)[there], rtol=1e-5)
     assert odometry.dof.tolist() == [3 * int(each) for each in there]
     assert odometry.notes[0].endswith("odometry: 29 innovations in 30 messages XKFD; 1 repeat the innovation before")
-    np.testing.assert_allclose(beacon.nis, (0.01 * (np.arange(30) - 15) / 0.5) ** 2)
-    np.testing.assert_allclose(beacon.t, 10.0 + 0.1 * np.arange(30))
+    assert_allclose(beacon.nis, (0.01 * (np.arange(30) - 15) / 0.5) ** 2)
+    assert_allclose(beacon.t, 10.0 + 0.1 * np.arange(30))
 
 
-def test_one_command_from_a_flight_to_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_command_from_a_flight_to_a_picture(tmp_path, capsys):
     path = flight(tmp_path / "a.bin", {"SH": [0.3] * 90 + [1.2] * 10, "SP": [0.1] * 100})
     out, err = consistency(capsys, "monitor", path, "--plot", tmp_path / "a.png")
     for said in ("hgt", "2 sigma", "10.0%", "100.0% from 18.91 s", "no NIS", "no verdict and no alarm", "≤ 0.05"):
@@ -133,7 +127,7 @@ def test_one_command_from_a_flight_to_a_picture(tmp_path: Path, capsys: pytest.C
     assert "alarm" not in data
 
 
-def test_what_cannot_be_used_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_used_is_one_line(tmp_path, capsys):
     path = tmp_path / "a.bin"
     assert "a.bin: no such file" in refused(capsys, "monitor", path)
     for content in (b"", b"not a log", bytes(1000)):
@@ -162,10 +156,10 @@ def test_what_cannot_be_used_is_one_line(tmp_path: Path, capsys: pytest.CaptureF
         assert "a log of ArduPilot needs pymavlink: pip install " in refused(capsys, "monitor", path)
 
 
-def test_a_log_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_a_log_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path):
     path = flight(tmp_path / "a.bin", {"SH": np.linspace(0.1, 0.9, 50)})
     whole = path.read_bytes()
     path.write_bytes(whole[:-700])
     (only,), _ = read_ratios(path)
     assert 20 < len(only.ratio) < 45
-    np.testing.assert_allclose(only.ratio, np.linspace(0.1, 0.9, 50)[: len(only.ratio)], atol=0.006)
+    assert_allclose(only.ratio, np.linspace(0.1, 0.9, 50)[: len(only.ratio)], atol=0.006)

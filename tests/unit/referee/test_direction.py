@@ -3,10 +3,6 @@
 Seeds are fixed and were not chosen; counts have limits at 1e-5.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from draws import autoregression, fully_dependent, independent, slow_axis, verdict_on
@@ -14,12 +10,11 @@ from scipy import stats
 
 from consistency.diagnostics import largest_direction, ratio_interval
 from consistency.referee.diagnostics.questions.scale import scale_test
-from consistency.referee.types import Array
 
 SURE = 1e-5
 
 
-def by_hand(w: Array) -> tuple[float, Array, Array]:
+def by_hand(w):
     """p value, the mean square of each run along the direction of the other half, and the direction of all."""
     moments = []
     for run in w:
@@ -27,7 +22,7 @@ def by_hand(w: Array) -> tuple[float, Array, Array]:
         if len(rows):
             moments.append(sum(np.outer(row, row) for row in rows) / len(rows))
 
-    def direction(chosen: list[Array]) -> Array:
+    def direction(chosen):
         values, vectors = np.linalg.eig(sum(chosen) / len(chosen))
         return np.real(vectors[:, np.argmax(np.real(values))])
 
@@ -40,7 +35,7 @@ def by_hand(w: Array) -> tuple[float, Array, Array]:
 
 @pytest.mark.parametrize("runs", [2, 3, 11, 38, 61])
 @pytest.mark.parametrize("n", [2, 3])
-def test_by_hand(runs: int, n: int) -> None:
+def test_by_hand(runs, n):
     rng = np.random.default_rng(41)
     w = independent(rng, runs, 7, n) @ rng.standard_normal((n, n))
     w[0, 3:] = np.nan
@@ -52,7 +47,7 @@ def test_by_hand(runs: int, n: int) -> None:
     assert np.linalg.norm(result.direction) == pytest.approx(1.0)
 
 
-def test_halves_of_fewer_than_twenty_runs_are_exact() -> None:
+def test_halves_of_fewer_than_twenty_runs_are_exact():
     """Chi-square with one degree of freedom a run, of both halves; Bonferroni."""
     w = independent(np.random.default_rng(42), 14, 5, 2) * 1.2
     _, along, _ = by_hand(w)
@@ -60,13 +55,13 @@ def test_halves_of_fewer_than_twenty_runs_are_exact() -> None:
     assert largest_direction(w).p_value == pytest.approx(min(expected, 1.0), rel=1e-9)
 
 
-def test_a_run_without_a_value_has_no_part() -> None:
+def test_a_run_without_a_value_has_no_part():
     w = independent(np.random.default_rng(43), 13, 5, 3)
     with_gaps = np.insert(w, [0, 4, 9], np.nan, axis=0)
     assert largest_direction(with_gaps).p_value == pytest.approx(largest_direction(w).p_value)
 
 
-def test_where_it_cannot_be_asked() -> None:
+def test_where_it_cannot_be_asked():
     rng = np.random.default_rng(44)
     for w in (independent(rng, 30, 5, 1), independent(rng, 1, 5, 3), np.full((4, 5, 3), np.nan)):
         result = largest_direction(w)
@@ -77,7 +72,7 @@ def test_where_it_cannot_be_asked() -> None:
 
 @pytest.mark.parametrize("world", [fully_dependent, autoregression, slow_axis])
 @pytest.mark.parametrize("n", [2, 6])
-def test_a_right_filter_is_not_found(world: Callable[..., Array], n: int) -> None:
+def test_a_right_filter_is_not_found(world, n):
     """100 draws of 50 runs at 5 %."""
     rng = np.random.default_rng(46)
     found = sum(largest_direction(world(rng, 50, 10, n)).p_value <= 0.05 for _ in range(100))
@@ -87,14 +82,14 @@ def test_a_right_filter_is_not_found(world: Callable[..., Array], n: int) -> Non
 # --- in a verdict that allows what is conservative ----------------------------------------------------------
 
 
-def correlated(w: Array, correlation: float = 0.8) -> Array:
+def correlated(w, correlation=0.8):
     """The first two components correlated; variances stay 1."""
     w = w.copy()
     w[..., 1] = correlation * w[..., 0] + np.sqrt(1.0 - correlation**2) * w[..., 1]
     return w
 
 
-def oblique(w: Array) -> Array:
+def oblique(w):
     """x1.6 in a direction between the axes, the rest x0.7."""
     u = 0.5 ** np.arange(w.shape[-1])
     u /= np.linalg.norm(u)
@@ -106,8 +101,8 @@ FAULTS = [(correlated, 2), (correlated, 3), (oblique, 6)]
 
 
 @pytest.mark.parametrize("world", [independent, autoregression])
-@pytest.mark.parametrize(("fault", "n"), FAULTS)
-def test_an_oblique_fault_is_found(fault: Callable[[Array], Array], n: int, world: Callable[..., Array]) -> None:
+@pytest.mark.parametrize("fault, n", FAULTS)
+def test_an_oblique_fault_is_found(fault, n, world):
     """100 runs, allow="conservative"; missed in 2 % at most, so that five draws have 8 in 10^5 to miss four."""
     rng = np.random.default_rng(48)
     draws = [verdict_on(fault(world(rng, 100, 60, n)), allow="conservative") for _ in range(5)]
@@ -118,7 +113,7 @@ def test_an_oblique_fault_is_found(fault: Callable[[Array], Array], n: int, worl
         assert any("in the direction" in v.reasons[0] for v in found)
 
 
-def test_the_sentence_on_an_oblique_fault_names_what_is_too_small() -> None:
+def test_the_sentence_on_an_oblique_fault_names_what_is_too_small():
     """x1.6 along (1, 1, 1, 1, 1, 1), the rest x0.7: every axis by itself is too large, and the direction is named."""
     rng, u = np.random.default_rng(53), np.full(6, 6**-0.5)
     for _ in range(5):
@@ -130,7 +125,7 @@ def test_the_sentence_on_an_oblique_fault_names_what_is_too_small() -> None:
         assert "in the direction +0." in text
 
 
-def test_the_sentence_names_the_direction() -> None:
+def test_the_sentence_names_the_direction():
     w = correlated(independent(np.random.default_rng(49), 100, 20, 3), 0.8)
     verdict = verdict_on(w, allow="conservative")
     assert "covariance too small by x1." in verdict.reasons[0]
@@ -142,7 +137,7 @@ def test_the_sentence_names_the_direction() -> None:
     assert np.abs(s["largest_direction"][:2]) == pytest.approx(np.full(2, np.sqrt(0.5)), abs=0.05)
 
 
-def test_it_is_asked_only_where_too_large_is_allowed() -> None:
+def test_it_is_asked_only_where_too_large_is_allowed():
     w = independent(np.random.default_rng(50), 40, 5, 3)
     asked = {a.question for a in verdict_on(w, allow="conservative").answers}
     assert "scale in some direction" in asked

@@ -1,7 +1,5 @@
 """A command that any signal ends at once, workers that end with it, and what is cleared by the next command."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re
@@ -12,8 +10,6 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -45,12 +41,10 @@ main()
 """
 
 
-def begun(
-    work: str, word: str = "list", ignored: int | None = None, err: int = subprocess.PIPE
-) -> subprocess.Popen[str]:
+def begun(work, word="list", ignored=None, err=subprocess.PIPE):
     """The command line whose command is ``work``, once that is there, with signals as in a terminal."""
 
-    def as_in_a_terminal() -> None:
+    def as_in_a_terminal():
         for number in STOPS:
             signal.signal(number, signal.SIG_IGN if number == ignored else signal.SIG_DFL)
 
@@ -65,21 +59,21 @@ def begun(
 
 @pytest.mark.parametrize("work", [SLEEPS, IN_C, SWALLOWS], ids=["sleeps", "in C", "swallows"])
 @pytest.mark.parametrize(
-    ("number", "status", "line"),
+    "number, status, line",
     [
         (signal.SIGINT, 130, "consistency: stopped\n"),
         (signal.SIGTERM, -signal.SIGTERM, ""),
         (signal.SIGHUP, -signal.SIGHUP, ""),
     ],
 )
-def test_a_signal_ends_a_command_whatever_it_does(work: str, number: int, status: int, line: str) -> None:
+def test_a_signal_ends_a_command_whatever_it_does(work, number, status, line):
     process = begun(work)
     process.send_signal(number)
     assert process.communicate(timeout=30)[1] == line
     assert process.returncode == status
 
 
-def test_ctrl_c_says_where_finished_runs_are_and_shows_the_cursor() -> None:
+def test_ctrl_c_says_where_finished_runs_are_and_shows_the_cursor():
     terminal, theirs = pty.openpty()
     process = begun(SLEEPS, "run", err=theirs)
     process.send_signal(signal.SIGINT)
@@ -93,27 +87,25 @@ def test_ctrl_c_says_where_finished_runs_are_and_shows_the_cursor() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_a_signal_that_the_caller_ignores_stays_ignored(number: int) -> None:
+def test_a_signal_that_the_caller_ignores_stays_ignored(number):
     process = begun("print('there', flush=True); time.sleep(0.5); print('done')", ignored=number)
     process.send_signal(number)
     assert process.communicate(timeout=30) == ("done\n", "")
     assert process.returncode == 0
 
 
-@pytest.mark.parametrize(("ends", "status"), [("pass", 0), ("raise SystemExit(2)", 2), ("sys.exit()", 0), ("1 / 0", 1)])
-def test_without_a_signal_it_ends_as_its_work_did(ends: str, status: int) -> None:
+@pytest.mark.parametrize("ends, status", [("pass", 0), ("raise SystemExit(2)", 2), ("sys.exit()", 0), ("1 / 0", 1)])
+def test_without_a_signal_it_ends_as_its_work_did(ends, status):
     process = begun(f"print('there', flush=True)\n{ends}")
     process.communicate(timeout=30)
     assert process.returncode == status
 
 
-def test_the_command_line_never_ends_its_caller(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_line_never_ends_its_caller(monkeypatch, capsys):
     """A notebook or a test that calls ``main`` gets SystemExit, and its handlers stay."""
     from consistency.commands import main
 
-    def interrupted(*_: object, **__: object) -> None:
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     before = [signal.getsignal(number) for number in STOPS]
@@ -129,35 +121,35 @@ def test_the_command_line_never_ends_its_caller(
 
 
 @pytest.fixture
-def ctrl_c() -> Iterator[None]:
+def ctrl_c():
     """Ctrl-C as in a terminal."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
-def test_the_main_thread_does_not_make_the_call_itself() -> None:
+def test_the_main_thread_does_not_make_the_call_itself():
     assert away_from_signals(threading.current_thread) is not threading.main_thread()
     outer, inner = away_from_signals(lambda: (threading.current_thread(), away_from_signals(threading.current_thread)))
     assert outer is inner, "a thread that takes no signals needs no other"
 
 
-def test_results_and_exceptions_come_back() -> None:
+def test_results_and_exceptions_come_back():
     assert away_from_signals(divmod, 7, 2) == (3, 1)
     with pytest.raises(ZeroDivisionError):
         away_from_signals(divmod, 7, 0)
 
 
-def functions_of(thread: threading.Thread) -> list[str]:
+def functions_of(thread):
     """Names of the functions in which a thread is."""
     return [frame.f_code.co_name for frame, _ in traceback.walk_stack(sys._current_frames()[thread.ident or 0])]
 
 
 @pytest.mark.usefixtures("ctrl_c")
-def test_ctrl_c_comes_after_the_call() -> None:
-    over: list[bool] = []
+def test_ctrl_c_comes_after_the_call():
+    over = []
 
-    def work() -> None:
+    def work():
         until = time.monotonic() + 20.0
         while "result" not in functions_of(threading.main_thread()) and time.monotonic() < until:
             time.sleep(0.001)
@@ -190,7 +182,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("prctl", [True, False])
-def test_a_worker_ends_with_its_parent(prctl: bool, tmp_path: Path) -> None:
+def test_a_worker_ends_with_its_parent(prctl, tmp_path):
     """By the system, and by a pipe where the system cannot."""
     script = tmp_path / "script.py"
     script.write_text(WORKER.format(prctl=prctl))
@@ -203,7 +195,7 @@ def test_a_worker_ends_with_its_parent(prctl: bool, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not stopping.IS_LINUX, reason="prctl")
-def test_a_worker_whose_parent_has_ended_before_ends() -> None:
+def test_a_worker_whose_parent_has_ended_before_ends():
     child = os.fork()
     if child == 0:
         end_with_parent(os.getpid(), None)  # not the number of the parent
@@ -211,7 +203,7 @@ def test_a_worker_whose_parent_has_ended_before_ends() -> None:
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
 
 
-def test_workers_share_one_pipe() -> None:
+def test_workers_share_one_pipe():
     import multiprocessing
 
     context = multiprocessing.get_context("spawn")
@@ -222,7 +214,7 @@ def test_workers_share_one_pipe() -> None:
 # --- what killed commands leave ------------------------------------------------------------------------
 
 
-def killed_while(work: object) -> None:
+def killed_while(work):
     """Do ``work`` in a process that is killed then."""
     child = os.fork()
     if child == 0:
@@ -231,11 +223,11 @@ def killed_while(work: object) -> None:
     os.waitpid(child, 0)
 
 
-def names(folder: Path) -> list[str]:
+def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_what_is_left_in_the_way_is_cleared_by_the_next_command(tmp_path: Path) -> None:
+def test_what_is_left_in_the_way_is_cleared_by_the_next_command(tmp_path):
     out = tmp_path / "out"
     killed_while(lambda: (NewFolder(out, "log").path / "table").touch())
     assert len(names(tmp_path)) == 1
@@ -247,16 +239,16 @@ def test_what_is_left_in_the_way_is_cleared_by_the_next_command(tmp_path: Path) 
     assert names(tmp_path) == [others.name]
 
 
-def test_a_folder_that_was_being_replaced_is_put_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_was_being_replaced_is_put_back(tmp_path, monkeypatch):
     out, manifest = tmp_path / "out", {"kind": "log", "schema_version": 1}
     write_folder(out, manifest, lambda path: (path / "old").touch())
     replace = os.replace
 
-    def killed(source: Path, target: Path) -> None:
+    def killed(source, target):
         replace(source, target)
         os.kill(os.getpid(), signal.SIGKILL)
 
-    def overwritten() -> None:
+    def overwritten():
         monkeypatch.setattr(os, "replace", killed)
         write_folder(out, manifest, lambda path: (path / "new").touch(), overwrite=True)
 
@@ -268,8 +260,8 @@ def test_a_folder_that_was_being_replaced_is_put_back(tmp_path: Path, monkeypatc
     assert "old" in names(out)
 
 
-def test_a_file_that_was_being_written_is_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def half() -> None:
+def test_a_file_that_was_being_written_is_cleared(tmp_path, monkeypatch):
+    def half():
         monkeypatch.setattr(os, "fsync", lambda _: os.kill(os.getpid(), signal.SIGKILL))
         write_whole(tmp_path / "page.html", b"half")
 
@@ -279,7 +271,7 @@ def test_a_file_that_was_being_written_is_cleared(tmp_path: Path, monkeypatch: p
     assert names(tmp_path) == ["page.html"]
 
 
-def test_a_place_that_has_only_a_journal_says_so(tmp_path: Path) -> None:
+def test_a_place_that_has_only_a_journal_says_so(tmp_path):
     out = tmp_path / "night"
     unfinished_of(out).mkdir()
     with pytest.raises(

@@ -1,31 +1,25 @@
 """States of SE2(3) with biases, in archives and tables: errors by the exponential of 5 x 5 matrices, NEES by hand."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from command import consistency
+from numpy.testing import assert_allclose
 from scipy.linalg import expm
 from test_layouts import ASL, lines, nanoseconds, skew
 
 import consistency as cs
-from consistency.referee.types import Array
 
 RUNS, STEPS = 3, 7
 
 
-def exponential(phi: Array, p: Array, v: Array) -> Array:
+def exponential(phi, p, v):
     """Element of SE2(3) as a matrix (5, 5), columns 3 and 4 velocity and position."""
     generator = np.zeros((5, 5))
     generator[:3, :3], generator[:3, 3], generator[:3, 4] = skew(phi), v, p
     return np.asarray(expm(generator))
 
 
-def states(convention: str, n: int = 15) -> tuple[dict[str, Array], Array, Array]:
+def states(convention, n=15):
     """States and truth, the errors (runs, steps, n) put between them, of half a radian and more, and covariances."""
     rng = np.random.default_rng()
     e = 0.5 * rng.normal(size=(RUNS, STEPS, n))
@@ -59,25 +53,25 @@ def states(convention: str, n: int = 15) -> tuple[dict[str, Array], Array, Array
     return out, e, P
 
 
-def read(path: Path, **arrays: Any) -> Path:
+def read(path, **arrays):
     np.savez(path, **arrays)
     return path
 
 
 @pytest.mark.parametrize("n", [9, 15])
 @pytest.mark.parametrize("convention", ["left", "right", "so3", "so3-body", "additive"])
-def test_errors_are_those_put_in(convention: str, n: int, tmp_path: Path) -> None:
+def test_errors_are_those_put_in(convention, n, tmp_path):
     arrays, e, P = states(convention, n)
     record = cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), error=convention)
-    np.testing.assert_allclose(record.error, e, atol=1e-9)
+    assert_allclose(record.error, e, atol=1e-9)
     nees = np.einsum("rti,rti->rt", e, np.linalg.solve(P, e[..., None])[..., 0])
-    np.testing.assert_allclose(record.nees, nees, rtol=1e-9)
+    assert_allclose(record.nees, nees, rtol=1e-9)
     assert record.axes[:9] == ("roll", "pitch", "yaw", "x", "y", "z", "vx", "vy", "vz")
     assert record.convention == convention
     assert any(note.startswith(f"error convention {convention}: ") for note in record.notes)
 
 
-def test_the_additive_error_is_the_others_to_first_order(tmp_path: Path) -> None:
+def test_the_additive_error_is_the_others_to_first_order(tmp_path):
     """Jacobians of ``left`` and ``so3`` by the additive error, by complex steps of 1e-30 through the exponential.
 
     Errors of 1e-5 rad and m: their squares are 1e-5 of them.
@@ -103,39 +97,37 @@ def test_the_additive_error_is_the_others_to_first_order(tmp_path: Path) -> None
     small["true_p"][0, 0], small["true_v"][0, 0] = own[:3, 4] + tiny[3:6], own[:3, 3] + tiny[6:]
     for kind, jacobian in J.items():
         record = cs.read(read(tmp_path / "imu.npz", **small, covariances=P[:1, :1]), error=kind)
-        np.testing.assert_allclose(record.error[0, 0], jacobian @ tiny, rtol=0, atol=1e-8)
+        assert_allclose(record.error[0, 0], jacobian @ tiny, rtol=0, atol=1e-8)
 
 
-def rotation_vector(R: Array) -> Array:
+def rotation_vector(R):
     """Of a rotation of less than half a turn."""
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine = np.sqrt(axis @ axis)
     return np.asarray(axis * np.arctan2(sine, np.trace(R) - 1.0) / sine)
 
 
-def test_another_order_of_the_covariance(tmp_path: Path) -> None:
+def test_another_order_of_the_covariance(tmp_path):
     """Manif has position, rotation, velocity; one run may lack its dimension."""
     arrays, e, P = states("left", 9)
     turned = [3, 4, 5, 0, 1, 2, 6, 7, 8]
     first = {key: array[0] for key, array in arrays.items()}
     path = read(tmp_path / "imu.npz", **first, covariances=P[0][:, turned][:, :, turned], order=["p", "R", "v"])
     record = cs.read(path, error="left")
-    np.testing.assert_allclose(record.error[0], e[0][:, turned], atol=1e-9)
+    assert_allclose(record.error[0], e[0][:, turned], atol=1e-9)
     assert record.axes == ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz")
-    np.testing.assert_allclose(
-        record.nees[0], np.einsum("ti,ti->t", e[0], np.linalg.solve(P[0], e[0][..., None])[..., 0])
-    )
+    assert_allclose(record.nees[0], np.einsum("ti,ti->t", e[0], np.linalg.solve(P[0], e[0][..., None])[..., 0]))
 
 
-def test_a_state_that_breaks_down_is_a_failure(tmp_path: Path) -> None:
+def test_a_state_that_breaks_down_is_a_failure(tmp_path):
     arrays, _, P = states("right")
     arrays["R"][1, 4] = np.nan
     record = cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), error="right")
     assert [(failure.run, failure.step) for failure in record.failures] == [(1, 5)]
 
 
-def broken(arrays: dict[str, Array], key: str, value: object) -> dict[str, Any]:
-    changed: dict[str, Any] = dict(arrays)
+def broken(arrays, key, value):
+    changed = dict(arrays)
     if value is None:
         del changed[key]
     else:
@@ -144,7 +136,7 @@ def broken(arrays: dict[str, Array], key: str, value: object) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    "key, value, said",
     [
         ("true_v", None, "key 'true_v' is missing, of the true states"),
         ("ba", None, "key 'ba' is missing; there are two biases or none"),
@@ -157,7 +149,7 @@ def broken(arrays: dict[str, Array], key: str, value: object) -> dict[str, Any]:
         ("covariances", np.tile(np.eye(9), (RUNS, STEPS, 1, 1)), "key 'covariances' has shape"),
     ],
 )
-def test_what_does_not_fit_is_named(key: str, value: object, said: str, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_named(key, value, said, tmp_path):
     arrays, _, P = states("left")
     path = read(tmp_path / "imu.npz", **broken({**arrays, "covariances": P}, key, value))
     with pytest.raises(cs.InputError, match=rf"imu\.npz: {said}"):
@@ -165,7 +157,7 @@ def test_what_does_not_fit_is_named(key: str, value: object, said: str, tmp_path
 
 
 @pytest.mark.parametrize("options", [{}, {"error": "so2"}, {"error": "vector"}])
-def test_the_error_has_to_be_declared(options: dict[str, str], tmp_path: Path) -> None:
+def test_the_error_has_to_be_declared(options, tmp_path):
     arrays, _, P = states("left")
     with pytest.raises(
         cs.InputError, match="whose error is not known; add --error so3, so3-body, left, right, additive: left"
@@ -173,7 +165,7 @@ def test_the_error_has_to_be_declared(options: dict[str, str], tmp_path: Path) -
         cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), **options)  # type: ignore[arg-type]
 
 
-def test_windows_are_refused(tmp_path: Path) -> None:
+def test_windows_are_refused(tmp_path):
     arrays, _, P = states("left")
     with pytest.raises(cs.InputError, match="--relative needs"):
         cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), error="left", relative=2, motions=True)
@@ -189,7 +181,7 @@ LABELS = ["x", "y", "z", "roll", "pitch", "yaw", *MOVING]
 PLACES = [3, 4, 5, 0, 1, 2, *range(6, 15)]  # position first, of the rotation first
 
 
-def w_first(R: Array) -> Array:
+def w_first(R):
     """Unit quaternions (N, 4) of rotations, by the largest of the four (Shepperd 1978)."""
     out = []
     for M in R:
@@ -206,19 +198,19 @@ def w_first(R: Array) -> Array:
     return np.array(out)
 
 
-def columns(arrays: dict[str, Array], true: bool = False) -> list[Array]:
+def columns(arrays, true=False):
     """Position, quaternion w first, velocity and biases of the first run."""
     side = "true_" if true else ""
     parts = [arrays[f"{side}{key}"][0] for key in ("v", "bg", "ba") if f"{side}{key}" in arrays]
     return [*np.column_stack([arrays[f"{side}p"][0], w_first(arrays[f"{side}R"][0]), *parts]).T]
 
 
-def named(arrays: dict[str, Array]) -> str:
+def named(arrays):
     true = columns(arrays, true=True)
     return lines("truth.csv", ",".join(["t", *POSE, *MOVING][: 1 + len(true)]), [T, *true])
 
 
-def stated(n: int, form: str) -> list[str]:
+def stated(n, form):
     """Names of the columns of a covariance."""
     i, j = np.triu_indices(n)
     return {
@@ -229,7 +221,7 @@ def stated(n: int, form: str) -> list[str]:
     }[form]
 
 
-def table(arrays: dict[str, Array], P: Array, form: str) -> str:
+def table(arrays, P, form):
     """The first run with covariances (N, n, n) in some form."""
     n, own = P.shape[-1], columns(arrays)
     i, j = np.triu_indices(n)
@@ -238,51 +230,49 @@ def table(arrays: dict[str, Array], P: Array, form: str) -> str:
     return lines("est.csv", ",".join(["t", *POSE, *MOVING[: n - 6], *stated(n, form)]), [T, *own, *values.T])
 
 
-def nees(e: Array, P: Array) -> Array:
+def nees(e, P):
     return np.array([x @ np.linalg.solve(C, x) for x, C in zip(e, P, strict=True)])
 
 
 @pytest.mark.parametrize(
-    ("kind", "form", "n"),
+    "kind, form, n",
     [
         *((kind, "named", n) for kind in ("left", "right", "additive", "so3-body") for n in (9, 15)),
         *(("right", form, n) for form in ("upper", "full") for n in (9, 15)),
     ],
 )
-def test_states_in_a_table(kind: str, form: str, n: int, inside: Path) -> None:
+def test_states_in_a_table(kind, form, n, inside):
     arrays, e, P = states(kind, n)
     e, P = e[0][:, PLACES[:n]], P[0][:, PLACES[:n]][:, :, PLACES[:n]]
     record = cs.read(table(arrays, P, form), truth=named(arrays), error=kind)
-    np.testing.assert_allclose(record.error[0], e, atol=1e-9)
-    np.testing.assert_allclose(record.nees[0], nees(e, P), rtol=1e-9)
+    assert_allclose(record.error[0], e, atol=1e-9)
+    assert_allclose(record.nees[0], nees(e, P), rtol=1e-9)
     assert record.axes == tuple(LABELS[:n])
     assert record.convention == kind
 
 
-@pytest.mark.parametrize(("name", "header"), [("data.csv", ASL), ("truth.csv", "")])
-def test_the_truth_of_euroc_has_velocity_and_biases(
-    name: str, header: str, inside: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("name, header", [("data.csv", ASL), ("truth.csv", "")])
+def test_the_truth_of_euroc_has_velocity_and_biases(name, header, inside, capsys):
     """With the rotation first in the covariance; one command."""
     arrays, e, P = states("left")
     first = table(arrays, P[0], "full")  # the columns have no labels, so that the order is declared
     truth = lines(name, header, [nanoseconds(T), *columns(arrays, true=True)])
     record = cs.read(first, truth=truth, error="left", covariance_order="rotation-translation")
-    np.testing.assert_allclose(record.nees[0], nees(e[0], P[0]), rtol=1e-9)
+    assert_allclose(record.nees[0], nees(e[0], P[0]), rtol=1e-9)
     _, err = consistency(capsys, "analyse", first, "--truth", truth, "--error", "left")
     assert "error convention left: Log(estimate^-1 truth)" in err
 
 
-def test_deviations_of_states_are_judged_component_by_component(inside: Path) -> None:
+def test_deviations_of_states_are_judged_component_by_component(inside):
     arrays, e, P = states("so3")
     e, P = e[0][:, PLACES], P[0][:, PLACES][:, :, PLACES]
     record = cs.read(table(arrays, P, "deviations"), truth=named(arrays), error="so3")
-    np.testing.assert_allclose(record.nees[0], (e**2 / np.diagonal(P, axis1=1, axis2=2)).sum(axis=1), rtol=1e-9)
+    assert_allclose(record.nees[0], (e**2 / np.diagonal(P, axis1=1, axis2=2)).sum(axis=1), rtol=1e-9)
     assert record.parts == tuple((i,) for i in range(15))
     assert record.axes == tuple(LABELS)
 
 
-def test_the_true_velocity_between_two_samples(inside: Path) -> None:
+def test_the_true_velocity_between_two_samples(inside):
     arrays, _, P = states("so3", 9)
     truth = columns(arrays, true=True)
     late = lines("truth.csv", ",".join(["t", *POSE, *MOVING[:3]]), [100.0 + 0.1 * np.arange(STEPS), *truth])
@@ -296,10 +286,10 @@ def test_the_true_velocity_between_two_samples(inside: Path) -> None:
     share = np.arange(STEPS) * (STEPS - 1) / STEPS
     for i, axis in enumerate("xyz"):
         true = np.interp(share, np.arange(STEPS), truth[7 + i])
-        np.testing.assert_allclose(record.error[0, :, record.axes.index(f"v{axis}")], true - own[7 + i], atol=1e-9)
+        assert_allclose(record.error[0, :, record.axes.index(f"v{axis}")], true - own[7 + i], atol=1e-9)
 
 
-def test_without_a_true_velocity_the_pose_is_judged(inside: Path) -> None:
+def test_without_a_true_velocity_the_pose_is_judged(inside):
     arrays, e, P = states("so3")
     e, P = e[0][:, PLACES], P[0][:, PLACES][:, :, PLACES]
     est = table(arrays, P, "named")
@@ -307,28 +297,28 @@ def test_without_a_true_velocity_the_pose_is_judged(inside: Path) -> None:
         less = {key: value for key, value in arrays.items() if keep or key not in ("true_v", "true_bg", "true_ba")}
         less = {key: value for key, value in less.items() if not key.startswith("true_b")}
         record = cs.read(est, truth=named(less), error="so3")
-        np.testing.assert_allclose(record.nees[0], nees(e[:, : 6 + keep], P[:, : 6 + keep, : 6 + keep]), rtol=1e-9)
+        assert_allclose(record.nees[0], nees(e[:, : 6 + keep], P[:, : 6 + keep, : 6 + keep]), rtol=1e-9)
         assert f"truth.csv: holds no {what}, so that those of est.csv are not judged" in record.notes
     aligned = cs.read(est, truth=named(arrays), error="so3", align="posyaw-all")
     assert aligned.axes == tuple(LABELS[:6])
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    "options, said",
     [
         ({}, r"est\.csv: holds a covariance of poses with their velocity, whose error is not known; add --error so3"),
         ({"error": "left", "axes": ["bgx"]}, r"--axes bgx: 'bgx' is not one of x, y, z, roll, pitch, yaw, vx, vy, vz$"),
     ],
 )
-def test_what_has_to_be_declared(options: dict[str, object], said: str, inside: Path) -> None:
+def test_what_has_to_be_declared(options, said, inside):
     arrays, _, P = states("left", 9)
     with pytest.raises(cs.InputError, match=said):
         cs.read(table(arrays, P[0], "full"), truth=named(arrays), **options)  # type: ignore[arg-type]
 
 
-def test_the_additive_error_is_of_states(inside: Path) -> None:
+def test_the_additive_error_is_of_states(inside):
     arrays, _, P = states("left", 9)
-    alone: Sequence[Array] = columns(arrays)[:7]
+    alone = columns(arrays)[:7]
     est = lines(
         "est.csv", ",".join(["t", *POSE, *stated(6, "full")]), [T, *alone, *P[0, :, :6, :6].reshape(STEPS, -1).T]
     )

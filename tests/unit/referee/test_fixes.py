@@ -1,18 +1,16 @@
 """Solutions of RTKLIB as truth and as estimates, written as its manual describes them."""
 
-from __future__ import annotations
-
 import datetime as dt
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import consistency
+from numpy.testing import assert_allclose, assert_array_equal
 from test_layouts import STEPS, drive, lines, tum
 
 import consistency as cs
 from consistency.referee.readers.formats.geodetic import axes_at, centred, leap_seconds, read_solution
-from consistency.referee.types import Array
 
 START = dt.datetime(2024, 3, 5, 10, 0, 0)  # of GPS, 18 s ahead of UTC
 EPOCH = 1709632800.0 - 18.0
@@ -27,11 +25,11 @@ LOCAL = """%  GPST              e-baseline(m)  n-baseline(m)  u-baseline(m)   Q 
 """  # noqa: E501
 
 
-def signed_root(value: float) -> float:
+def signed_root(value):
     return float(np.sign(value) * np.sqrt(abs(value)))
 
 
-def stamps(clock: str = "GPST", weeks: bool = False) -> list[str]:
+def stamps(clock="GPST", weeks=False):
     ahead = {"GPST": 0.0, "UTC": -18.0, "JST": 9 * 3600 - 18.0}[clock]
     times = [START + dt.timedelta(seconds=ahead + 0.25 * k) for k in range(STEPS)]
     if not weeks:
@@ -40,7 +38,7 @@ def stamps(clock: str = "GPST", weeks: bool = False) -> list[str]:
     return [f"{int(s // 604800)} {s % 604800:.3f}" for s in since]
 
 
-def solution(path: str, place: Array, P: Array, clock: str = "GPST", weeks: bool = False) -> str:
+def solution(path, place, P, clock="GPST", weeks=False):
     """Geodetic places (N, 3) with covariances (N, 3, 3) of east, north, up."""
     rows = []
     for when, (latitude, longitude, height), C in zip(stamps(clock, weeks), place, P, strict=True):
@@ -51,7 +49,7 @@ def solution(path: str, place: Array, P: Array, clock: str = "GPST", weeks: bool
     return path
 
 
-def flight() -> tuple[Array, Array]:
+def flight():
     """Places (N, 3) some hundred metres apart, and covariances (N, 3, 3) with cross terms of both signs."""
     rng = np.random.default_rng()
     place = PLACE + np.column_stack([rng.normal(size=(STEPS, 2)) * 1e-3, 20 * rng.normal(size=STEPS)])
@@ -59,7 +57,7 @@ def flight() -> tuple[Array, Array]:
     return place, root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(3)
 
 
-def plane(place: Array, origin: Array) -> Array:
+def plane(place, origin):
     """East, north, up (N, 3) from an origin, by closed formulas of WGS 84 written out again."""
     a, b = 6378137.0, 6356752.314245179
     out = []
@@ -76,27 +74,27 @@ def plane(place: Array, origin: Array) -> Array:
     return np.column_stack([d @ east, d @ np.cross(up, east), d @ up])
 
 
-def test_the_ellipsoid() -> None:
+def test_the_ellipsoid():
     """At the equator, at a pole, and orthonormal axes; a closed path in the plane is closed."""
-    np.testing.assert_allclose(centred(np.array([0.0, 90.0, 10.0])), [0.0, 6378147.0, 0.0], atol=1e-6)
-    np.testing.assert_allclose(centred(np.array([90.0, 12.0, 10.0]))[2], 6356752.314245 + 10.0, atol=1e-5)
+    assert_allclose(centred(np.array([0.0, 90.0, 10.0])), [0.0, 6378147.0, 0.0], atol=1e-6)
+    assert_allclose(centred(np.array([90.0, 12.0, 10.0]))[2], 6356752.314245 + 10.0, atol=1e-5)
     turn = axes_at(PLACE)
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-15)
-    np.testing.assert_allclose(np.cross(turn[0], turn[1]), turn[2], atol=1e-15)
+    assert_allclose(turn @ turn.T, np.eye(3), atol=1e-15)
+    assert_allclose(np.cross(turn[0], turn[1]), turn[2], atol=1e-15)
 
 
-@pytest.mark.parametrize(("clock", "weeks"), [("GPST", False), ("GPST", True), ("UTC", False), ("JST", False)])
-def test_times_are_utc(clock: str, weeks: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("clock, weeks", [("GPST", False), ("GPST", True), ("UTC", False), ("JST", False)])
+def test_times_are_utc(clock, weeks, tmp_path):
     place, P = flight()
     read = read_solution(Path(solution(str(tmp_path / "rover.pos"), place, P, clock, weeks)))
-    np.testing.assert_allclose(read.t, EPOCH + 0.25 * np.arange(STEPS), atol=1e-6)
-    np.testing.assert_array_equal(read.values[:, 1:4], place)
-    np.testing.assert_allclose(read.values[:, 4:].reshape(-1, 3, 3), P, rtol=1e-12)
+    assert_allclose(read.t, EPOCH + 0.25 * np.arange(STEPS), atol=1e-6)
+    assert_array_equal(read.values[:, 1:4], place)
+    assert_allclose(read.values[:, 4:].reshape(-1, 3, 3), P, rtol=1e-12)
     assert "18 leap seconds less" in read.note if clock == "GPST" else f"times of {clock} as UTC" in read.note
     assert read.note.endswith(f"{STEPS} fixed")
 
 
-def test_leap_seconds() -> None:
+def test_leap_seconds():
     """IERS: 0 in 1980, 13 in 2000, 17 up to the end of 2016, 18 since."""
     at = [dt.datetime(1980, 6, 1), dt.datetime(2000, 1, 1), dt.datetime(2016, 12, 31), dt.datetime(2017, 1, 2)]
     assert [leap_seconds((day - dt.datetime(1970, 1, 1)).total_seconds()) for day in at] == [0, 13, 17, 18]
@@ -104,7 +102,7 @@ def test_leap_seconds() -> None:
     assert [leap_seconds(new_year + s) for s in (17.5, 18.0)] == [17, 18]
 
 
-def test_a_solution_against_a_solution(inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_solution_against_a_solution(inside, capsys):
     """Both in the plane of the first true place; a covariance is turned from its own place into it."""
     place, P = flight()
     off = place + np.random.default_rng().normal(size=place.shape) * [5e-7, 5e-7, 0.05]
@@ -115,7 +113,7 @@ def test_a_solution_against_a_solution(inside: Path, capsys: pytest.CaptureFixtu
     for each, C, at in zip(e, P, off, strict=True):
         turn = axes_at(place[0]) @ axes_at(at).T
         nees.append(each @ np.linalg.solve(turn @ C @ turn.T, each))
-    np.testing.assert_allclose(record.nees[0], nees, rtol=1e-6)  # places of 6e6 m hold errors of 0.05 m to 1e-8
+    assert_allclose(record.nees[0], nees, rtol=1e-6)  # places of 6e6 m hold errors of 0.05 m to 1e-8
     _, err = consistency(capsys, "analyse", estimates, "--truth", truth)
     assert (
         "rover.pos: read as a solution of RTKLIB, 15 columns, times of GPS as UTC, 18 leap seconds less; 12 fixed"
@@ -124,20 +122,18 @@ def test_a_solution_against_a_solution(inside: Path, capsys: pytest.CaptureFixtu
     assert "base.pos: x is east, y north, z up from its first place" in err
 
 
-def test_a_solution_as_the_truth_of_poses(inside: Path) -> None:
+def test_a_solution_as_the_truth_of_poses(inside):
     """The position of the estimate in the same plane; where it is in another world a note names the remedy."""
     place, P = flight()
     d = drive(start=EPOCH)
     d.own[:, :3] = plane(place, place[0]) - (d.true - d.own)[:, :3]
     record = cs.read(tum(d), truth=solution("rtk.pos", place, P))
     e, C = plane(place, place[0]) - d.own[:, :3], d.P[:, :3, :3]
-    np.testing.assert_allclose(
-        record.nees[0], [each @ np.linalg.solve(M, each) for each, M in zip(e, C, strict=True)], rtol=1e-6
-    )
+    assert_allclose(record.nees[0], [each @ np.linalg.solve(M, each) for each, M in zip(e, C, strict=True)], rtol=1e-6)
     assert any("add --align posyaw-all where est.tum is in another world" in note for note in record.notes)
 
 
-def test_the_truth_of_a_solution_has_a_covariance(inside: Path) -> None:
+def test_the_truth_of_a_solution_has_a_covariance(inside):
     """As it is beside fixes and beside poses, turned into the plane; it counts as 0 unless it is asked for."""
     place, P = flight()
     turn = axes_at(place[0]) @ np.swapaxes(axes_at(place), 1, 2)
@@ -146,7 +142,7 @@ def test_the_truth_of_a_solution_has_a_covariance(inside: Path) -> None:
     d.own[:, :3] = plane(place, place[0])
     for estimates in (solution("rover.pos", place + np.array([1e-7, 1e-7, 0.01]), P), tum(d)):
         record = cs.read(estimates, truth=truth, truth_covariance="columns")
-        np.testing.assert_allclose(record.truth_covariance[0], stated, rtol=1e-6, atol=1e-12)
+        assert_allclose(record.truth_covariance[0], stated, rtol=1e-6, atol=1e-12)
         without = cs.read(estimates, truth=truth)
         assert without.truth_covariance is None
         said = "rtk.pos: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"
@@ -154,7 +150,7 @@ def test_the_truth_of_a_solution_has_a_covariance(inside: Path) -> None:
         assert said not in record.notes
 
 
-def test_a_baseline_is_local_already(inside: Path) -> None:
+def test_a_baseline_is_local_already(inside):
     rng = np.random.default_rng()
     _, P = flight()
     true = 30 * rng.normal(size=(STEPS, 3))
@@ -171,13 +167,11 @@ def test_a_baseline_is_local_already(inside: Path) -> None:
     truth = lines("truth.txt", "", [EPOCH + 0.25 * np.arange(STEPS), *true.T], " ")
     record = cs.read("enu.pos", truth=truth)
     e = true - own
-    np.testing.assert_allclose(
-        record.nees[0], [x @ np.linalg.solve(C, x) for x, C in zip(e, P, strict=True)], rtol=1e-9
-    )
+    assert_allclose(record.nees[0], [x @ np.linalg.solve(C, x) for x, C in zip(e, P, strict=True)], rtol=1e-9)
     assert any(note.endswith("12 float") for note in record.notes)
 
 
-def centred_solution(path: str, place: Array, P: Array) -> str:
+def centred_solution(path, place, P):
     """The same fixes from the centre of the earth, with covariances of x, y, z."""
     header = HEADER.format(clock="GPST")
     for old, new in zip(("latitude(deg)", "longitude(deg)", "height(m)"), "xyz", strict=True):
@@ -196,7 +190,7 @@ def centred_solution(path: str, place: Array, P: Array) -> str:
     return path
 
 
-def sexagesimal_solution(path: str, place: Array, P: Array) -> str:
+def sexagesimal_solution(path, place, P):
     """The same fixes in degrees, minutes and seconds."""
     text = Path(solution(path, place, P)).read_text(encoding="utf-8")
     text = text.replace("(deg)", "(d'\")")
@@ -210,21 +204,21 @@ def sexagesimal_solution(path: str, place: Array, P: Array) -> str:
 
 @pytest.mark.parametrize("write", [centred_solution, sexagesimal_solution])
 @pytest.mark.parametrize("corner", [PLACE, [-33.5, -0.2, 12.0], [-0.3, 179.9, -20.0], [89.9, -120.0, 5.0]])
-def test_other_forms_of_a_place(write: object, corner: Array, inside: Path) -> None:
+def test_other_forms_of_a_place(write, corner, inside):
     assert callable(write)
     place, P = flight()
     place = place - PLACE + np.asarray(corner)
     plain, other = read_solution(Path(solution("a.pos", place, P))), read_solution(Path(write("b.pos", place, P)))
     here, there = plain.local(), other.local(plain.values[0, 1:4])
-    np.testing.assert_allclose(there[0], here[0], atol=2e-8)  # 6e6 m in a double, and degrees of 14 digits
-    np.testing.assert_allclose(there[1], here[1], rtol=1e-7, atol=1e-12)
-    np.testing.assert_array_equal(other.t, plain.t)
+    assert_allclose(there[0], here[0], atol=2e-8)  # 6e6 m in a double, and degrees of 14 digits
+    assert_allclose(there[1], here[1], rtol=1e-7, atol=1e-12)
+    assert_array_equal(other.t, plain.t)
     record = cs.read("b.pos", truth=solution("truth.pos", place + np.array([1e-7, 2e-7, 0.05]), 1e-6 * P))
     same = cs.read("a.pos", truth="truth.pos")
-    np.testing.assert_allclose(record.nees, same.nees, rtol=1e-4)
+    assert_allclose(record.nees, same.nees, rtol=1e-4)
 
 
-def test_an_angle_that_is_none(tmp_path: Path) -> None:
+def test_an_angle_that_is_none(tmp_path):
     place, P = flight()
     path = Path(sexagesimal_solution(str(tmp_path / "rover.pos"), place, P))
     lines_of = path.read_text(encoding="utf-8").splitlines()
@@ -236,7 +230,7 @@ def test_an_angle_that_is_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    "old, new, said",
     [
         ("latitude(deg)", "latitude(gon)", r"rover\.pos: holds none of latitude\(deg\).*out-solformat =llh, =xyz or"),
         ("sdeu(m)", "other(m)", r"rover\.pos: column 'sdeu\(m\)' is missing"),
@@ -247,7 +241,7 @@ def test_an_angle_that_is_none(tmp_path: Path) -> None:
         ("   1  9 ", "   x  9 ", r"rover\.pos, line 6: a field is not a number"),
     ],
 )
-def test_what_is_broken_is_one_line(old: str, new: str, said: str, inside: Path) -> None:
+def test_what_is_broken_is_one_line(old, new, said, inside):
     place, P = flight()
     solution("truth.pos", place, P)
     text = Path(solution("rover.pos", place, P)).read_text()
@@ -258,14 +252,14 @@ def test_what_is_broken_is_one_line(old: str, new: str, said: str, inside: Path)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    "options, said",
     [
         ({"lever_arm": [0.0, 0.0, 1.0]}, r"--lever-arm: does not go with rover\.pos, of positions with their own"),
         ({"error": "left"}, r"--error: does not go with rover\.pos"),
         ({"relative": 2, "motions": True}, r"--relative: needs a truth with orientations"),
     ],
 )
-def test_options_of_orientations_are_refused(options: dict[str, object], said: str, inside: Path) -> None:
+def test_options_of_orientations_are_refused(options, said, inside):
     place, P = flight()
     solution("truth.pos", place, P)
     with pytest.raises(cs.InputError, match=said):

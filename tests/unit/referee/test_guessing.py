@@ -1,9 +1,6 @@
 """No error is declared: which conventions the covariances do not contradict."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,20 +11,19 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.diagnostics import judge
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.types import Array
 
 # standard deviations of x, y, z (m) and of the rotation about x, y, z (rad): they differ, so that a frame shows
 SIGMA = np.array([0.02, 0.2, 0.06, 0.01, 0.1, 0.03])
 
 
-def write(folder: Path, convention: str, runs: int = 40, factor: float = 1.0, key: int = 1) -> tuple[Path, Path]:
+def write(folder, convention, runs=40, factor=1.0, key=1):
     """Poses whose errors have the covariance diag(SIGMA^2) in a convention, to first order; ``factor`` on it."""
     rng, est, truth = np.random.default_rng(key), folder / "est", folder / "truth"
     est.mkdir()
     truth.mkdir()
     numbers = " ".join(f"{x:.12g}" for x in (np.diag(SIGMA**2)).ravel())
     for run in range(runs):
-        lines: list[list[str]] = [[], []]
+        lines = [[], []]
         for k in range(3):
             p, R = 20.0 * rng.standard_normal(3), Rotation.random(random_state=rng.integers(2**31))
             e = 0.1 * np.sqrt(factor) * SIGMA * rng.standard_normal(6)
@@ -39,12 +35,12 @@ def write(folder: Path, convention: str, runs: int = 40, factor: float = 1.0, ke
     return est, truth
 
 
-def small(numbers: str) -> str:
+def small(numbers):
     """A hundredth of the covariance, so that rotations are small."""
     return " ".join(f"{float(x) / 100.0:.12g}" for x in numbers.split())
 
 
-def applied(p: Array, R: Rotation, e: Array, convention: str) -> tuple[Array, Rotation]:
+def applied(p, R, e, convention):
     turn = Rotation.from_rotvec(e[3:])
     if convention == "so3":
         return p + e[:3], turn * R
@@ -55,12 +51,12 @@ def applied(p: Array, R: Rotation, e: Array, convention: str) -> tuple[Array, Ro
     return turn.apply(p) + e[:3], turn * R
 
 
-def _text(p: Array, R: Rotation) -> str:
+def _text(p, R):
     return " ".join(f"{x:.15g}" for x in (*p, *R.as_quat()))
 
 
 @pytest.mark.parametrize("convention", SPATIAL)
-def test_the_right_convention_is_the_one_that_is_left(tmp_path: Path, convention: str) -> None:
+def test_the_right_convention_is_the_one_that_is_left(tmp_path, convention):
     """At a false-alarm rate of 1e-4, so that chance rejects the right one in 1 of 10,000 seeds."""
     (record,) = read_recordings(*write(tmp_path, convention), error="guess")
     assert set(record.guesses) == set(SPATIAL)
@@ -73,7 +69,7 @@ def test_the_right_convention_is_the_one_that_is_left(tmp_path: Path, convention
     assert v.guesses[convention].ratio.holds(1.0)
 
 
-def test_the_declared_error_has_its_own_status_and_intervals_hold_together(tmp_path: Path) -> None:
+def test_the_declared_error_has_its_own_status_and_intervals_hold_together(tmp_path):
     """Bonferroni over four conventions: wider than the interval of one."""
     files = write(tmp_path, "left")
     (right,), (wrong,), (guess,) = (read_recordings(*files, error=kind) for kind in ("left", "so3", "guess"))
@@ -91,7 +87,7 @@ def test_the_declared_error_has_its_own_status_and_intervals_hold_together(tmp_p
     assert high > alone.scale.inflation.high
 
 
-def test_none_fits(tmp_path: Path) -> None:
+def test_none_fits(tmp_path):
     (guess,) = read_recordings(*write(tmp_path, "left", factor=9.0), error="guess")
     v = judge(guess)
     assert v.status == "undecided"
@@ -99,7 +95,7 @@ def test_none_fits(tmp_path: Path) -> None:
     assert len([line for line in v.reasons if line.startswith("if the error is ")]) == 4
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(tmp_path, capsys):
     est, truth = write(tmp_path, "so3-body")
     said = json.loads(consistency(capsys, "analyse", est, "--truth", truth, "--error", "guess", "--json")[0])["est"]
     assert said["status"] == "undecided"
@@ -108,7 +104,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert said["statistics"]["guesses"]["left"]["possible"] is False
 
 
-def test_a_table_of_planar_poses(tmp_path: Path) -> None:
+def test_a_table_of_planar_poses(tmp_path):
     rng = np.random.default_rng(3)
     est = ["run,step,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh"]
     truth = ["run,step,x,y,heading"]
@@ -132,12 +128,12 @@ def test_a_table_of_planar_poses(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         ({"relative": "1"}, "--error guess: does not go with --relative"),
         ({"truth_covariance": "columns"}, "--error guess: does not go with --truth-covariance"),
     ],
 )
-def test_what_is_refused(tmp_path: Path, options: dict[str, str], message: str) -> None:
+def test_what_is_refused(tmp_path, options, message):
     with pytest.raises(cs.InputError, match=message):
         read_recordings(*write(tmp_path, "so3", 2), error="guess", **options)

@@ -1,39 +1,34 @@
 """``cs.judge`` of arrays and files: failed runs are counted, misuse is refused."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 from draws import identities, independent
+from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
-from consistency.referee.types import Array
 
 RUNS, STEPS = 60, 20
 SURE = 1e-6  # false-alarm rate of a verdict
 
 
 @pytest.fixture
-def error(rng: np.random.Generator) -> Array:
+def error(rng):
     return independent(rng, RUNS, STEPS, 2)
 
 
-def test_arrays_are_judged(error: Array, tmp_path: Path) -> None:
+def test_arrays_are_judged(error, tmp_path):
     verdict = cs.judge(error, identities(error), axes=["x", "y"], name="my.filter", false_alarm=SURE)
     assert (verdict.status, verdict.filter, verdict.runs, verdict.steps) == ("consistent", "my.filter", RUNS, STEPS)
     assert verdict.axes.names == ("x", "y")
     assert cs.judge(2.0 * error, identities(error), false_alarm=SURE).status == "overconfident"
-    np.testing.assert_array_equal(verdict.record.error, error)
+    assert_array_equal(verdict.record.error, error)
     np.savez(tmp_path / "mine.npz", errors=error, covariances=identities(error), axes=["x", "y"])
     read = cs.judge(str(tmp_path / "mine.npz"), false_alarm=SURE)
     assert read.reasons == verdict.reasons
     assert cs.judge(tmp_path / "mine.npz").filter == "mine"
 
 
-def test_failed_runs_are_counted_and_the_others_judged(error: Array) -> None:
+def test_failed_runs_are_counted_and_the_others_judged(error):
     P = identities(error).copy()
     error[3, 12:] = np.nan
     P[7, 4] = -np.eye(2)
@@ -51,7 +46,7 @@ def test_failed_runs_are_counted_and_the_others_judged(error: Array) -> None:
     assert "3 of 60 runs failed" in fault.reasons[1]
 
 
-def test_a_known_start_is_left_out_by_name(error: Array) -> None:
+def test_a_known_start_is_left_out_by_name(error):
     P = identities(error).copy()
     P[:, 0], P[:, 1, 1] = 0.0, 0.0
     verdict = cs.judge(error, P, false_alarm=SURE)
@@ -59,7 +54,7 @@ def test_a_known_start_is_left_out_by_name(error: Array) -> None:
     assert not verdict.failures
 
 
-def test_a_masked_step_has_no_truth(error: Array, tmp_path: Path) -> None:
+def test_a_masked_step_has_no_truth(error, tmp_path):
     """It is no failure, in arrays and files of errors, of estimates and of NEES; what stands there does not count."""
     mask = np.zeros((RUNS, STEPS), bool)
     mask[3, 12:15] = mask[:, 4] = mask[5, -1] = True
@@ -69,7 +64,7 @@ def test_a_masked_step_has_no_truth(error: Array, tmp_path: Path) -> None:
     assert verdict.status == "consistent"
     alive = (~mask).sum(axis=0)
     assert verdict.scale.alive.tolist() == alive.tolist()
-    np.testing.assert_allclose(verdict.scale.mean_anees, np.ma.array(nees, mask=mask).mean(axis=1).mean(), rtol=1e-12)
+    assert_allclose(verdict.scale.mean_anees, np.ma.array(nees, mask=mask).mean(axis=1).mean(), rtol=1e-12)
     assert not verdict.failures
     assert verdict.left_out_steps == ()
     estimates = np.where(mask[..., None], 1.0, -error)
@@ -91,9 +86,9 @@ def test_a_masked_step_has_no_truth(error: Array, tmp_path: Path) -> None:
         cs.judge(tmp_path / "mine.npz")
 
 
-def test_rows_are_runs_only_where_that_is_said(rng: np.random.Generator) -> None:
+def test_rows_are_runs_only_where_that_is_said(rng):
     error = independent(rng, 300, 1, 2)[:, 0]
-    P = np.broadcast_to(np.eye(2), (300, 2, 2))
+    P = identities(error)
     verdict = cs.judge(error, P, independent=True, false_alarm=SURE)
     assert (verdict.status, verdict.runs, verdict.steps) == ("consistent", 300, 1)
     with pytest.raises(cs.InputError, match=r"errors\[None\] and covariances\[None\] are one run of many"):
@@ -101,7 +96,7 @@ def test_rows_are_runs_only_where_that_is_said(rng: np.random.Generator) -> None
     assert cs.judge(error[None], P[None]).runs == 1
 
 
-def test_a_covariance_of_zero_is_a_known_start_only_where_all_runs_begin_so(rng: np.random.Generator) -> None:
+def test_a_covariance_of_zero_is_a_known_start_only_where_all_runs_begin_so(rng):
     error = independent(rng, 300, 1, 2)[:, 0]
     P = np.array(identities(error))
     P[:20] = 0.0
@@ -114,8 +109,8 @@ def test_a_covariance_of_zero_is_a_known_start_only_where_all_runs_begin_so(rng:
     assert cs.judge(error, deviations=sigma, independent=True, false_alarm=SURE).status == "failed"
 
 
-@pytest.mark.parametrize(("first", "failed"), [([0, 1, 2], [1]), ([1, 1, 2], []), ([2, 1, STEPS], [3])])
-def test_how_long_a_known_start_may_be(error: Array, first: list[int], failed: list[int]) -> None:
+@pytest.mark.parametrize("first, failed", [([0, 1, 2], [1]), ([1, 1, 2], []), ([2, 1, STEPS], [3])])
+def test_how_long_a_known_start_may_be(error, first, failed):
     """``first``: steps of singular covariances at the beginning of runs 1, 2 and 3; of all others one, if any has."""
     P = np.array(identities(error))
     P[:, : min(first)] = 0.0
@@ -127,7 +122,7 @@ def test_how_long_a_known_start_may_be(error: Array, first: list[int], failed: l
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    "change, why",
     [
         (lambda e, P: (e[:, 0], P[:, 0, 0]), r"errors has shape \(300,\), needs \(N, n\).*errors\[:, None\]"),
         (lambda e, P: (e, P[0]), r"covariances has shape \(2, 2\), needs \(300, 2, 2\).*np.broadcast_to"),
@@ -135,9 +130,7 @@ def test_how_long_a_known_start_may_be(error: Array, first: list[int], failed: l
         (lambda e, P: (e, P[1:]), r"covariances has shape \(299, 2, 2\), needs \(300, 2, 2\) beside errors"),
     ],
 )
-def test_rows_that_do_not_fit_are_told_as_they_were_given(
-    change: Callable[..., tuple[Array, Array]], why: str, rng: np.random.Generator
-) -> None:
+def test_rows_that_do_not_fit_are_told_as_they_were_given(change, why, rng):
     error = independent(rng, 300, 1, 2)[:, 0]
     errors, P = change(error, identities(error))
     with pytest.raises(cs.InputError, match=why):
@@ -145,7 +138,7 @@ def test_rows_that_do_not_fit_are_told_as_they_were_given(
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    "change, why",
     [
         (lambda e, P: (e, P[:, :, :1]), "key 'covariances' has shape"),
         (lambda e, P: (e, P + np.array([[0.0, 0.1], [0.0, 0.0]])), "not symmetric"),
@@ -160,12 +153,12 @@ def test_rows_that_do_not_fit_are_told_as_they_were_given(
         (lambda e, P: (e, None), "^covariances: needed beside errors"),
     ],
 )
-def test_misuse_is_refused(error: Array, change: Callable[..., tuple[Array, Array]], why: str) -> None:
+def test_misuse_is_refused(error, change, why):
     with pytest.raises(cs.InputError, match=why):
         cs.judge(*change(error, identities(error)))
 
 
-def test_names_are_checked(error: Array) -> None:
+def test_names_are_checked(error):
     with pytest.raises(cs.InputError, match="'axes' names 1 components, the error has 2"):
         cs.judge(error, identities(error), axes=["x"])
     with pytest.raises(cs.InputError, match=r"^name"):

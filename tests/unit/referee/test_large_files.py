@@ -1,16 +1,13 @@
 """Text files are read in blocks: the same as line by line, with the same refusals, in memory of the numbers alone."""
 
-from __future__ import annotations
-
 import tracemalloc
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_array_equal, assert_equal
 
 from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
 from consistency.referee.errors import InputError
@@ -22,12 +19,12 @@ LAYOUT = "t and two numbers"
 
 
 @contextmanager
-def blocks_of(size: int) -> Iterator[None]:
+def blocks_of(size):
     with mock.patch.object(text_blocks, "BLOCK", size):
         yield
 
 
-def numbers_of(path: Path, size: int, slow: bool = False) -> tuple[list[list[float]], list[int]] | str:
+def numbers_of(path, size, slow=False):
     """Values and lines, or what is refused; ``slow`` reads line by line."""
     with blocks_of(size):
         try:
@@ -71,12 +68,12 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_numbers_in_blocks_are_those_line_by_line(name: str, tmp_path: Path) -> None:
+def test_numbers_in_blocks_are_those_line_by_line(name, tmp_path):
     path = tmp_path / "a.txt"
     path.write_text(NUMBERS[name], encoding="utf-8", newline="")
     whole = numbers_of(path, 2**22, slow=True)
     for size in (4, 7, 13, 2**22):
-        np.testing.assert_equal(numbers_of(path, size), whole)
+        assert_equal(numbers_of(path, size), whole)
     refused = (
         "word, hexadecimal, glued, short, wider, all wide, unequal sums, equal letters, lone return, back, twice, "
     )
@@ -84,7 +81,7 @@ def test_numbers_in_blocks_are_those_line_by_line(name: str, tmp_path: Path) -> 
     assert isinstance(whole, str) == (name in refused.split(", "))
 
 
-def test_the_line_of_a_fault_far_down_is_named(tmp_path: Path) -> None:
+def test_the_line_of_a_fault_far_down_is_named(tmp_path):
     path, rows = tmp_path / "a.txt", [f"{k} 2 3" for k in range(1, 400)]
     for line, bad, what in ((7, "7 2", "has 2 columns"), (390, "390 two 3", "not a number"), (399, "398 2 3", "twice")):
         path.write_text("# t a b\n" + "\n".join([*rows[: line - 1], bad, *rows[line:]]) + "\n", encoding="utf-8")
@@ -95,7 +92,7 @@ def test_the_line_of_a_fault_far_down_is_named(tmp_path: Path) -> None:
             assert what in found
 
 
-def test_text_that_is_none_is_refused_wherever_it_stands(tmp_path: Path) -> None:
+def test_text_that_is_none_is_refused_wherever_it_stands(tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes(b"1 2 3\n" * 9 + b"2 3 \x80\n")
     for size in (20, 2**22):
@@ -124,7 +121,7 @@ TABLES = {
 }
 
 
-def table_of(path: Path, size: int) -> tuple[dict[str, list[object]], list[int]] | str:
+def table_of(path, size):
     """Cells as readers take them, numbers or text, and their lines."""
     with blocks_of(size):
         try:
@@ -135,7 +132,7 @@ def table_of(path: Path, size: int) -> tuple[dict[str, list[object]], list[int]]
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_tables_in_blocks_are_those_line_by_line(name: str, tmp_path: Path) -> None:
+def test_tables_in_blocks_are_those_line_by_line(name, tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(TABLES[name], encoding="utf-8", newline="")
     with mock.patch.object(Block, "plain", False):
@@ -150,7 +147,7 @@ def test_tables_in_blocks_are_those_line_by_line(name: str, tmp_path: Path) -> N
         assert found == whole
 
 
-def cell(value: object) -> object:
+def cell(value):
     try:
         number = float(str(value))
     except ValueError:
@@ -170,19 +167,19 @@ CELLS = {
 
 @pytest.mark.parametrize("plain", [True, False])
 @pytest.mark.parametrize("text", CELLS)
-def test_a_cell(text: str, plain: bool, tmp_path: Path) -> None:
+def test_a_cell(text, plain, tmp_path):
     (tmp_path / "a.csv").write_text(f"x,y\n1,{text}\n2,3\n" + ("" if plain else "# a comment\n"), encoding="utf-8")
     sheet, expected = read_sheet(tmp_path / "a.csv"), CELLS[text]
     if isinstance(expected, str):
         with pytest.raises(InputError, match=f"a.csv, line 2: column 'y': {expected} "):
             sheet.numbers("y")
     else:
-        np.testing.assert_array_equal(sheet.numbers("y"), [expected, 3.0])
+        assert_array_equal(sheet.numbers("y"), [expected, 3.0])
         assert sheet.empty("y").tolist() == [bool(np.isnan(expected)), False]
 
 
 @pytest.mark.parametrize(
-    ("rows", "sentence"),
+    "rows, sentence",
     [
         ("True\nFALSE\n", "line 2: column 'x': a truth value or a date, which is to be written as a number .True."),
         ("1\nTrue\n", "line 3: column 'x': not a number .True."),
@@ -190,20 +187,20 @@ def test_a_cell(text: str, plain: bool, tmp_path: Path) -> None:
         ("9007199254740994\n2\n", "line 2: column 'x': a number too large to be counted exactly"),
     ],
 )
-def test_a_column_of_whole_numbers(rows: str, sentence: str, tmp_path: Path) -> None:
+def test_a_column_of_whole_numbers(rows, sentence, tmp_path):
     (tmp_path / "a.csv").write_text("x\n" + rows)
     with pytest.raises(InputError, match=sentence):
         read_sheet(tmp_path / "a.csv").numbers("x", whole=True)
 
 
 @pytest.mark.parametrize("name", ["NA", ""])
-def test_an_empty_name_of_a_filter(name: str, tmp_path: Path) -> None:
+def test_an_empty_name_of_a_filter(name, tmp_path):
     (tmp_path / "a.csv").write_text(f"x,filter\n1,a\n2,{name}\n")
     with pytest.raises(InputError, match=r"a\.csv, line 3: column 'filter' is empty"):
         read_sheet(tmp_path / "a.csv")
 
 
-def test_a_table_of_parquet_is_that_of_text(tmp_path: Path) -> None:
+def test_a_table_of_parquet_is_that_of_text(tmp_path):
     frame = pd.DataFrame({"x": [1, 2, 3], "y": [0.5, None, 2.0], "z": ["1", None, "b"], "b": [True, False, True]})
     frame["filter"] = pd.Categorical(["1", "2", "1"])
     frame.to_parquet(tmp_path / "a.parquet")
@@ -211,7 +208,7 @@ def test_a_table_of_parquet_is_that_of_text(tmp_path: Path) -> None:
     one, other = read_sheet(tmp_path / "a.parquet"), read_sheet(tmp_path / "a.csv")
     assert list(one.data) == list(other.data)
     for name in ("x", "y"):
-        np.testing.assert_array_equal(one.numbers(name), other.numbers(name))
+        assert_array_equal(one.numbers(name), other.numbers(name))
     assert one.texts("filter").tolist() == other.texts("filter").tolist() == ["1", "2", "1"]
     for column, what in (("z", "not a number .b."), ("b", "a truth value or a date")):
         for sheet in (one, other):
@@ -219,7 +216,7 @@ def test_a_table_of_parquet_is_that_of_text(tmp_path: Path) -> None:
                 sheet.numbers(column)
 
 
-def test_memory_is_that_of_the_numbers(tmp_path: Path) -> None:
+def test_memory_is_that_of_the_numbers(tmp_path):
     """Lines of text and their fields took twenty times as much as the numbers."""
     rng = np.random.default_rng(90125)
     values = np.column_stack([np.arange(60_000.0), rng.normal(size=(60_000, 3))])
@@ -235,7 +232,7 @@ def test_memory_is_that_of_the_numbers(tmp_path: Path) -> None:
             assert peak < 5 * values.nbytes
 
 
-def test_matrices_are_looked_at_in_pieces_alike() -> None:
+def test_matrices_are_looked_at_in_pieces_alike():
     rng = np.random.default_rng(4077)
     root = rng.normal(size=(ROWS + 3, 2, 2))
     P = root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(2)

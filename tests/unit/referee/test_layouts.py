@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 from command import consistency, refused
+from numpy.testing import assert_allclose
 from recorded import read_recordings
 
 import consistency as cs
@@ -32,28 +32,28 @@ W_FIRST, W_LAST = ["w", "x", "y", "z"], ["x", "y", "z", "w"]
 # --- the reference: nothing here is of the package or of SciPy --------------------------------------
 
 
-def matrix(q: Array) -> Array:
+def matrix(q):
     """Rotation matrix of a unit quaternion x, y, z, w (Shuster 1993)."""
     v, w = q[:3], q[3]
     return (w * w - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) + 2.0 * w * skew(v)
 
 
-def skew(v: Array) -> Array:
+def skew(v):
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-def product(p: Array, q: Array) -> Array:
+def product(p, q):
     """Hamilton product, x, y, z, w."""
     return np.append(p[3] * q[:3] + q[3] * p[:3] + np.cross(p[:3], q[:3]), p[3] * q[3] - p[:3] @ q[:3])
 
 
-def rotation_vector(q: Array) -> Array:
+def rotation_vector(q):
     q = q if q[3] >= 0 else -q
     sine = np.sqrt(q[:3] @ q[:3])
     return q[:3] * (2.0 * np.arctan2(sine, q[3]) / sine if sine > 0 else 2.0)
 
 
-def reference(own: Array, true: Array, P: Array, body: bool = False) -> Array:
+def reference(own, true, P, body=False):
     """NEES (N,) of poses (N, 7) with P (N, 6, 6): position and rotation about the axes of the world or of the body."""
     out = []
     for a, b, C in zip(own, true, P, strict=True):
@@ -71,7 +71,7 @@ class Drive(NamedTuple):
     P: Array  # (N, 6, 6)
 
 
-def drive(start: float = EPOCH, root: Array | None = None) -> Drive:
+def drive(start=EPOCH, root=None):
     """Poses with errors of their covariance, which has cross terms and differs from row to row, unless it is given."""
     rng = np.random.default_rng()
     turns = rng.normal(size=(STEPS, 4)) + np.array([0, 0, 0, 3])
@@ -85,9 +85,7 @@ def drive(start: float = EPOCH, root: Array | None = None) -> Drive:
     return Drive(start + 0.25 * np.arange(STEPS), np.column_stack([true[:, :3] - e[:, :3], own]), true, P)
 
 
-def lines(
-    path: str, header: str, columns: Sequence[Array | Sequence[str]], separator: str = ",", end: str = "\n"
-) -> str:
+def lines(path, header, columns, separator=",", end="\n"):
     """A file of columns, whole numbers as such, written as text so that no digit is lost."""
     cells = [[each if isinstance(each, str) else _text(each) for each in column] for column in columns]
     rows = [separator.join(row) for row in zip(*cells, strict=True)]
@@ -95,25 +93,25 @@ def lines(
     return path
 
 
-def _text(value: float | np.integer) -> str:
+def _text(value):
     return str(int(value)) if isinstance(value, (int, np.integer)) else repr(float(value))
 
 
-def nanoseconds(t: Array) -> Array:
+def nanoseconds(t):
     return np.array([round(each * 4) * 250_000_000 for each in t], np.int64)
 
 
-def whole(t: Array) -> list[Array]:
+def whole(t):
     """Seconds and nanoseconds."""
     ns = nanoseconds(t)
     return [ns // 10**9, ns % 10**9]
 
 
-def with_w_first(pose: Array) -> list[Array]:
+def with_w_first(pose):
     return list(pose[:, [0, 1, 2, 6, 3, 4, 5]].T)
 
 
-def matrices(pose: Array, rows: int = 3) -> list[Array]:
+def matrices(pose, rows=3):
     """Matrices of 3 or 4 x 4 row by row, as columns."""
     M = np.zeros((len(pose), 4, 4))
     M[:, 3, 3] = 1.0
@@ -122,8 +120,8 @@ def matrices(pose: Array, rows: int = 3) -> list[Array]:
     return list(M[:, :rows].reshape(len(pose), -1).T)
 
 
-def tum(d: Drive, path: str = "est.tum") -> str:
-    return lines(path, "", [d.t, *d.own.T, *d.P.reshape(STEPS, 36).T], " ")
+def tum(d, path="est.tum", end="\n"):
+    return lines(path, "", [d.t, *d.own.T, *d.P.reshape(STEPS, 36).T], " ", end)
 
 
 # --- truth -------------------------------------------------------------------------------------------
@@ -136,14 +134,14 @@ ASL = "#timestamp," + ",".join(
 REST = [np.full(STEPS, value) for value in (0.1, 0.2, 0.3, -0.002, 0.02, 0.07, -0.02, 0.1, 0.06)]
 
 
-def kitti(d: Drive) -> str:
+def kitti(d):
     lines("times.txt", "", [d.t])
     return lines("07.txt", "", matrices(d.true), " ")
 
 
 EUROC = "read as EuRoC truth, 17 columns, nanoseconds, quaternion w first"
 SHORT = "#time(ns),px,py,pz,qw,qx,qy,qz,vx,vy,vz,bwx,bwy,bwz,bax,bay,baz"  # as OpenVINS heads the columns of EuRoC
-TRUTHS: dict[str, tuple[Callable[[Drive], str], str]] = {
+TRUTHS = {
     "EuRoC": (lambda d: lines("data.csv", ASL, [nanoseconds(d.t), *with_w_first(d.true), *REST]), EUROC),
     "EuRoC, short": (lambda d: lines("truth.csv", SHORT, [nanoseconds(d.t), *with_w_first(d.true), *REST]), EUROC),
     "EuRoC, no names": (lambda d: lines("truth.csv", "", [nanoseconds(d.t), *with_w_first(d.true), *REST]), EUROC),
@@ -181,16 +179,16 @@ TRUTHS: dict[str, tuple[Callable[[Drive], str], str]] = {
 
 
 @pytest.mark.parametrize("name", TRUTHS)
-def test_truth_as_it_is_written(name: str, inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_truth_as_it_is_written(name, inside, capsys):
     d = drive()
     write, said = TRUTHS[name]
     truth = write(d)
     record = cs.read(tum(d), truth=truth)
-    np.testing.assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
+    assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
     assert said in consistency(capsys, "analyse", "est.tum", "--truth", truth)[1]
 
 
-def test_the_first_rows_of_euroc_judge_themselves(tmp_path: Path) -> None:
+def test_the_first_rows_of_euroc_judge_themselves(tmp_path):
     """Its own rows, moved by a known error, against the file as it is."""
     path = DATA / "euroc_static" / "groundtruth_first97.csv"
     if not path.is_file():
@@ -205,7 +203,7 @@ def test_the_first_rows_of_euroc_judge_themselves(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "est.txt", np.column_stack([t, own, P]), fmt="%.17g")
     record = cs.read(tmp_path / "est.txt", truth=path)
     assert record.nees.shape == (1, 96)
-    np.testing.assert_allclose(record.nees, 4.0, atol=2e-4)  # six digits of the quaternions: 1e-6 rad, 1e-4 of a sigma
+    assert_allclose(record.nees, 4.0, atol=2e-4)  # six digits of the quaternions: 1e-6 rad, 1e-4 of a sigma
 
 
 @pytest.mark.parametrize(
@@ -216,7 +214,7 @@ def test_the_first_rows_of_euroc_judge_themselves(tmp_path: Path) -> None:
         ("kitti06_f0-50/poses.txt", 51),
     ],
 )
-def test_matrices_of_data_sets_as_they_are(name: str, count: int, tmp_path: Path) -> None:
+def test_matrices_of_data_sets_as_they_are(name, count, tmp_path):
     path = DATA / name
     if not path.is_file():
         pytest.skip(f"no {path}; set CONSISTENCY_DATA to the folder that holds {name.partition('/')[0]}")
@@ -236,13 +234,13 @@ def test_matrices_of_data_sets_as_they_are(name: str, count: int, tmp_path: Path
     np.savetxt(tmp_path / "est.txt", np.column_stack([t, own, P]), fmt="%.17g")
     record = cs.read(tmp_path / "est.txt", truth=path)
     assert record.nees.shape == (1, count)
-    np.testing.assert_allclose(record.nees, 4.0, rtol=1e-3)  # matrices of seven digits, two ways to a quaternion
+    assert_allclose(record.nees, 4.0, rtol=1e-3)  # matrices of seven digits, two ways to a quaternion
 
 
 # --- estimates ---------------------------------------------------------------------------------------
 
 
-def rostopic(d: Drive) -> str:
+def rostopic(d):
     """rostopic echo -p of nav_msgs/Odometry: stamps in ns, frames as text, and a twist with its covariance."""
     pose = [f"field.pose.pose.position.{a}" for a in SPACE] + [f"field.pose.pose.orientation.{a}" for a in W_LAST]
     names = [
@@ -264,7 +262,7 @@ def rostopic(d: Drive) -> str:
     return lines("odom.csv", ",".join(names), [*columns, *[zero] * 6, *[zero + 9.0] * 36])
 
 
-def bagpy(d: Drive) -> str:
+def bagpy(d):
     pose = [f"pose.pose.position.{a}" for a in SPACE] + [f"pose.pose.orientation.{a}" for a in W_LAST]
     names = ["Time", "header.seq", "header.stamp.secs", "header.stamp.nsecs", "header.frame_id", *pose]
     names += [f"pose.covariance_{i}" for i in range(36)]
@@ -272,13 +270,13 @@ def bagpy(d: Drive) -> str:
     return lines("odom.csv", ",".join(names), columns)
 
 
-def twist_first(d: Drive) -> str:
+def twist_first(d):
     names = ["t", *(f"twist.covariance{i}" for i in range(36)), *(f"pose.covariance{i}" for i in range(36))]
     names += [f"pose.position.{a}" for a in SPACE] + [f"pose.orientation.{a}" for a in W_LAST]
     return lines("odom.csv", ",".join(names), [d.t, *np.full((36, STEPS), 9.0), *d.P.reshape(STEPS, 36).T, *d.own.T])
 
 
-def plotjuggler(d: Drive) -> str:
+def plotjuggler(d):
     """Of a topic of ROS 2: its fields with slashes, the stamp in two."""
     pose = [f"/odom/pose/pose/position/{a}" for a in SPACE] + [f"/odom/pose/pose/orientation/{a}" for a in W_LAST]
     names = ["__time", "/odom/header/stamp/sec", "/odom/header/stamp/nanosec", *pose]
@@ -286,19 +284,19 @@ def plotjuggler(d: Drive) -> str:
     return lines("odom.csv", ",".join(names), [d.t + 0.1, *whole(d.t), *d.own.T, *d.P.reshape(STEPS, 36).T])
 
 
-def w_first_indexed(d: Drive) -> str:
+def w_first_indexed(d):
     names = ["t", *SPACE, "qw", "qx", "qy", "qz", *(f"cov[{i};{j}]" for i in range(6) for j in range(6))]
     return lines("est.csv", ",".join(names), [d.t, *with_w_first(d.own), *d.P.reshape(STEPS, 36).T])
 
 
-def cnspy(d: Drive) -> str:
+def cnspy(d):
     """PoseWithCovTyped of cnspy_spatial_csv_formats."""
     names = ["t", *(f"t{a}" for a in SPACE), *(f"q{a}" for a in W_LAST)]
     names += [f"T{'xyzabc'[i]}{'xyzabc'[j]}" for i, j in zip(*UPPER, strict=True)] + ["est_err_type"]
     return lines("est.csv", ",".join(names), [d.t, *d.own.T, *d.P[:, UPPER[0], UPPER[1]].T, ["type1"] * STEPS])
 
 
-def named_words(d: Drive) -> str:
+def named_words(d):
     words = [*SPACE, "roll", "pitch", "yaw"]
     names = ["timestamp_us", *SPACE, *(f"q_{a}" for a in W_LAST)]
     names += [f"P_{words[j]}_{words[i]}" for i, j in zip(*UPPER, strict=True)]
@@ -306,12 +304,12 @@ def named_words(d: Drive) -> str:
     return lines("est.csv", ";".join(names), columns, ";")
 
 
-def kitti_with_covariance(d: Drive) -> str:
+def kitti_with_covariance(d):
     lines("times.txt", "", [d.t])
     return lines("est.txt", "", [*matrices(d.own), *d.P.reshape(STEPS, 36).T], " ")
 
 
-ESTIMATES: dict[str, tuple[Callable[[Drive], str], str]] = {
+ESTIMATES = {
     "rostopic echo -p": (rostopic, "90 columns, nanoseconds, quaternion w last, covariance in 36 columns"),
     "bagpy": (bagpy, "48 columns, seconds and nanoseconds, quaternion w last, covariance in 36 columns"),
     "twist first": (twist_first, "80 columns, seconds, quaternion w last, covariance in 36 columns"),
@@ -332,29 +330,29 @@ ESTIMATES: dict[str, tuple[Callable[[Drive], str], str]] = {
 
 
 @pytest.mark.parametrize("name", ESTIMATES)
-def test_estimates_as_they_are_written(name: str, inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_estimates_as_they_are_written(name, inside, capsys):
     d = drive()
     write, said = ESTIMATES[name]
     path = write(d)
     truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
     record = cs.read(path, truth=truth)
-    np.testing.assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
+    assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
     assert said in consistency(capsys, "analyse", path, "--truth", truth)[1]
 
 
-def test_steps_stand_for_times_where_both_have_none(inside: Path) -> None:
+def test_steps_stand_for_times_where_both_have_none(inside):
     d = drive(start=0.0)
     Path("a").mkdir()
     truth = lines("a/truth.txt", "", matrices(d.true), " ")
     own = lines("a/est.txt", "", [*matrices(d.own), *d.P.reshape(STEPS, 36).T], " ")
-    np.testing.assert_allclose(cs.read(own, truth=truth).nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
+    assert_allclose(cs.read(own, truth=truth).nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
     numbered = lines("a/large.txt", "", [np.arange(STEPS), *matrices(d.true, 4)], " ")
     record = cs.read(own, truth=numbered)
-    np.testing.assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
+    assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
     assert any("the first one the number of the step" in note for note in record.notes)
 
 
-def test_two_blocks_of_cnspy_are_judged_apart(inside: Path) -> None:
+def test_two_blocks_of_cnspy_are_judged_apart(inside):
     """PosOrientWithCov: triangles of position and rotation; which error they are of, the format does not say."""
     d = drive()
     names = ["t", *(f"t{a}" for a in SPACE), *(f"q{a}" for a in W_LAST)]
@@ -366,19 +364,19 @@ def test_two_blocks_of_cnspy_are_judged_apart(inside: Path) -> None:
     apart[:, :3, 3:] = apart[:, 3:, :3] = 0.0
 
     position, rotation = read_recordings(Path(path), Path(truth), error="so3")
-    np.testing.assert_allclose(position.nees[0] + rotation.nees[0], reference(d.own, d.true, apart), rtol=1e-9)
+    assert_allclose(position.nees[0] + rotation.nees[0], reference(d.own, d.true, apart), rtol=1e-9)
 
 
 NAMES = "t,x,y,z,qx,qy,qz,qw"
 TWO = "t,a.position.x,a.position.y,a.position.z,b.position.x,b.position.y,b.position.z,qx,qy,qz,qw"
 
 
-def short(d: Drive) -> str:
+def short(d):
     lines("times.txt", "", [d.t[1:]])
     return lines("t.txt", "", matrices(d.true), " ")
 
 
-def alone(d: Drive) -> Array:
+def alone(d):
     """Squares of errors over variances, (N, 6)."""
     out = []
     for a, b, C in zip(d.own, d.true, d.P, strict=True):
@@ -387,7 +385,7 @@ def alone(d: Drive) -> Array:
     return np.array(out)
 
 
-def deviated_names(d: Drive) -> str:
+def deviated_names(d):
     names = ["t", *SPACE, *(f"q{a}" for a in W_LAST), *(f"std_{a}" for a in (*SPACE, "roll", "pitch", "yaw"))]
     return lines("est.csv", ",".join(names), [d.t, *d.own.T, *np.sqrt(np.diagonal(d.P, axis1=1, axis2=2)).T])
 
@@ -399,27 +397,27 @@ def deviated_names(d: Drive) -> str:
         deviated_names,
     ],
 )
-def test_deviations_are_judged_axis_by_axis(write: Callable[[Drive], str], inside: Path) -> None:
+def test_deviations_are_judged_axis_by_axis(write, inside):
     d = drive()
     path, truth = write(d), lines("truth.tum", "", [d.t, *d.true.T], " ")
     record = cs.read(path, truth=truth)
     assert record.parts == ((0,), (1,), (2,), (3,), (4,), (5,))
     variances = np.diagonal(np.asarray(record.covariance[0]), axis1=1, axis2=2)
-    np.testing.assert_allclose(record.error[0] ** 2 / variances, alone(d), rtol=1e-9)
+    assert_allclose(record.error[0] ** 2 / variances, alone(d), rtol=1e-9)
     assert any("standard deviations" in note for note in record.notes)
     if path.endswith(".txt"):
         own = lines(
             "turned.txt", "", [d.t, *d.own.T, *np.roll(np.sqrt(np.diagonal(d.P, axis1=1, axis2=2)), 3, axis=1).T], " "
         )
         turned = cs.read(own, truth=truth, covariance_order="rotation-translation")
-        np.testing.assert_allclose(turned.nees, record.nees, rtol=1e-9)
+        assert_allclose(turned.nees, record.nees, rtol=1e-9)
     assert list(cs.judge(record).parts) == [*SPACE, "roll", "pitch", "yaw"]
     with pytest.raises(cs.InputError, match="--relative needs covariances of whole poses"):
         cs.read(path, truth=truth, relative=2, motions=True)
 
 
 @pytest.mark.parametrize("names", ["sigma_a,sigma_b", "std_a,std_b", "sa,sb", "P_a_a,P_b_b"])
-def test_deviations_of_a_state(names: str, inside: Path) -> None:
+def test_deviations_of_a_state(names, inside):
     rng = np.random.default_rng()
     step, e, sigma = np.arange(1, STEPS + 1), rng.normal(size=(STEPS, 2)), 1.0 + rng.random((STEPS, 2))
     stated = sigma**2 if names.startswith("P") else sigma
@@ -427,7 +425,7 @@ def test_deviations_of_a_state(names: str, inside: Path) -> None:
     lines("truth.csv", "step,a,b", [step, *np.zeros((2, STEPS))])
     record = cs.read("est.csv", truth="truth.csv", state=["a", "b"])
     assert record.parts == ((0,), (1,))
-    np.testing.assert_allclose(record.nees[0], (e**2 / sigma**2).sum(axis=1), rtol=1e-9)
+    assert_allclose(record.nees[0], (e**2 / sigma**2).sum(axis=1), rtol=1e-9)
     assert (
         "est: standard deviations without cross terms are stated, so each component is judged by itself" in record.notes
     )
@@ -436,18 +434,18 @@ def test_deviations_of_a_state(names: str, inside: Path) -> None:
         cs.read("est.csv", truth="truth.csv", state=["a", "b"])
 
 
-def semicolons(path: str) -> str:
+def semicolons(path):
     text = Path(path).read_text()
     Path(path).write_text(text.replace(",", ";").replace(".", ","))
     return path
 
 
-def recoded(path: str) -> str:
+def recoded(path):
     Path(path).write_bytes(Path(path).read_text().encode("utf-16"))
     return path
 
 
-REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
+REFUSED = {
     "a quaternion that is no unit": (
         lambda d: lines("t.csv", "t,x,y,z,qw,qx,qy,qz", [d.t, *with_w_first(1.01 * d.true)]),
         r"t\.csv, line 2: the quaternion has length 1\.01, not 1; read as .* quaternion w first",
@@ -505,7 +503,7 @@ REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_read_is_one_line(name: str, inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_read_is_one_line(name, inside, capsys):
     d = drive()
     write, said = REFUSED[name]
     truth = write(d)
@@ -519,9 +517,7 @@ def test_what_cannot_be_read_is_one_line(name: str, inside: Path, capsys: pytest
 
 @pytest.mark.parametrize("fields", [2, 1])
 @pytest.mark.parametrize("file", ["est.tum", "truth.tum", "t.csv"])
-def test_a_last_line_that_is_cut_short_is_left_out(
-    file: str, fields: int, inside: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_last_line_that_is_cut_short_is_left_out(file, fields, inside, capsys):
     """A field less, or the last one cut to its first digit: a variance or a part of a quaternion that is 0."""
     d = drive()
     truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
@@ -535,7 +531,7 @@ def test_a_last_line_that_is_cut_short_is_left_out(
     assert record.notes[0].startswith(f"{file}: the last line, ")
     assert "has no end and is left out" in record.notes[0]
     assert not record.failures
-    np.testing.assert_allclose(record.nees[0, : STEPS - 1], reference(d.own, d.true, d.P)[:-1], rtol=1e-9)
+    assert_allclose(record.nees[0, : STEPS - 1], reference(d.own, d.true, d.P)[:-1], rtol=1e-9)
     assert "has no end and is left out" in consistency(capsys, "analyse", "est.tum", "--truth", truth)[1]
 
 
@@ -549,7 +545,7 @@ CUT = {
 
 
 @pytest.mark.parametrize("case", CUT)
-def test_a_last_row_of_a_table_that_is_cut_short_is_left_out(case: str, inside: Path) -> None:
+def test_a_last_row_of_a_table_that_is_cut_short_is_left_out(case, inside):
     rows, (file, cut) = [float(k) for k in range(STEPS)], CUT[case]
     names = ("t", "a", "P_a_a")
     table = [dict(zip(names, (t, 0.1 * t, 0.01), strict=True)) for t in rows]
@@ -573,33 +569,31 @@ def test_a_last_row_of_a_table_that_is_cut_short_is_left_out(case: str, inside: 
             cs.read(est, truth="truth.csv", state=["a"], max_dt=0.5)
 
 
-def test_whole_files_without_a_final_newline_are_read_whole(inside: Path) -> None:
+def test_whole_files_without_a_final_newline_are_read_whole(inside):
     d = drive()
     lines("truth.csv", NAMES, [d.t, *d.true.T], end="")
-    Path("est.tum").write_text(Path(tum(d)).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8")
+    tum(d, end="")
     record = cs.read("est.tum", truth="truth.csv")
     assert record.nees.shape == (1, STEPS)
     assert not any("has no end" in note for note in record.notes)
 
 
-def test_a_last_line_of_nan_is_a_failure(inside: Path) -> None:
+def test_a_last_line_of_nan_is_a_failure(inside):
     """It was written so; one that is not positive definite may be cut in its last number."""
     d = drive()
     truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
     own, P = d.own.copy(), d.P.copy()
     own[-1] = np.nan
-    Path("est.tum").write_text(
-        Path(tum(d._replace(own=own))).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8"
-    )
+    tum(d._replace(own=own), end="")
     assert [failure.step for failure in cs.read("est.tum", truth=truth).failures] == [STEPS]
     P[-1, 5, 5] = 0.0
-    Path("est.tum").write_text(Path(tum(d._replace(P=P))).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8")
+    tum(d._replace(P=P), end="")
     assert not cs.read("est.tum", truth=truth).failures
     tum(d._replace(P=P))
     assert [failure.step for failure in cs.read("est.tum", truth=truth).failures] == [STEPS]
 
 
-def test_a_file_of_one_broken_line_is_refused_for_it(inside: Path) -> None:
+def test_a_file_of_one_broken_line_is_refused_for_it(inside):
     d = drive()
     Path("t.tum").write_text("1.0 2.0", encoding="utf-8")
     with pytest.raises(cs.InputError, match=r"t\.tum, line 1: has 2 columns"):
@@ -609,19 +603,19 @@ def test_a_file_of_one_broken_line_is_refused_for_it(inside: Path) -> None:
 # --- what can be read but looks wrong -----------------------------------------------------------------
 
 
-def many(steps: int = 60) -> Drive:
+def many(steps=60):
     """A longer drive."""
     parts = [drive(root=0.1 * np.eye(6)) for _ in range(steps // STEPS)]
     t, own, true, P = (np.concatenate(each) for each in zip(*parts, strict=True))
     return Drive(EPOCH + 0.25 * np.arange(len(t)), own, true, P)
 
 
-def turned_quaternions(d: Drive) -> tuple[str, str]:
+def turned_quaternions(d):
     own = np.column_stack([d.own[:, :3], d.own[:, [6, 3, 4, 5]]])
     return lines("est.csv", "", [d.t, *own.T, *d.P.reshape(-1, 36).T]), lines("t.csv", NAMES, [d.t, *d.true.T])
 
 
-def millimetres(d: Drive) -> tuple[str, str]:
+def millimetres(d):
     true = d.true * [1000, 1000, 1000, 1, 1, 1, 1]
     lines("est.tum", "", [d.t, *d.own.T, *d.P.reshape(-1, 36).T], " ")
     return "est.tum", lines("t.csv", "#timestamp [ns],px,py,pz,qw,qx,qy,qz", [nanoseconds(d.t), *with_w_first(true)])
@@ -634,9 +628,7 @@ def millimetres(d: Drive) -> tuple[str, str]:
         (millimetres, "the positions of the truth are in millimetres; divide them by 1000"),
     ],
 )
-def test_a_mix_up_that_can_be_read_gets_a_hint(
-    write: Callable[[Drive], tuple[str, str]], mend: str, inside: Path
-) -> None:
+def test_a_mix_up_that_can_be_read_gets_a_hint(write, mend, inside):
     estimates, truth = write(many())
     record = cs.read(estimates, truth=truth)
     assert [note for note in record.notes if re.search(mend, note)], record.notes
@@ -652,7 +644,7 @@ P = np.array([[0.04, 0.01, 0.005], [0.01, 0.09, -0.01], [0.005, -0.01, 0.01]])
 @pytest.mark.parametrize(
     ("unit", "name"), [(10**3, "milliseconds"), (10**6, "microseconds"), (10**9, "nanoseconds"), (1, "")]
 )
-def test_the_unit_that_makes_times_overlap_is_named(unit: int, name: str) -> None:
+def test_the_unit_that_makes_times_overlap_is_named(unit, name):
     for longer in (T, np.arange(600.0)):  # a truth may begin earlier and end later
         said = [unit_apart(unit * T, longer, ("a", "b")), unit_apart(longer, unit * T, ("b", "a"))]
         assert said == [f"; a seems to be in {name}, and has to be in seconds" if name else ""] * 2
@@ -661,14 +653,14 @@ def test_the_unit_that_makes_times_overlap_is_named(unit: int, name: str) -> Non
 
 
 @pytest.mark.parametrize("heading", ["heading", "theta"])
-def test_a_lower_triangle_is_a_covariance(heading: str, inside: Path) -> None:
+def test_a_lower_triangle_is_a_covariance(heading, inside):
     e = np.random.default_rng().normal(size=(len(T), 3)) * [0.2, 0.3, 0.1]
     places = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
     names = ",".join(f"P_{'xyh'[i]}{'xyh'[j]}" for i, j in places)
     lines("est.csv", f"t,x,y,{heading},{names}", [T, *-e.T, *(np.full(len(T), P[i, j]) for i, j in places)])
     lines("truth.csv", f"t,x,y,{heading}", [T, *np.zeros((3, len(T)))])
     record = cs.read("est.csv", truth="truth.csv")
-    np.testing.assert_allclose(record.nees[0], np.einsum("ti,ti->t", e, np.linalg.solve(P, e.T).T), rtol=1e-9)
+    assert_allclose(record.nees[0], np.einsum("ti,ti->t", e, np.linalg.solve(P, e.T).T), rtol=1e-9)
     assert not record.parts
 
 
@@ -698,7 +690,7 @@ def test_a_lower_triangle_is_a_covariance(heading: str, inside: Path) -> None:
         ),
     ],
 )
-def test_a_refusal_names_the_remedy(name: str, header: str, rows: str, said: str, inside: Path) -> None:
+def test_a_refusal_names_the_remedy(name, header, rows, said, inside):
     Path("d").mkdir()
     Path(name).write_text(f"{header}\n{rows}")
     lines("truth.csv", "t,x,y,heading", [T, T, T, T])
@@ -706,14 +698,14 @@ def test_a_refusal_names_the_remedy(name: str, header: str, rows: str, said: str
         cs.read(name.split("/")[0], truth="truth.csv")
 
 
-def test_units_of_the_si_and_other_words_are_let_pass() -> None:
+def test_units_of_the_si_and_other_words_are_let_pass():
     require_units(["t [ns]", "v (m/s)", "omega[rad/s]", "P_xx [m^2]", "x [cmd]", "x (degraded)"], Path("o.csv"))
     for name in ("v (km/h)", "P_hh [deg^2]", "yaw [ ° ]", "pitch (degrees)", "z [CM]"):
         with pytest.raises(cs.InputError, match=r"o\.csv: column .* units are SI and radians"):
             require_units([name], Path("o.csv"))
 
 
-def test_a_list_in_a_cell() -> None:
+def test_a_list_in_a_cell():
     cells = np.empty(1, object)
     cells[0] = [0.01, 0.0]
     with pytest.raises(
@@ -724,7 +716,7 @@ def test_a_list_in_a_cell() -> None:
     assert fields_of('"t" "x"') == ["t", "x"]
 
 
-def test_a_solution_of_positions_is_called_so(inside: Path) -> None:
+def test_a_solution_of_positions_is_called_so(inside):
     head = "%  UTC latitude(deg) longitude(deg) height(m) Q sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m)\n"
     rows = (f"2023/11/14 22:13:2{k}.000 47.4 8.5 488.0 1 0.1 0.1 0.2 0 0 0\n" for k in range(3))
     Path("a.pos").write_text(head + "".join(rows))

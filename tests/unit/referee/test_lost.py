@@ -3,10 +3,6 @@
 Draws have a fixed seed that was not chosen; statistical limits are at 1e-5 or further out.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from draws import identities, independent
@@ -16,7 +12,6 @@ from consistency.diagnostics import (
     Design,
     Record,
     Settings,
-    Verdict,
     follow,
     gate_runs,
     judge,
@@ -28,17 +23,17 @@ from consistency.diagnostics import (
 from consistency.referee.diagnostics.questions.lost_runs import lost_evidence, lost_of
 from consistency.referee.diagnostics.statistics.number_of_runs import share_limit
 from consistency.referee.gating.watch import RunningTest, watching
-from consistency.referee.types import Array, Failure
+from consistency.referee.types import Failure
 from consistency.testing import InsufficientTrials, assert_consistent
 
 SURE = 1e-5
 
 
-def verdict_on(nees: Array, failures: tuple[Failure, ...] = (), **settings: Any) -> Verdict:
+def verdict_on(nees, failures=(), **settings):
     return judge(Record("f", nees=nees, dof=3, failures=failures), Settings(**settings))
 
 
-def right(runs: int, steps: int = 4) -> Array:
+def right(runs, steps=4):
     """NEES whose mean is 3 and whose distribution is chi-square's in every step: quantiles, no chance in it."""
     levels = (np.arange(runs) + 0.5) / runs
     order = np.random.default_rng(3)
@@ -50,7 +45,7 @@ def right(runs: int, steps: int = 4) -> Array:
 
 @pytest.mark.parametrize("dof", [1, 3, 6])
 @pytest.mark.parametrize("rate", [0.05, 1e-3, 1e-6])
-def test_the_bound_is_the_mean_beyond_the_quantile(dof: int, rate: float) -> None:
+def test_the_bound_is_the_mean_beyond_the_quantile(dof, rate):
     q = stats.chi2.isf(rate, dof)
     mean, _ = integrate.quad(lambda x: x * stats.chi2.pdf(x, dof), q, np.inf, epsabs=1e-14)
     assert float(lost_bound(dof, rate)) == pytest.approx(mean / rate, rel=1e-6)
@@ -60,20 +55,20 @@ def test_the_bound_is_the_mean_beyond_the_quantile(dof: int, rate: float) -> Non
 # --- the share -------------------------------------------------------------------------------------------
 
 
-def test_none_lost_leaves_a_share_open() -> None:
+def test_none_lost_leaves_a_share_open():
     assert share_limit(0, 50) == pytest.approx(1.0 - 0.05 ** (1 / 50))
     assert share_limit(2, 40) == pytest.approx(stats.beta.ppf(0.95, 3, 38))
     assert share_limit(7, 7) == 1.0
     assert stats.binom.cdf(3, 90, share_limit(3, 90, 0.99)) == pytest.approx(0.01)
 
 
-@pytest.mark.parametrize(("lost", "runs"), [(0, 59), (1, 93), (2, 124)])
-def test_runs_that_exclude_five_percent(lost: int, runs: int) -> None:
+@pytest.mark.parametrize("lost, runs", [(0, 59), (1, 93), (2, 124)])
+def test_runs_that_exclude_five_percent(lost, runs):
     assert lost_runs(0.05, lost=lost) == runs
     assert share_limit(lost, runs) <= 0.05 < share_limit(lost, runs - 1)
 
 
-def test_plans_have_at_least_these_runs() -> None:
+def test_plans_have_at_least_these_runs():
     assert gate_runs(3, 2.0) == 21
     assert gate_runs(3, 2.0, lost=0.05) == 59
     assert gate_runs(3, 2.0, power=0.9, lost=0.05) == lost_runs(0.05, 0.9) == 45
@@ -82,7 +77,7 @@ def test_plans_have_at_least_these_runs() -> None:
     assert pilot_plan(means, 3, 100, 2.0, lost=0.05).runs == 59 > pilot_plan(means, 3, 100, 2.0).runs
 
 
-def test_a_share_out_of_range_is_refused() -> None:
+def test_a_share_out_of_range_is_refused():
     for share in (0.0, 1.0, -0.1):
         with pytest.raises(ValueError, match="lost must lie between 0 and 1"):
             lost_runs(share)
@@ -97,7 +92,7 @@ def test_a_share_out_of_range_is_refused() -> None:
 # --- verdicts --------------------------------------------------------------------------------------------
 
 
-def test_what_stays_open_is_said() -> None:
+def test_what_stays_open_is_said():
     verdict = verdict_on(right(50))
     assert verdict.status == "consistent"
     assert verdict.reasons[0].endswith("; lost runs of up to 5.8 % cannot be excluded with 50 runs")
@@ -105,8 +100,8 @@ def test_what_stays_open_is_said() -> None:
     assert verdict.statistics["lost"]["asked"] is None
 
 
-@pytest.mark.parametrize(("runs", "status"), [(58, "undecided"), (59, "consistent")])
-def test_a_share_that_is_asked_for_takes_its_runs(runs: int, status: str) -> None:
+@pytest.mark.parametrize("runs, status", [(58, "undecided"), (59, "consistent")])
+def test_a_share_that_is_asked_for_takes_its_runs(runs, status):
     verdict = verdict_on(right(runs), lost=0.05)
     assert verdict_on(right(runs)).status == "consistent"
     assert verdict.status == status
@@ -120,7 +115,7 @@ def test_a_share_that_is_asked_for_takes_its_runs(runs: int, status: str) -> Non
     assert verdict.answers == verdict_on(right(runs)).answers
 
 
-def test_a_run_beyond_the_bound_is_lost() -> None:
+def test_a_run_beyond_the_bound_is_lost():
     """The bound is that of the rate over the number of runs; one run just beyond it is lost, one just below is not."""
     bound = float(lost_bound(3, 0.05 / 60))
     for factor, count in ((0.999, 0), (1.001, 1)):
@@ -132,7 +127,7 @@ def test_a_run_beyond_the_bound_is_lost() -> None:
         assert lost.upper == pytest.approx(share_limit(count, 60))
 
 
-def test_a_lost_run_takes_more_runs() -> None:
+def test_a_lost_run_takes_more_runs():
     nees = right(500)
     nees[7] = 1.5 * float(lost_bound(3, 0.05 / 500))
     free, asked = verdict_on(nees, false_alarm=0.05), verdict_on(nees, lost=0.05)
@@ -145,7 +140,7 @@ def test_a_lost_run_takes_more_runs() -> None:
     assert fewer.lost.needed == 93
 
 
-def test_failed_runs_are_lost_and_runs_without_a_value_are_none(rng: np.random.Generator) -> None:
+def test_failed_runs_are_lost_and_runs_without_a_value_are_none(rng):
     nees = right(60)
     nees[3], nees[5] = np.nan, np.nan
     evidence = Record("f", nees=nees, dof=3, failures=(Failure("f", 13, 2, "broke"),), runs=np.arange(60) + 10)
@@ -154,8 +149,8 @@ def test_failed_runs_are_lost_and_runs_without_a_value_are_none(rng: np.random.G
     assert lost_of(Record("f", nees=np.full((2, 3), np.nan), dof=3), np.full((2, 3), np.nan), 3, Settings()) is None
 
 
-def test_innovations_alone_show_no_share(rng: np.random.Generator) -> None:
-    nis: dict[str, Any] = {"nis": rng.chisquare(2, (200, 30)), "nis_dof": np.full((200, 30), 2)}
+def test_innovations_alone_show_no_share(rng):
+    nis = {"nis": rng.chisquare(2, (200, 30)), "nis_dof": np.full((200, 30), 2)}
     verdict = judge(Record("f", **nis, optimal_gain=True), Settings(SURE, lost=0.05))
     assert verdict.status == "undecided"
     assert "cannot show" in verdict.reasons[0]
@@ -164,7 +159,7 @@ def test_innovations_alone_show_no_share(rng: np.random.Generator) -> None:
 # --- until decided -----------------------------------------------------------------------------------------
 
 
-def test_the_bet_against_a_share() -> None:
+def test_the_bet_against_a_share():
     none = np.zeros(100, bool)
     evidence = lost_evidence(none, 0.05)
     by_hand = np.mean([((1.0 - q) / 0.95) ** 100 for q in (0.0, 0.00625, 0.0125, 0.025)])
@@ -178,7 +173,7 @@ def test_the_bet_against_a_share() -> None:
     )
 
 
-def test_until_decided_goes_on_until_the_share_is_excluded() -> None:
+def test_until_decided_goes_on_until_the_share_is_excluded():
     nees = right(400)
     free, runs = follow(Design(3, max_runs=400), lambda n: Record("f", nees=nees[:n], dof=3))
     asked, more = follow(Design(3, max_runs=400, lost=0.05), lambda n: Record("f", nees=nees[:n], dof=3))
@@ -196,7 +191,7 @@ def test_until_decided_goes_on_until_the_share_is_excluded() -> None:
 # --- gates -------------------------------------------------------------------------------------------------
 
 
-def test_a_gate_asks_for_runs_that_exclude_the_share(rng: np.random.Generator) -> None:
+def test_a_gate_asks_for_runs_that_exclude_the_share(rng):
     error = independent(rng, 110, 6, 3)
     assert_consistent(error, identities(error), false_alarm=SURE)
     with pytest.raises(InsufficientTrials, match=r"lost runs of up to 2\.69 % cannot be excluded.*--lost 0\.01") as few:
@@ -206,9 +201,9 @@ def test_a_gate_asks_for_runs_that_exclude_the_share(rng: np.random.Generator) -
     assert_consistent(error, identities(error), false_alarm=SURE, lost=0.05)
 
 
-def test_a_marker_may_ask(rng: np.random.Generator) -> None:
+def test_a_marker_may_ask(rng):
     error = independent(rng, 110, 6, 3)
-    entries: list[Any] = []
+    entries = []
     with watching(RunningTest({"lost": 0.01}, keep=entries.append)), pytest.raises(InsufficientTrials):
         assert_consistent(error, identities(error), false_alarm=SURE)
     assert entries[0].lost == 0.01

@@ -1,14 +1,10 @@
 """The monitor: its likelihood ratios by integration, its evidence by the definition, and what it makes of a change."""
 
-from __future__ import annotations
-
 import copy
 import math
 import pickle
 import re
 import runpy
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,10 +15,8 @@ import consistency as cs
 from consistency.referee.diagnostics.monitoring.monitor import RATIOS, alternatives, bet_on, start_share
 from consistency.referee.diagnostics.monitoring.truncated_chi2 import gate_limit, gated_mean, gated_scale, log_chi2_cdf
 
-ROOT = Path(__file__).parents[3]
 
-
-def fed(monitor: cs.Monitor, nis: Any, dof: int) -> list[cs.Alarm]:
+def fed(monitor, nis, dof):
     """Alarms of a series of NIS with the same degrees of freedom."""
     return [alarm for value in nis if (alarm := monitor.update(value, dof)) is not None]
 
@@ -30,7 +24,7 @@ def fed(monitor: cs.Monitor, nis: Any, dof: int) -> list[cs.Alarm]:
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(300)
 
 
-def expectation(function: Any, scale: float, dof: int, limit: float) -> float:
+def expectation(function, scale, dof, limit):
     """E function(NIS) of scale x chi-square(dof), given that it is at most ``limit``.
 
     Gauss-Legendre over the square root of the NIS, where the density has no pole, as far as no alternative has
@@ -49,16 +43,14 @@ def expectation(function: Any, scale: float, dof: int, limit: float) -> float:
 @pytest.mark.parametrize("gate", [None, 0.99, 0.95])
 @pytest.mark.parametrize("tolerance", [1.0, 1.2])
 @pytest.mark.parametrize("dof", [1, 2, 3, 7])
-def test_no_scale_within_the_tolerance_is_bet_against_with_profit(
-    dof: int, tolerance: float, gate: float | None
-) -> None:
+def test_no_scale_within_the_tolerance_is_bet_against_with_profit(dof, tolerance, gate):
     """E LR is 1 at the edge, at most 1 within, and above 1 at the alternative itself (negative control)."""
     bet = bet_on(dof, tolerance, gate)
     limit = math.inf if gate is None else stats.chi2.ppf(gate, dof)
     assert bet.limit == limit
     for (scale, edge), (constant, slope) in zip(alternatives(tolerance), bet.terms, strict=True):
 
-        def ratio(nis: float, constant: float = constant, slope: float = slope) -> float:
+        def ratio(nis, constant=constant, slope=slope):
             return math.exp(constant + slope * nis)
 
         assert expectation(ratio, edge, dof, limit) == pytest.approx(1.0, abs=1e-9)
@@ -68,7 +60,7 @@ def test_no_scale_within_the_tolerance_is_bet_against_with_profit(
         assert expectation(ratio, beyond, dof, limit) > 1.0 + 1e-6
 
 
-def test_alternatives_are_outside_the_tolerance_on_both_sides() -> None:
+def test_alternatives_are_outside_the_tolerance_on_both_sides():
     for tolerance in (1.0, 1.2, 3.0):
         pairs = alternatives(tolerance)
         above, below = pairs[: len(RATIOS)], pairs[len(RATIOS) :]
@@ -77,7 +69,7 @@ def test_alternatives_are_outside_the_tolerance_on_both_sides() -> None:
         np.testing.assert_allclose([a * b for (a, _), (b, _) in zip(above, below, strict=True)], 1.0)
 
 
-def test_shares_add_up_to_one() -> None:
+def test_shares_add_up_to_one():
     terms = 10**6
     head = math.fsum(start_share(k) for k in range(1, terms + 1))
     tail = 1 / math.log(terms + 1)  # at least the sum of 1 / (n ln^2 n) over n > terms + 1, by the integral
@@ -94,7 +86,7 @@ def test_shares_add_up_to_one() -> None:
 # --- the chi-square behind a gate ----------------------------------------------------------------------
 
 
-def test_the_distribution_function_does_not_underflow() -> None:
+def test_the_distribution_function_does_not_underflow():
     for x, dof in ((0.3, 1), (5.0, 3), (2.0, 40), (900.0, 1000)):
         assert log_chi2_cdf(x, dof) == pytest.approx(math.log(stats.chi2.cdf(x, dof)), rel=1e-10)
     for x, dof in ((100.0, 3000), (1500.0, 4000), (3.0e4, 1.0e5), (1e-200, 4)):
@@ -107,7 +99,7 @@ def test_the_distribution_function_does_not_underflow() -> None:
 
 @pytest.mark.parametrize("dof", [1, 3, 10])
 @pytest.mark.parametrize("scale", [0.3, 1.0, 1.7])
-def test_the_scale_behind_a_gate_is_recovered(dof: int, scale: float) -> None:
+def test_the_scale_behind_a_gate_is_recovered(dof, scale):
     limit = gate_limit(0.99, dof)
     mean = expectation(lambda nis: nis, scale, dof, limit)
     assert gated_mean(scale, dof, limit) == pytest.approx(mean, rel=1e-6)
@@ -120,7 +112,7 @@ def test_the_scale_behind_a_gate_is_recovered(dof: int, scale: float) -> None:
 # --- the evidence --------------------------------------------------------------------------------------
 
 
-def by_definition(nis: list[float], dof: list[int], tolerance: float, mission: int | None) -> float:
+def by_definition(nis, dof, tolerance, mission):
     """Mean over alternatives of the sum over starts of share x product of density ratios, and the shares to come."""
     total, edges = 0.0, [tolerance] * len(RATIOS) + [1 / tolerance] * len(RATIOS)
     scales = [tolerance * ratio for ratio in RATIOS] + [1 / (tolerance * ratio) for ratio in RATIOS]
@@ -135,7 +127,7 @@ def by_definition(nis: list[float], dof: list[int], tolerance: float, mission: i
 
 @pytest.mark.parametrize("mission", [None, 20])
 @pytest.mark.parametrize("tolerance", [1.0, 1.2])
-def test_evidence_by_its_definition(tolerance: float, mission: int | None) -> None:
+def test_evidence_by_its_definition(tolerance, mission):
     rng = np.random.default_rng()
     dof = rng.integers(1, 4, 30).tolist()
     nis = (1.3 * rng.chisquare(dof)).tolist()
@@ -151,14 +143,14 @@ def test_evidence_by_its_definition(tolerance: float, mission: int | None) -> No
 
 
 @pytest.mark.parametrize("gate", [None, 0.99])
-def test_the_evidence_of_a_right_filter_is_a_martingale(gate: float | None) -> None:
+def test_the_evidence_of_a_right_filter_is_a_martingale(gate):
     """Its expectation after the next innovation is what it is now, wherever it is."""
     rng = np.random.default_rng()
     monitor = cs.Monitor(1e-9, tolerance=1.0, gate=gate)
     limit = math.inf if gate is None else gate_limit(gate, 2)
     for value in (0.7, 1.9, *rng.chisquare(2, 3).clip(max=4.0)):
 
-        def after(nis: float, before: cs.Monitor = copy.deepcopy(monitor)) -> float:  # noqa: B008
+        def after(nis, before=copy.deepcopy(monitor)):  # noqa: B008
             following = copy.deepcopy(before)
             following.update(nis, 2)
             return following.evidence
@@ -167,7 +159,7 @@ def test_the_evidence_of_a_right_filter_is_a_martingale(gate: float | None) -> N
         monitor.update(float(value), 2)
 
 
-def test_an_alarm_is_raised_at_the_inverse_of_the_rate() -> None:
+def test_an_alarm_is_raised_at_the_inverse_of_the_rate():
     for false_alarm in (0.2, 0.01):
         monitor, before = cs.Monitor(false_alarm, tolerance=1.0), 1.0
         while not (alarm := monitor.update(2.6, 2)):  # evidence that grows by a few percent a step
@@ -183,7 +175,7 @@ def test_an_alarm_is_raised_at_the_inverse_of_the_rate() -> None:
 
 @pytest.mark.parametrize("tolerance", [1.0, 1.2])
 @pytest.mark.parametrize(("ratio", "direction"), [(3.0, "overconfident"), (0.2, "conservative")])
-def test_a_change_is_found_with_its_step_direction_and_scale(ratio: float, direction: str, tolerance: float) -> None:
+def test_a_change_is_found_with_its_step_direction_and_scale(ratio, direction, tolerance):
     monitor = cs.Monitor(tolerance=tolerance)
     assert not fed(monitor, [3.0] * 200, 3)  # exactly the expected value
     alarms = fed(monitor, [3.0 * ratio] * 200, 3)
@@ -197,14 +189,14 @@ def test_a_change_is_found_with_its_step_direction_and_scale(ratio: float, direc
 
 
 @pytest.mark.parametrize(("ratio", "direction"), [(1.07, "overconfident"), (0.93, "conservative")])
-def test_the_direction_of_a_small_fault(ratio: float, direction: str) -> None:
+def test_the_direction_of_a_small_fault(ratio, direction):
     """The alternatives nearest to 1 on either side are the best there."""
     alarm = fed(cs.Monitor(tolerance=1.0), [300.0 * ratio] * 200, 300)[0]
     assert alarm.direction == direction
     assert alarm.scale == pytest.approx(ratio)
 
 
-def test_since_when_by_its_definition() -> None:
+def test_since_when_by_its_definition():
     """The step after the one at which the sum of log ratios of the r with the largest R was lowest."""
     rng = np.random.default_rng()
     constant, slope = np.array(bet_on(2, 1.0).terms).T
@@ -224,7 +216,7 @@ def test_since_when_by_its_definition() -> None:
         assert monitor.alarm.direction == ("overconfident" if best < len(RATIOS) else "conservative")
 
 
-def test_scales_within_the_tolerance_raise_nothing_and_begin_nothing() -> None:
+def test_scales_within_the_tolerance_raise_nothing_and_begin_nothing():
     monitor = cs.Monitor(0.5, tolerance=1.2)
     assert not fed(monitor, [1.2 * 3.0, 3.0 / 1.2] * 5000, 3)
     assert monitor.largest == 1.0
@@ -233,7 +225,7 @@ def test_scales_within_the_tolerance_raise_nothing_and_begin_nothing() -> None:
     assert fed(cs.Monitor(0.5, tolerance=1.0), [1.2 * 3.0] * 5000, 3)  # negative control: the exact test alarms
 
 
-def test_steps_without_an_innovation_count_as_steps_only() -> None:
+def test_steps_without_an_innovation_count_as_steps_only():
     monitor, dense = cs.Monitor(), cs.Monitor()
     for nis, dof in ((2.0, 2), (7.0, 2), (3.0, 2), (12.0, 2), (15.0, 2), (14.0, 2), (30.0, 2)):
         for nothing in ((None, 0), (math.nan, 0), (math.nan, 2), (None, 3), (0.0, 0)):
@@ -249,7 +241,7 @@ def test_steps_without_an_innovation_count_as_steps_only() -> None:
     assert monitor.rejections == 0
 
 
-def test_numbers_of_numpy_will_do() -> None:
+def test_numbers_of_numpy_will_do():
     plain, numpy = cs.Monitor(), cs.Monitor()
     for value in (1.0, 9.0, 4.0):
         plain.update(value, 3)
@@ -263,9 +255,7 @@ def test_numbers_of_numpy_will_do() -> None:
 
 @pytest.mark.parametrize(("gate", "rest"), [(0.99, 2), (0.999, 2), (0.95, 5), (0.98, 5)])
 @pytest.mark.parametrize("rejected", [1e6, None, math.nan])
-def test_a_rejection_is_no_evidence_and_the_next_innovations_are_not_judged(
-    rejected: float | None, gate: float, rest: int
-) -> None:
+def test_a_rejection_is_no_evidence_and_the_next_innovations_are_not_judged(rejected, gate, rest):
     monitor = cs.Monitor(gate=gate)
     fed(monitor, [3.0, 5.0], 3)
     before = monitor.evidence
@@ -282,7 +272,7 @@ def test_a_rejection_is_no_evidence_and_the_next_innovations_are_not_judged(
     assert monitor.innovations == 3
 
 
-def test_a_nis_at_the_limit_is_accepted() -> None:
+def test_a_nis_at_the_limit_is_accepted():
     monitor, limit = cs.Monitor(gate=0.99), gate_limit(0.99, 3)
     monitor.update(limit, 3)
     assert (monitor.innovations, monitor.rejections) == (1, 0)
@@ -291,7 +281,7 @@ def test_a_nis_at_the_limit_is_accepted() -> None:
     assert limit == pytest.approx(11.3449, abs=1e-4)  # tables of chi-square
 
 
-def test_the_scale_of_an_alarm_allows_for_the_gate() -> None:
+def test_the_scale_of_an_alarm_allows_for_the_gate():
     limit = gate_limit(0.99, 3)
     monitor = cs.Monitor(gate=0.99)
     fed(monitor, [gated_mean(1.0, 3, limit)] * 100, 3)
@@ -308,7 +298,7 @@ def test_the_scale_of_an_alarm_allows_for_the_gate() -> None:
 # --- limits --------------------------------------------------------------------------------------------
 
 
-def test_nothing_overflows() -> None:
+def test_nothing_overflows():
     monitor = cs.Monitor()
     alarm = monitor.update(1e300, 1)
     assert alarm.direction == "overconfident"
@@ -326,7 +316,7 @@ def test_nothing_overflows() -> None:
         assert fed(many, [0.7e5] * 2, 100_000)[0].direction == "conservative"
 
 
-def test_memory_does_not_grow_and_a_stored_monitor_goes_on() -> None:
+def test_memory_does_not_grow_and_a_stored_monitor_goes_on():
     rng = np.random.default_rng()
     monitor, sizes = cs.Monitor(gate=0.99), []
     for _ in range(2):
@@ -342,7 +332,7 @@ def test_memory_does_not_grow_and_a_stored_monitor_goes_on() -> None:
     assert restored.evidence == monitor.evidence
 
 
-def test_reset_starts_anew() -> None:
+def test_reset_starts_anew():
     monitor, new = cs.Monitor(gate=0.99), cs.Monitor(gate=0.99)
     fed(monitor, [9.0] * 200 + [100.0], 3)
     assert monitor.alarm is not None
@@ -366,7 +356,7 @@ def test_reset_starts_anew() -> None:
         (None, math.inf, "dof must be a whole number"),
     ],
 )
-def test_refused_values_leave_everything_as_it_was(nis: float | None, dof: Any, said: str) -> None:
+def test_refused_values_leave_everything_as_it_was(nis, dof, said):
     monitor = cs.Monitor()
     fed(monitor, [3.0, 4.0], 3)
     before = copy.deepcopy(vars(monitor))
@@ -389,7 +379,7 @@ def test_refused_values_leave_everything_as_it_was(nis: float | None, dof: Any, 
         ({"mission": 2.5}, "mission must be a whole number"),
     ],
 )
-def test_refused_options(options: dict[str, Any], said: str) -> None:
+def test_refused_options(options, said):
     with pytest.raises(ValueError, match=re.escape(said)):
         cs.Monitor(**options)
 
@@ -397,7 +387,7 @@ def test_refused_options(options: dict[str, Any], said: str) -> None:
 # --- words ---------------------------------------------------------------------------------------------
 
 
-def test_the_sentence_says_what_is_judged_and_what_is_not() -> None:
+def test_the_sentence_says_what_is_judged_and_what_is_not():
     alarm = fed(cs.Monitor(), [2.0] * 10 + [9.0] * 100, 2)[0]
     said = str(alarm)
     assert f"alarm in step {alarm.step}: overconfident since step 11" in said
@@ -414,7 +404,7 @@ def test_the_sentence_says_what_is_judged_and_what_is_not() -> None:
         assert "pose" in text
 
 
-def test_the_example_of_the_manual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_of_the_manual(tmp_path, capsys):
     (tmp_path / "example.py").write_text(blocks("docs/monitor.md", "python")[0].text)
     runpy.run_path(str(tmp_path / "example.py"))
     printed = capsys.readouterr().out.split()

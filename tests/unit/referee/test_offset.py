@@ -1,13 +1,11 @@
 """Clocks that differ, on runs whose offset is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from recorded import read_recordings
 from scipy import stats
 
@@ -17,20 +15,19 @@ from consistency.referee.readers import clock_offset
 from consistency.referee.readers.clock_offset import Offset, clock_shift, offset_of, steps_of
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses
-from consistency.referee.types import Array
 
 SIGMA = np.array([0.3, 0.3, 0.02])
 TRUE_T = np.arange(-2.0, 12.0, 0.02)
 
 
-def path(rng: np.random.Generator, speed: float) -> Array:
+def path(rng, speed):
     """A winding drive at every 0.02 s, (700, 3)."""
     heading = rng.uniform(-3, 3) + 0.4 * np.sin(rng.uniform(-1, 1) * TRUE_T) + 0.2 * TRUE_T
     steps = 0.02 * speed * np.column_stack([np.cos(heading), np.sin(heading)])
     return np.column_stack([np.cumsum(steps, axis=0), wrap(heading)])
 
 
-def run_of(rng: np.random.Generator, offset: float, noise: float = 1.0, speed: float = 5.0) -> Poses:
+def run_of(rng, offset, noise=1.0, speed=5.0):
     """100 estimates in 10 s, whose clock is ``offset`` early."""
     t, truth = 0.1 * np.arange(100), path(rng, speed)
     poses = Poses(
@@ -42,23 +39,23 @@ def run_of(rng: np.random.Generator, offset: float, noise: float = 1.0, speed: f
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     return np.random.default_rng()
 
 
 @pytest.mark.parametrize("offset", [-0.35, -0.012, 0.0, 0.04, 0.7])
-def test_without_noise_it_is_found_to_the_millisecond(rng: np.random.Generator, offset: float) -> None:
+def test_without_noise_it_is_found_to_the_millisecond(rng, offset):
     found = offset_of([run_of(rng, offset, noise=1e-3) for _ in range(5)])
     assert found.value == pytest.approx(offset, abs=5e-4)
     assert found.low <= found.value <= found.high
 
 
-def test_a_step_goes_to_the_offset(rng: np.random.Generator) -> None:
+def test_a_step_goes_to_the_offset(rng):
     steps = steps_of(run_of(rng, 0.02, noise=1e-3), 0.0, 3)
-    np.testing.assert_allclose(steps, 0.02, atol=2e-3)
+    assert_allclose(steps, 0.02, atol=2e-3)
 
 
-def test_the_interval_by_hand(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_interval_by_hand(rng, monkeypatch):
     """Student's t of the steps that five runs would go from the offset: 2.7764 standard errors with 4 of freedom."""
     steps = iter([0.001, -0.002, 0.004, 0.0, 0.002])
     monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.array([next(steps)]))
@@ -72,15 +69,13 @@ def test_the_interval_by_hand(rng: np.random.Generator, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("nees", "then", "alone"), [(5.0, 2.0, False), (5.0, 3.0, True), (3.9, 1.0, True), (4.1, 1.0, False)]
+    "nees, then, alone", [(5.0, 2.0, False), (5.0, 3.0, True), (3.9, 1.0, True), (4.1, 1.0, False)]
 )
-def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(
-    nees: float, then: float, alone: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(nees, then, alone, rng, monkeypatch):
     """Mean NEES over its degrees of freedom as it is, and 0.04 s later: beyond 4, and less than half of that."""
     asked = []
 
-    def steps(poses: Poses, shift: float, parts: int) -> Array:
+    def steps(poses, shift, parts):
         asked.append(parts)
         return np.array([0.001, -0.001, np.nan, 0.0])
 
@@ -98,24 +93,22 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(
     assert asked == [1, 1]
 
 
-@pytest.mark.parametrize(("steps", "p"), [((0.0, 0.0), None), ((0.0, np.nan, 0.0), None), ((0.0, 0.0, 0.0), 0.0)])
-def test_steps_that_agree_are_certain_and_two_are_none(
-    steps: tuple[float, ...], p: float | None, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("steps, p", [((0.0, 0.0), None), ((0.0, np.nan, 0.0), None), ((0.0, 0.0, 0.0), 0.0)])
+def test_steps_that_agree_are_certain_and_two_are_none(steps, p, rng, monkeypatch):
     monkeypatch.setattr(clock_offset, "_size", lambda _, shift, __: 1.0 + (shift - 0.04) ** 2)
     monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.array(steps))
     found = offset_of([run_of(rng, 0.0)])
     assert (None if found is None else found.p_value) == p
 
 
-def test_steps_that_agree_on_no_offset_find_none(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_that_agree_on_no_offset_find_none(rng, monkeypatch):
     monkeypatch.setattr(clock_offset, "_size", lambda _, shift, __: 1.0 + abs(shift))
     monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.zeros(4))
     found = offset_of([run_of(rng, 0.0)])
     assert (found.value, found.p_value) == (0.0, 1.0)
 
 
-def test_with_noise_it_is_named(rng: np.random.Generator) -> None:
+def test_with_noise_it_is_named(rng):
     """40 ms at 5 m/s are 0.2 m beside a sigma of 0.3 m. The estimate spreads by 1.2 ms: 10 times that is never seen."""
     runs = [run_of(rng, 0.04) for _ in range(20)]
     found = offset_of(runs)
@@ -130,19 +123,19 @@ def test_with_noise_it_is_named(rng: np.random.Generator) -> None:
     assert "is added to the timestamps" in notes[0]
 
 
-def test_a_right_clock_is_left_alone(rng: np.random.Generator) -> None:
-    """Each is named with probability 1e-4: more than 2 of 60 with 4e-8."""
-    assert sum(bool(clock_shift("est", [run_of(rng, 0.0) for _ in range(8)], None)[1]) for _ in range(60)) <= 2
+def test_a_right_clock_is_left_alone(rng):
+    """Each is named with probability 1e-4: more than 1 of 20 with 2e-6."""
+    assert sum(bool(clock_shift("est", [run_of(rng, 0.0) for _ in range(8)], None)[1]) for _ in range(20)) <= 1
 
 
-def test_the_error_of_a_single_run_is_not_laid_on_the_clock(rng: np.random.Generator) -> None:
+def test_the_error_of_a_single_run_is_not_laid_on_the_clock(rng):
     """An error along the path looks the same; only one far too large for the covariance is named."""
     for noise in (1.0, 0.01):  # the second is sure of the offset
         assert clock_shift("est", [run_of(rng, 0.04, noise)], None)[1] == []
     assert "of estimates and truth seem to differ by" in clock_shift("est", [run_of(rng, 0.3)], None)[1][0]
 
 
-def test_where_nothing_moves_there_is_none(rng: np.random.Generator) -> None:
+def test_where_nothing_moves_there_is_none(rng):
     runs = [run_of(rng, 0.0) for _ in range(4)]
     still = [replace(run, truth=np.zeros_like(run.truth), estimate=0.1 * SIGMA * run.estimate) for run in runs]
     assert offset_of(still) is None
@@ -154,7 +147,7 @@ def test_where_nothing_moves_there_is_none(rng: np.random.Generator) -> None:
 
 
 @pytest.fixture
-def tables(tmp_path: Path, rng: np.random.Generator) -> Path:
+def tables(tmp_path, rng):
     """Estimates of 12 runs that are 0.1 s early, with their truths."""
     estimates, truths = [], []
     for number in range(12):
@@ -169,7 +162,7 @@ def tables(tmp_path: Path, rng: np.random.Generator) -> Path:
     return tmp_path
 
 
-def test_tables_are_read_with_an_offset(tables: Path) -> None:
+def test_tables_are_read_with_an_offset(tables):
     """NEES 3 expected, of 1,200: 2.5 and 3.5 are 7 sigma away."""
     files = tables / "est.csv", tables / "truth.csv"
     for option, right in ((None, False), (0.1, True), ("estimate", True), (-0.1, False)):
@@ -179,7 +172,7 @@ def test_tables_are_read_with_an_offset(tables: Path) -> None:
     assert cs.judge(cs.read(*files, time_offset=0.1)).status != "overconfident"
 
 
-def test_trajectories_are_read_with_an_offset(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_trajectories_are_read_with_an_offset(tmp_path, rng):
     for folder in ("est", "truth", "P"):
         (tmp_path / folder).mkdir()
     for number in range(6):
@@ -200,11 +193,11 @@ def test_trajectories_are_read_with_an_offset(tmp_path: Path, rng: np.random.Gen
     assert any("--time-offset 0." in note for note in read_recordings(*files)[0].notes)
 
 
-def test_what_has_truth_is_judged_at_every_offset(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_has_truth_is_judged_at_every_offset(rng, monkeypatch):
     """Also where a shift leaves it without truth: an offset explains nothing by leaving estimates out."""
     asked = []
 
-    def size(_: object, shift: float, judged: np.ndarray) -> float:
+    def size(_, shift, judged):
         asked.append(bool(judged.all()))
         return 1.0 + (shift - 0.04) ** 2
 
@@ -216,21 +209,17 @@ def test_what_has_truth_is_judged_at_every_offset(rng: np.random.Generator, monk
     assert all(asked)
 
 
-@pytest.mark.parametrize(
-    ("explained", "alone", "found"), [(0.02, False, True), (0.004, False, False), (0.02, True, False)]
-)
-def test_an_offset_that_makes_next_to_nothing_is_not_named(explained: float, alone: bool, found: bool) -> None:
+@pytest.mark.parametrize("explained, alone, found", [(0.02, False, True), (0.004, False, False), (0.02, True, False)])
+def test_an_offset_that_makes_next_to_nothing_is_not_named(explained, alone, found):
     """However sure: x and y exchanged looked like clocks that differ by 0.01 s, which made 0 % of the NEES."""
     assert Offset(-0.01, -0.014, -0.006, 1e-9, explained, alone).found == found
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.05])
-def test_a_truth_beside_the_estimates_is_that_of_other_times_if_the_clocks_differ(
-    rng: np.random.Generator, shift: float
-) -> None:
+def test_a_truth_beside_the_estimates_is_that_of_other_times_if_the_clocks_differ(rng, shift):
     p = run_of(rng, 0.0)
     own = p.known(0.0).truth
     beside, apart = (replace(p, true_t=t, truth=own, max_dt=0.2).known(shift) for t in (p.t, p.t.copy()))
-    np.testing.assert_allclose(beside.truth, apart.truth)
-    np.testing.assert_array_equal(beside.rows, apart.rows)
+    assert_allclose(beside.truth, apart.truth)
+    assert_array_equal(beside.rows, apart.rows)
     assert np.array_equal(beside.truth, own) == (shift == 0.0)

@@ -1,13 +1,11 @@
 """One function decides, and makes each verdict once and whole."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from draws import identities, independent
+from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
 from consistency.diagnostics import Design, MapRecord, Record, Rejections, Settings, Verdict, follow, judge, look
@@ -30,25 +28,25 @@ from consistency.referee.types import Failure
 RUNS = 24
 
 
-def record(scale: float = 1.0, **more: Any) -> Record:
+def record(scale=1.0, **more):
     error = scale * independent(np.random.default_rng(5), RUNS, 4, 3)
     nees = np.square(error).sum(axis=-1)
     return Record("f", error, identities(error), nees, axes=("x", "y", "heading"), **more)
 
 
-def map_of(runs: int) -> MapRecord:
+def map_of(runs):
     """Two landmarks of each run, the second of the last one without a NEES."""
     run, nees = np.repeat(np.arange(runs), 2), np.tile([3.0, 6.0], runs)
     nees[-1] = np.nan
 
-    def landmarks(last: Any) -> Record:
+    def landmarks(last):
         assert last.shape == (runs,)
         return Record("map", nees=np.tile([3.0, 6.0], (runs, 1)), dof=3, landmarks=np.array([7, 9]))
 
     return MapRecord(run, nees, 3, landmarks)
 
 
-def whole_record() -> Record:
+def whole_record():
     """A record with everything that stands beside the errors."""
     error = independent(np.random.default_rng(6), RUNS, 4, 3)
     counts = (np.full(RUNS, n) for n in (10, 4, 3, 2))
@@ -59,12 +57,12 @@ def whole_record() -> Record:
     )  # fmt: skip
 
 
-def test_a_verdict_is_made_once_and_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_verdict_is_made_once_and_whole(monkeypatch):
     """One for the record, one in the world and one on the map; none is refilled."""
-    made: list[str] = []
+    made = []
     build = Verdict.__init__
 
-    def count(self: Verdict, *arguments: Any, **more: Any) -> None:
+    def count(self, *arguments, **more):
         build(self, *arguments, **more)
         made.append(self.status)
 
@@ -84,7 +82,7 @@ def test_a_verdict_is_made_once_and_whole(monkeypatch: pytest.MonkeyPatch) -> No
     assert judge(record()).record is None
 
 
-def test_the_doors_to_the_judge_say_the_same() -> None:
+def test_the_doors_to_the_judge_say_the_same():
     """Of a record, of its arrays, of a sequence of records."""
     given = record(2.0)
     verdicts = [judge(given), cs.judge(given), cs.analyse([given])["f"]]
@@ -95,7 +93,7 @@ def test_the_doors_to_the_judge_say_the_same() -> None:
         assert verdict.statistics["ratio"] == verdicts[0].statistics["ratio"]
 
 
-def test_a_look_has_what_stands_beside_the_errors_of_its_runs() -> None:
+def test_a_look_has_what_stands_beside_the_errors_of_its_runs():
     given = whole_record()
     verdict = look(Design(3), given.first_runs(12), 0.5)
     assert verdict.world is not None
@@ -110,7 +108,7 @@ def test_a_look_has_what_stands_beside_the_errors_of_its_runs() -> None:
     assert verdict.world.answers != judge(errors.first_runs(12)).answers, "a look costs a part of the rate"
 
 
-def test_a_design_judges_by_the_look_that_decides() -> None:
+def test_a_design_judges_by_the_look_that_decides():
     given, design = record(3.0), Design(3)
     verdict, runs = follow(design, given.first_runs, RUNS)
     by_design = judge(given, design=design)
@@ -119,7 +117,7 @@ def test_a_design_judges_by_the_look_that_decides() -> None:
     assert judge(given).runs == RUNS
 
 
-def test_findings_are_a_verdict_without_words() -> None:
+def test_findings_are_a_verdict_without_words():
     found = Findings("f", "undecided", 3, 4, Settings())
     assert not hasattr(found, "reasons")
     assert Verdict(**vars(found), reasons=("undecided: so",)).status == "undecided"
@@ -129,7 +127,7 @@ def test_findings_are_a_verdict_without_words() -> None:
 
 
 @pytest.mark.parametrize("asked", [[MAIN], [STEP, "bias"], [MAIN, STEP, "shape", "outliers"], list(SHARES)])
-def test_shares_add_to_one(asked: list[str]) -> None:
+def test_shares_add_to_one(asked):
     shares = shares_of(asked)
     assert list(shares) == asked
     assert sum(shares.values()) == pytest.approx(1.0)
@@ -137,51 +135,51 @@ def test_shares_add_to_one(asked: list[str]) -> None:
         assert shares[MAIN] == SHARES[MAIN]
 
 
-def test_the_scale_is_asked_at_the_whole_rate_where_nothing_else_is() -> None:
+def test_the_scale_is_asked_at_the_whole_rate_where_nothing_else_is():
     settings = Settings(false_alarm=0.04)
     alone, among = (list(answers(dict.fromkeys(q, 0.5), 0.04).values()) for q in ([MAIN], [MAIN, STEP]))
     assert at_share(alone, settings).false_alarm == pytest.approx(0.08)
     assert at_share(among, settings).false_alarm == pytest.approx(0.04)
 
 
-def test_only_faults_are_tolerated() -> None:
+def test_only_faults_are_tolerated():
     given = tuple(answers({MAIN: 1e-9, STEP: 0.9, "bias": 1e-9}, 0.05).values())
     assert [a.tolerated for a in with_tolerated(given, {MAIN, STEP})] == [True, False, False]
 
 
-def test_the_smallest_p_value_of_steps_counts_their_number() -> None:
+def test_the_smallest_p_value_of_steps_counts_their_number():
     assert least_of_steps(np.array([0.3, np.nan, 0.01, 0.2])) == (pytest.approx(0.03), 3)
     p, step = least_of_steps(np.full(3, np.nan))
     assert np.isnan(p)
     assert step is None
 
 
-def test_the_last_nees_of_each_run() -> None:
+def test_the_last_nees_of_each_run():
     nees = np.array([[1.0, 2.0, np.nan], [np.nan, np.nan, np.nan], [3.0, np.nan, 4.0]])
-    np.testing.assert_array_equal(last_nees(Record("f", nees=nees, dof=3)), [2.0, np.nan, 4.0])
+    assert_array_equal(last_nees(Record("f", nees=nees, dof=3)), [2.0, np.nan, 4.0])
     assert last_nees(replace(record(), nees=None)) is None
 
 
 # --- arrays -------------------------------------------------------------------------------------------------
 
 
-def test_a_group_of_components_is_whitened_by_its_own_covariance() -> None:
+def test_a_group_of_components_is_whitened_by_its_own_covariance():
     rng = np.random.default_rng(8)
     A = rng.standard_normal((2, 5, 3, 3))
     e, P = rng.standard_normal((2, 5, 3)), A @ np.swapaxes(A, -1, -2) + np.eye(3)
-    np.testing.assert_allclose(whiten_group(e, P, [1]), e[..., [1]] / np.sqrt(P[..., 1, 1, None]))
+    assert_allclose(whiten_group(e, P, [1]), e[..., [1]] / np.sqrt(P[..., 1, 1, None]))
     pair = whiten(e[..., [2, 0]], P[..., [2, 0], :][..., [2, 0]])
-    np.testing.assert_array_equal(whiten_group(e, P, [2, 0]), pair)
-    np.testing.assert_array_equal(whiten_group(e, P, [0, 1, 2]), whiten(e, P))
+    assert_array_equal(whiten_group(e, P, [2, 0]), pair)
+    assert_array_equal(whiten_group(e, P, [0, 1, 2]), whiten(e, P))
 
 
-def test_every_entry_is_asked() -> None:
+def test_every_entry_is_asked():
     P = np.zeros((4, 5, 3, 3))
     P[1, 2, 0, 2] = P[3, 4, 1, 1] = np.nan
     assert np.argwhere(~every_entry(np.isfinite, P)).tolist() == [[1, 2], [3, 4]]
 
 
-def test_a_failed_run_is_no_verdict_of_the_rest() -> None:
+def test_a_failed_run_is_no_verdict_of_the_rest():
     given = replace(record(), failures=(Failure("f", 3, 2, "diverged"),))
     assert given.error is not None
     given.error[3, 1:] = np.nan

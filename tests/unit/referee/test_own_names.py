@@ -232,7 +232,7 @@ def test_a_folder_of_tables_is_read_as_runs(tmp_path: Path) -> None:
         one = cs.read(tmp_path / "est" / f"{run}.csv", tmp_path / "truth" / f"{run}.csv", columns=columns)
         np.testing.assert_allclose(record.nees[run], one.nees[0], rtol=1e-12)  # type: ignore[index]
     (tmp_path / "truth" / "2.csv").unlink()
-    with pytest.raises(cs.InputError, match=r"--truth .*truth: holds no file '2' for .*2\.csv"):
+    with pytest.raises(cs.InputError, match=r"--truth .*truth: holds no table '2' for .*2\.csv"):
         cs.read(tmp_path / "est", tmp_path / "truth", columns=columns)
 
 

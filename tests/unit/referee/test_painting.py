@@ -1,16 +1,12 @@
 """Marks are drawn with the values that they have, names are shown literally, and files of figures are small."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure as Drawing
+from numpy.testing import assert_array_equal
 from painted import legend_of, places, shaded
 
 from consistency.referee.document.blocks import Document, Figure
@@ -46,11 +42,11 @@ STEPS = np.arange(1.0, 6.0)
 TAG = "0-1"
 
 
-def axes_of(*marks: Callable[[Axes], None]) -> Axes:
+def axes_of(*marks):
     return drawn(partial(draw, *marks)).axes[0]
 
 
-def draw(*marks: Callable[[Axes], None], legend: bool = False) -> Drawing:
+def draw(*marks, legend=False):
     figure, (axes,) = canvas(2.0)
     for mark in marks:
         mark(axes)
@@ -89,7 +85,7 @@ def test_a_line_has_its_values_its_look_and_its_filter():
     values = np.array([1.0, 2.0, 300.0, np.nan, 4.0])
     axes = axes_of(lambda axes: curve(axes, STEPS, values, style(1), "f", TAG), lambda axes: log_axis(axes, "y"))
     (line,) = axes.lines
-    np.testing.assert_array_equal(line.get_ydata(), values)
+    assert_array_equal(line.get_ydata(), values)
     assert to_hex(line.get_color()).upper() == style(1).colour
     assert line.is_dashed()
     assert (line.get_label(), line.get_gid()) == ("f", "filter:0-1")
@@ -109,7 +105,7 @@ def test_small_points_are_one_path_of_those_that_are_known():
     y = np.array([1.0, np.nan, 3.0, 4.0, np.inf])
     axes = axes_of(lambda axes: points(axes, STEPS, y, style(0), "p", TAG))
     (found,) = places(axes)
-    np.testing.assert_array_equal(found, [[1, 1], [3, 3], [4, 4]])
+    assert_array_equal(found, [[1, 1], [3, 3], [4, 4]])
     assert axes.get_ylim()[0] < 1.0 < 4.0 < axes.get_ylim()[1]
     text = svg(partial(draw, lambda axes: points(axes, STEPS, y, style(0), "p", TAG)))
     (marks,) = re.findall(r'<g class="filter-0-1"><path d="([^"]*)"', text)
@@ -118,7 +114,7 @@ def test_small_points_are_one_path_of_those_that_are_known():
 
 
 def test_intervals_have_a_row_each_and_an_arrow_where_they_go_on():
-    def mark(axes: Axes) -> None:
+    def mark(axes):
         axes.set_xlim(0.1, 10.0)
         name_rows(axes, ["$x$", "y"])
         intervals(axes, np.array([0.0, 1.0]), np.array([[2.0, 1.5, 3.0], [0.5, 0.0, np.inf]]), style(0), "f", TAG)
@@ -133,7 +129,7 @@ def test_intervals_have_a_row_each_and_an_arrow_where_they_go_on():
     arrows = [(line.get_marker(), line.get_xdata().tolist()) for line in axes.lines if line.get_marker() in "<>"]
     assert arrows == [("<", [0.1]), (">", [10.0])]
     assert {line.get_gid() for line in axes.lines} == {"filter:0-1"}
-    np.testing.assert_array_equal(axes.lines[-1].get_xydata(), [[2.0, 0.0], [0.5, 1.0]])
+    assert_array_equal(axes.lines[-1].get_xydata(), [[2.0, 0.0], [0.5, 1.0]])
 
 
 def test_a_panel_with_none_below_it_has_numbers_on_its_axis():
@@ -151,7 +147,7 @@ def test_a_map_has_equal_axes_and_height():
 
 
 def test_a_log_axis_has_plain_numbers():
-    def mark(axes: Axes) -> None:
+    def mark(axes):
         axes.set_ylim(0.5, 40.0)
         log_axis(axes, "y")
 
@@ -168,15 +164,15 @@ def test_thin_keeps_extremes_ends_and_short_lines():
     assert len(keep) <= MOST
     assert {0, 12_345, 23_456, 29_999} <= set(keep.tolist())
     assert (np.diff(keep) > 0).all()
-    np.testing.assert_array_equal(thin(line[:200]), np.arange(200))
+    assert_array_equal(thin(line[:200]), np.arange(200))
 
 
 @pytest.mark.parametrize("mark", ["curve", "path", "band", "edges"])
-def test_a_long_mark_is_thinned_and_keeps_its_peak(mark: str):
+def test_a_long_mark_is_thinned_and_keeps_its_peak(mark):
     x, y = np.arange(9000.0), np.zeros(9000)
     y[4321] = 7.0
     ends = np.column_stack([-y, y])
-    marks: dict[str, Callable[[Axes], None]] = {
+    marks = {
         "curve": lambda axes: curve(axes, x, y, style(0)),
         "path": lambda axes: path(axes, np.column_stack([y, np.zeros(9000)]), style(0)),
         "band": lambda axes: band(axes, x, ends),
@@ -196,7 +192,7 @@ def test_a_long_mark_is_thinned_and_keeps_its_peak(mark: str):
 
 def test_names_are_shown_literally():
     marks = [partial(curve, x=STEPS, y=STEPS, look=style(i), label=name) for i, name in enumerate(ODD)]
-    title: list[Callable[[Axes], None]] = [lambda axes: axes.set_title(ODD[0])]
+    title = [lambda axes: axes.set_title(ODD[0])]
     figure = drawn(partial(draw, *marks, *title, legend=True))
     assert legend_of(figure) == list(ODD)
     text = svg(partial(draw, *marks, *title, legend=True))
@@ -205,7 +201,7 @@ def test_names_are_shown_literally():
 
 
 def test_a_legend_has_each_label_once_and_room_of_its_own():
-    def both(legend: bool) -> Drawing:
+    def both(legend):
         figure, panels = canvas(2.0, 2, 2)
         for axes in panels:
             curve(axes, STEPS, STEPS, style(0), "a filter", TAG)
@@ -230,7 +226,7 @@ def test_a_panel_has_a_legend_of_its_own():
 # --- files ------------------------------------------------------------------------------------
 
 
-def line_of(name: str = "f", tag: str = "") -> Callable[[], Drawing]:
+def line_of(name="f", tag=""):
     return partial(draw, lambda axes: curve(axes, STEPS, np.sqrt(STEPS), style(0), name, tag), legend=True)
 
 
@@ -252,7 +248,7 @@ def test_coordinates_have_one_digit_and_groups_no_names():
 
 
 def test_what_has_words_to_hover_has_a_title_up_to_a_limit():
-    def tiles(count: int) -> Drawing:
+    def tiles(count):
         figure, (axes,) = canvas(2.0)
         for number in range(count):
             axes.plot(number, 0, "o", gid=f"{TITLE}<{number}> & more")
@@ -267,8 +263,8 @@ def test_what_has_words_to_hover_has_a_title_up_to_a_limit():
     assert "<title>" not in pictures[id(document.figures[1])][0]
 
 
-@pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
-def test_files_of_a_figure_hold_no_date(kind: str, begin: bytes):
+@pytest.mark.parametrize("kind, begin", [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_files_of_a_figure_hold_no_date(kind, begin):
     first, second = (saved(drawn(line_of()), kind) for _ in range(2))
     assert first.startswith(begin)
     assert first == second

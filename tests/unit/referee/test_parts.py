@@ -3,14 +3,12 @@
 Verdicts on right estimators are at a rate of 1e-6 each, or are counted against a binomial limit whose rate is stated.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from draws import independent
+from numpy.testing import assert_allclose
 from scipy import stats
 
 import consistency as cs
@@ -18,8 +16,7 @@ from consistency.diagnostics import Record, Settings, gate_runs, judge, ratio_in
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.gating.session import needed_at
-from consistency.referee.gating.watch import Entry, RunningTest, watching
-from consistency.referee.types import Array
+from consistency.referee.gating.watch import RunningTest, watching
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 SURE = 1e-6
@@ -29,16 +26,16 @@ BIAS = np.array([2.0, 0.0, 0.0])
 MIX = np.linalg.cholesky(np.array([[1.0, 0.5, 0.5], [0.5, 1.0, 0.5], [0.5, 0.5, 1.0]]))
 
 
-def correlated(rng: np.random.Generator, runs: int = 60, steps: int = 12) -> Array:
+def correlated(rng, runs=60, steps=12):
     """Errors with variances of 1 and correlations of 0.5, which deviations do not tell."""
     return independent(rng, runs, steps, 3) @ MIX.T
 
 
-def of_deviations(error: Array, rate: float = SURE, **settings: object) -> cs.Verdict:
+def of_deviations(error, rate=SURE, **settings):
     return cs.judge(error, deviations=np.ones(error.shape), axes=["x", "y", "z"], false_alarm=rate, **settings)
 
 
-def test_right_marginals_are_consistent_whatever_the_correlation(rng: np.random.Generator) -> None:
+def test_right_marginals_are_consistent_whatever_the_correlation(rng):
     error = correlated(rng)
     verdict = of_deviations(error)
     assert verdict.status == "consistent"
@@ -47,27 +44,27 @@ def test_right_marginals_are_consistent_whatever_the_correlation(rng: np.random.
     assert verdict.p_value == pytest.approx(min(1.0, 3.0 * min(part.p_value for part in parts)))
     shown = [part.equivalence.p_value for part in parts if part.equivalence is not None]
     assert verdict.equivalence.p_value == max(shown) > min(shown)
-    np.testing.assert_allclose(verdict.scale.mean_anees, 3.0 * np.square(error).mean(), rtol=1e-12)
+    assert_allclose(verdict.scale.mean_anees, 3.0 * np.square(error).mean(), rtol=1e-12)
     assert "(1 expected under any correlation), is not judged" in verdict.reasons[1]
     whole = cs.judge(error, diagonal(np.ones(error.shape)), false_alarm=SURE)
     assert whole.status != "consistent"  # the cross terms taken as 0 are a fault of the shape
 
 
-def test_rate_of_false_alarms(rng: np.random.Generator) -> None:
+def test_rate_of_false_alarms(rng):
     """A right referee exceeds the binomial limit with probability 1e-5; three axes at the whole rate each reach it."""
     faults = sum(bool(of_deviations(correlated(rng, 20, 1), RATE).faults) for _ in range(DRAWS))
     assert faults <= stats.binom.isf(1e-5, DRAWS, RATE)
 
 
 @pytest.mark.parametrize(
-    ("factor", "status"),
+    "factor, status",
     [
         ((1.0, 2.0, 1.0), "overconfident"),
         ((0.4, 0.4, 1.0), "conservative"),
         ((0.4, 1.0, 2.5), "inconsistent"),
     ],
 )
-def test_an_axis_is_found_by_itself(rng: np.random.Generator, factor: Array, status: str) -> None:
+def test_an_axis_is_found_by_itself(rng, factor, status):
     """Ratios of 4 or 1/6 in 60 runs of 12 steps are found with a probability of 1 - 1e-6."""
     verdict = of_deviations(correlated(rng) * factor)
     assert verdict.status == status
@@ -78,13 +75,13 @@ def test_an_axis_is_found_by_itself(rng: np.random.Generator, factor: Array, sta
         assert f"{name}: covariance too {sides[name]} by x" in verdict.reasons[0]
 
 
-def test_a_small_fault_is_found_at_the_rate_that_others_leave(rng: np.random.Generator) -> None:
+def test_a_small_fault_is_found_at_the_rate_that_others_leave(rng):
     """Holm: y alone is at fault at the whole rate over one part, not at that over three."""
     parts = of_deviations(correlated(rng) * (9.0, 9.0, 1.0), RATE).parts
     assert [round(RATE / part.settings.false_alarm) for part in parts.values()] == [3, 3, 1]
 
 
-def test_a_bias_is_named_beside_a_wrong_size(rng: np.random.Generator) -> None:
+def test_a_bias_is_named_beside_a_wrong_size(rng):
     error = correlated(rng)
     assert of_deviations(error + BIAS).status == "biased"
     verdict = of_deviations(error * (1.0, 3.0, 1.0) + BIAS)
@@ -92,7 +89,7 @@ def test_a_bias_is_named_beside_a_wrong_size(rng: np.random.Generator) -> None:
     assert "x: mean error" in verdict.reasons[0]
 
 
-def test_failed_runs_and_a_known_start(rng: np.random.Generator) -> None:
+def test_failed_runs_and_a_known_start(rng):
     error, sigma = correlated(rng), np.ones((60, 12, 3))
     sigma[:, 0, 1] = 0.0
     error[5, 7:] = np.nan
@@ -104,7 +101,7 @@ def test_failed_runs_and_a_known_start(rng: np.random.Generator) -> None:
     assert (verdict.lost.count, verdict.lost.runs) == (2, 60)
 
 
-def test_parts_of_several_components_use_their_cross_terms(rng: np.random.Generator) -> None:
+def test_parts_of_several_components_use_their_cross_terms(rng):
     """x and y with their correlation, z by itself."""
     error = correlated(rng)
     P = np.broadcast_to(np.array([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 1.0]]), (60, 12, 3, 3))
@@ -116,7 +113,7 @@ def test_parts_of_several_components_use_their_cross_terms(rng: np.random.Genera
     assert "x, y: correlation of the wrong sign" in judge(replace(record, covariance=P), Settings(SURE)).reasons[0]
 
 
-def test_innovations_share_the_rate(rng: np.random.Generator) -> None:
+def test_innovations_share_the_rate(rng):
     nis = rng.chisquare(2, (60, 12))
     record = each_alone(
         Record("f", correlated(rng), diagonal(np.ones((60, 12, 3))), nis=nis, nis_dof=np.full((60, 12), 2))
@@ -129,14 +126,14 @@ def test_innovations_share_the_rate(rng: np.random.Generator) -> None:
     assert verdict.faults == ("innovation scale of innovations",)
 
 
-def test_one_component_has_no_cross_terms(rng: np.random.Generator) -> None:
+def test_one_component_has_no_cross_terms(rng):
     error = independent(rng, 60, 12, 1)
     one, same = cs.judge(error, deviations=2.0 + 0.0 * error), cs.judge(error, 4.0 + 0.0 * error[..., None])
     assert one.reasons == same.reasons
     assert not one.parts
 
 
-def test_misuse_is_refused(rng: np.random.Generator) -> None:
+def test_misuse_is_refused(rng):
     error = correlated(rng)
     with pytest.raises(cs.InputError, match="give one of them"):
         cs.judge(error, diagonal(error), deviations=error)
@@ -151,7 +148,7 @@ def test_misuse_is_refused(rng: np.random.Generator) -> None:
 # --- gates -----------------------------------------------------------------------------------------
 
 
-def test_a_gate_judges_deviations_as_files_and_arrays_are(rng: np.random.Generator) -> None:
+def test_a_gate_judges_deviations_as_files_and_arrays_are(rng):
     error = correlated(rng)
     verdict = assert_consistent(error, deviations=np.ones(error.shape), axes=["x", "y", "z"], false_alarm=SURE)
     assert verdict.reasons == replace(of_deviations(error), filter=verdict.filter).reasons
@@ -165,10 +162,10 @@ def test_a_gate_judges_deviations_as_files_and_arrays_are(rng: np.random.Generat
 
 
 @pytest.mark.parametrize("innovations", [False, True])
-def test_a_gate_plans_for_parts_that_share_the_rate(innovations: bool, rng: np.random.Generator) -> None:
+def test_a_gate_plans_for_parts_that_share_the_rate(innovations, rng):
     error = correlated(rng, 9, 3)
-    kept: list[Entry] = []
-    more: dict[str, Any] = {"nis": rng.chisquare(2, (9, 3)), "nis_dof": 2, "optimal_gain": True} if innovations else {}
+    kept = []
+    more = {"nis": rng.chisquare(2, (9, 3)), "nis_dof": 2, "optimal_gain": True} if innovations else {}
     needed = gate_runs(1, 1.5, SURE / (3 + innovations), 0.95)
     with (
         watching(RunningTest(keep=kept.append)),
@@ -180,7 +177,7 @@ def test_a_gate_plans_for_parts_that_share_the_rate(innovations: bool, rng: np.r
     assert needed_at(kept[0], 0.1 * SURE) == gate_runs(1, 1.5, 0.1 * SURE / (3 + innovations), 0.95)
 
 
-def test_two_estimators_that_state_deviations(rng: np.random.Generator) -> None:
+def test_two_estimators_that_state_deviations(rng):
     error = correlated(rng)
     right, small = np.ones(error.shape), np.full(error.shape, 0.5)
     assert not assert_not_worse(error, None, error, deviations_a=right, deviations_b=small, detect=9.0).worse
@@ -192,14 +189,10 @@ def test_two_estimators_that_state_deviations(rng: np.random.Generator) -> None:
         assert_not_worse(error[..., :2], None, error, deviations_a=right[..., :2], deviations_b=right)
 
 
-@pytest.mark.parametrize(
-    ("parts", "least"), [(((0,), (1,), (2,), (3,)), 1), (((0, 1), (2, 3)), 2), (((0,), (1, 2, 3)), 1)]
-)
-def test_the_interval_of_the_whole_allows_for_parts_whose_errors_are_the_same(
-    rng: np.random.Generator, parts: tuple[tuple[int, ...], ...], least: int
-) -> None:
+@pytest.mark.parametrize("parts, least", [(((0,), (1,), (2,), (3,)), 1), (((0, 1), (2, 3)), 2), (((0,), (1, 2, 3)), 1)])
+def test_the_interval_of_the_whole_allows_for_parts_whose_errors_are_the_same(rng, parts, least):
     """With fewer than 20 runs: the mean NEES then has the degrees of freedom of the smallest part."""
     error = independent(rng, 8, 5, 4)
     verdict = judge(Record("f", error, diagonal(np.ones(error.shape)), dof=4, axes=tuple("wxyz"), parts=parts))
     expected = ratio_interval(np.square(error).mean(axis=(1, 2)), least)
-    np.testing.assert_allclose(verdict.scale.inflation, expected)
+    assert_allclose(verdict.scale.inflation, expected)

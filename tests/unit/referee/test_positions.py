@@ -1,15 +1,13 @@
 """A truth of positions alone, of a point of the body in every convention; planar poses, of speeds and in space."""
 
-from __future__ import annotations
-
 import gzip
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import consistency, refused
+from numpy.testing import assert_allclose
 from recorded import read_recordings
 from test_layouts import (
     DATA,
@@ -32,19 +30,18 @@ import consistency as cs
 from consistency.referee.readers.formats.planar_columns import motions_of, poses_of
 from consistency.referee.readers.formats.position_truth import _jacobian
 from consistency.referee.readers.formats.table import planar_sheet
-from consistency.referee.types import Array
 
 ARM = np.array([0.3, -0.2, 0.5])
 SMALL = 1e-6
 
 
-def exponential(v: Array) -> Array:
+def exponential(v):
     """Quaternion x, y, z, w of a rotation vector."""
     angle = np.sqrt(v @ v)
     return np.append(v * (np.sin(angle / 2) / angle if angle > 0 else 0.5), np.cos(angle / 2))
 
 
-def group(xi: Array) -> tuple[Array, Array]:
+def group(xi):
     """Rotation and translation of the exponential of SE(3): Sola et al. (2018), eq. 172."""
     v, angle = xi[3:], np.sqrt(xi[3:] @ xi[3:])
     W = skew(v)
@@ -54,7 +51,7 @@ def group(xi: Array) -> tuple[Array, Array]:
     return matrix(exponential(v)), V @ xi[:3]
 
 
-def moved(convention: str, pose: Array, e: Array) -> Array:
+def moved(convention, pose, e):
     """Position of the point of the true pose, whose error is ``e`` in a convention."""
     R, p = matrix(pose[3:]), pose[:3]
     if convention == "so3":
@@ -68,17 +65,17 @@ def moved(convention: str, pose: Array, e: Array) -> Array:
 
 
 @pytest.mark.parametrize("convention", ["so3", "so3-body", "left", "right"])
-def test_derivatives_are_those_of_differences(convention: str) -> None:
+def test_derivatives_are_those_of_differences(convention):
     d = drive()
     R = np.array([matrix(q) for q in d.own[:, 3:]])
     J = _jacobian(convention, R, ARM, d.own[:, :3] + R @ ARM)
     for pose, rows in zip(d.own, J, strict=True):
         for i, side in enumerate(SMALL * np.eye(6)):
             slope = (moved(convention, pose, side) - moved(convention, pose, -side)) / (2 * SMALL)
-            np.testing.assert_allclose(rows[:, i], slope, atol=1e-8)
+            assert_allclose(rows[:, i], slope, atol=1e-8)
 
 
-def bare(d: Drive, point: Array) -> str:
+def bare(d, point):
     return lines("prism.txt", "", [d.t, *point.T], " ")
 
 
@@ -92,10 +89,10 @@ def bare(d: Drive, point: Array) -> str:
     ids=["Leica", "bare", "GNSS"],
 )
 def test_the_point_of_a_prism(
-    write: Callable[[Drive, Array], str],
-    inside: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    write,
+    inside,
+    capsys,
+):
     d = drive()
     R, true = (np.array([matrix(q) for q in pose[:, 3:]]) for pose in (d.own, d.true))
     truth = write(d, d.true[:, :3] + true @ ARM)
@@ -104,14 +101,14 @@ def test_the_point_of_a_prism(
     J = np.concatenate([np.tile(np.eye(3), (STEPS, 1, 1)), [-skew(each @ ARM) for each in R]], axis=2)
     P = J @ d.P @ np.swapaxes(J, 1, 2)
     nees = [each @ np.linalg.solve(C, each) for each, C in zip(e, P, strict=True)]
-    np.testing.assert_allclose(record.nees[0], nees, rtol=1e-9)
+    assert_allclose(record.nees[0], nees, rtol=1e-9)
     assert record.axes == ("x", "y", "z")
     _, err = consistency(capsys, "analyse", "est.tum", "--truth", truth, "--lever-arm", "0.3,-0.2,0.5")
     assert "the truth has no orientation, so that the position alone is judged, of the point (0.3, -0.2, 0.5) m" in err
     assert "no orientation" in err or "without orientations" in err
 
 
-def test_the_origin_needs_no_rotation(inside: Path) -> None:
+def test_the_origin_needs_no_rotation(inside):
     """Deviations alone do for it, and so do two blocks; a lever arm would need their cross terms."""
     d = drive()
     truth = bare(d, d.true[:, :3])
@@ -119,9 +116,7 @@ def test_the_origin_needs_no_rotation(inside: Path) -> None:
     own = lines("est.txt", "", [d.t, *d.own.T, *sigma.T], " ")
     record = cs.read(own, truth=truth)
     assert record.parts == ((0,), (1,), (2,))
-    np.testing.assert_allclose(
-        record.nees[0], ((d.true - d.own)[:, :3] ** 2 / sigma[:, :3] ** 2).sum(axis=1), rtol=1e-9
-    )
+    assert_allclose(record.nees[0], ((d.true - d.own)[:, :3] ** 2 / sigma[:, :3] ** 2).sum(axis=1), rtol=1e-9)
     with pytest.raises(cs.InputError, match=r"est\.txt, line 1: --lever-arm moves errors of the rotation.*not stated"):
         cs.read(own, truth=truth, lever_arm=[0.0, 0.0, 0.1])
     upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
@@ -129,12 +124,12 @@ def test_the_origin_needs_no_rotation(inside: Path) -> None:
     blocks = lines("blocks.txt", "", [d.t, *d.own.T, *split], " ")
     e, C = (d.true - d.own)[:, :3], d.P[:, :3, :3]
     nees = [each @ np.linalg.solve(P, each) for each, P in zip(e, C, strict=True)]
-    np.testing.assert_allclose(cs.read(blocks, truth=truth).nees[0], nees, rtol=1e-9)
+    assert_allclose(cs.read(blocks, truth=truth).nees[0], nees, rtol=1e-9)
     with pytest.raises(cs.InputError, match="--error right moves errors"):
         cs.read(blocks, truth=truth, error="right")
 
 
-def test_a_broken_estimate_fails_there(inside: Path) -> None:
+def test_a_broken_estimate_fails_there(inside):
     d = drive()
     truth = bare(d, d.true[:, :3])
     d.own[5] = np.nan
@@ -142,7 +137,7 @@ def test_a_broken_estimate_fails_there(inside: Path) -> None:
     assert [failure.step for failure in record.failures] == [6]
 
 
-def test_a_frame_is_fitted_to_positions(inside: Path) -> None:
+def test_a_frame_is_fitted_to_positions(inside):
     """Estimates in a world that is turned about z and shifted: the same errors, to what the fit takes of them."""
     d = drive()
     P = 1e-10 * d.P  # as good as no errors, so that the frame is the one put in
@@ -155,11 +150,11 @@ def test_a_frame_is_fitted_to_positions(inside: Path) -> None:
     straight = cs.read(tum(Drive(d.t, own, d.true, P)), truth=truth)
     assert record.align == "posyaw-all"
     assert record.nees.sum() < straight.nees.sum() * (1 + 1e-6)
-    np.testing.assert_allclose(record.error[0], straight.error[0], atol=5e-5)
+    assert_allclose(record.error[0], straight.error[0], atol=5e-5)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    "options, said",
     [
         ({"align": "se3-all"}, r"--align se3-all: needs a truth with orientations; prism\.txt"),
         ({"align": "origin"}, r"--align origin: needs a truth with orientations; prism\.txt holds positions alone"),
@@ -169,14 +164,14 @@ def test_a_frame_is_fitted_to_positions(inside: Path) -> None:
         ({"lever_arm": [1.0, 2.0, float("nan")]}, "--lever-arm: must be three numbers x,y,z, in m"),
     ],
 )
-def test_what_needs_an_orientation_is_refused(options: dict[str, object], said: str, inside: Path) -> None:
+def test_what_needs_an_orientation_is_refused(options, said, inside):
     d = drive()
     bare(d, d.true[:, :3])
     with pytest.raises(cs.InputError, match=said):
         cs.read(tum(d), truth="prism.txt", **options)  # type: ignore[arg-type]
 
 
-def test_positions_are_no_estimates_and_poses_need_no_arm(inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_positions_are_no_estimates_and_poses_need_no_arm(inside, capsys):
     d = drive()
     lines("truth.txt", "", [d.t, *d.true.T], " ")
     with pytest.raises(cs.InputError, match=r"prism\.txt, line 1: has 4 columns"):
@@ -192,7 +187,7 @@ def test_positions_are_no_estimates_and_poses_need_no_arm(inside: Path, capsys: 
         assert "--lever-arm: must be three numbers x,y,z, in m" in err
 
 
-def test_axes_of_a_product() -> None:
+def test_axes_of_a_product():
     """The helpers above agree with each other: a half turn about z."""
     assert np.allclose(
         matrix(product(np.array([0.0, 0.0, 1.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0]))) @ ARM, [-0.3, 0.2, 0.5]
@@ -207,7 +202,7 @@ P = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]
 UPPER = np.triu_indices(3)
 
 
-def walked(t: Array, v: Array, omega: Array, parts: int = 4000) -> Array:
+def walked(t, v, omega, parts=4000):
     """Poses by many small straight steps, (N, 3): the path that the speeds say, to the square of a step."""
     pose, out = np.zeros(3), [np.zeros(3)]
     for k in range(len(t) - 1):
@@ -219,20 +214,20 @@ def walked(t: Array, v: Array, omega: Array, parts: int = 4000) -> Array:
     return np.array(out)
 
 
-def test_arcs_are_the_limit_of_small_steps() -> None:
+def test_arcs_are_the_limit_of_small_steps():
     t = np.array([0.0, 0.3, 0.5, 1.1, 1.2])
     v, omega = np.array([1.0, -0.5, 2.0, 1.0, 9.0]), np.array([0.7, 3.0, 0.0, -2.0, 9.0])
-    np.testing.assert_allclose(poses_of(motions_of(t, v, omega)), walked(t, v, omega), atol=1e-7)
+    assert_allclose(poses_of(motions_of(t, v, omega)), walked(t, v, omega), atol=1e-7)
 
 
-def speeds(path: str, name: str = "t,v,omega") -> tuple[Array, Array, Array]:
+def speeds(path, name="t,v,omega"):
     rng = np.random.default_rng()
     t, v, omega = 0.25 * np.arange(STEPS), 1.0 + rng.random(STEPS), rng.normal(size=STEPS)
     lines(path, name, [t, v, omega])
     return t, v, omega
 
 
-def test_speeds_are_motions_with_their_covariances(inside: Path) -> None:
+def test_speeds_are_motions_with_their_covariances(inside):
     """Windows of one motion: the NEES is that of the motions, worked out from the speeds."""
     t, v, omega = speeds("odo.csv")
     root = 0.1 * np.random.default_rng().normal(size=(3, 3))
@@ -254,41 +249,41 @@ def test_speeds_are_motions_with_their_covariances(inside: Path) -> None:
         D, M = (arc(speed * v[k] * dt, turn[k]) for speed, turn in ((1.0, a), (1.02, b)))
         e = log(np.linalg.solve(D, M))
         nees.append(e @ np.linalg.solve(C, e))
-    np.testing.assert_allclose(record.nees.ravel(), nees, rtol=1e-5)
+    assert_allclose(record.nees.ravel(), nees, rtol=1e-5)
 
 
-def arc(way: float, turn: float) -> Array:
+def arc(way, turn):
     """Pose matrix at the end of an arc."""
     x, y = way * np.sin(turn) / turn, way * (1.0 - np.cos(turn)) / turn
     return np.array([[np.cos(turn), -np.sin(turn), x], [np.sin(turn), np.cos(turn), y], [0.0, 0.0, 1.0]])
 
 
-def log(M: Array) -> Array:
+def log(M):
     """Logarithm in SE(2): Sola, Deray & Atchuthan (2018), eq. 157."""
     turn = np.arctan2(M[1, 0], M[0, 0])
     a, b = np.sin(turn) / turn, (1.0 - np.cos(turn)) / turn
     return np.append(np.linalg.solve(np.array([[a, -b], [b, a]]), M[:2, 2]), turn)
 
 
-def test_packed_speeds_and_other_names(inside: Path) -> None:
+def test_packed_speeds_and_other_names(inside):
     t, v, omega = speeds("odo.dat", "# Time [s]    forward velocity [m/s]    angular velocity[rad/s]")
     Path("odo.dat").write_text(Path("odo.dat").read_text().replace(",", "\t "))
     Path("odo.dat.gz").write_bytes(gzip.compress(Path("odo.dat").read_bytes()))
     for name in ("odo.dat", "odo.dat.gz"):
         sheet, note = planar_sheet(Path(name), motions=False)
         assert "integrated to poses, 3 columns, seconds" in note
-        np.testing.assert_allclose(
+        assert_allclose(
             np.column_stack([sheet.data[a] for a in ("x", "y", "heading")]), poses_of(motions_of(t, v, omega))
         )
     names = "%time,field.header.stamp,field.twist.twist.linear.x,field.twist.twist.angular.z"
     lines("twist.csv", names, [nanoseconds(EPOCH + t), nanoseconds(EPOCH + t), v, omega])
     sheet, note = planar_sheet(Path("twist.csv"), motions=True)
     assert note.endswith("integrated to motions, 4 columns, nanoseconds")
-    np.testing.assert_allclose(sheet.data["t"], EPOCH + t, atol=1e-6)
-    np.testing.assert_allclose(sheet.data["heading"], motions_of(t, v, omega)[:, 2], atol=1e-12)
+    assert_allclose(sheet.data["t"], EPOCH + t, atol=1e-6)
+    assert_allclose(sheet.data["heading"], motions_of(t, v, omega)[:, 2], atol=1e-12)
 
 
-def test_planar_estimates_against_a_truth_in_space(inside: Path) -> None:
+def test_planar_estimates_against_a_truth_in_space(inside):
     """The heading is that of the x axis, whatever roll and pitch are."""
     t, heading = EPOCH + 0.25 * np.arange(STEPS), np.linspace(-3.0, 3.0, STEPS)
     half, zero = heading / 2, np.zeros(STEPS)
@@ -297,12 +292,12 @@ def test_planar_estimates_against_a_truth_in_space(inside: Path) -> None:
     own = [t, true[:, 0] - 0.1, true[:, 1], heading + 0.2]
     lines("est.csv", ",".join(["t,x,y,theta", *P]), [*own, zero + 0.04, zero, zero, zero + 0.04, zero, zero + 0.16])
     (record,) = read_recordings(Path("est.csv"), Path("data.csv"))
-    np.testing.assert_allclose(record.nees, 0.1**2 / 0.04 + 0.2**2 / 0.16, rtol=1e-9)
+    assert_allclose(record.nees, 0.1**2 / 0.04 + 0.2**2 / 0.16, rtol=1e-9)
     assert record.notes[0] == "est.csv: read as planar poses, 10 columns, seconds"
     assert record.notes[1].endswith("quaternion w first, of which the heading is that of the x axis")
 
 
-def test_the_robots_of_mrclam_as_they_are() -> None:
+def test_the_robots_of_mrclam_as_they_are():
     """Odometry and truth of a robot: a second of driving is a few percent off (README of the data)."""
     folder = DATA / "mrclam" / "MRCLAM_Dataset6"
     if not folder.is_dir():
@@ -312,7 +307,7 @@ def test_the_robots_of_mrclam_as_they_are() -> None:
     rows = np.loadtxt(folder / "Robot1_Odometry.dat.gz")
     assert "speed and turn rate" in said
     assert len(odometry) == len(rows)
-    np.testing.assert_allclose(odometry.data["heading"][1:], rows[:-1, 2] * np.diff(rows[:, 0]), atol=1e-9)
+    assert_allclose(odometry.data["heading"][1:], rows[:-1, 2] * np.diff(rows[:, 0]), atol=1e-9)
     t = odometry.data["t"]
     heading = np.unwrap(np.interp(t, truth.data["t"], np.unwrap(truth.data["heading"])))
     inside = (t > truth.data["t"][0]) & (t < truth.data["t"][-1])
@@ -322,7 +317,7 @@ def test_the_robots_of_mrclam_as_they_are() -> None:
     assert 0.002 < np.std(error) < 0.05
 
 
-def test_speeds_without_a_covariance_are_refused(inside: Path) -> None:
+def test_speeds_without_a_covariance_are_refused(inside):
     t, *_ = speeds("odo.csv")
     lines("truth.csv", "t,x,y,heading", [t, t, t, 0 * t])
     with pytest.raises(cs.InputError, match=r"odo\.csv: column 'P_xx' is missing"):

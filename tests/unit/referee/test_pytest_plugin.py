@@ -10,8 +10,6 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
-from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -48,7 +46,7 @@ def gate(values, **options):
 
 
 @pytest.fixture
-def session(pytester: pytest.Pytester) -> pytest.Pytester:
+def session(pytester):
     """A folder with a module of samples; plugins of the outer session that inner ones do not need are off."""
     pytester.makepyfile(samples=SAMPLES)
     # in this process modules of the distribution may be loaded before the inner session looks at them
@@ -57,12 +55,12 @@ def session(pytester: pytest.Pytester) -> pytest.Pytester:
     return pytester
 
 
-def make(session: pytest.Pytester, tests: str, name: str = "test_it") -> None:
+def make(session, tests, name="test_it"):
     session.makepyfile(**{name: "from samples import *\n" + tests})
 
 
-def gates_of(path: Path) -> list[dict[str, Any]]:
-    data: dict[str, Any] = json.loads((path / "gates.json").read_text())
+def gates_of(path):
+    data = json.loads((path / "gates.json").read_text())
     return list(data["gates"])
 
 
@@ -89,7 +87,7 @@ def test_without():
 
 
 @pytest.mark.parametrize("workers", [[], ["-n", "2"]], ids=["one process", "xdist"])
-def test_gates_are_summed_up_and_written(session: pytest.Pytester, workers: list[str]) -> None:
+def test_gates_are_summed_up_and_written(session, workers):
     make(session, THREE)
     result = session.runpytest(*workers, "--consistency-report=gates.json", "--junitxml=junit.xml")
     result.assert_outcomes(passed=3, failed=2)
@@ -122,7 +120,7 @@ def test_gates_are_summed_up_and_written(session: pytest.Pytester, workers: list
     ]  # fmt: skip
 
 
-def test_no_gates_no_table(session: pytest.Pytester) -> None:
+def test_no_gates_no_table(session):
     make(session, "def test_without():\n    pass")
     result = session.runpytest("--consistency-report=gates.json")
     result.assert_outcomes(passed=1)
@@ -130,7 +128,7 @@ def test_no_gates_no_table(session: pytest.Pytester) -> None:
     assert gates_of(session.path) == []
 
 
-def test_what_is_not_finite_is_null(session: pytest.Pytester) -> None:
+def test_what_is_not_finite_is_null(session):
     make(
         session, "def test_innovations():\n    assert_consistent(nis=nees(9), nis_dof=3, detect=9.0, optimal_gain=True)"
     )
@@ -139,7 +137,7 @@ def test_what_is_not_finite_is_null(session: pytest.Pytester) -> None:
     assert gate["inflation"] is None
 
 
-def test_a_comparison_is_recorded(session: pytest.Pytester) -> None:
+def test_a_comparison_is_recorded(session):
     make(
         session,
         "def test_it(consistency_runs):\n"
@@ -157,13 +155,13 @@ def test_a_comparison_is_recorded(session: pytest.Pytester) -> None:
 class Page(HTMLParser):
     """Tags of a page that is well formed, and what it loads from elsewhere."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.open: list[str] = []
         self.seen: list[str] = []
         self.loaded: list[str] = []
 
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attributes):
         self.seen.append(tag)
         self.loaded += [
             value or "" for key, value in attributes if key in ("src", "href") and value not in ("data:,", "#content")
@@ -171,11 +169,11 @@ class Page(HTMLParser):
         if tag not in ("meta", "link"):
             self.open.append(tag)
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
 
-def test_the_page_stands_alone(session: pytest.Pytester) -> None:
+def test_the_page_stands_alone(session):
     make(session, "def test_it():\n    gate(nees(200), name='<b>mine & yours')")
     session.runpytest("--consistency-report=gates.html").assert_outcomes(passed=1)
     text = (session.path / "gates.html").read_text(encoding="utf-8")
@@ -190,7 +188,7 @@ def test_the_page_stands_alone(session: pytest.Pytester) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    "options, said",
     [
         (["--consistency-report=gates.txt"], "must end in .html or .json or .md or .xml"),
         (["--consistency-report=nowhere/gates.json"], "nowhere does not exist; make it first"),
@@ -200,7 +198,7 @@ def test_the_page_stands_alone(session: pytest.Pytester) -> None:
         (["-o", "consistency_false_alarm=few"], "consistency_false_alarm must be a number, got 'few'"),
     ],
 )
-def test_unusable_options_stop_before_the_tests(session: pytest.Pytester, options: list[str], said: str) -> None:
+def test_unusable_options_stop_before_the_tests(session, options, said):
     make(session, "def test_it():\n    open('ran', 'w').close()")
     (session.path / "folder.json").mkdir()
     result = session.runpytest(*options)
@@ -209,8 +207,8 @@ def test_unusable_options_stop_before_the_tests(session: pytest.Pytester, option
     assert not (session.path / "ran").exists()
 
 
-def test_a_folder_without_leave_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**_: Any) -> None:
+def test_a_folder_without_leave_is_refused(tmp_path, monkeypatch):
+    def refuse(**_):
         raise PermissionError(13, "Permission denied")
 
     assert path_fault(tmp_path / "gates.json") == ""
@@ -221,7 +219,7 @@ def test_a_folder_without_leave_is_refused(tmp_path: Path, monkeypatch: pytest.M
 # --- runs to simulate ----------------------------------------------------------------------------
 
 
-def test_the_marker_plans_and_is_asked(session: pytest.Pytester) -> None:
+def test_the_marker_plans_and_is_asked(session):
     make(
         session,
         "@pytest.mark.consistency(dof=3, detect=2.0, false_alarm=1e-4)\n"
@@ -241,7 +239,7 @@ def test_the_marker_plans_and_is_asked(session: pytest.Pytester) -> None:
     assert session.runpytest("--markers").ret == 0
 
 
-def test_the_marker_that_plans_enough_runs_is_named(session: pytest.Pytester) -> None:
+def test_the_marker_that_plans_enough_runs_is_named(session):
     """Of a gate with an error of fewer dimensions than the fixture has planned for."""
     make(
         session,
@@ -277,7 +275,7 @@ def test_the_marker_that_plans_enough_runs_is_named(session: pytest.Pytester) ->
     session.runpytest("--consistency-runs=5").assert_outcomes(passed=1)
 
 
-def test_runs_from_the_command_line(session: pytest.Pytester) -> None:
+def test_runs_from_the_command_line(session):
     make(
         session,
         "@pytest.mark.consistency(detect=2.0)\n"
@@ -288,7 +286,7 @@ def test_runs_from_the_command_line(session: pytest.Pytester) -> None:
     session.runpytest("--consistency-runs=500").assert_outcomes(passed=1)
 
 
-def test_a_marker_with_other_arguments(session: pytest.Pytester) -> None:
+def test_a_marker_with_other_arguments(session):
     make(session, "@pytest.mark.consistency(3, runs=7)\ndef test_it():\n    pass")
     result = session.runpytest()
     result.assert_outcomes(errors=1)
@@ -299,7 +297,7 @@ def test_a_marker_with_other_arguments(session: pytest.Pytester) -> None:
 
 
 @given(st.floats(1e-9, 0.5), st.lists(st.integers(0, 60), min_size=1, max_size=12))
-def test_the_budget_is_spent_and_not_more(budget: float, gates: list[int]) -> None:
+def test_the_budget_is_spent_and_not_more(budget, gates):
     """Whatever the numbers of gates of the tests: the rates at which they can fail add up to the budget."""
     spent = [in_place_rate(budget, len(gates), before) for count in gates for before in range(count)]
     if not spent:
@@ -328,7 +326,7 @@ def test_own_rate(consistency_runs):
 
 
 @pytest.mark.parametrize("workers", [[], ["-n", "2"]], ids=["one process", "xdist"])
-def test_a_gate_can_fail_at_the_end(session: pytest.Pytester, workers: list[str]) -> None:
+def test_a_gate_can_fail_at_the_end(session, workers):
     """Three gates share 1e-3: p = 3e-4 is a fault, p = 6e-4 is none."""
     make(session, LATE)
     options = ["--consistency-false-alarm=1e-3", "--consistency-report=gates.json", "--junitxml=junit.xml"]
@@ -358,14 +356,14 @@ def test_a_gate_can_fail_at_the_end(session: pytest.Pytester, workers: list[str]
     assert failed == ["test_near"]
 
 
-def test_the_budget_of_the_ini_file(session: pytest.Pytester) -> None:
+def test_the_budget_of_the_ini_file(session):
     make(session, LATE)
     session.makeini("[pytest]\nconsistency_false_alarm = 2.5e-3")
     session.runpytest().assert_outcomes(passed=2, failed=2)
     session.runpytest("--consistency-false-alarm=1e-3").assert_outcomes(passed=3, failed=1)
 
 
-def test_what_is_certain_fails_in_place(session: pytest.Pytester) -> None:
+def test_what_is_certain_fails_in_place(session):
     make(session, "def test_it(consistency_runs):\n    gate(nees(consistency_runs, 3.0))\n    open('went on', 'w')")
     result = session.runpytest("--consistency-false-alarm=1e-3")
     result.assert_outcomes(failed=1)
@@ -373,20 +371,20 @@ def test_what_is_certain_fails_in_place(session: pytest.Pytester) -> None:
     assert not (session.path / "went on").exists()
 
 
-def test_planned_runs_suffice_for_the_budget(session: pytest.Pytester) -> None:
+def test_planned_runs_suffice_for_the_budget(session):
     """Twenty gates in one test are as many as the plan allows for."""
     make(session, "def test_it(consistency_runs):\n    for _ in range(20):\n        gate(nees(consistency_runs))")
     session.runpytest("--consistency-false-alarm=1e-3").assert_outcomes(passed=1)
 
 
-def test_what_is_shown_passes_at_any_share_of_the_budget(session: pytest.Pytester) -> None:
+def test_what_is_shown_passes_at_any_share_of_the_budget(session):
     """That a filter is right is shown at a rate that no budget divides: fewer runs than planned may do."""
     runs = gate_runs(3, 1.5, 1e-3, 0.95)
     make(session, f"@pytest.mark.parametrize('i', range(4))\ndef test_it(i):\n    gate(nees({runs} - 9 * i))")
     session.runpytest("--consistency-false-alarm=1e-3").assert_outcomes(passed=4)
 
 
-def test_too_few_to_compare_can_show_at_the_end(session: pytest.Pytester) -> None:
+def test_too_few_to_compare_can_show_at_the_end(session):
     """Enough for the whole budget, too few for a fifth of it."""
     make(
         session,
@@ -403,7 +401,7 @@ def test_too_few_to_compare_can_show_at_the_end(session: pytest.Pytester) -> Non
     result.stdout.fnmatch_lines(["*is not found worse, but * runs are too few to pass: *"])
 
 
-def test_too_few_to_decide_fail_in_place(session: pytest.Pytester) -> None:
+def test_too_few_to_decide_fail_in_place(session):
     """And asks for the number that will do."""
     make(session, "def test_it():\n    gate(nees(8))")
     result = session.runpytest("--consistency-false-alarm=1e-3")
@@ -411,7 +409,7 @@ def test_too_few_to_decide_fail_in_place(session: pytest.Pytester) -> None:
     result.stdout.fnmatch_lines([f"E *Simulate {gate_runs(3, 1.5, in_place_rate(1e-3, 1), 0.95)} runs*"])
 
 
-def test_a_gate_that_a_test_expects_to_fail_stays_so(session: pytest.Pytester) -> None:
+def test_a_gate_that_a_test_expects_to_fail_stays_so(session):
     make(
         session,
         "def test_it(consistency_runs):\n"
@@ -426,7 +424,7 @@ def test_a_gate_that_a_test_expects_to_fail_stays_so(session: pytest.Pytester) -
     assert result.ret == 0
 
 
-def test_many_gates_wait_for_the_end(session: pytest.Pytester) -> None:
+def test_many_gates_wait_for_the_end(session):
     """From the eleventh on nothing fails in place; 25 gates, so the first ten have had half the budget."""
     make(
         session,
@@ -444,14 +442,14 @@ def test_many_gates_wait_for_the_end(session: pytest.Pytester) -> None:
 # --- neighbours ----------------------------------------------------------------------------------
 
 
-def test_gates_work_without_the_plugin(session: pytest.Pytester) -> None:
+def test_gates_work_without_the_plugin(session):
     make(session, "def test_good():\n    gate(nees(102))\n\ndef test_bad():\n    gate(nees(102, 2.0))")
     result = session.runpytest_subprocess("-p", "no:consistency")
     result.assert_outcomes(passed=1, failed=1)
     result.stdout.no_fnmatch_line("*consistency gates*")
 
 
-def test_gates_work_without_pytest(tmp_path: Path) -> None:
+def test_gates_work_without_pytest(tmp_path):
     code = (
         "import sys\n"
         "sys.modules['pytest'] = None\n"
@@ -465,7 +463,7 @@ def test_gates_work_without_pytest(tmp_path: Path) -> None:
     assert out.stdout == "overconfident\n"
 
 
-def test_a_second_try_replaces_the_first(session: pytest.Pytester) -> None:
+def test_a_second_try_replaces_the_first(session):
     """As plugins do that run a failed test again: the gates of the last try count."""
     session.makeconftest(
         "from _pytest.runner import runtestprotocol\n"

@@ -1,15 +1,14 @@
 """Options of files: one record for readers, commands and Python; tables in memory are read as files of them are."""
 
-from __future__ import annotations
-
 import inspect
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from command import consistency
+from draws import identities
+from numpy.testing import assert_allclose
 from recorded import read_recordings
 
 import consistency as cs
@@ -17,12 +16,12 @@ from consistency.referee.readers.options import MAX_DT, Reading, flag_of
 from consistency.testing import assert_consistent
 
 
-def test_python_has_every_option_of_files() -> None:
+def test_python_has_every_option_of_files():
     names = list(inspect.signature(cs.read).parameters)
     assert names == ["estimates", *(each.name for each in fields(Reading)), "filter"]
 
 
-def test_what_follows_from_options() -> None:
+def test_what_follows_from_options():
     assert (Reading().tolerance, Reading().shift) == (MAX_DT, 0.0)
     given = Reading(max_dt=0.5, time_offset=-2.0, motions=False)
     assert (given.tolerance, given.shift) == (0.5, -2.0)
@@ -33,7 +32,7 @@ def test_what_follows_from_options() -> None:
 
 
 @pytest.fixture
-def tables(tmp_path: Path) -> tuple[Path, Path]:
+def tables(tmp_path):
     """Two components at 0.3 s and so on, and a truth that is t and -t at whole seconds."""
     t = np.arange(1.0, 9.0)
     est = "t,a,b,P_a_a,P_a_b,P_b_b\n" + "".join(f"{k + 0.3},{k + 0.4},{-k},1,0,1\n" for k in t)
@@ -42,18 +41,18 @@ def tables(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "est.csv", tmp_path / "truth.csv"
 
 
-def test_readers_take_tolerance_and_offset(tables: tuple[Path, Path]) -> None:
+def test_readers_take_tolerance_and_offset(tables):
     with pytest.raises(cs.InputError, match=r"within 0\.01 s \(--max-dt\)"):
         read_recordings(*tables, state=["a", "b"])
     (near,) = read_recordings(*tables, state=["a", "b"], max_dt=0.3)
-    np.testing.assert_allclose(near.error[0], [[-0.1, -0.3]] * 8, atol=1e-12)
+    assert_allclose(near.error[0], [[-0.1, -0.3]] * 8, atol=1e-12)
     (moved,) = read_recordings(*tables, state=["a", "b"], time_offset=-0.3)
-    np.testing.assert_allclose(moved.error[0], [[-0.4, 0.0]] * 8, atol=1e-12)
+    assert_allclose(moved.error[0], [[-0.4, 0.0]] * 8, atol=1e-12)
     (whole,) = read_recordings(*tables, state=["a", "b"], time_offset=-1, max_dt=0.3)
-    np.testing.assert_allclose(whole.error[0], [[-1.1, 0.7]] * 8, atol=1e-12)
+    assert_allclose(whole.error[0], [[-1.1, 0.7]] * 8, atol=1e-12)
 
 
-def test_windows_are_moved_by_an_offset(tmp_path: Path) -> None:
+def test_windows_are_moved_by_an_offset(tmp_path):
     rows = "".join(f"{k + 0.5},1,0,0,1,0,0,1,0,1\n" for k in range(12))
     (tmp_path / "est.csv").write_text("t,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh\n" + rows)
     (tmp_path / "truth.csv").write_text("t,x,y,heading\n" + "".join(f"{k},{k},0,0\n" for k in range(12)))
@@ -61,24 +60,22 @@ def test_windows_are_moved_by_an_offset(tmp_path: Path) -> None:
     with pytest.raises(cs.InputError, match=r"within 0\.01 s \(--max-dt\)"):
         read_recordings(*files, relative=2, motions=True)
     (record,) = read_recordings(*files, time_offset=-0.5, relative=2, motions=True)
-    np.testing.assert_allclose(record.error, np.zeros((1, 5, 3)), atol=1e-12)
+    assert_allclose(record.error, np.zeros((1, 5, 3)), atol=1e-12)
 
 
-def test_motions_has_no_opposite(capsys: pytest.CaptureFixture[str]) -> None:
+def test_motions_has_no_opposite(capsys):
     shown, _ = consistency(capsys, "analyse", "--help")
     assert "--motions " in shown
     assert "--no-motions" not in shown
 
 
-def test_names_on_the_command_line_may_have_spaces(
-    tables: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_on_the_command_line_may_have_spaces(tables, capsys):
     consistency(capsys, "analyse", tables[0], "--truth", tables[1], "--state", "a, b", "--time-offset", "-0.3")
 
 
-def test_a_step_without_a_measurement_has_no_covariance_to_check(rng: np.random.Generator) -> None:
+def test_a_step_without_a_measurement_has_no_covariance_to_check(rng):
     v = rng.normal(size=(400, 10, 2))
-    S = np.broadcast_to(np.eye(2), (400, 10, 2, 2)).copy()
+    S = identities(v).copy()
     v[:, 3] = S[:, 3] = np.nan
     assert assert_consistent(innovations=v, innovation_covariances=S, optimal_gain=True).status == "consistent"
 
@@ -90,7 +87,7 @@ STEPS = 8
 OWN = ["run", "t", "a", "b", "P_a_a", "P_a_b", "P_b_b"]
 
 
-def frames() -> tuple[pd.DataFrame, pd.DataFrame]:
+def frames():
     rng = np.random.default_rng()
     run, t = np.repeat([0, 1], STEPS), np.tile(0.1 * np.arange(STEPS), 2)
     truth = pd.DataFrame({"run": run, "t": t, "a": rng.normal(size=2 * STEPS), "b": rng.normal(size=2 * STEPS)})
@@ -102,33 +99,31 @@ def frames() -> tuple[pd.DataFrame, pd.DataFrame]:
 class Columns:
     """The least that a table has to be."""
 
-    def __init__(self, frame: pd.DataFrame) -> None:
+    def __init__(self, frame):
         self.columns, self._frame = tuple(frame.columns), frame
 
-    def __getitem__(self, name: str) -> list[object]:
+    def __getitem__(self, name):
         return list(self._frame[name])
 
 
 @pytest.mark.parametrize(
     "wrap", [lambda frame: frame, Columns, lambda frame: frame.sample(frac=1).sort_values(["run", "t"])]
 )
-def test_a_table_is_read_as_its_file(wrap: type, tmp_path: Path) -> None:
+def test_a_table_is_read_as_its_file(wrap, tmp_path):
     own, truth = frames()
     own.to_csv(tmp_path / "own.csv", index=False)
     truth.to_csv(tmp_path / "truth.csv", index=False)
     files = cs.read(tmp_path / "own.csv", truth=tmp_path / "truth.csv", state=["a", "b"])
     record = cs.read(wrap(own), truth=wrap(truth), state=["a", "b"])
-    np.testing.assert_allclose(record.nees, files.nees, rtol=1e-9)
+    assert_allclose(record.nees, files.nees, rtol=1e-9)
     e = truth[["a", "b"]].to_numpy() - own[["a", "b"]].to_numpy()
-    np.testing.assert_allclose(
-        record.nees.ravel(), np.einsum("ni,ni->n", e, np.linalg.solve([[2.0, 0.5], [0.5, 1.0]], e.T).T)
-    )
+    assert_allclose(record.nees.ravel(), np.einsum("ni,ni->n", e, np.linalg.solve([[2.0, 0.5], [0.5, 1.0]], e.T).T))
     mixed = cs.read(wrap(own), truth=tmp_path / "truth.csv", state=["a", "b"])
-    np.testing.assert_allclose(mixed.nees, files.nees, rtol=1e-9)
+    assert_allclose(mixed.nees, files.nees, rtol=1e-9)
     assert record.name == "estimates"
 
 
-def test_missing_values_and_filters(tmp_path: Path) -> None:
+def test_missing_values_and_filters(tmp_path):
     own, truth = frames()
     own.loc[5, "a"] = np.nan
     assert [(f.run, f.step) for f in cs.read(own, truth=truth, state=["a", "b"]).failures] == [(0, 6)]
@@ -145,7 +140,7 @@ def test_missing_values_and_filters(tmp_path: Path) -> None:
         cs.read(both, truth=truth, state=["a", "b"], filter="pf")
 
 
-def test_what_is_wrong_is_named_by_table_and_row(tmp_path: Path) -> None:
+def test_what_is_wrong_is_named_by_table_and_row(tmp_path):
     own, truth = frames()
     with pytest.raises(cs.InputError, match=r"^truth: column 'b' is missing"):
         cs.read(own, truth=truth.drop(columns="b"), state=["a", "b"])
@@ -161,7 +156,7 @@ def test_what_is_wrong_is_named_by_table_and_row(tmp_path: Path) -> None:
         cs.read(own, truth=truth, covariance="P.txt", state=["a", "b"])
 
 
-def test_runs_and_steps_the_wrong_way_round_are_named() -> None:
+def test_runs_and_steps_the_wrong_way_round_are_named():
     errors, P = np.random.default_rng().normal(size=(4, 9, 2)), np.broadcast_to(np.eye(2), (9, 4, 2, 2))
     with pytest.raises(cs.InputError, match=r"\(9, 4, 2, 2\), needs \(4, 9, 2, 2\); runs and steps are swapped in one"):
         cs.judge(errors, P)
@@ -169,13 +164,13 @@ def test_runs_and_steps_the_wrong_way_round_are_named() -> None:
         cs.judge(errors, np.broadcast_to(np.eye(2), (3, 9, 2, 2)))
 
 
-def test_a_truth_the_wrong_way_round_is_named(tmp_path: Path) -> None:
+def test_a_truth_the_wrong_way_round_is_named(tmp_path):
     own = np.random.default_rng().normal(size=(4, 9, 2))
     np.savez(
         tmp_path / "a.npz",
         estimates=own,
         truth=np.swapaxes(own, 0, 1),
-        covariances=np.broadcast_to(np.eye(2), (4, 9, 2, 2)),
+        covariances=identities(own),
     )
     with pytest.raises(cs.InputError, match=r"'estimates' \(4, 9, 2\); runs and steps are swapped in one"):
         cs.read(tmp_path / "a.npz")

@@ -5,16 +5,13 @@ rate of 1e-5, comparisons with simulations have 5-sigma limits (6e-7 each), and 
 would be missed: together under 1 false failure in 1,000 runs of this file.
 """
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pytest
-from draws import autoregression
+from draws import autoregression, identities
 from hypothesis import given
 from hypothesis import strategies as st
 from referee import judge
@@ -47,7 +44,6 @@ from consistency.diagnostics import (
 from consistency.diagnostics import judge as judge_record
 from consistency.referee.diagnostics.questions.outliers import beyond_stated, outliers
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
-from consistency.referee.types import Array
 
 AXES = ("x", "y", "heading")
 RUNS, STEPS, DOF = 100, 40, 3
@@ -55,7 +51,7 @@ FALSE_ALARM = 1e-5
 P = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.003]])  # m^2, m rad, rad^2
 
 
-def within(count: int, total: int, rate: float, sigmas: float = 5.0) -> bool:
+def within(count, total, rate, sigmas=5.0):
     """Is the count of a binomial variable as near to its mean as it should be?"""
     return bool(abs(count - total * rate) <= sigmas * np.sqrt(total * rate * (1 - rate)) + 1)
 
@@ -64,7 +60,7 @@ def within(count: int, total: int, rate: float, sigmas: float = 5.0) -> bool:
 
 
 @pytest.mark.parametrize(("ratio", "runs"), [(1.2, 260), (1.5, 53), (2.0, 18)])
-def test_required_runs_are_the_planned_ones(ratio: float, runs: int) -> None:
+def test_required_runs_are_the_planned_ones(ratio, runs):
     """Worked out outside this project: 3 degrees of freedom, two-sided 5 %, power 0.95."""
     assert required_runs(3, ratio) == runs
 
@@ -72,7 +68,7 @@ def test_required_runs_are_the_planned_ones(ratio: float, runs: int) -> None:
 @pytest.mark.parametrize("dof", [1, 3, 6])
 @pytest.mark.parametrize("ratio", [0.5, 0.8, 1.3, 3.0])
 @pytest.mark.parametrize("two_sided", [True, False])
-def test_required_runs_are_the_fewest(dof: int, ratio: float, two_sided: bool) -> None:
+def test_required_runs_are_the_fewest(dof, ratio, two_sided):
     """Counted up one by one."""
     tail = 0.01 / (2 if two_sided else 1)
     for runs in range(1, 10_000):
@@ -85,7 +81,7 @@ def test_required_runs_are_the_fewest(dof: int, ratio: float, two_sided: bool) -
     assert power_of(dof, runs, ratio, 0.01, two_sided) >= 0.9 > power_of(dof, runs - 1, ratio, 0.01, two_sided)
 
 
-def test_a_gate_plans_with_the_share_of_the_mean() -> None:
+def test_a_gate_plans_with_the_share_of_the_mean():
     assert gate_runs(3, 1.5) == required_runs(3, 1.5, 0.025)
     assert gate_runs(3, 1.5, 0.01, 0.9, "conservative") == required_runs(3, 1.5, 0.005, 0.9, two_sided=False)
     assert gate_runs(3, 1.5) > required_runs(3, 1.5)
@@ -94,12 +90,12 @@ def test_a_gate_plans_with_the_share_of_the_mean() -> None:
 @pytest.mark.parametrize(
     "arguments", [(0, 1.5), (3, 1.0), (3, -1.0), (3, float("inf")), (3, 1.5, 0.0), (3, 1.5, 0.1, 1)]
 )
-def test_required_runs_refuse_what_cannot_be_planned(arguments: tuple[Any, ...]) -> None:
+def test_required_runs_refuse_what_cannot_be_planned(arguments):
     with pytest.raises(ValueError, match="must"):
         required_runs(*arguments)
 
 
-def test_required_runs_refuse_a_ratio_too_near_to_one() -> None:
+def test_required_runs_refuse_a_ratio_too_near_to_one():
     with pytest.raises(ValueError, match="more than 10000000 runs"):
         required_runs(3, 1.0001)
 
@@ -108,7 +104,7 @@ def test_required_runs_refuse_a_ratio_too_near_to_one() -> None:
 
 
 @given(st.lists(st.floats(1e-12, 1.0), min_size=3, max_size=3))
-def test_the_correction_is_that_of_closed_testing(p: list[float]) -> None:
+def test_the_correction_is_that_of_closed_testing(p):
     """Every intersection of the questions by weighted Bonferroni; a question's p is the largest of those it is in."""
     names = (MAIN, "bias", "outliers")
     found = answers(dict(zip(names, p, strict=True)), 0.05)
@@ -124,7 +120,7 @@ def test_the_correction_is_that_of_closed_testing(p: list[float]) -> None:
         assert found[name].found == (found[name].adjusted <= 0.05)
 
 
-def test_shares_of_questions_not_asked_go_to_the_others_but_not_to_the_main() -> None:
+def test_shares_of_questions_not_asked_go_to_the_others_but_not_to_the_main():
     for all_but in ("scale in some direction", "shape"):
         everything = answers({q: 0.5 for q in SHARES if q != all_but}, 0.05)
         assert sum(a.share for a in everything.values()) == pytest.approx(1.0)
@@ -142,7 +138,7 @@ def test_shares_of_questions_not_asked_go_to_the_others_but_not_to_the_main() ->
 
 
 @pytest.mark.parametrize("scale", [1e-18, 1.0, 1e18])
-def test_whitened_errors_square_to_the_nees(fresh: np.random.Generator, scale: float) -> None:
+def test_whitened_errors_square_to_the_nees(fresh, scale):
     A = fresh.standard_normal((5, 4, 3, 5))
     C = A @ np.swapaxes(A, -1, -2)
     e = fresh.standard_normal((5, 4, 3))
@@ -152,19 +148,19 @@ def test_whitened_errors_square_to_the_nees(fresh: np.random.Generator, scale: f
     assert np.allclose((root @ w[..., None])[..., 0], e, rtol=1e-8)
 
 
-def test_whitening_leaves_out_what_has_no_root() -> None:
+def test_whitening_leaves_out_what_has_no_root():
     C = np.array([np.eye(2), np.zeros((2, 2)), -np.eye(2), np.ones((2, 2)), np.full((2, 2), np.nan)])
     w = whiten(np.ones((5, 2)), C)
     assert np.isfinite(w).all(axis=-1).tolist() == [True, False, False, False, False]
 
 
-def test_an_axis_of_no_variance_is_left_out_in_silence() -> None:
+def test_an_axis_of_no_variance_is_left_out_in_silence():
     with np.errstate(all="raise"):
         assert np.isnan(standardise(np.ones((1, 2)), np.diag([0.0, 4.0])[None])[0, 0])
 
 
 @given(st.integers(1, 80), st.integers(1, 80), st.integers(0, 10**6))
-def test_a_spread_step_is_one_that_the_run_has(runs: int, steps: int, seed: int) -> None:
+def test_a_spread_step_is_one_that_the_run_has(runs, steps, seed):
     present = np.random.default_rng(seed).random((runs, steps)) < 0.5
     chosen = spread_steps(present)
     assert np.array_equal(chosen >= 0, present.any(axis=1))
@@ -173,7 +169,7 @@ def test_a_spread_step_is_one_that_the_run_has(runs: int, steps: int, seed: int)
 
 
 @pytest.mark.parametrize("runs", [10, 50, 1000])
-def test_spread_steps_fill_the_trajectory_evenly(runs: int) -> None:
+def test_spread_steps_fill_the_trajectory_evenly(runs):
     """The golden-ratio sequence puts in every fifth its share of runs, give or take two."""
     counts = np.bincount(spread_steps(np.ones((runs, 100), bool)) // 20, minlength=5)
     assert np.abs(counts - runs / 5).max() <= 2
@@ -182,7 +178,7 @@ def test_spread_steps_fill_the_trajectory_evenly(runs: int) -> None:
 # --- scale ---------------------------------------------------------------------------------------------
 
 
-def test_bonferroni_band_is_exact_in_each_step(fresh: np.random.Generator) -> None:
+def test_bonferroni_band_is_exact_in_each_step(fresh):
     nees = fresh.chisquare(3, (30, 20))
     nees[:4, 10:] = np.nan
     band = simultaneous_band(nees, 3, 0.04, "bonferroni")
@@ -196,9 +192,7 @@ def test_bonferroni_band_is_exact_in_each_step(fresh: np.random.Generator) -> No
 
 @pytest.mark.parametrize("method", ["max", "bonferroni"])
 @pytest.mark.parametrize("allow", [None, "conservative"])
-def test_p_value_of_the_curve_is_where_it_would_leave_its_band(
-    fresh: np.random.Generator, method: str, allow: str | None
-) -> None:
+def test_p_value_of_the_curve_is_where_it_would_leave_its_band(fresh, method, allow):
     nees = np.square(autoregression(fresh, 40, 30, 3, 0.9)).sum(axis=-1)
     p = simultaneous_band(nees, 3, 0.05, method, allow).p_value
     if p < 0.9:
@@ -218,14 +212,14 @@ SWEAT = np.array([
 ])  # fmt: skip
 
 
-def test_hotelling_on_a_published_example() -> None:
+def test_hotelling_on_a_published_example():
     test = hotelling(SWEAT - [4.0, 50.0, 10.0])
     assert test.statistic == pytest.approx(9.74, abs=0.005)
     assert test.p_value == pytest.approx(0.065, abs=5e-4)
     assert test.mean == pytest.approx([0.640, -4.600, -0.035])
 
 
-def test_hotelling_of_one_component_is_the_t_test(fresh: np.random.Generator) -> None:
+def test_hotelling_of_one_component_is_the_t_test(fresh):
     x = fresh.standard_normal((15, 1)) + 0.5
     t = stats.ttest_1samp(x[:, 0], 0.0)
     test = hotelling(x)
@@ -234,7 +228,7 @@ def test_hotelling_of_one_component_is_the_t_test(fresh: np.random.Generator) ->
     assert test.interval[0] == pytest.approx(tuple(t.confidence_interval(0.95)))
 
 
-def test_t_squared_of_each_step_is_that_of_the_runs_it_has(fresh: np.random.Generator) -> None:
+def test_t_squared_of_each_step_is_that_of_the_runs_it_has(fresh):
     w = fresh.standard_normal((12, 4, 3))
     w[5:, 3], w[3:, 2] = np.nan, np.nan
     statistic, p = t_squared(w)
@@ -247,7 +241,7 @@ def test_t_squared_of_each_step_is_that_of_the_runs_it_has(fresh: np.random.Gene
 
 
 @pytest.mark.parametrize("sample", [np.ones((3, 3)), np.ones(5), np.full((9, 2), np.nan)])
-def test_hotelling_refuses_what_it_cannot_judge(sample: Array) -> None:
+def test_hotelling_refuses_what_it_cannot_judge(sample):
     with pytest.raises(ValueError, match="more finite rows"):
         hotelling(sample)
 
@@ -255,7 +249,7 @@ def test_hotelling_refuses_what_it_cannot_judge(sample: Array) -> None:
 # --- shape ---------------------------------------------------------------------------------------------
 
 
-def test_sphericity_of_two_components_is_exact(fresh: np.random.Generator) -> None:
+def test_sphericity_of_two_components_is_exact(fresh):
     """W^((N - 2) / 2) is the p value where n = 2 (Anderson 2003, sec. 10.7.3)."""
     w = fresh.standard_normal((20, 50, 2))
     _, p = sphericity(w)
@@ -265,7 +259,7 @@ def test_sphericity_of_two_components_is_exact(fresh: np.random.Generator) -> No
 
 
 @pytest.mark.parametrize("n", [3, 6])
-def test_sphericity_p_values_are_uniform(fresh: np.random.Generator, n: int) -> None:
+def test_sphericity_p_values_are_uniform(fresh, n):
     """20,000 steps of independent runs, at the fewest runs that are asked; 10 % to Box's expansion."""
     w = fresh.standard_normal((4 * n, 20_000, n))
     _, p = sphericity(w)
@@ -275,12 +269,12 @@ def test_sphericity_p_values_are_uniform(fresh: np.random.Generator, n: int) -> 
         assert count <= 1.1 * 20_000 * level + 5 * np.sqrt(20_000 * level)
 
 
-def test_sphericity_does_not_trust_its_expansion_with_few_runs(fresh: np.random.Generator) -> None:
+def test_sphericity_does_not_trust_its_expansion_with_few_runs(fresh):
     """Below 4 n runs its far tail is up to twice too small, and the smallest of many steps lives there."""
     assert np.isnan(sphericity(fresh.standard_normal((11, 2, 3)))[1]).all()
 
 
-def test_identity_statistic_is_chi_square(fresh: np.random.Generator) -> None:
+def test_identity_statistic_is_chi_square(fresh):
     p = np.array([identity_statistic(fresh.standard_normal((30, 3)))[1] for _ in range(5000)])
     for level in (0.5, 0.05, 0.01):
         assert within(int((p <= level).sum()), 5000, level)
@@ -288,7 +282,7 @@ def test_identity_statistic_is_chi_square(fresh: np.random.Generator) -> None:
     assert identity_statistic(np.zeros((5, 2))) == (float("inf"), 0.0)
 
 
-def test_mean_shape_by_hand(fresh: np.random.Generator) -> None:
+def test_mean_shape_by_hand(fresh):
     w = fresh.standard_normal((30, 20, 3))
     w[3, 5:] = np.nan
     shape, p = mean_shape(w)
@@ -301,7 +295,7 @@ def test_mean_shape_by_hand(fresh: np.random.Generator) -> None:
 # --- tails ---------------------------------------------------------------------------------------------
 
 
-def test_outliers_of_a_conservative_filter_are_outliers_for_the_stated_covariance(fresh: np.random.Generator) -> None:
+def test_outliers_of_a_conservative_filter_are_outliers_for_the_stated_covariance(fresh):
     """P right in a fifth of the runs and 4 times too large in the others; one false alarm in 1,000."""
     w = fresh.standard_normal((50, 50, 3)) * np.where(np.arange(50) % 5 == 0, 1.0, 0.5)[:, None, None]
     covariance = np.broadcast_to(np.eye(3), (50, 50, 3, 3))
@@ -317,14 +311,14 @@ def test_outliers_of_a_conservative_filter_are_outliers_for_the_stated_covarianc
     assert "outliers" in judge_record(Record("f", error=w, covariance=covariance), settings).faults
 
 
-def test_whiteness_needs_more_innovations_of_more_components(fresh: np.random.Generator) -> None:
+def test_whiteness_needs_more_innovations_of_more_components(fresh):
     for m, fewest in ((1, 400), (10, 400), (30, 1200)):
         u, S = fresh.standard_normal((fewest // 20, 20, m)), np.eye(m)
         assert np.isfinite(whiteness(u, np.broadcast_to(S, (*u.shape, m))).p_value)
         assert np.isnan(whiteness(u[1:], np.broadcast_to(S, (*u[1:].shape, m))).p_value)
 
 
-def test_outliers_by_hand(fresh: np.random.Generator) -> None:
+def test_outliers_by_hand(fresh):
     w = fresh.standard_normal((12, 7, 2))
     w[4, 3:] = np.nan
     found = outliers(w)
@@ -344,7 +338,7 @@ def test_outliers_by_hand(fresh: np.random.Generator) -> None:
     assert found.p_value == pytest.approx(min(1.0, min(p) * (12 * 3 + 11 * 4)))
 
 
-def test_pit_is_the_exact_test_of_kolmogorov(fresh: np.random.Generator) -> None:
+def test_pit_is_the_exact_test_of_kolmogorov(fresh):
     nees = fresh.chisquare(3, (37, 11))
     chosen = spread_steps(np.ones((37, 11), bool))
     expected = stats.kstest(nees[np.arange(37), chosen], stats.chi2(3).cdf, method="exact")
@@ -355,11 +349,11 @@ def test_pit_is_the_exact_test_of_kolmogorov(fresh: np.random.Generator) -> None
     assert np.isnan(pit(np.full((5, 5), np.nan), 3).p_value)
 
 
-def test_coverage_interval_in_closed_form() -> None:
+def test_coverage_interval_in_closed_form():
     """All or none within: ends at (alpha / 2)^(1 / N); else quantiles of Beta."""
     error = np.zeros((30, 1, 3))
     error[:, 0, 1], error[:9, 0, 2] = 5.0, 5.0
-    share, interval = coverage_interval(error, np.broadcast_to(np.eye(3), (30, 1, 3, 3)), confidence=0.9)
+    share, interval = coverage_interval(error, identities(error), confidence=0.9)
     end = 0.05 ** (1 / 30)
     assert share.tolist() == [1.0, 0.0, 0.7]
     assert interval[0] == pytest.approx([end, 1.0])
@@ -370,7 +364,7 @@ def test_coverage_interval_in_closed_form() -> None:
 # --- innovations ---------------------------------------------------------------------------------------
 
 
-def test_portmanteau_of_one_series_is_that_of_statsmodels(fresh: np.random.Generator) -> None:
+def test_portmanteau_of_one_series_is_that_of_statsmodels(fresh):
     """Ljung-Box has N (N + 2) / (N - l) where the mean over pairs gives N^2 / (N - l)."""
     u = fresh.standard_normal(500)
     u -= u.mean()
@@ -382,7 +376,7 @@ def test_portmanteau_of_one_series_is_that_of_statsmodels(fresh: np.random.Gener
     assert found.p_value == pytest.approx(stats.chi2.sf(found.statistic, 10))
 
 
-def test_total_nis_by_hand() -> None:
+def test_total_nis_by_hand():
     nis, dof = np.array([[3.0, np.nan, 8.0]]), np.array([[2, 0, 6]])
     test = nis_test(nis, dof)
     assert (test.ratio, test.dof) == (11.0 / 8.0, 8)
@@ -393,7 +387,7 @@ def test_total_nis_by_hand() -> None:
 # --- credibility ---------------------------------------------------------------------------------------
 
 
-def test_noncredibility_by_hand(fresh: np.random.Generator) -> None:
+def test_noncredibility_by_hand(fresh):
     """10 / N sum |log10 rho|, rho the NEES with the stated over that with the actual error matrix."""
     error = fresh.standard_normal((9, 2, 2)) * [1.0, 4.0]
     C = np.diag([1.0, 9.0])
@@ -410,27 +404,27 @@ def test_noncredibility_by_hand(fresh: np.random.Generator) -> None:
 Case = dict[str, Any]
 
 
-def clean(rng: np.random.Generator, runs: int = RUNS, coefficient: float = 0.9) -> Case:
+def clean(rng, runs=RUNS, coefficient=0.9):
     """Errors as a filter makes them, their right covariance, white innovations of 2 components."""
     w = autoregression(rng, runs, STEPS, DOF, coefficient)
     return {"w": w, "u": rng.standard_normal((runs, STEPS, 2))}
 
 
-def verdict_of(case: Case, **options: Any) -> cs.Verdict:
+def verdict_of(case, **options):
     w, u = case["w"], case["u"]
     runs, steps, _ = w.shape
     error = w @ np.linalg.cholesky(P).T * case.get("units", 1.0)
     return judge(
         "f", error, np.broadcast_to(P * case.get("units", 1.0) ** 2, (runs, steps, 3, 3)).copy(), optimal_gain=True,
         nis=np.square(u).sum(axis=-1), nis_dof=np.full((runs, steps), 2), innovations=u,
-        innovation_covariances=np.broadcast_to(np.eye(2), (runs, steps, 2, 2)), axes=AXES,
+        innovation_covariances=identities(u), axes=AXES,
         **{"false_alarm": FALSE_ALARM, **options},
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("runs", [1, 2, 5, 9, 12, 20, 60])
 @pytest.mark.parametrize("coefficient", [0.0, 0.9, 0.999])
-def test_a_clean_filter_is_left_alone(fresh: np.random.Generator, runs: int, coefficient: float) -> None:
+def test_a_clean_filter_is_left_alone(fresh, runs, coefficient):
     """At 1e-6 each, 21 of them."""
     verdict = verdict_of(clean(fresh, runs, coefficient), false_alarm=1e-6)
     assert verdict.status in ("consistent", "undecided"), verdict.reasons
@@ -445,7 +439,7 @@ def test_a_clean_filter_is_left_alone(fresh: np.random.Generator, runs: int, coe
 
 
 @pytest.mark.parametrize("units", [1e-18, 1e-9, 1e9, 1e18])
-def test_units_do_not_matter(fresh: np.random.Generator, units: float) -> None:
+def test_units_do_not_matter(fresh, units):
     case = clean(fresh)
     plain, scaled = verdict_of(case), verdict_of(case | {"units": units})
     assert scaled.status == plain.status == "consistent"
@@ -453,7 +447,7 @@ def test_units_do_not_matter(fresh: np.random.Generator, units: float) -> None:
         assert a["p_value"] == pytest.approx(b["p_value"], rel=1e-6)
 
 
-def test_runs_that_end_early_are_no_fault(fresh: np.random.Generator) -> None:
+def test_runs_that_end_early_are_no_fault(fresh):
     case = clean(fresh, 20, 0.0)
     for run in range(20):
         case["w"][run, 1 + 2 * run :] = np.nan
@@ -463,21 +457,21 @@ def test_runs_that_end_early_are_no_fault(fresh: np.random.Generator) -> None:
 # --- whole verdicts: faults ----------------------------------------------------------------------------
 
 
-def correlated(case: Case, rng: np.random.Generator) -> Case:
+def correlated(case, rng):
     """x and y go together by 0.5, which the covariance does not say; steps independent."""
     w = rng.standard_normal(case["w"].shape)
     w[..., 1] = 0.5 * w[..., 0] + np.sqrt(0.75) * w[..., 1]
     return case | {"w": w}
 
 
-def heavy_tailed(case: Case, rng: np.random.Generator) -> Case:
+def heavy_tailed(case, rng):
     """Student's t with 5 degrees of freedom and the stated covariance."""
     runs = 400
     g = rng.standard_normal((runs, STEPS, DOF)) * np.sqrt(3.0 / rng.chisquare(5, (runs, STEPS, 1)))
     return {"w": g, "u": rng.standard_normal((runs, STEPS, 2))}
 
 
-def wrong_for_a_moment(case: Case, rng: np.random.Generator) -> Case:
+def wrong_for_a_moment(case, rng):
     """Step 18 has errors of chi-square's own quantiles: by chance their tails look heavy in 7 % of samples."""
     directions = rng.standard_normal((RUNS, DOF))
     quantiles = stats.chi2(DOF).ppf((np.arange(RUNS) + 0.5) / RUNS)
@@ -485,27 +479,24 @@ def wrong_for_a_moment(case: Case, rng: np.random.Generator) -> Case:
     return case
 
 
-Fault = Callable[[Case, np.random.Generator], Case]
-
-
-def changed(where: Any = ..., factor: Any = 1.0, shift: Any = 0.0) -> Fault:
+def changed(where=..., factor=1.0, shift=0.0):
     """Errors of some runs, steps and axes times a factor, and with a shift."""
 
-    def change(case: Case, rng: np.random.Generator) -> Case:
+    def change(case, rng):
         case["w"][where] = factor * case["w"][where] + shift
         return case
 
     return change
 
 
-def correlated_in_a_step(case: Case, rng: np.random.Generator) -> Case:
+def correlated_in_a_step(case, rng):
     case["w"][:, 30, 1] = 0.95 * case["w"][:, 30, 0] + np.sqrt(1 - 0.95**2) * case["w"][:, 30, 1]
     return case
 
 
 OVER, UNDER, WRONG = ("overconfident",), ("conservative",), ("inconsistent",)
 BIASED, HEAVY = ("biased",), ("heavy-tailed",)
-FAULTS: dict[str, tuple[Fault, str, tuple[str, ...], str]] = {
+FAULTS = {
     "too small": (changed(factor=np.sqrt(2.0)), "scale", OVER, "covariance too small by x"),
     "too large": (changed(factor=np.sqrt(0.4)), "scale", UNDER, "covariance too large by x"),
     "biased": (changed(shift=[1.2, 0.0, 0.0]), "bias", BIASED, "biased: mean error +1."),
@@ -534,7 +525,7 @@ FAULTS: dict[str, tuple[Fault, str, tuple[str, ...], str]] = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_found_and_named(name: str, fresh: np.random.Generator) -> None:
+def test_a_fault_is_found_and_named(name, fresh):
     """Judged at a false-alarm rate of 1e-5; missed with less than 1e-5."""
     fault, question, statuses, words = FAULTS[name]
     verdict = verdict_of(fault(clean(fresh), fresh))
@@ -543,7 +534,7 @@ def test_a_fault_is_found_and_named(name: str, fresh: np.random.Generator) -> No
     assert words in verdict.reasons[0]
 
 
-def test_the_distribution_is_judged_where_its_mean_is_right(fresh: np.random.Generator) -> None:
+def test_the_distribution_is_judged_where_its_mean_is_right(fresh):
     """NEES that hardly spreads around 3."""
     verdict = judge("f", nees=3.0 + 0.1 * fresh.standard_normal((RUNS, STEPS)), dof=3, false_alarm=FALSE_ALARM)
     assert verdict.faults == ("distribution",)
@@ -551,7 +542,7 @@ def test_the_distribution_is_judged_where_its_mean_is_right(fresh: np.random.Gen
     assert "does not follow the chi-square" in verdict.reasons[0]
 
 
-def test_where_when_and_how_much(fresh: np.random.Generator) -> None:
+def test_where_when_and_how_much(fresh):
     """From step 21 on the covariance of the heading is 6 times too small."""
     case = clean(fresh)
     case["w"][:, 20:, 2] *= np.sqrt(6.0)
@@ -565,7 +556,7 @@ def test_where_when_and_how_much(fresh: np.random.Generator) -> None:
     assert "no bias found" in verdict.reasons[0]
 
 
-def test_a_step_found_only_by_what_holm_leaves_is_still_named(fresh: np.random.Generator) -> None:
+def test_a_step_found_only_by_what_holm_leaves_is_still_named(fresh):
     """A wrong shape is found and frees its share: with that a step is found which its own share would not do for.
 
     The NEES of a step grows until it is found; there the side and the step must be named, whatever found them.
@@ -578,7 +569,7 @@ def test_a_step_found_only_by_what_holm_leaves_is_still_named(fresh: np.random.G
         w[..., 0] = np.sqrt(nees) * signs  # all on one axis
         w[:, 4, 0] *= np.sqrt(factor)
         w += 1e-3 * fresh.standard_normal(w.shape)
-        verdict = judge("f", w, np.broadcast_to(np.eye(3), (30, 10, 3, 3)))
+        verdict = judge("f", w, identities(w))
         if "scale in some step" in verdict.faults:
             break
     assert "scale in some step" in verdict.faults
@@ -590,56 +581,52 @@ def test_a_step_found_only_by_what_holm_leaves_is_still_named(fresh: np.random.G
 # --- degenerate input ------------------------------------------------------------------------------------
 
 
-def stated(shape: tuple[int, ...]) -> Array:
-    return np.broadcast_to(np.eye(shape[-1]), (*shape, shape[-1])).copy()
-
-
 @pytest.mark.parametrize("runs", [1, 2, 3, 4, 9, 10])
 @pytest.mark.parametrize("steps", [1, 2, 10])
 @pytest.mark.parametrize("n", [1, 3, 9])
-def test_any_shape_is_judged(fresh: np.random.Generator, runs: int, steps: int, n: int) -> None:
+def test_any_shape_is_judged(fresh, runs, steps, n):
     """54 shapes at 1e-7 each; a warning would be an error. Ten runs show no ratio of 1.5, unless steps are many."""
     e = fresh.standard_normal((runs, steps, n))
     for options in ({}, {"allow": "conservative"}, {"method": "bonferroni"}):
-        verdict = judge("f", e, stated(e.shape), false_alarm=1e-7, **options)
+        verdict = judge("f", e, identities(e), false_alarm=1e-7, **options)
         assert verdict.status in ("consistent", "undecided"), verdict.reasons
         assert verdict.p_value <= 1.0
 
 
 @pytest.mark.parametrize("runs", [5, 20])
-def test_no_error_at_all_is_conservative(runs: int) -> None:
+def test_no_error_at_all_is_conservative(runs):
     e = np.zeros((runs, 30, 3))
-    assert judge("f", e, stated(e.shape)).status == "conservative"
+    assert judge("f", e, identities(e)).status == "conservative"
     assert judge("f", nees=np.zeros((runs, 30)), dof=3).status == "conservative"
 
 
 @pytest.mark.parametrize("value", [0.1, 1.0, 10.0])
-def test_one_and_the_same_error_is_not_consistent(value: float) -> None:
+def test_one_and_the_same_error_is_not_consistent(value):
     e = np.full((20, 30, 3), value)
-    assert judge("f", e, stated(e.shape)).status != "consistent"
+    assert judge("f", e, identities(e)).status != "consistent"
     assert judge("f", nees=np.full((20, 30), 3 * value), dof=3).status != "consistent"
 
 
-def test_a_perfect_axis_is_judged(fresh: np.random.Generator) -> None:
+def test_a_perfect_axis_is_judged(fresh):
     e = fresh.standard_normal((30, 30, 3))
     e[..., 2] = 0.0
-    verdict = judge("f", e, stated(e.shape), axes=AXES)
+    verdict = judge("f", e, identities(e), axes=AXES)
     assert not verdict.consistent
     assert "scale of an axis" in verdict.faults
 
 
 @pytest.mark.parametrize("ratio", [1e-36, 1e-18, 1e18, 1e36])
-def test_a_covariance_out_of_all_proportion(fresh: np.random.Generator, ratio: float) -> None:
+def test_a_covariance_out_of_all_proportion(fresh, ratio):
     e = fresh.standard_normal((20, 30, 3))
-    verdict = judge("f", e, stated(e.shape) / ratio)
+    verdict = judge("f", e, identities(e) / ratio)
     assert verdict.status == ("overconfident" if ratio > 1 else "conservative")
     assert max(len(number) for number in re.findall(r"[\d.e+-]+", verdict.reasons[0])) <= len("+1.0e+18")
 
 
 @pytest.mark.parametrize("what", ["error", "covariance", "nees"])
-def test_nothing_but_nan_is_failed(fresh: np.random.Generator, what: str) -> None:
+def test_nothing_but_nan_is_failed(fresh, what):
     e = fresh.standard_normal((20, 30, 3))
-    arrays: dict[str, Any] = {"error": e, "covariance": stated(e.shape), "nees": np.square(e).sum(axis=-1)}
+    arrays = {"error": e, "covariance": identities(e), "nees": np.square(e).sum(axis=-1)}
     arrays[what] = np.full_like(arrays[what], np.nan)
     verdict = judge("f", **arrays)
     assert verdict.status == "failed"

@@ -1,13 +1,11 @@
 """Relative poses over windows: groups, covariances by finite differences, windows, broken rows and notes."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import relative_poses as world
+from numpy.testing import assert_allclose, assert_array_equal
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
@@ -15,17 +13,17 @@ from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_err
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, spatial_error, to_left
 from consistency.referee.readers.pipeline.relative_motions import windows_of
 from consistency.referee.readers.windows import Relative, relative_of, windows
-from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import judge_all
 
 GROUPS = tuple(world.SIGMA)
+NEXT = Relative(1, "step")
 
 
-def random_poses(rng: np.random.Generator, group: str, number: int) -> Array:
+def random_poses(rng, group, number):
     return exp(rng.normal(size=(number, len(AXES[group]))))
 
 
-def error_of(group: str, truth: Array, estimate: Array, convention: str) -> Array:
+def error_of(group, truth, estimate, convention):
     of = planar_error if group == "SE(2)" else spatial_error
     return of(vectors(truth), vectors(estimate), convention)
 
@@ -34,62 +32,62 @@ def error_of(group: str, truth: Array, estimate: Array, convention: str) -> Arra
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_matrices_inverse_log_and_adjoint(group: str, rng: np.random.Generator) -> None:
+def test_matrices_inverse_log_and_adjoint(group, rng):
     T, U = random_poses(rng, group, 20), random_poses(rng, group, 20)
-    np.testing.assert_allclose(matrices(vectors(T)), T, atol=1e-12)
-    np.testing.assert_allclose(inverse(T) @ T, np.broadcast_to(np.eye(T.shape[-1]), T.shape), atol=1e-12)
-    np.testing.assert_allclose(exp(log(T)), T, atol=1e-9)
+    assert_allclose(matrices(vectors(T)), T, atol=1e-12)
+    assert_allclose(inverse(T) @ T, np.broadcast_to(np.eye(T.shape[-1]), T.shape), atol=1e-12)
+    assert_allclose(exp(log(T)), T, atol=1e-9)
     e = 0.1 * rng.normal(size=(20, len(AXES[group])))
     moved = np.einsum("nij,nj->ni", adjoint(T), e)
-    np.testing.assert_allclose(T @ exp(e) @ inverse(T), exp(moved), atol=1e-9)
-    np.testing.assert_allclose(adjoint(T) @ adjoint(U), adjoint(T @ U), atol=1e-9)
-    np.testing.assert_allclose(composed(np.stack([T[0], U[0], T[1]]))[2], T[0] @ U[0] @ T[1], atol=1e-12)
+    assert_allclose(T @ exp(e) @ inverse(T), exp(moved), atol=1e-9)
+    assert_allclose(adjoint(T) @ adjoint(U), adjoint(T @ U), atol=1e-9)
+    assert_allclose(composed(np.stack([T[0], U[0], T[1]]))[2], T[0] @ U[0] @ T[1], atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("group", "convention"), [("SE(2)", c) for c in PLANAR if c != "vector"] + [("SE(3)", c) for c in SPATIAL]
 )
-def test_every_convention_becomes_the_left_error(group: str, convention: str, rng: np.random.Generator) -> None:
+def test_every_convention_becomes_the_left_error(group, convention, rng):
     T = random_poses(rng, group, 10)
     truth = T @ exp(1e-6 * rng.normal(size=(10, len(AXES[group]))))
     left, own = (error_of(group, truth, T, c) for c in ("left", convention))
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", to_left(T, convention), own), left, atol=1e-10)
+    assert_allclose(np.einsum("nij,nj->ni", to_left(T, convention), own), left, atol=1e-10)
 
 
 # --- covariances, by finite differences --------------------------------------------------------------
 
 
-def numerical(of: Callable[[Array], Array], n: int, step: float = 1e-6) -> Array:
+def numerical(of, n, step=1e-6):
     """Jacobian of a function of (n,) at zero, by central differences."""
     return np.stack([(of(step * u) - of(-step * u)) / (2.0 * step) for u in np.eye(n)], axis=-1)
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_motions_make_up_the_covariance_of_a_window(group: str, rng: np.random.Generator) -> None:
+def test_motions_make_up_the_covariance_of_a_window(group, rng):
     simulated, n, size = drive(rng, group, 8), len(AXES[group]), 4
     found = windows_of(motion_stretch(simulated), Relative(size, "step", True, True))
     assert len(found.t) == 2
     for window in range(2):
         D = simulated.motions[window * size : (window + 1) * size]
 
-        def end(e: Array, D: Array = D) -> Array:
+        def end(e, D=D):
             return log(inverse(composed(D)[-1:]) @ composed(D @ exp(e.reshape(size, n)))[-1:])[0]
 
         J = numerical(end, size * n)
         S = np.kron(np.eye(size), simulated.covariance[0])
-        np.testing.assert_allclose(found.covariance[window], J @ S @ J.T, rtol=1e-6, atol=1e-11)
+        assert_allclose(found.covariance[window], J @ S @ J.T, rtol=1e-6, atol=1e-11)
         true = inverse(simulated.truth[window * size]) @ simulated.truth[(window + 1) * size]
-        np.testing.assert_allclose(found.error[window], log(inverse(composed(D)[-1]) @ true[None])[0], atol=1e-10)
+        assert_allclose(found.error[window], log(inverse(composed(D)[-1]) @ true[None])[0], atol=1e-10)
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_joint_covariance_of_two_poses_makes_up_that_of_a_window(group: str, rng: np.random.Generator) -> None:
+def test_joint_covariance_of_two_poses_makes_up_that_of_a_window(group, rng):
     stretch, n, kind = pose_stretch(rng, group, 3, 5, 1.0, 0), len(AXES[group]), DECLARED[group]
-    found = windows_of(stretch, Relative(1, "step"))
+    found = windows_of(stretch, NEXT)
     T = matrices(stretch.estimate)
     for k in (1, 2):
 
-        def window(e: Array, k: int = k) -> Array:
+        def window(e, k=k):
             both = np.stack([e[:n], e[n:]])
             moved = T[k - 1 : k + 1] @ exp(np.einsum("nij,nj->ni", to_left(T[k - 1 : k + 1], kind), both))
             return log(inverse(inverse(T[k - 1]) @ T[k])[None] @ (inverse(moved[0]) @ moved[1]))[0]
@@ -98,17 +96,17 @@ def test_joint_covariance_of_two_poses_makes_up_that_of_a_window(group: str, rng
         joint = np.block(
             [[stretch.covariance[k - 1], stretch.cross[k]], [stretch.cross[k].T, stretch.covariance[k]]]
         )  # fmt: skip
-        np.testing.assert_allclose(found.covariance[k - 1], J @ joint @ J.T, rtol=1e-6, atol=1e-10)
+        assert_allclose(found.covariance[k - 1], J @ joint @ J.T, rtol=1e-6, atol=1e-10)
 
 
 # --- windows -------------------------------------------------------------------------------------------
 
 
-def test_windows_in_steps_seconds_and_metres() -> None:
+def test_windows_in_steps_seconds_and_metres():
     t, rows = np.arange(11) * 0.5, np.arange(11)
     place = np.column_stack([np.cumsum([0, 1, 1, 1, 3, 1, 1, 1, 1, 1, 1.0]), np.zeros(11)])
 
-    def cut(text: str) -> list[tuple[int, int]]:
+    def cut(text):
         relative = relative_of(text)
         first, last, _ = windows(t, place, rows, relative, "f")
         return list(zip(first.tolist(), last.tolist(), strict=True))
@@ -119,23 +117,23 @@ def test_windows_in_steps_seconds_and_metres() -> None:
     assert cut("3m") == [(0, 3), (3, 4), (4, 7), (7, 10)]
 
 
-def test_a_window_over_missing_rows_is_left_out() -> None:
+def test_a_window_over_missing_rows_is_left_out():
     rows = np.array([0, 2, 4, 9, 11, 13])
     first, last, left_out = windows(np.arange(14.0), np.zeros((6, 2)), rows, Relative(2, "s"), "f")
     assert (first.tolist(), last.tolist(), left_out) == ([0, 2, 9, 11], [2, 4, 11, 13], 1)
 
 
-def test_rows_without_truth_change_no_other_window(rng: np.random.Generator) -> None:
+def test_rows_without_truth_change_no_other_window(rng):
     stretch, size = motion_stretch(drive(rng, "SE(2)", 12)), Relative(2, "step", True, True)
     there = np.delete(np.arange(13), 3)
     whole, some = windows_of(stretch, size), windows_of(replace(stretch, rows=there, truth=stretch.truth[there]), size)
     same, here = np.nonzero((whole.t[:, None] == some.t) & (whole.track.t[:, None] == some.track.t))
     assert len(here) >= 4
-    np.testing.assert_array_equal(some.error[here], whole.error[same])
-    np.testing.assert_array_equal(some.covariance[here], whole.covariance[same])
+    assert_array_equal(some.error[here], whole.error[same])
+    assert_array_equal(some.covariance[here], whole.covariance[same])
 
 
-def test_time_on_a_common_clock_of_1970_is_no_matter_of_rounding() -> None:
+def test_time_on_a_common_clock_of_1970_is_no_matter_of_rounding():
     t = 1.7e9 + np.arange(101) * 0.1
     first, last, _ = windows(t, np.zeros((101, 2)), np.arange(101), Relative(1, "s"), "f")
     assert (last - first == 10).all()
@@ -143,7 +141,7 @@ def test_time_on_a_common_clock_of_1970_is_no_matter_of_rounding() -> None:
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "1.5", "ten", "10h", "nan", "inf", "1e", "s", ""])
-def test_sizes_that_are_none(text: str) -> None:
+def test_sizes_that_are_none(text):
     with pytest.raises(cs.InputError, match="must be a whole number of steps"):
         relative_of(text)
 
@@ -151,12 +149,12 @@ def test_sizes_that_are_none(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "shown"), [("100", "100 steps"), ("1", "1 step"), ("10s", "10 s"), ("0.5 m", "0.5 m")]
 )
-def test_sizes_as_they_are_shown(text: str, shown: str) -> None:
+def test_sizes_as_they_are_shown(text, shown):
     relative = relative_of(text)
     assert relative.text == shown
 
 
-def test_a_window_that_cross_covariances_do_not_reach_over_is_named(rng: np.random.Generator) -> None:
+def test_a_window_that_cross_covariances_do_not_reach_over_is_named(rng):
     stretch = pose_stretch(rng, "SE(2)", 8, 5, 1.0, 0)
     truth = np.column_stack([[0.0, 2.0, 2.5, 3.0, 4.1, 6.2, 7.0, 8.3], np.zeros((8, 2))])  # windows of 1, 3, 1, 2 rows
     with pytest.raises(cs.InputError, match="row 4: --relative 2m: the window spans 3 rows"):
@@ -167,7 +165,7 @@ def test_a_window_that_cross_covariances_do_not_reach_over_is_named(rng: np.rand
 
 
 @pytest.mark.parametrize("row", [1, 7, 12, 29])
-def test_a_broken_row_is_a_failed_window(row: int, rng: np.random.Generator) -> None:
+def test_a_broken_row_is_a_failed_window(row, rng):
     stretch = motion_stretch(drive(rng, "SE(3)", 29))
     stretch.estimate[row] = np.nan
     record = recorded([stretch], "5", True)
@@ -180,27 +178,27 @@ def test_a_broken_row_is_a_failed_window(row: int, rng: np.random.Generator) -> 
     assert any(f"1 of {verdict.runs} windows failed, first window {verdict.runs}: " in r for r in verdict.reasons)
 
 
-def test_a_covariance_that_is_not_finite_is_named(rng: np.random.Generator) -> None:
+def test_a_covariance_that_is_not_finite_is_named(rng):
     stretch = motion_stretch(drive(rng, "SE(2)", 20))
     stretch.covariance[8, 0, 0] = np.inf
     assert recorded([stretch], "5", True).failures[0].reason == "covariance is not finite (row 8)"
     found = windows_of(stretch, Relative(5, "step", True))
-    np.testing.assert_array_equal(found.error[-1], 0.0)
+    assert_array_equal(found.error[-1], 0.0)
     assert np.isnan(found.covariance[-1]).all()
 
 
-def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
+def test_a_log_that_is_broken_from_the_start(rng):
     for group in GROUPS:
         stretch = pose_stretch(rng, group, 6, 5, 1.0, 0)
         stretch.estimate[0] = np.nan
         record = recorded([stretch], "1", False)
         assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
         assert not any("first order" in note for note in record.notes)
-        assert windows_of(stretch, Relative(1, "step")).track.t.tolist() == [stretch.t[0]]
+        assert windows_of(stretch, NEXT).track.t.tolist() == [stretch.t[0]]
         assert judge_all([record])["log"].status == "failed"
 
 
-def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None:
+def test_neighbours_that_go_together_are_named(rng):
     """Errors of a bias of three sigma, and of a noisy truth: certain but for 1e-5."""
     simulated = drive(rng, "SE(2)", 200)
     biased = simulated.motions @ exp(np.array([[0.1, 0.0, 0.0]]) + 0.01 * rng.normal(size=(200, 3)))
@@ -216,11 +214,11 @@ def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None
     assert any("neighbouring windows go opposite ways" in note for note in notes)
 
 
-def test_motions_are_judged_however_few(rng: np.random.Generator) -> None:
+def test_motions_are_judged_however_few(rng):
     assert recorded([motion_stretch(drive(rng, "SE(2)", 20))], "1", True).unshown == ""
 
 
-def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng: np.random.Generator) -> None:
+def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng):
     """True motions that err by 0.2 or 5 sigma for 50 windows at a time: certain but for 1e-5."""
     simulated = drive(rng, "SE(2)", 400)
     n = 3
@@ -236,50 +234,50 @@ def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng: np.random.Ge
     assert (plain_one.caption, plain_one.unshown) == ("", "")
 
 
-def test_windows_too_wide_for_first_order_are_named(rng: np.random.Generator) -> None:
+def test_windows_too_wide_for_first_order_are_named(rng):
     simulated = drive(rng, "SE(2)", 200, sigma=np.array([0.01, 0.01, 0.05]))
     assert any("to first order is doubtful" in note for note in recorded([motion_stretch(simulated)], "50", True).notes)
     assert not any("first order" in note for note in recorded([motion_stretch(simulated)], "1", True).notes)
 
 
-def test_a_cross_covariance_that_is_not_finite_breaks_the_window_that_ends_there(rng: np.random.Generator) -> None:
+def test_a_cross_covariance_that_is_not_finite_breaks_the_window_that_ends_there(rng):
     stretch = pose_stretch(rng, "SE(2)", 8, 5, 1.0, 0)
-    whole = windows_of(stretch, Relative(1, "step"))
+    whole = windows_of(stretch, NEXT)
     stretch.cross[4, 2, 0] = np.inf
-    found = windows_of(stretch, Relative(1, "step"))
-    np.testing.assert_array_equal(found.t, stretch.t[1:5])
-    np.testing.assert_array_equal(found.covariance[:3], whole.covariance[:3])
+    found = windows_of(stretch, NEXT)
+    assert_array_equal(found.t, stretch.t[1:5])
+    assert_array_equal(found.covariance[:3], whole.covariance[:3])
     assert np.isnan(found.covariance[3]).all()
-    np.testing.assert_array_equal(found.error[3], 0.0)
+    assert_array_equal(found.error[3], 0.0)
     assert recorded([stretch], "1", False).failures[0].reason == "covariance is not finite (row 4)"
 
 
-def test_the_first_row_of_motions_is_only_where_they_start(rng: np.random.Generator) -> None:
+def test_the_first_row_of_motions_is_only_where_they_start(rng):
     stretch = motion_stretch(drive(rng, "SE(3)", 12))
     whole = windows_of(stretch, Relative(4, "step", True))
     stretch.estimate[0], stretch.covariance[0] = 7.0, np.nan
     found = windows_of(stretch, Relative(4, "step", True))
-    np.testing.assert_array_equal(found.error, whole.error)
-    np.testing.assert_array_equal(found.covariance, whole.covariance)
+    assert_array_equal(found.error, whole.error)
+    assert_array_equal(found.covariance, whole.covariance)
     stretch.covariance[1] = np.nan
     assert windows_of(stretch, Relative(4, "step", True)).t.tolist() == [stretch.t[1]]
 
 
-def test_poses_need_a_cross_covariance_of_the_very_next_row(rng: np.random.Generator) -> None:
+def test_poses_need_a_cross_covariance_of_the_very_next_row(rng):
     stretch = pose_stretch(rng, "SE(2)", 9, 5, 1.0, 0)
     with pytest.raises(cs.InputError, match=r"^row 2: --relative 2: the window spans 2 rows, .* reaches one row back"):
         windows_of(stretch, Relative(2, "step"))
     with pytest.raises(cs.InputError, match="poses: --relative: covariances of two poses do not tell"):
-        windows_of(replace(stretch, cross=None), Relative(1, "step"))
+        windows_of(replace(stretch, cross=None), NEXT)
 
 
-def test_runs_have_windows_by_their_times_where_those_are_known(rng: np.random.Generator) -> None:
+def test_runs_have_windows_by_their_times_where_those_are_known(rng):
     """The second run has no truth before its fifth row, and so no first two windows."""
     first, second = (motion_stretch(drive(rng, "SE(2)", 12), run) for run in range(2))
     late = replace(second, rows=second.rows[4:], truth=second.truth[4:])
     record = recorded([first, late], "2", True)
-    np.testing.assert_allclose(record.t, first.t[[2, 4, 6, 8, 10, 12]])
-    np.testing.assert_array_equal(np.isnan(record.error[:, :, 0]).sum(axis=1), [0, 2])
+    assert_allclose(record.t, first.t[[2, 4, 6, 8, 10, 12]])
+    assert_array_equal(np.isnan(record.error[:, :, 0]).sum(axis=1), [0, 2])
     assert np.isnan(record.error[1, :2]).all()
     timeless = [replace(each, t=np.full(13, np.nan)) for each in (first, late)]
     record = recorded(timeless, "2", True)
@@ -290,7 +288,7 @@ def test_runs_have_windows_by_their_times_where_those_are_known(rng: np.random.G
 # --- notes ---------------------------------------------------------------------------------------------
 
 
-def test_notes_say_what_windows_are_of(rng: np.random.Generator) -> None:
+def test_notes_say_what_windows_are_of(rng):
     planar = recorded([motion_stretch(drive(rng, "SE(2)", 19)), motion_stretch(drive(rng, "SE(2)", 19), 1)], "2", True)
     assert planar.notes[0] == (
         "log: relative poses over 18 windows of 2 steps; the error is Log(estimated^-1 true motion) of SE(2), in the "
@@ -309,7 +307,7 @@ def test_notes_say_what_windows_are_of(rng: np.random.Generator) -> None:
     assert (planar.independent, spatial.independent) == (True, False)
 
 
-def test_windows_that_are_left_out_are_counted(rng: np.random.Generator) -> None:
+def test_windows_that_are_left_out_are_counted(rng):
     stretches = [motion_stretch(drive(rng, "SE(2)", 12), run) for run in range(2)]
     there = np.delete(np.arange(13), 3)
     some = [replace(stretch, rows=there, truth=stretch.truth[there]) for stretch in stretches]
@@ -321,7 +319,7 @@ def test_windows_that_are_left_out_are_counted(rng: np.random.Generator) -> None
     assert not any("left out" in note for note in recorded(stretches, size, True).notes)
 
 
-def test_the_rotation_of_a_window_is_that_of_its_widest_axis(rng: np.random.Generator) -> None:
+def test_the_rotation_of_a_window_is_that_of_its_widest_axis(rng):
     """A median over windows, of the greatest standard deviation about any axis."""
     for group, sigma in (("SE(2)", (9.0, 9.0, 0.12)), ("SE(3)", (9.0, 9.0, 9.0, 0.01, 0.12, 0.02))):
         stretch = motion_stretch(drive(rng, group, 30))

@@ -1,9 +1,6 @@
 """Sections of a report on filters with an error of their own, and on maps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from invariant import Invariant
@@ -12,39 +9,37 @@ import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.build import build_report
 from consistency.bench.pages.sections import anees
-from consistency.bench.pages.sections.report_input import Study
 from consistency.bench.pages.sections.study_sections import maps, of_own_errors, own_errors
-from consistency.diagnostics import Interval, MapScore
-from consistency.referee.document.blocks import Cell, Name, Quantity, Status, Table
+from consistency.referee.document.blocks import Name, Quantity, Status, Table
 from consistency.referee.document.judged_filters import page
 from consistency.referee.document.wording import brief, written
 from consistency.referee.pages import verdicts
 
 
 @pytest.fixture(scope="module")
-def results(uvd: cs.Scenario) -> cs.Results:
+def results(uvd):
     return cs.run_trials(uvd, ["ekf-uvd", Invariant()], runs=6, seed=5, jobs=1)
 
 
 @pytest.fixture(scope="module")
-def folder(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(results, tmp_path_factory):
     out = tmp_path_factory.mktemp("report") / "run"
     results.write(out)
     return out
 
 
 @pytest.fixture(scope="module")
-def study(folder: Path) -> Study:
+def study(folder):
     return build_report(folder).studies[0]
 
 
-def rows_of(blocks: tuple[object, ...]) -> tuple[tuple[Cell, ...], ...]:
+def rows_of(blocks):
     [found] = [block for block in blocks if isinstance(block, Table)]
     [(_, rows)] = found.groups
     return rows
 
 
-def test_both_errors_stand_below_each_other(study: Study) -> None:
+def test_both_errors_stand_below_each_other(study):
     track = study.tracks[1]
     v = track.verdict
     own, world = rows_of(own_errors(study))
@@ -56,7 +51,7 @@ def test_both_errors_stand_below_each_other(study: Study) -> None:
     assert caption.startswith("right: Log(truth estimate^-1) of SE(2), in the world frame; so2: position difference")
 
 
-def test_captions_name_the_filters_with_an_error_of_their_own(study: Study) -> None:
+def test_captions_name_the_filters_with_an_error_of_their_own(study):
     assert "Judged in an error of their own, but for the RMSE: right (right)" in verdicts.verdicts_caption(study)
     assert anees.anees_caption(anees.read(study)).endswith("In the filter's own error: right (right).")
     alone = replace(study, tracks=study.tracks[:1])
@@ -65,7 +60,7 @@ def test_captions_name_the_filters_with_an_error_of_their_own(study: Study) -> N
     assert own_errors(alone) == ()
 
 
-def test_the_rmse_is_that_of_the_pose_in_the_world(study: Study) -> None:
+def test_the_rmse_is_that_of_the_pose_in_the_world(study):
     track = study.tracks[1]
     [measure] = [m for m in page("") if m.column.head == "RMSE position (m)"]
     cell = written(measure.cell(track.verdict))
@@ -73,11 +68,11 @@ def test_the_rmse_is_that_of_the_pose_in_the_world(study: Study) -> None:
     assert cell != f"{track.verdict.accuracy.rmse_position:.3f}", "negative control"
 
 
-def _of_map(score: MapScore) -> tuple[Interval, ...]:
+def _of_map(score):
     return score.ratio, score.verdict.joint.both, score.verdict.joint.map
 
 
-def test_maps_of_all_filters(study: Study) -> None:
+def test_maps_of_all_filters(study):
     rows = rows_of(maps(study))
     score = study.tracks[0].verdict.map
     ends = [f"{brief(i.value)} [{brief(i.low)}, {brief(i.high)}]" for i in _of_map(score)]
@@ -92,7 +87,7 @@ def test_maps_of_all_filters(study: Study) -> None:
     assert maps(replace(study, tracks=without)) == ()
 
 
-def test_both_formats_hold_both_sections(folder: Path, tmp_path: Path) -> None:
+def test_both_formats_hold_both_sections(folder, tmp_path):
     write_reports(folder, tmp_path / "r.html", tmp_path / "r.pdf", False)
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     for text in (

@@ -1,17 +1,14 @@
 """The report of another estimator's files, and the same from Python."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from command import consistency, refused
 from matplotlib.figure import Figure as Drawn
+from numpy.testing import assert_allclose
 from painted import by_title, legend_of, lines, panels, places, shaded
 from recorded import read_recordings
 from scipy import stats
@@ -27,37 +24,39 @@ from consistency.referee.verdicts.sources import judge_all
 RUNS, STEPS = 30, 25
 
 
-def errors_of(rng: np.random.Generator, n: int = 2, ratio: float = 1.0) -> dict[str, Any]:
+def errors_of(rng, n=2, ratio=1.0):
     P = np.diag(0.1 * np.arange(1, n + 1))
     errors = np.sqrt(ratio) * rng.multivariate_normal(np.zeros(n), P, size=(RUNS, STEPS))
     return {"errors": errors, "covariances": np.broadcast_to(P, (RUNS, STEPS, n, n)).copy()}
 
 
 @pytest.fixture
-def archive(tmp_path: Path, rng: np.random.Generator) -> Path:
+def archive(tmp_path, rng):
     np.savez(tmp_path / "mine.npz", **errors_of(rng), axes=["x", "yaw"], t=1.7e9 + 0.1 * np.arange(STEPS))
     return tmp_path / "mine.npz"
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     return np.random.default_rng()
 
 
-def document(path: Path) -> Any:
+def document(path):
     records = read_recordings(path)
     return compose_files(records, judge_all(records), path.name, {"command": "consistency analyse"})
 
 
-def test_the_verdict_stands_on_top_and_the_pictures_first(archive: Path) -> None:
+def test_the_verdict_stands_on_top_and_the_pictures_first(archive):
     made = document(archive)
     sentence = cs.judge(cs.read(archive)).reasons[0]
     assert made.answer == f"mine is {sentence}."
-    assert [block.title for block in made.chapters[0].blocks] == ["Errors and stated bounds", "NEES", "Coverage"]
+    assert [block.title for block in made.chapters[0].blocks] == [
+        "NEES", "Errors over their stated sigma", "Which run, and when", "Errors and stated bounds", "Coverage",
+    ]  # fmt: skip
     assert [chapter.anchor for chapter in made.chapters] == ["estimator-0", "verdicts", "provenance"]
 
 
-def test_what_the_files_do_not_tell_has_no_column(archive: Path) -> None:
+def test_what_the_files_do_not_tell_has_no_column(archive):
     (shown,) = [block for block in document(archive).chapters[1].blocks if isinstance(block, Table)][:1]
     heads = [column.head for column in shown.columns]
     assert {"Filter", "Verdict", "Mean ANEES", "RMSE position (m)", "Failed runs"} <= set(heads)
@@ -65,9 +64,7 @@ def test_what_the_files_do_not_tell_has_no_column(archive: Path) -> None:
     assert [len(row) for _, rows in shown.groups for row in rows] == [len(heads)]
 
 
-def test_the_cells_of_a_wide_table_name_their_heads(
-    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_cells_of_a_wide_table_name_their_heads(archive, tmp_path, capsys):
     """A narrow screen shows each row of it by itself."""
     consistency(capsys, "analyse", archive, "--report", tmp_path / "r")
     source = (tmp_path / "r/report.html").read_text("utf-8")
@@ -78,26 +75,26 @@ def test_the_cells_of_a_wide_table_name_their_heads(
     assert 'wide">' not in narrow
 
 
-def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive: Path) -> None:
+def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive):
     record = read_recordings(archive)[0]
     drawn = panels(by_title(document(archive))["Errors and stated bounds"])
     assert [axes.get_ylabel() for axes in drawn] == ["x (m)", "yaw (deg)"]
     for axes, factor, variance, error in zip(drawn, (1.0, 180 / np.pi), (0.1, 0.2), record.error[0].T, strict=True):
         (line,), (below,) = lines(axes, "run 0"), lines(axes, "2-sigma bounds")
-        np.testing.assert_allclose(line.get_xdata(), 0.1 * np.arange(STEPS), atol=1e-6)
-        np.testing.assert_allclose(line.get_ydata(), factor * error)
-        np.testing.assert_allclose(below.get_ydata(), -2.0 * factor * np.sqrt(variance))
+        assert_allclose(line.get_xdata(), 0.1 * np.arange(STEPS), atol=1e-6)
+        assert_allclose(line.get_ydata(), factor * error)
+        assert_allclose(below.get_ydata(), -2.0 * factor * np.sqrt(variance))
     assert "Time 0 is 1700000000.00 s." in by_title(document(archive))["NEES"].caption
 
 
-def test_without_times_steps_are_on_the_axis(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_without_times_steps_are_on_the_axis(tmp_path, rng):
     np.savez(tmp_path / "e.npz", **errors_of(rng))
     clock = clock_of(read_recordings(tmp_path / "e.npz")[0].t)
     assert (clock.word, clock.values[0], clock.values[-1]) == ("step", 1, STEPS)
     assert unit_of("axis 0") == ("", 1.0)
 
 
-def test_coverage_is_that_of_the_errors(tmp_path: Path) -> None:
+def test_coverage_is_that_of_the_errors(tmp_path):
     """Errors at the quantiles of a Gaussian with 4 times the stated variance: known shares, without chance."""
     n = 4000
     z = 2.0 * stats.norm.ppf((np.arange(n) + 0.5) / n)
@@ -107,43 +104,75 @@ def test_coverage_is_that_of_the_errors(tmp_path: Path) -> None:
     expected = 2.0 * stats.norm.cdf(stats.norm.ppf(0.5 + 0.5 * p) / 2.0) - 1.0
     assert set(found) == {"axis 0", "all together"}
     for shares in found.values():
-        np.testing.assert_allclose(shares, expected, atol=2e-3)
+        assert_allclose(shares, expected, atol=2e-3)
 
 
-def test_the_longest_run_is_shown(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_the_longest_run_is_shown(tmp_path, rng):
     np.savez(tmp_path / "e.npz", **errors_of(rng), lengths=np.array([STEPS - 3] * 4 + [STEPS] * (RUNS - 4)))
     assert shown_run(read_recordings(tmp_path / "e.npz")[0]) == 4
 
 
-def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path, rng):
     np.savez(tmp_path / "e.npz", **{key: value[0] for key, value in errors_of(rng).items()})
     record = read_recordings(tmp_path / "e.npz")[0]
     found = record_figures(record, cs.judge(cs.read(tmp_path / "e.npz")))
-    assert legend_of(panels(found[0])[0].figure) == ["2-sigma bounds", "run 0"]
-    assert found[1].caption.startswith("NEES; 2 is expected")
+    assert found[0].caption.startswith("NEES; 2 is expected")
+    assert legend_of(panels(found[1])[0].figure) == ["2 sigma", "run 0"]
+    assert [of.title for of in found] == [
+        "NEES",
+        "Errors over their stated sigma",
+        "Errors and stated bounds",
+        "Coverage",
+    ]
+    assert legend_of(panels(found[2])[0].figure) == ["2-sigma bounds", "run 0"]
 
 
-def test_runs_of_one_step_stand_side_by_side(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_the_worst_run_is_named_and_drawn(tmp_path, rng):
+    data = errors_of(rng)
+    data["errors"][7] *= 5.0
+    np.savez(tmp_path / "e.npz", **data)
+    record = cs.read(tmp_path / "e.npz")
+    worst = next(of for of in record_figures(record, cs.judge(record)) if of.title == "Which run, and when")
+    of_runs, of_steps = panels(worst)
+    assert of_steps.get_ylabel() == "NEES of run 7"
+    assert_allclose(places(of_runs)[0][:, 1], record.nees.mean(axis=1))
+    assert_allclose(places(of_runs)[1], [[7.0, record.nees[7].mean()]])
+
+
+def test_the_first_steps_set_no_axis(tmp_path, rng):
+    """A filter that starts with a large error and says so."""
+    data = errors_of(rng)
+    usual = np.abs(data["errors"]).max()
+    data["errors"][:, :2] *= 1000.0
+    data["covariances"] = data["covariances"] * np.where(np.arange(STEPS) < 2, 1e6, 1.0)[:, None, None]
+    np.savez(tmp_path / "e.npz", **data)
+    record = cs.read(tmp_path / "e.npz")
+    found = {of.title: of for of in record_figures(record, cs.judge(record))}
+    assert panels(found["Errors and stated bounds"])[0].get_ylim()[1] < 10.0 * usual
+    assert panels(found["Errors over their stated sigma"])[0].get_ylim()[1] < 10.0
+
+
+def test_runs_of_one_step_stand_side_by_side(tmp_path, rng):
     """A factor or a calibration: no curve along the steps, which would be a point."""
     errors = rng.normal(size=(RUNS, 1, 2))
     covariances = np.broadcast_to(np.diag([0.25, 4.0]), (RUNS, 1, 2, 2))
     np.savez(tmp_path / "e.npz", errors=errors, covariances=covariances, axes=["x", "yaw"])
     record = cs.read(tmp_path / "e.npz")
-    of_errors, of_nees, _ = record_figures(record, cs.judge(record))
+    of_nees, of_errors, _ = record_figures(record, cs.judge(record))
     for axes, factor, sigma, error in zip(
         panels(of_errors), (1.0, 180 / np.pi), (0.5, 2.0), errors[:, 0].T, strict=True
     ):
-        np.testing.assert_allclose(places(axes)[0], np.column_stack([np.arange(RUNS), factor * error]))
-        np.testing.assert_allclose(shaded(axes), (-2 * factor * sigma, 2 * factor * sigma))
+        assert_allclose(places(axes)[0], np.column_stack([np.arange(RUNS), factor * error]))
+        assert_allclose(shaded(axes), (-2 * factor * sigma, 2 * factor * sigma))
     (axes,) = panels(of_nees)
-    np.testing.assert_allclose(places(axes)[0][:, 1], errors[:, 0] ** 2 @ [4.0, 0.25])
+    assert_allclose(places(axes)[0][:, 1], errors[:, 0] ** 2 @ [4.0, 0.25])
     span = axes.patches[0]
     ends = span.get_y(), span.get_y() + span.get_height()
-    np.testing.assert_allclose(stats.chi2.cdf(ends, 2), (0.025, 0.975))
+    assert_allclose(stats.chi2.cdf(ends, 2), (0.025, 0.975))
 
 
 @pytest.mark.parametrize("steps", [1, STEPS])
-def test_every_panel_of_a_plot_has_a_legend(steps: int, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_every_panel_of_a_plot_has_a_legend(steps, tmp_path, rng):
     np.savez(tmp_path / "e.npz", **{key: value[:, :steps] for key, value in errors_of(rng).items()})
     record = cs.read(tmp_path / "e.npz")
     unnamed = replace(record, axes=())
@@ -155,7 +184,7 @@ def test_every_panel_of_a_plot_has_a_legend(steps: int, tmp_path: Path, rng: np.
         assert texts == ["expected", "axis 0", "axis 1", "all together"]
 
 
-def test_what_is_not_there_is_not_drawn(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_what_is_not_there_is_not_drawn(tmp_path, rng):
     np.savez(tmp_path / "n.npz", nees=rng.chisquare(3, (RUNS, STEPS)), dof=3)
     assert set(by_title(document(tmp_path / "n.npz"))) >= {"NEES", "Coverage"}
     assert "Errors and stated bounds" not in by_title(document(tmp_path / "n.npz"))
@@ -167,7 +196,7 @@ def test_what_is_not_there_is_not_drawn(tmp_path: Path, rng: np.random.Generator
         cs.read(tmp_path / "i.csv").plot()
 
 
-def test_each_of_several_estimators_has_its_sentence(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_each_of_several_estimators_has_its_sentence(tmp_path, rng):
     lines = ["filter,run,step,a,P_a_a"]
     for name, scale in (("good", 1.0), ("bad", 3.0)):
         lines += [
@@ -192,7 +221,7 @@ def test_each_of_several_estimators_has_its_sentence(tmp_path: Path, rng: np.ran
 # --- the command ------------------------------------------------------------------------------------
 
 
-def test_one_command_writes_page_paper_and_numbers(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_command_writes_page_paper_and_numbers(archive, capsys):
     out = archive.parent / "deep" / "out"
     printed, _ = consistency(capsys, "analyse", archive, "--report", out)
     assert sorted(path.name for path in out.iterdir()) == [
@@ -211,9 +240,7 @@ def test_one_command_writes_page_paper_and_numbers(archive: Path, capsys: pytest
     assert "exists already" in refused(capsys, "analyse", archive, "--report", out)
 
 
-def test_a_report_that_is_not_replaced_is_refused_before_the_work(
-    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_report_that_is_not_replaced_is_refused_before_the_work(archive, tmp_path, capsys):
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "mine.txt").write_text("mine")
@@ -227,9 +254,7 @@ def test_a_report_that_is_not_replaced_is_refused_before_the_work(
 
 
 @pytest.mark.parametrize("name", ["r.xml", "r.md"])
-def test_a_file_that_analyse_has_written_is_replaced(
-    name: str, archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_analyse_has_written_is_replaced(name, archive, tmp_path, capsys):
     consistency(capsys, "analyse", archive, "--report", tmp_path / name)
     first = (tmp_path / name).read_text()
     consistency(capsys, "analyse", archive, "--report", tmp_path / name)
@@ -239,7 +264,7 @@ def test_a_file_that_analyse_has_written_is_replaced(
     consistency(capsys, "analyse", archive, "--report", tmp_path / name, "--overwrite")
 
 
-def test_what_a_report_is_not_for(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_report_is_not_for(archive, tmp_path, capsys):
     assert "--overwrite goes with --report" in refused(capsys, "analyse", archive, "--overwrite")
     scenario = cs.load_scenario("linear-gaussian").variant("short", truth__steps=5)
     cs.run_trials(scenario, ["kf"], runs=2, jobs=1).write(tmp_path / "results")
@@ -251,7 +276,7 @@ def test_what_a_report_is_not_for(archive: Path, tmp_path: Path, capsys: pytest.
 # --- Python -----------------------------------------------------------------------------------------
 
 
-def test_a_record_and_its_verdict_draw_themselves(archive: Path, tmp_path: Path) -> None:
+def test_a_record_and_its_verdict_draw_themselves(archive, tmp_path):
     record = cs.read(archive)
     assert repr(record) == f"<Record mine: {RUNS} runs x {STEPS} steps, error - of x, yaw>"
     verdict = cs.judge(record, false_alarm=0.01, detect=2.0)
@@ -267,7 +292,7 @@ def test_a_record_and_its_verdict_draw_themselves(archive: Path, tmp_path: Path)
         cs.judge(record, false_alarm=2.0)
 
 
-def test_names_of_files_are_shown_as_they_are(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_names_of_files_are_shown_as_they_are(tmp_path, rng):
     np.savez(tmp_path / "<b>a&b.npz", **errors_of(rng))
     record = cs.read(tmp_path / "<b>a&b.npz")
     assert "<b>" not in record._repr_html_()

@@ -3,11 +3,8 @@
 Seeds are fixed and were not chosen; counts have limits at 1e-5.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,16 +16,16 @@ from consistency.diagnostics import Design, Record, Verdict, e_process, ever, fo
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
 from consistency.referee.diagnostics.statistics import e_process as betting
-from consistency.referee.types import Array, Failure
+from consistency.referee.types import Failure
 
 SURE = 1e-5
 
 
-def inspections(design: Design, count: int) -> list[tuple[int, float | None]]:
+def inspections(design, count):
     return list(itertools.islice(design.inspections(), count))
 
 
-def evidence_from(error: Array, **more: Any) -> Any:
+def evidence_from(error, **more):
     """The first runs of a filter, as many as asked for."""
     P = identities(error)
     return lambda runs: Record("f", error[:runs], P[:runs], **more)
@@ -37,7 +34,7 @@ def evidence_from(error: Array, **more: Any) -> Any:
 # --- the grid -----------------------------------------------------------------------------------------
 
 
-def test_looks_double_and_the_scale_is_looked_at_in_between() -> None:
+def test_looks_double_and_the_scale_is_looked_at_in_between():
     found = inspections(Design(3), 13)
     assert [runs for runs, _ in found] == [12, 15, 18, 21, 24, 30, 36, 42, 48, 60, 72, 84, 96]
     spent = dict(found)
@@ -45,14 +42,14 @@ def test_looks_double_and_the_scale_is_looked_at_in_between() -> None:
     assert [spent[n] for n in (12, 24, 48, 96)] == pytest.approx([1 / 2, 1 / 6, 1 / 12, 1 / 20])
 
 
-def test_all_looks_cost_the_rate_once() -> None:
+def test_all_looks_cost_the_rate_once():
     costs = [s for _, s in inspections(Design(3), 400) if s is not None]
     assert len(costs) == 100
     assert 0.98 < sum(costs) < 1.0
 
 
 @pytest.mark.parametrize("max_runs", [1, 5, 11, 12, 13, 14, 15, 16, 20, 23, 24, 25, 30, 31, 47, 48, 49, 100, 1000])
-def test_a_limit_on_runs_ends_with_a_look(max_runs: int) -> None:
+def test_a_limit_on_runs_ends_with_a_look(max_runs):
     found = list(Design(3, max_runs=max_runs).inspections())
     runs = [n for n, _ in found]
     assert runs[-1] == max_runs
@@ -75,12 +72,12 @@ def test_a_limit_on_runs_ends_with_a_look(max_runs: int) -> None:
         {"power": 1.0},
     ],
 )
-def test_what_cannot_be_is_refused(options: dict[str, Any]) -> None:
+def test_what_cannot_be_is_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         sequential_design(**{"dof": 3, **options})
 
 
-def test_settings_are_those_of_the_plan() -> None:
+def test_settings_are_those_of_the_plan():
     settings = sequential_design(2, 0.5, 0.01, 0.9, 40).settings
     assert (settings.detect, settings.false_alarm, settings.power, settings.allow) == (0.5, 0.01, 0.9, None)
 
@@ -88,7 +85,7 @@ def test_settings_are_those_of_the_plan() -> None:
 # --- one look ------------------------------------------------------------------------------------------
 
 
-def test_the_scale_is_that_of_the_e_process_and_the_rest_pays_for_the_look() -> None:
+def test_the_scale_is_that_of_the_e_process_and_the_rest_pays_for_the_look():
     rng = np.random.default_rng(71)
     error = 1.1 * independent(rng, 24, 6, 3)
     error[:20] *= 1.3  # earlier evidence counts though it has faded
@@ -105,7 +102,7 @@ def test_the_scale_is_that_of_the_e_process_and_the_rest_pays_for_the_look() -> 
     assert set(between.values()) == {1.0}
 
 
-def test_what_is_shown_is_shown_by_betting() -> None:
+def test_what_is_shown_is_shown_by_betting():
     error = independent(np.random.default_rng(73), 96, 6, 3)
     verdict = look(Design(3, detect=1.7), evidence_from(error)(96), 0.05)
     means = np.square(error).sum(axis=-1).mean(axis=1) / 3
@@ -113,7 +110,7 @@ def test_what_is_shown_is_shown_by_betting() -> None:
     assert verdict.equivalence == expected
 
 
-def test_consistent_is_said_at_looks_only() -> None:
+def test_consistent_is_said_at_looks_only():
     evidence = evidence_from(independent(np.random.default_rng(74), 200, 20, 3))(200)
     design = Design(3, false_alarm=SURE)
     assert look(design, evidence, 0.05).status == "consistent"
@@ -123,13 +120,13 @@ def test_consistent_is_said_at_looks_only() -> None:
     assert between.faults == ()
 
 
-def test_a_gross_fault_is_found_between_looks_too() -> None:
+def test_a_gross_fault_is_found_between_looks_too():
     error = np.sqrt(20.0) * independent(np.random.default_rng(75), 15, 6, 3)
     assert look(Design(3), evidence_from(error)(15), None).status == "overconfident"
     assert look(Design(3), evidence_from(error / 40.0)(15), None).status == "conservative"
 
 
-def test_a_correlation_is_found_at_looks_only() -> None:
+def test_a_correlation_is_found_at_looks_only():
     error = independent(np.random.default_rng(76), 48, 20, 2)
     error[..., 1] = 0.9 * error[..., 0] + np.sqrt(0.19) * error[..., 1]
     design, evidence = Design(2, false_alarm=1e-3), evidence_from(error)(48)
@@ -137,13 +134,13 @@ def test_a_correlation_is_found_at_looks_only() -> None:
     assert look(design, evidence, None).faults == ()
 
 
-def test_failed_runs_decide_at_once() -> None:
+def test_failed_runs_decide_at_once():
     error = independent(np.random.default_rng(77), 15, 6, 3)
     failures = (Failure("f", 2, 1, "diverged"),)
     assert look(Design(3, false_alarm=SURE), evidence_from(error, failures=failures)(15), None).status == "failed"
 
 
-def test_without_truth_looks_are_at_the_innovations() -> None:
+def test_without_truth_looks_are_at_the_innovations():
     rng = np.random.default_rng(78)
     nis, dof = 2.0 * rng.chisquare(2, (48, 30)), np.full((48, 30), 2)
     evidence = Record("f", nis=nis, nis_dof=dof, optimal_gain=True)
@@ -156,7 +153,7 @@ def test_without_truth_looks_are_at_the_innovations() -> None:
     assert scale.p_value == pytest.approx(12 * plain.p_value)
 
 
-def test_a_look_inside_judge() -> None:
+def test_a_look_inside_judge():
     """A scale just below and just above its half of the rate."""
     evidence = evidence_from(independent(np.random.default_rng(79), 24, 6, 3))(24)
     design = Design(3, false_alarm=0.01)
@@ -169,7 +166,7 @@ def test_a_look_inside_judge() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_decision_stands_however_many_runs_follow(seed: int) -> None:
+def test_a_decision_stands_however_many_runs_follow(seed):
     rng = np.random.default_rng(seed)
     ratio = [1.0, 1.0, 1.6, 1.6, 0.5, 4.0][seed]
     error = np.sqrt(ratio) * independent(rng, 400, 5, 3)
@@ -183,7 +180,7 @@ def test_a_decision_stands_however_many_runs_follow(seed: int) -> None:
     assert (later.status, later.reasons, again) == (verdict.status, verdict.reasons, used)
 
 
-def test_a_verdict_is_that_of_the_first_inspection_that_decides() -> None:
+def test_a_verdict_is_that_of_the_first_inspection_that_decides():
     error = np.sqrt(1.7) * independent(np.random.default_rng(81), 400, 5, 3)
     design, evidence = Design(3), evidence_from(error)
     verdict, used = follow(design, evidence, 400)
@@ -195,11 +192,11 @@ def test_a_verdict_is_that_of_the_first_inspection_that_decides() -> None:
         assert at.status == "undecided"
 
 
-def test_a_limit_is_not_exceeded() -> None:
+def test_a_limit_is_not_exceeded():
     error = independent(np.random.default_rng(82), 400, 2, 3)
-    asked: list[int] = []
+    asked = []
 
-    def evidence(runs: int) -> Record:
+    def evidence(runs):
         asked.append(runs)
         return evidence_from(error)(runs)
 
@@ -225,12 +222,12 @@ def test_a_limit_is_not_exceeded() -> None:
 # --- the same for several filters at a time -----------------------------------------------------------------
 
 
-def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_later_look_does_not_overwrite_a_decision(monkeypatch):
     """'early' is decided at the first look, and would be found consistent later; 'late' keeps the runs coming."""
-    calls: list[tuple[str, int]] = []
+    calls = []
     script = {("early", 12): "overconfident", ("late", 24): "conservative"}
 
-    def verdict_at(design: Design, evidence: Record, spent: float | None) -> Verdict:
+    def verdict_at(design, evidence, spent):
         runs = len(evidence.run_numbers)
         calls.append((evidence.name, runs))
         status = script.get((evidence.name, runs), "consistent" if evidence.name == "early" else "undecided")
@@ -238,9 +235,9 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(sequential, "look", verdict_at)
     monkeypatch.setattr(sequential, "speaks", lambda design, evidence, spent: spent is not None)
-    verdicts: dict[str, Verdict] = {}
+    verdicts = {}
 
-    def read(runs: int, name: str) -> Record:
+    def read(runs, name):
         return Record(name, runs=np.arange(runs))
 
     counts = list(sequential.looks(sequential_design(3), ["early", "late"], read, verdicts))
@@ -258,7 +255,7 @@ SIGMAS = 5.0
 STAKES = [("up", stake) for stake in (0.1, 0.25, 0.5, 1.0)] + [("down", stake) for stake in (0.25, 0.5, 1.0, 2.0, 4.0)]
 
 
-def only(monkeypatch: pytest.MonkeyPatch, side: str, stake: float) -> None:
+def only(monkeypatch, side, stake):
     """One stake in place of the mixture."""
     monkeypatch.setattr(betting, side.upper(), np.array([stake]))
 
@@ -266,7 +263,7 @@ def only(monkeypatch: pytest.MonkeyPatch, side: str, stake: float) -> None:
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(60)
 
 
-def mean_of_a_bet(side: str, n: int, ratio: float = 1.0, kink: float = 1.0) -> float:
+def mean_of_a_bet(side, n, ratio=1.0, kink=1.0):
     """Expected value after one run of one step, by Gauss-Legendre over the chi distribution of the error's length."""
     ends = [0.0, float(np.sqrt(n * kink / ratio)), float(np.sqrt(n * kink / ratio)) + 9.0]
     mean = 0.0
@@ -277,13 +274,13 @@ def mean_of_a_bet(side: str, n: int, ratio: float = 1.0, kink: float = 1.0) -> f
     return mean
 
 
-def test_the_stakes_are_these() -> None:
+def test_the_stakes_are_these():
     assert [("up", s) for s in betting.UP] + [("down", s) for s in betting.DOWN] == STAKES
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
-@pytest.mark.parametrize(("side", "stake"), STAKES)
-def test_every_bet_is_fair(monkeypatch: pytest.MonkeyPatch, side: str, stake: float, n: int) -> None:
+@pytest.mark.parametrize("side, stake", STAKES)
+def test_every_bet_is_fair(monkeypatch, side, stake, n):
     """Mean 1 exactly if the covariance is right and the steps of a run are one; below 1 if it errs the other way."""
     only(monkeypatch, side, stake)
     kink = 1.0 + 1.0 / stake
@@ -294,16 +291,16 @@ def test_every_bet_is_fair(monkeypatch: pytest.MonkeyPatch, side: str, stake: fl
 
 
 @functools.cache
-def mean_pay(stake: float, n: int) -> float:
+def mean_pay(stake, n):
     """Of max(0, 1 - stake (Y - 1)) for Y = chi-square(n) / n."""
 
-    def paid(length: float) -> float:
+    def paid(length):
         return max(0.0, 1.0 - stake * (length**2 / n - 1.0)) * float(stats.chi.pdf(length, n))
 
     return float(integrate.quad(paid, 0.0, np.sqrt(n * (1.0 + 1.0 / stake)), epsabs=1e-12)[0])
 
 
-def by_hand(means: Array, dof: Array) -> tuple[list[float], list[float]]:
+def by_hand(means, dof):
     """Products and their means in plain numbers."""
     up, down = [1.0] * 4, [1.0] * 5
     all_up, all_down = [], []
@@ -317,7 +314,7 @@ def by_hand(means: Array, dof: Array) -> tuple[list[float], list[float]]:
     return all_up, all_down
 
 
-def test_against_plain_products() -> None:
+def test_against_plain_products():
     """Over runs of unlike dimension, some far from 1."""
     rng = np.random.default_rng(11)
     dof = np.array([1, 3, 2, 3, 6, 1, 1, 2])
@@ -330,20 +327,20 @@ def test_against_plain_products() -> None:
     assert bet.both == pytest.approx([(a + b) / 2 for a, b in zip(up, down, strict=True)], rel=1e-7)
 
 
-def test_one_number_of_degrees_of_freedom_serves_all_runs() -> None:
+def test_one_number_of_degrees_of_freedom_serves_all_runs():
     means = np.array([0.5, 1.5, 0.8])
     assert e_process(means, 3).down == pytest.approx(e_process(means, np.array([3, 3, 3])).down)
     assert e_process(means, 1).down != pytest.approx(e_process(means, 3).down)
 
 
-def ever_reaches(rng: np.random.Generator, side: str, ratio: float, n: int, sequences: int, runs: int = 200) -> float:
+def ever_reaches(rng, side, ratio, n, sequences, runs=200):
     """Share of sequences of fully dependent runs that ever reach 20."""
     means = ratio * rng.chisquare(n, (sequences, runs)) / n
     return sum(float(getattr(e_process(y, n), side).max()) >= 20.0 for y in means) / sequences
 
 
 @pytest.mark.parametrize("n", [1, 3])
-def test_ville(n: int) -> None:
+def test_ville(n):
     """At most 5 % of sequences of 200 runs ever reach 20, at the worst dependence; 400 sequences."""
     rng = np.random.default_rng(13)
     limit = 0.05 + SIGMAS * np.sqrt(0.05 * 0.95 / 400)
@@ -354,13 +351,13 @@ def test_ville(n: int) -> None:
     assert ever_reaches(rng, "both", 0.6, n, 50) > 0.5
 
 
-def test_ever_is_the_inverse_of_the_largest_value() -> None:
+def test_ever_is_the_inverse_of_the_largest_value():
     assert ever(np.array([0.5, 40.0, 0.1])) == pytest.approx(1 / 40)
     assert ever(np.array([0.5, 0.9])) == 1.0
     assert ever(np.empty(0)) == 1.0
 
 
-def test_what_was_seen_is_not_forgotten() -> None:
+def test_what_was_seen_is_not_forgotten():
     """Record against a fault that comes later does not take an earlier finding back."""
     bet = e_process(np.concatenate([np.full(20, 2.0), np.full(200, 0.9)]), 3)
     assert ever(bet.up) < 1e-4
@@ -370,7 +367,7 @@ def test_what_was_seen_is_not_forgotten() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 3])
-def test_extreme_runs(n: int) -> None:
+def test_extreme_runs(n):
     """No error at all, and an error beyond all bounds: no warning, nothing but finite numbers."""
     for means in ([0.0], [0.0] * 400, [1e300], [1e300] * 5, [0.0, 1e300, 1.0], [1e-300] * 50):
         bet = e_process(np.array(means), n)
@@ -381,14 +378,14 @@ def test_extreme_runs(n: int) -> None:
     assert ever(e_process(np.zeros(40), n).down) < 1e-6
 
 
-def test_one_run_does_not_end_the_game() -> None:
+def test_one_run_does_not_end_the_game():
     """A wild run costs a bet downwards all but a fiftieth of what it had."""
     before, after = e_process(np.append(np.full(30, 0.5), 1e6), 3).down[-2:]
     assert after == pytest.approx(0.02 * before)
     assert e_process(np.concatenate([[1e6], np.full(60, 0.5)]), 3).down[-1] > 20.0
 
 
-def test_no_run_no_evidence() -> None:
+def test_no_run_no_evidence():
     bet = e_process(np.empty(0), 3)
     assert len(bet.both) == 0
     assert ever(bet.both) == 1.0

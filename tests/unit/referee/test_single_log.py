@@ -1,21 +1,20 @@
 """A single log: how its NEES decorrelates, the interval of its ratio, and pieces of it that stand as runs."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import calibration_pieces
 import calibration_windows
 import numpy as np
 import pandas as pd
 import pytest
+from draws import identities
+from numpy.testing import assert_array_equal
 from recorded import read_recordings
 from scipy import signal, stats
 from single_log import errors
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.planning.single_log import (
     APART,
     MOST,
@@ -28,20 +27,19 @@ from consistency.referee.diagnostics.questions.independence import ALIKE, ENOUGH
 from consistency.referee.diagnostics.questions.lost_runs import early_ends
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import judge_all
 
 SETTINGS = Settings()
 SURE = 1e-5
 
 
-def log_of(rng: np.random.Generator, rho: float, steps: int, n: int = 3, ratio: float = 1.0) -> Verdict:
+def log_of(rng, rho, steps, n=3, ratio=1.0):
     e = np.sqrt(ratio) * errors(rng, rho, steps, n)[None]
-    return judge(Record("log", e, np.broadcast_to(np.eye(n), (*e.shape, n))), Settings(SURE))
+    return judge(of(e), Settings(SURE))
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
-def test_correlation_time_of_an_autoregression(rho: float, rng: np.random.Generator) -> None:
+def test_correlation_time_of_an_autoregression(rho, rng):
     """Within 5 standard errors (Sokal 1997) of (1 + rho) / (1 - rho)."""
     steps, exact = 200_000, (1.0 + rho) / (1.0 - rho)
     found, lag = correlation_time(errors(rng, rho, steps, 1)[:, 0])
@@ -49,7 +47,7 @@ def test_correlation_time_of_an_autoregression(rho: float, rng: np.random.Genera
     assert lag >= 5.0 * found
 
 
-def test_effective_dof_of_gaussian_errors(rng: np.random.Generator) -> None:
+def test_effective_dof_of_gaussian_errors(rng):
     """The NEES of AR(rho) decorrelates as rho^2: nu = n T / tau; ten percent are more than five standard errors."""
     steps, n, rho = 200_000, 2, 0.7
     found = within(np.square(errors(rng, rho, steps, n)).sum(axis=1), n, SETTINGS, 1.5)
@@ -61,7 +59,7 @@ def test_effective_dof_of_gaussian_errors(rng: np.random.Generator) -> None:
     assert found.ratio.high == pytest.approx(found.ratio.value / low, rel=1e-2)
 
 
-def test_too_short_or_too_slow_a_log_says_nothing(rng: np.random.Generator) -> None:
+def test_too_short_or_too_slow_a_log_says_nothing(rng):
     assert within(np.square(errors(rng, 0.0, 19, 3)).sum(axis=1), 3, SETTINGS, 1.5) is None
     assert within(np.full(400, 3.0), 3, SETTINGS, 1.5) is None
     assert within(np.linspace(1.0, 5.0, 400), 3, SETTINGS, 1.5) is None
@@ -69,14 +67,14 @@ def test_too_short_or_too_slow_a_log_says_nothing(rng: np.random.Generator) -> N
     assert any("the log is too short to show how its errors decorrelate" in reason for reason in verdict.reasons)
 
 
-def test_steps_without_a_nees_are_passed_over(rng: np.random.Generator) -> None:
+def test_steps_without_a_nees_are_passed_over(rng):
     nees = np.square(errors(rng, 0.0, 500, 3)).sum(axis=1)
     gaps = np.full(1000, np.nan)
     gaps[::2] = nees
     assert within(gaps, 3, SETTINGS, 1.5) == within(nees, 3, SETTINGS, 1.5)
 
 
-def test_a_single_log_says_its_ratio_and_what_would_decide(rng: np.random.Generator) -> None:
+def test_a_single_log_says_its_ratio_and_what_would_decide(rng):
     verdict = log_of(rng, 0.9, 600)
     assert verdict.status == "undecided"
     found = verdict.scale.within if verdict.scale is not None else None
@@ -92,7 +90,7 @@ def test_a_single_log_says_its_ratio_and_what_would_decide(rng: np.random.Genera
     assert "within the log" in str(verdict)
 
 
-def test_a_long_log_is_to_be_cut(rng: np.random.Generator) -> None:
+def test_a_long_log_is_to_be_cut(rng):
     """And cut as it says it decides: consistent, at rates of 1e-5."""
     verdict = log_of(rng, 0.5, 20_000)
     found = verdict.scale.within
@@ -100,17 +98,17 @@ def test_a_long_log_is_to_be_cut(rng: np.random.Generator) -> None:
     assert found.pieces == 50
     assert any("cut into 50 runs, this log would then probably decide" in reason for reason in verdict.reasons)
     cut = errors(rng, 0.5, 20_000, 3).reshape(50, 400, 3)
-    assert judge(Record("cut", cut, np.broadcast_to(np.eye(3), (50, 400, 3, 3))), Settings(SURE)).consistent
+    assert judge(of(cut), Settings(SURE)).consistent
 
 
-def test_several_runs_have_no_such_line(rng: np.random.Generator) -> None:
+def test_several_runs_have_no_such_line(rng):
     e = errors(rng, 0.5, 400, 3).reshape(2, 200, 3)
-    verdict = judge(Record("two", e, np.broadcast_to(np.eye(3), (2, 200, 3, 3))), Settings(SURE))
+    verdict = judge(of(e), Settings(SURE))
     assert verdict.scale.within is None
     assert not any("decorrelate" in reason for reason in verdict.reasons)
 
 
-def poses(path: Path, e: Array) -> Path:
+def poses(path, e):
     step = np.arange(1, len(e) + 1)
     truth = pd.DataFrame({"step": step, "x": 0.1 * step, "y": 0.0, "heading": 0.0})
     truth.to_csv(path.with_name("truth.csv"), index=False)
@@ -121,7 +119,7 @@ def poses(path: Path, e: Array) -> Path:
     return path
 
 
-def test_relative_poses_are_named_where_they_would_help(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_relative_poses_are_named_where_they_would_help(tmp_path, rng):
     file = poses(tmp_path / "one.csv", errors(rng, 0.8, 300, 3))
     recordings = read_recordings(file, tmp_path / "truth.csv")
     verdict = judge_all(recordings, settings=Settings(SURE))["one"]
@@ -142,25 +140,24 @@ def test_relative_poses_are_named_where_they_would_help(tmp_path: Path, rng: np.
 N = 2
 
 
-def log(rng: np.random.Generator, steps: int, rho: float = 0.0, constant: float = 0.0, ratio: float = 1.0) -> Record:
+def log(rng, steps, rho=0.0, constant=0.0, ratio=1.0):
     """Errors AR(rho) beside an error that has a share ``constant`` of the variance and is the same in all steps."""
     w = rng.standard_normal((steps, N))
     w[1:] *= np.sqrt(1.0 - rho**2)
     e = np.sqrt(1.0 - constant) * signal.lfilter([1.0], [1.0, -rho], w, axis=0)
     e += np.sqrt(constant) * rng.standard_normal((1, N))
-    P = np.broadcast_to(np.eye(N), (1, steps, N, N))
-    return Record("log", np.sqrt(ratio) * e[None], P, axes=("x", "y"), t=np.arange(float(steps)))
+    return Record("log", np.sqrt(ratio) * e[None], identities(e[None]), axes=("x", "y"), t=np.arange(float(steps)))
 
 
-def of(array: Array, name: str = "log") -> Record:
-    return Record(name, array, np.broadcast_to(np.eye(array.shape[-1]), (*array.shape, array.shape[-1])))
+def of(array, name="log"):
+    return Record(name, array, identities(array))
 
 
-def test_pieces_are_rows_of_the_log() -> None:
+def test_pieces_are_rows_of_the_log():
     one = log(np.random.default_rng(1), 1003)
     r = in_pieces(one, 25)
     assert (r.error.shape, r.unit, len(r.run_numbers)) == ((25, 40, N), "piece", 25)
-    np.testing.assert_array_equal(r.error.reshape(-1, N), one.error[0, :1000])
+    assert_array_equal(r.error.reshape(-1, N), one.error[0, :1000])
     assert (r.times[3, 0], r.run_numbers[0]) == (120.0, 1)
     assert set(r.unavailable) == set(BIAS)
     assert not r.unshown
@@ -169,7 +166,7 @@ def test_pieces_are_rows_of_the_log() -> None:
     assert "25 pieces" in v.reasons[0]
 
 
-def test_the_advised_number_does_not_depend_on_the_size_of_the_errors() -> None:
+def test_the_advised_number_does_not_depend_on_the_size_of_the_errors():
     one = log(np.random.default_rng(1), 4000, 0.5)
     a, b = (in_pieces(of(scale * np.asarray(one.error))) for scale in (1.0, 7.0))
     assert a.error.shape == b.error.shape
@@ -180,7 +177,7 @@ def test_the_advised_number_does_not_depend_on_the_size_of_the_errors() -> None:
     assert m.upper > 1.1 * m.time
 
 
-def test_the_correlation_is_about_zero_and_of_sizes_too() -> None:
+def test_the_correlation_is_about_zero_and_of_sizes_too():
     rng = np.random.default_rng(2)
     white = rng.standard_normal((3000, N))
     assert memory_of(white).time < 1.5
@@ -193,7 +190,7 @@ def test_the_correlation_is_about_zero_and_of_sizes_too() -> None:
     assert memory_of(one_axis).time > 300.0
 
 
-def test_a_right_log_is_no_fault_and_a_wrong_one_is() -> None:
+def test_a_right_log_is_no_fault_and_a_wrong_one_is():
     """At most 4 faults in 20 right logs: more in 3 of 1,000 at a rate of 5 %; it was 1 of 60 for AR(.95)."""
     rng = np.random.default_rng(3)
     found = [judge(in_pieces(log(rng, 3000, 0.5))) for _ in range(20)]
@@ -204,7 +201,7 @@ def test_a_right_log_is_no_fault_and_a_wrong_one_is() -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_a_constant_part_is_undecided(share: float) -> None:
+def test_a_constant_part_is_undecided(share):
     rng = np.random.default_rng(4)
     found = [judge(in_pieces(log(rng, 3000, 0.5, share, ratio=3.0))) for _ in range(5)]
     assert sum(v.status == "undecided" for v in found) >= 4
@@ -213,7 +210,7 @@ def test_a_constant_part_is_undecided(share: float) -> None:
     assert not some.answers
 
 
-def test_too_short_pieces_are_undecided() -> None:
+def test_too_short_pieces_are_undecided():
     one = log(np.random.default_rng(5), 400, 0.9)
     v = judge(in_pieces(one))
     assert (v.status, v.runs) == ("undecided", FEWEST)
@@ -222,7 +219,7 @@ def test_too_short_pieces_are_undecided() -> None:
     assert "10 pieces of one log are too few, at least 20 are needed" in few.reasons[0]
 
 
-def test_neighbours_are_tested_by_the_code_of_windows() -> None:
+def test_neighbours_are_tested_by_the_code_of_windows():
     """Pieces whose sizes change slowly: each is white by itself, and all of the first half are small."""
     rng = np.random.default_rng(6)
     e = rng.standard_normal((1, 8000, N))
@@ -235,7 +232,7 @@ def test_neighbours_are_tested_by_the_code_of_windows() -> None:
     assert independence(w, np.arange(1.0, 61.0)).doubtful
 
 
-def test_growing_errors_are_refused() -> None:
+def test_growing_errors_are_refused():
     one = log(np.random.default_rng(7), 2000)
     growing = np.linspace(0.1, 3.0, 2000)[None, :, None, None] * np.eye(N)
     with pytest.raises(cs.InputError, match=r"the stated variance of x grows by x.* over the log.* --relative 10s"):
@@ -246,7 +243,7 @@ def test_growing_errors_are_refused() -> None:
     assert in_pieces(Record("log", one.error, shrinking, axes=("x", "y"))).unit == "piece"
 
 
-def test_what_is_refused() -> None:
+def test_what_is_refused():
     rng = np.random.default_rng(8)
     with pytest.raises(cs.InputError, match="needs the errors of one log; log has 2 runs"):
         in_pieces(of(rng.standard_normal((2, 100, N))))
@@ -256,15 +253,15 @@ def test_what_is_refused() -> None:
         in_pieces(of(np.full((1, 30, N), np.nan)))
 
 
-def test_steps_before_the_first_covariance_are_in_no_piece() -> None:
+def test_steps_before_the_first_covariance_are_in_no_piece():
     one = of(np.random.default_rng(9).standard_normal((1, 1010, N)))
     P = np.asarray(one.covariance).copy()
     P[0, :10] = np.nan
     r = in_pieces(Record("log", one.error, P), 25)
-    np.testing.assert_array_equal(r.error.reshape(-1, N), one.error[0, 10:])
+    assert_array_equal(r.error.reshape(-1, N), one.error[0, 10:])
 
 
-def test_the_rows_of_the_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rows_of_the_calibration(monkeypatch):
     """Shorter logs and studies: a right one is at fault in 2 of 2 once in 400."""
     monkeypatch.setattr(calibration_pieces, "QUICK_GATES", 2)
     rows = calibration_pieces.rows(True, 7)
@@ -283,7 +280,7 @@ def test_the_rows_of_the_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"split": "auto", "truth_covariance": "columns"}, "--truth-covariance: does not go with --split"),
     ],
 )
-def test_options(tmp_path: Path, options: dict[str, str], message: str) -> None:
+def test_options(tmp_path, options, message):
     rng = np.random.default_rng(10)
     head = "t,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh\n"
     rows = [",".join(map(str, [k, *(0.1 * rng.standard_normal(3)), 0.01, 0, 0, 0.01, 0, 0.01])) for k in range(600)]
@@ -302,7 +299,7 @@ def test_options(tmp_path: Path, options: dict[str, str], message: str) -> None:
 # --- whether pieces are independent ---------------------------------------------------------------------------
 
 
-def test_the_first_band_by_hand() -> None:
+def test_the_first_band_by_hand():
     """Band 1 of 20 values: frequencies 0 and 1 against the others, an F ratio of sums of squares of projections."""
     w = np.linspace(-1.0, 1.5, 20)[:, None] + 0.3 * np.cos(np.arange(20))[:, None]
     k = np.arange(20)
@@ -325,14 +322,14 @@ def test_the_first_band_by_hand() -> None:
 
 
 @pytest.mark.parametrize("count", [20, 31, 200])
-def test_independent_pieces_are_doubted_at_the_stated_rate(count: int, rng: np.random.Generator) -> None:
+def test_independent_pieces_are_doubted_at_the_stated_rate(count, rng):
     """400 logs; the rate of 0.5 % is exceeded by chance in 1e-5."""
     doubted = sum(independence(rng.normal(size=(count, 3))).doubtful for _ in range(400))
     assert doubted <= stats.binom.isf(SURE, 400, 0.005)
 
 
 @pytest.mark.parametrize(("memory", "count"), [(0.5, 400), (0.8, 150), (0.95, 150)])
-def test_sizes_that_go_on_are_doubted(memory: float, count: int, rng: np.random.Generator) -> None:
+def test_sizes_that_go_on_are_doubted(memory, count, rng):
     """Missed in fewer than 1e-5: signs are independent, sizes AR."""
     found = independence(calibration_windows.windows_of(rng, count, memory))
     assert found.doubtful
@@ -340,7 +337,7 @@ def test_sizes_that_go_on_are_doubted(memory: float, count: int, rng: np.random.
     assert found.alike
 
 
-def test_signs_and_what_takes_turns(rng: np.random.Generator) -> None:
+def test_signs_and_what_takes_turns(rng):
     noise = rng.normal(size=(301, 2))
     back = independence(noise[1:] - noise[:-1])
     assert back.doubtful
@@ -359,7 +356,7 @@ def test_signs_and_what_takes_turns(rng: np.random.Generator) -> None:
     assert not turns.alike
 
 
-def test_scale_and_gaps_are_no_matter_and_few_are_not_asked(rng: np.random.Generator) -> None:
+def test_scale_and_gaps_are_no_matter_and_few_are_not_asked(rng):
     w = rng.normal(size=(FEWEST + 1, 3))
     gap = np.insert(w, 5, np.nan, axis=0)
     a, b = independence(w), independence(7.0 * gap)
@@ -374,7 +371,7 @@ def test_scale_and_gaps_are_no_matter_and_few_are_not_asked(rng: np.random.Gener
     assert RATE < 0.005
 
 
-def test_rows_of_the_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_the_calibration(monkeypatch):
     monkeypatch.setattr(calibration_windows, "QUICK_GATES", 3)
     monkeypatch.setattr(calibration_windows, "QUICK_RIGHT", 3)
     rows = calibration_windows.rows(True, 5)
@@ -385,7 +382,7 @@ def test_rows_of_the_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- runs that end early ---------------------------------------------------------------------------------------
 
 
-def test_early_ends_by_hand() -> None:
+def test_early_ends_by_hand():
     """Two of five runs end in step 1 with ranks 5 and 3, one of three in step 2 with rank 2."""
     nan = np.nan
     nees = np.array([[5.0, nan, nan], [3.0, nan, nan], [1.0, 2.0, nan], [2.0, 1.0, 4.0], [4.0, 3.0, 4.0]])
@@ -400,14 +397,14 @@ def test_early_ends_by_hand() -> None:
     assert np.isnan(early_ends(np.ones((4, 2))).p_value)
 
 
-def runs(rng: np.random.Generator, number: int, steps: int) -> Array:
+def runs(rng, number, steps):
     """NEES (number, steps) of errors AR(.9), n = 3."""
     noise = rng.normal(size=(number, steps, 3))
     noise[:, 1:] *= np.sqrt(1.0 - 0.9**2)
     return np.square(signal.lfilter([1.0], [1.0, -0.9], noise, axis=1)).sum(axis=-1)
 
 
-def test_runs_that_end_lost_are_named_and_others_are_not(rng: np.random.Generator) -> None:
+def test_runs_that_end_lost_are_named_and_others_are_not(rng):
     """100 runs that end where the NEES is beyond its 5 % point, certain but for 1e-5; 60 gates of any lengths."""
     nees = runs(rng, 100, 60)
     ended = np.cumsum(nees > stats.chi2.isf(0.05, 3), axis=1) - (nees > stats.chi2.isf(0.05, 3)) > 0
@@ -426,7 +423,7 @@ def test_runs_that_end_lost_are_named_and_others_are_not(rng: np.random.Generato
     assert lost <= stats.binom.isf(SURE, 60, 2e-3)
 
 
-def test_ends_with_small_errors_are_no_matter(rng: np.random.Generator) -> None:
+def test_ends_with_small_errors_are_no_matter(rng):
     nees = runs(rng, 100, 20)
     nees[np.argsort(nees[:, 9])[:30], 10:] = np.nan
     found = early_ends(nees)

@@ -1,22 +1,18 @@
 """First steps left out of the statistics, and the hint that a fault is in them alone."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from command import consistency, refused
 from draws import autoregression, identities, independent, verdict_on
+from numpy.testing import assert_array_equal
 from recorded import read_recordings
 
 import consistency as cs
 from consistency.diagnostics import Record
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped, skip_of, without_first
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
 from consistency.testing import ConsistencyError, assert_consistent, assert_not_worse
 
@@ -26,7 +22,7 @@ VOID = "a number that was chosen on these data voids the false-alarm rate"
 
 
 @pytest.fixture
-def errors(rng: np.random.Generator) -> Array:
+def errors(rng):
     """Too large in the first 6 of 40 steps, right afterwards."""
     error = independent(rng, RUNS, STEPS, 3)
     error[:, :FIRST] *= 4.0
@@ -34,7 +30,7 @@ def errors(rng: np.random.Generator) -> Array:
 
 
 @pytest.fixture
-def archive(tmp_path: Path, errors: Array) -> Path:
+def archive(tmp_path, errors):
     path = tmp_path / "mine.npz"
     np.savez(path, errors=errors, covariances=identities(errors), t=100.0 + 0.5 * np.arange(STEPS))
     return path
@@ -44,28 +40,28 @@ def archive(tmp_path: Path, errors: Array) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("given", "size", "unit"), [("20", 20, "step"), (20, 20, "step"), ("2s", 2, "s"), (" 0.5 s", 0.5, "s")]
+    "given, size, unit", [("20", 20, "step"), (20, 20, "step"), ("2s", 2, "s"), (" 0.5 s", 0.5, "s")]
 )
-def test_steps_or_seconds(given: str | int, size: float, unit: str) -> None:
+def test_steps_or_seconds(given, size, unit):
     assert skip_of(given) == Skip(size, unit)
 
 
 @pytest.mark.parametrize("given", [None, 0, "0", "0s"])
-def test_nothing_is_left_out(given: Any) -> None:
+def test_nothing_is_left_out(given):
     assert skip_of(given) is None
 
 
 @pytest.mark.parametrize("given", [-1, "2.5", 2.5, True, "x", "2m", "s", ""])
-def test_neither_steps_nor_seconds(given: Any) -> None:
+def test_neither_steps_nor_seconds(given):
     with pytest.raises(ValueError, match="must be a whole number of steps"):
         skip_of(given)
 
 
-def test_seconds_count_from_the_first_time_of_each_run() -> None:
+def test_seconds_count_from_the_first_time_of_each_run():
     """The step at the end of the seconds is kept; a run that begins later loses later steps."""
     t = np.array([[0.0, 0.5, 1.0, 1.5], [np.nan, 7.0, 7.5, 8.0]])
-    np.testing.assert_array_equal(Skip(1.0, "s").mask((2, 4), t), [[1, 1, 0, 0], [0, 1, 1, 0]])
-    np.testing.assert_array_equal(Skip(1.0, "s").mask((2, 4), t[0]), [[1, 1, 0, 0]] * 2)
+    assert_array_equal(Skip(1.0, "s").mask((2, 4), t), [[1, 1, 0, 0], [0, 1, 1, 0]])
+    assert_array_equal(Skip(1.0, "s").mask((2, 4), t[0]), [[1, 1, 0, 0]] * 2)
     with pytest.raises(ValueError, match="there are no times; give a number of steps"):
         Skip(1.0, "s").mask((2, 4), np.array([[0.0, 1.0, 2.0, 3.0], [np.nan] * 4]))
 
@@ -73,7 +69,7 @@ def test_seconds_count_from_the_first_time_of_each_run() -> None:
 # --- verdicts ---------------------------------------------------------------------------------------
 
 
-def test_the_rest_is_judged_by_its_own_steps(archive: Path, errors: Array) -> None:
+def test_the_rest_is_judged_by_its_own_steps(archive, errors):
     """As the errors without those steps, whose numbers it keeps; one right log in 1e5 is found at fault."""
     record = cs.read(archive)
     assert cs.judge(record).status == "overconfident"
@@ -90,7 +86,7 @@ def test_the_rest_is_judged_by_its_own_steps(archive: Path, errors: Array) -> No
     assert np.isfinite(record.nees).all()  # type: ignore[arg-type]
 
 
-def test_steps_keep_their_numbers(errors: Array) -> None:
+def test_steps_keep_their_numbers(errors):
     errors[:, 22] *= 5.0
     with pytest.raises(ConsistencyError, match="without the first 6 steps of each run") as fault:
         assert_consistent(errors, np.array(identities(errors)), skip=FIRST, false_alarm=0.01)
@@ -98,7 +94,7 @@ def test_steps_keep_their_numbers(errors: Array) -> None:
 
 
 @pytest.mark.parametrize("given", ["2.5s", "5"])
-def test_files_by_seconds_or_steps(given: str, archive: Path) -> None:
+def test_files_by_seconds_or_steps(given, archive):
     """Steps are half a second apart."""
     verdict = cs.judge(cs.read(archive), skip=given)
     assert verdict.statistics["skipped_steps"] == 5
@@ -106,7 +102,7 @@ def test_files_by_seconds_or_steps(given: str, archive: Path) -> None:
     assert np.isfinite(verdict.statistics["anees"][5:]).all()
 
 
-def test_tables_have_times_of_each_run(tmp_path: Path) -> None:
+def test_tables_have_times_of_each_run(tmp_path):
     """Two days, which share no clock: seconds count from the first estimate of each."""
     head = "run,t,a,P_a_a\n"
     rows = [f"{run},{5000.0 * run + 0.1 * k:.1f},{{}},1\n" for run in range(3) for k in range(10 + run)]
@@ -118,11 +114,11 @@ def test_tables_have_times_of_each_run(tmp_path: Path) -> None:
     (record,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv", state=["a"])
     assert np.isnan(record.t).all()
     rest = record.without_first(Skip(0.35, "s"))
-    np.testing.assert_array_equal(np.isfinite(rest.nees).sum(axis=1), [6, 7, 8])  # type: ignore[arg-type]
+    assert_array_equal(np.isfinite(rest.nees).sum(axis=1), [6, 7, 8])  # type: ignore[arg-type]
     assert record.without_first(None).skipped is None
 
 
-def test_windows_count_as_steps_and_by_their_beginning(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_windows_count_as_steps_and_by_their_beginning(tmp_path, rng):
     D = np.tile([1.0, 0.0, 0.0], (40, 1))
     np.savez(
         tmp_path / "m.npz", estimates=D + 0.01 * rng.normal(size=D.shape), truth=np.cumsum(D, axis=0),
@@ -138,7 +134,7 @@ def test_windows_count_as_steps_and_by_their_beginning(tmp_path: Path, rng: np.r
     assert "without the first 2 steps of each log" in verdict.reasons[0]
 
 
-def test_a_run_of_which_nothing_is_left_is_named(errors: Array, tmp_path: Path) -> None:
+def test_a_run_of_which_nothing_is_left_is_named(errors, tmp_path):
     lengths = np.full(RUNS, STEPS)
     lengths[3] = 4
     np.savez(tmp_path / "short.npz", errors=errors, covariances=identities(errors), lengths=lengths)
@@ -147,17 +143,17 @@ def test_a_run_of_which_nothing_is_left_is_named(errors: Array, tmp_path: Path) 
     assert any("nothing is left of 1 run;" in reason for reason in verdict.reasons)
 
 
-def test_a_run_that_had_nothing_has_lost_nothing() -> None:
+def test_a_run_that_had_nothing_has_lost_nothing():
     """Of a whole run, one of two steps and one without a value, the second alone is emptied."""
     nees = np.ones((3, 5))
     nees[1, 2:] = nees[2] = np.nan
     left, lost = without_first(Skip(2), {"nees": nees, "nis_dof": np.full((3, 5), 4)}, "mine")
     assert lost == Skipped(Skip(2), steps=2, empty=1)
-    np.testing.assert_array_equal(np.isfinite(left["nees"]), [[False] * 2 + [True] * 3, [False] * 5, [False] * 5])
+    assert_array_equal(np.isfinite(left["nees"]), [[False] * 2 + [True] * 3, [False] * 5, [False] * 5])
     assert left["nis_dof"].tolist() == [[0, 0, 4, 4, 4]] * 3
 
 
-def test_refusals(archive: Path, tmp_path: Path, errors: Array) -> None:
+def test_refusals(archive, tmp_path, errors):
     record = cs.read(archive)
     with pytest.raises(InputError, match="--skip 40: nothing of mine is left, whose last step is 40"):
         cs.judge(record, skip=STEPS)
@@ -168,11 +164,11 @@ def test_refusals(archive: Path, tmp_path: Path, errors: Array) -> None:
         cs.judge(record, skip=2.5)
 
 
-def test_innovations_without_the_first_steps(rng: np.random.Generator) -> None:
+def test_innovations_without_the_first_steps(rng):
     """NIS of the left-out steps count no more, nor do their degrees of freedom; one right case in 1e5 fails."""
     nis = rng.chisquare(2, (RUNS, STEPS))
     nis[:, :FIRST] *= 9.0
-    given: Any = {"nis": nis, "nis_dof": 2, "optimal_gain": True, "false_alarm": SURE}
+    given = {"nis": nis, "nis_dof": 2, "optimal_gain": True, "false_alarm": SURE}
     with pytest.raises(ConsistencyError):
         assert_consistent(**given)
     verdict = assert_consistent(**given, skip=FIRST)
@@ -180,14 +176,14 @@ def test_innovations_without_the_first_steps(rng: np.random.Generator) -> None:
     assert verdict.innovations.ratio == pytest.approx(nis[:, FIRST:].mean() / 2)
 
 
-def test_gates_with_nees_alone(errors: Array) -> None:
+def test_gates_with_nees_alone(errors):
     nees = np.square(errors).sum(axis=-1)
     assert assert_consistent(nees=nees, dof=3, skip=FIRST, false_alarm=SURE).statistics["skipped_steps"] == FIRST
     with pytest.raises(ConsistencyError, match="skip=8 in a gate"):
         assert_consistent(nees=nees, dof=3, false_alarm=0.01)
 
 
-def test_a_comparison_without_the_first_steps(errors: Array, rng: np.random.Generator) -> None:
+def test_a_comparison_without_the_first_steps(errors, rng):
     """Both filters are right afterwards; one pair in 1e5 is said to differ."""
     P, other = np.array(identities(errors)), independent(rng, RUNS, STEPS, 3)
     with pytest.raises(ConsistencyError):
@@ -195,7 +191,7 @@ def test_a_comparison_without_the_first_steps(errors: Array, rng: np.random.Gene
     assert_not_worse(errors, P, other, P, false_alarm=SURE, skip=FIRST, detect=3.0)
 
 
-def test_a_baseline_holds_what_it_was_written_with(archive: Path, tmp_path: Path) -> None:
+def test_a_baseline_holds_what_it_was_written_with(archive, tmp_path):
     records = read_recordings(archive)
     write_baseline(baseline(records, "mine", skip=FIRST), tmp_path / "base.json")
     assert read_baseline(tmp_path / "base.json", skip="6").skip == "6"
@@ -207,7 +203,7 @@ def test_a_baseline_holds_what_it_was_written_with(archive: Path, tmp_path: Path
     assert (rest < means).all()
 
 
-def test_records_of_two_errors() -> None:
+def test_records_of_two_errors():
     """Errors stay, and so does the error of the filter's own; what they are held against is left out."""
     shape = (2, 4)
     P, own = np.full((*shape, 3, 3), 1.0), np.full((*shape, 3, 3), 2.0)
@@ -220,8 +216,8 @@ def test_records_of_two_errors() -> None:
     rest = c.without_first(Skip(2.0, "s"))
     world = rest.in_world
     for values in (rest.nees, rest.nis, rest.covariance[..., 0, 1], world.nees, world.covariance[..., 2, 2]):
-        np.testing.assert_array_equal(np.isnan(values), [[True, True, False, False]] * 2)
-    np.testing.assert_array_equal(rest.nis_dof, [[0, 0, 1, 1]] * 2)
+        assert_array_equal(np.isnan(values), [[True, True, False, False]] * 2)
+    assert_array_equal(rest.nis_dof, [[0, 0, 1, 1]] * 2)
     assert rest.nis_dof.dtype == np.int64
     assert rest.error is world.error is error
     assert np.isfinite(P).all()
@@ -229,7 +225,7 @@ def test_records_of_two_errors() -> None:
         c.without_first(Skip(4))
 
 
-def test_the_command(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(archive, tmp_path, capsys):
     out, _ = consistency(capsys, "analyse", archive, "--skip", "3s", "--fail-on", "inconsistent", "--json")
     (verdict,) = json.loads(out).values()
     assert verdict["statistics"]["skip"] == "3s"
@@ -248,7 +244,7 @@ def test_the_command(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize("ratio", [6.0, 1.0 / 6.0])
 @pytest.mark.parametrize("steps", [1, 5, 16])
-def test_a_fault_of_the_first_steps_is_named(steps: int, ratio: float, rng: np.random.Generator) -> None:
+def test_a_fault_of_the_first_steps_is_named(steps, ratio, rng):
     """50 standard errors from being missed, and the ratio afterwards is outside its interval in one case of 20."""
     error = independent(rng, 200, 60, 3)
     error[:, :steps] *= np.sqrt(ratio)
@@ -264,14 +260,14 @@ def test_a_fault_of_the_first_steps_is_named(steps: int, ratio: float, rng: np.r
     assert verdict.statistics["until"] == until.step
 
 
-def test_a_bias_of_the_first_steps_is_named(rng: np.random.Generator) -> None:
+def test_a_bias_of_the_first_steps_is_named(rng):
     error = autoregression(rng, 100, 64, 3)
     error[:, :8, 0] += 4.0
     verdict = verdict_on(error, false_alarm=SURE)
     assert verdict.location.until.step == 8
 
 
-def test_no_hint_where_a_fault_remains(rng: np.random.Generator) -> None:
+def test_no_hint_where_a_fault_remains(rng):
     """Half of the fault is left, or a later step has one too, or the fault is in the later steps."""
     for scale in (np.r_[np.full(8, 9.0), np.full(56, 2.5)], np.r_[9.0, np.ones(40), 9.0, np.ones(22)],
                   np.r_[np.ones(32), np.full(32, 9.0)], np.r_[np.full(40, 9.0), np.ones(24)]):  # fmt: skip
@@ -281,7 +277,7 @@ def test_no_hint_where_a_fault_remains(rng: np.random.Generator) -> None:
         assert verdict.location.until is None
 
 
-def test_no_hint_of_few_runs_or_a_single_step(rng: np.random.Generator) -> None:
+def test_no_hint_of_few_runs_or_a_single_step(rng):
     for shape in ((7, 60), (50, 1)):
         error = 3.0 * independent(rng, *shape, 3)
         if shape[1] > 1:

@@ -1,19 +1,16 @@
 """Flight logs of PX4 through the monitor: pairs, sensors, units, repeats, gaps, NaN, and every refusal."""
 
-from __future__ import annotations
-
 import struct
 import sys
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
 from command import consistency
+from numpy.testing import assert_allclose
 from scipy import stats
 
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
 from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch
 
 pytest.importorskip("pyulog", reason="needs the extra 'ulog'")
@@ -24,9 +21,7 @@ STEP = 20_000  # us between messages
 NAN = float("nan")
 
 
-def flight(
-    innovations: Array, variances: Array, field: str = "gps_hpos", *, sample: bool = True, start: int = 10**7
-) -> Flight:
+def flight(innovations, variances, field="gps_hpos", *, sample=True, start=10**7):
     """Innovations (N, n) of one sensor with their variances (N, n)."""
     log = Flight(sample=sample)
     for k, (own, variance) in enumerate(zip(innovations, variances, strict=True)):
@@ -34,28 +29,28 @@ def flight(
     return log
 
 
-def draws(ratio: float = 1.0, steps: int = 400, n: int = 2) -> tuple[Array, Array]:
+def draws(ratio=1.0, steps=400, n=2):
     """White innovations whose true variance is ``ratio`` times the one that is logged, which changes."""
     rng = np.random.default_rng()
     variance = np.exp(rng.normal(size=(steps, n)))
     return np.sqrt(ratio * variance) * rng.normal(size=(steps, n)), variance
 
 
-def test_the_nis_of_a_sensor_is_the_sum_over_its_components(tmp_path: Path) -> None:
+def test_the_nis_of_a_sensor_is_the_sum_over_its_components(tmp_path):
     own, variance = draws()
     path = flight(own, variance).write(tmp_path / "a.ulg")
     log = read_innovations(path)
     assert log.name == "gps_hpos"
-    np.testing.assert_allclose(log.nis, (own**2 / variance).sum(axis=1), rtol=1e-5)  # floats of four bytes
+    assert_allclose(log.nis, (own**2 / variance).sum(axis=1), rtol=1e-5)  # floats of four bytes
     assert (log.dof == 2).all()
-    np.testing.assert_allclose(log.t, 10.0 + 0.02 * np.arange(len(own)), rtol=1e-12)
+    assert_allclose(log.t, 10.0 + 0.02 * np.arange(len(own)), rtol=1e-12)
     assert log.step.tolist() == list(range(1, len(own) + 1))
     one = read_innovations(path, "gps_hpos[1]")
-    np.testing.assert_allclose(one.nis, own[:, 1] ** 2 / variance[:, 1], rtol=1e-5)
+    assert_allclose(one.nis, own[:, 1] ** 2 / variance[:, 1], rtol=1e-5)
     assert (one.dof == 1).all()
 
 
-def test_an_honest_filter_raises_no_alarm_and_one_that_is_not_does(tmp_path: Path) -> None:
+def test_an_honest_filter_raises_no_alarm_and_one_that_is_not_does(tmp_path):
     """False-alarm rate 1e-5; a variance four times too small is found in 400 steps of 2 with certainty."""
     for ratio, alarm in ((1.0, False), (4.0, True)):
         path = flight(*draws(ratio)).write(tmp_path / "a.ulg")
@@ -64,18 +59,18 @@ def test_an_honest_filter_raises_no_alarm_and_one_that_is_not_does(tmp_path: Pat
         assert watched.alarm is None or watched.alarm.direction == "overconfident"
 
 
-def test_repeats_nan_and_sensors_that_are_not_fused_are_no_measurements(tmp_path: Path) -> None:
+def test_repeats_nan_and_sensors_that_are_not_fused_are_no_measurements(tmp_path):
     own = np.array([[1.0, 2.0], [1.0, 2.0], [1.0, 3.0], [NAN, NAN], [NAN, 2.0], [3.0, 1.0], [0.0, 0.0], [0.0, 4.0]])
     variance = np.array(
         [[4.0, 1.0], [4.0, 1.0], [4.0, 1.0], [4.0, 1.0], [1.0, 1.0], [9.0, NAN], [0.0, 0.0], [1.0, 2.0]]
     )
     log = read_innovations(flight(own, variance).write(tmp_path / "a.ulg"))
-    np.testing.assert_allclose(log.nis, [4.25, NAN, 9.25, NAN, 4.0, 1.0, NAN, 8.0])
+    assert_allclose(log.nis, [4.25, NAN, 9.25, NAN, 4.0, 1.0, NAN, 8.0])
     assert log.dof.tolist() == [2, 0, 2, 0, 1, 1, 0, 2]
     assert "gps_hpos: 5 innovations in 8 messages; 1 message repeat" in log.notes[0]
 
 
-def test_what_has_no_partner_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_what_has_no_partner_is_left_out_and_counted(tmp_path):
     own, variance = draws(steps=6)
     log = Flight()
     for k in range(6):
@@ -86,18 +81,18 @@ def test_what_has_no_partner_is_left_out_and_counted(tmp_path: Path) -> None:
             log.log(TOPICS[1], stamp, {"gps_hpos": variance[k]})
     found = read_innovations(log.write(tmp_path / "a.ulg"))
     keep = [0, 2, 3, 5]
-    np.testing.assert_allclose(found.nis, (own**2 / variance).sum(axis=1)[keep], rtol=1e-5)
-    np.testing.assert_allclose(found.t, 5.0 + 0.02 * np.array(keep))
+    assert_allclose(found.nis, (own**2 / variance).sum(axis=1)[keep], rtol=1e-5)
+    assert_allclose(found.t, 5.0 + 0.02 * np.array(keep))
     assert any("2 messages have no partner" in note for note in found.notes)
 
 
-def test_logs_without_the_time_of_the_sample_go_by_that_of_publication(tmp_path: Path) -> None:
+def test_logs_without_the_time_of_the_sample_go_by_that_of_publication(tmp_path):
     own, variance = draws(steps=5)
     found = read_innovations(flight(own, variance, sample=False).write(tmp_path / "a.ulg"))
-    np.testing.assert_allclose(found.nis, (own**2 / variance).sum(axis=1), rtol=1e-5)
+    assert_allclose(found.nis, (own**2 / variance).sum(axis=1), rtol=1e-5)
 
 
-def test_gaps_and_losses_are_named(tmp_path: Path) -> None:
+def test_gaps_and_losses_are_named(tmp_path):
     own, variance = draws(steps=20)
     log = Flight()
     for k in range(20):
@@ -110,17 +105,17 @@ def test_gaps_and_losses_are_named(tmp_path: Path) -> None:
     assert "damaged" not in notes
 
 
-def test_a_log_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_a_log_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path):
     own, variance = draws(steps=50)
     path = flight(own, variance).write(tmp_path / "a.ulg")
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 3 // 5])
     log = read_innovations(path)
     assert 20 < len(log.nis) < 40
-    np.testing.assert_allclose(log.nis, (own**2 / variance).sum(axis=1)[: len(log.nis)], rtol=1e-5)
+    assert_allclose(log.nis, (own**2 / variance).sum(axis=1)[: len(log.nis)], rtol=1e-5)
 
 
-def test_sensors_and_instances_are_chosen(tmp_path: Path) -> None:
+def test_sensors_and_instances_are_chosen(tmp_path):
     (gps, S), (baro, T) = draws(steps=9), draws(steps=9, n=1)
     log = Flight()
     for k in range(9):
@@ -132,8 +127,8 @@ def test_sensors_and_instances_are_chosen(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds more than one sensor \(gps_hpos, baro_vpos\); choose with --filter"):
         read_innovations(path, run=0)
     first, second = (read_innovations(path, "baro_vpos", run) for run in (0, 1))
-    np.testing.assert_allclose(first.nis, baro[:, 0] ** 2 / T[:, 0], rtol=1e-5)
-    np.testing.assert_allclose(second.nis, 4.0 * first.nis, rtol=1e-5)
+    assert_allclose(first.nis, baro[:, 0] ** 2 / T[:, 0], rtol=1e-5)
+    assert_allclose(second.nis, 4.0 * first.nis, rtol=1e-5)
     with pytest.raises(InputError, match=r"--filter gps_hpos: is never fused in .*; there are: baro_vpos$"):
         read_innovations(path, "gps_hpos", 1)
     with pytest.raises(InputError, match=r"--filter sonar: is not in .*; there are: gps_hpos, baro_vpos$"):
@@ -142,7 +137,7 @@ def test_sensors_and_instances_are_chosen(tmp_path: Path) -> None:
         read_innovations(path, "baro_vpos", 3)
 
 
-def test_what_cannot_be_judged_is_refused(tmp_path: Path) -> None:
+def test_what_cannot_be_judged_is_refused(tmp_path):
     own, variance = draws(steps=3)
     path = tmp_path / "a.ulg"
     with pytest.raises(InputError, match=r"a\.ulg: no such file"):
@@ -180,7 +175,7 @@ def test_what_cannot_be_judged_is_refused(tmp_path: Path) -> None:
 OLD = {"vel_pos_innov": 6, "mag_innov": 3, "heading_innov": 1, "flow_innov": 2}  # of ekf2_innovations, PX4 v1.9
 
 
-def old_flight(path: Path, own: Array, variance: Array) -> Path:
+def old_flight(path, own, variance):
     """The message of older firmware: (N, 12) innovations and their variances, as its definition orders them."""
     fields = [f"{name}{end}" for end in ("", "_var") for name in OLD]
     sizes = [*OLD.values(), *OLD.values()]
@@ -193,7 +188,7 @@ def old_flight(path: Path, own: Array, variance: Array) -> Path:
     return path
 
 
-def test_the_older_message_holds_innovations_and_variances(tmp_path: Path) -> None:
+def test_the_older_message_holds_innovations_and_variances(tmp_path):
     """Six of velocity and position are three sensors, as they are fused at different times: GPS, and the barometer."""
     own, variance = draws(n=12)
     held = own.copy()
@@ -204,16 +199,16 @@ def test_the_older_message_holds_innovations_and_variances(tmp_path: Path) -> No
     columns = {"vel": [0, 1, 2], "hpos": [3, 4], "mag": [6, 7, 8], "heading": [9], "flow": [10, 11], "mag[1]": [7]}
     for sensor, places in columns.items():
         log = read_innovations(path, sensor)
-        np.testing.assert_allclose(log.nis, ratio[:, places].sum(axis=1), rtol=1e-5)
+        assert_allclose(log.nis, ratio[:, places].sum(axis=1), rtol=1e-5)
         assert (log.dof == len(places)).all()
     height = read_innovations(path, "vpos")
-    np.testing.assert_allclose(height.nis[::2], ratio[::2, 5], rtol=1e-5)
+    assert_allclose(height.nis[::2], ratio[::2, 5], rtol=1e-5)
     assert np.isnan(height.nis[1::2]).all()
     with pytest.raises(InputError, match=r"more than one sensor \(vel, hpos, vpos, mag, heading, …\)"):
         read_innovations(path)
 
 
-def test_one_command_from_a_flight_to_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_command_from_a_flight_to_a_picture(tmp_path, capsys):
     """False-alarm rate 1e-3 of the mission is the tool's; here the innovations are their own quantiles."""
     values = np.sqrt(stats.chi2.ppf((np.arange(200) * 77 % 200 + 0.5) / 200, 1))[:, None]
     path = flight(values, np.ones((200, 1)), "baro_vpos").write(tmp_path / "a.ulg")

@@ -1,21 +1,19 @@
 """Truth with a covariance of its own: what is said is about P, and only what its errors allow."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import calibration_truth
 import numpy as np
 import pytest
 from command import consistency, refused
 from draws import autoregression
+from numpy.testing import assert_allclose, assert_array_equal
 from painted import lines, panels
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
     contrasts,
     of_both,
@@ -23,7 +21,6 @@ from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
     upper_weights,
 )
 from consistency.referee.pages.record_figures import record_figures
-from consistency.referee.types import Array
 
 RUNS, STEPS, N = 50, 8, 3
 DECLARED = {"white": "independent", "AR": "independent", "per run": "per-run", "common": "common"}
@@ -31,11 +28,11 @@ P = np.array([[1.0, 0.4, 0.0], [0.4, 2.0, -0.3], [0.0, -0.3, 0.5]])
 Q = np.array([[2.0, 0.0, 0.5], [0.0, 0.7, 0.1], [0.5, 0.1, 1.0]])
 
 
-def share(of_truth: Array) -> float:
+def share(of_truth):
     return float(np.trace(np.linalg.solve(P + of_truth, of_truth)) / N)
 
 
-def truth_of_share(s: float) -> Array:
+def truth_of_share(s):
     """Multiple of Q that makes the share s."""
     low, high = 0.0, 1e3
     for _ in range(80):
@@ -44,7 +41,7 @@ def truth_of_share(s: float) -> Array:
     return low * Q
 
 
-def errors_of_truth(rng: np.random.Generator, kind: str, runs: int, steps: int) -> Array:
+def errors_of_truth(rng, kind, runs, steps):
     if kind == "white":
         return rng.standard_normal((runs, steps, N))
     if kind == "AR":
@@ -55,9 +52,9 @@ def errors_of_truth(rng: np.random.Generator, kind: str, runs: int, steps: int) 
 
 
 def record(
-    rng: np.random.Generator, kind: str, s: float, ratio: float = 1.0, errors: str | None = None, runs: int = RUNS,
-    steps: int = STEPS, shared: bool = False,
-) -> Record:  # fmt: skip
+    rng, kind, s, ratio = 1.0, errors = None, runs = RUNS,
+    steps = STEPS, shared = False,
+):  # fmt: skip
     """Errors of a filter whose covariance is wrong by ``ratio``, against a truth of the share s."""
     of_truth = truth_of_share(s)
     e = np.sqrt(ratio) * autoregression(rng, runs, steps, N, 0.5) @ np.linalg.cholesky(P).T
@@ -69,7 +66,7 @@ def record(
     )  # fmt: skip
 
 
-def verdicts(kind: str, s: float, ratio: float, errors: str | None, count: int, key: int) -> list[Verdict]:
+def verdicts(kind, s, ratio, errors, count, key):
     rng = np.random.default_rng(key)
     return [judge(record(rng, kind, s, ratio, errors)) for _ in range(count)]
 
@@ -77,14 +74,14 @@ def verdicts(kind: str, s: float, ratio: float, errors: str | None, count: int, 
 # --- rates --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("kind", "errors"), [*DECLARED.items(), *((kind, None) for kind in (*DECLARED, "signs"))])
-def test_a_right_filter_is_rarely_at_fault(kind: str, errors: str | None) -> None:
+@pytest.mark.parametrize("kind, errors", [*DECLARED.items(), *((kind, None) for kind in (*DECLARED, "signs"))])
+def test_a_right_filter_is_rarely_at_fault(kind, errors):
     """At most 12 faults in 100 at 5 %: more by chance in 0.15 % of seeds at that rate. At s = .2 it was 0 to 4."""
     found = verdicts(kind, 0.3, 1.0, errors, 100, 20260101)
     assert sum(bool(v.faults) for v in found) <= 12
 
 
-def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherwise() -> None:
+def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherwise():
     """The error that all runs share has s = .3: an honest filter is biased if the truth is said to be independent."""
     rng = np.random.default_rng(5)
     one = record(rng, "common", 0.3, errors="independent")
@@ -95,7 +92,7 @@ def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherw
 
 
 @pytest.mark.parametrize("errors", [None, "common"])
-def test_a_bias_beyond_the_truth_is_found(errors: str | None) -> None:
+def test_a_bias_beyond_the_truth_is_found(errors):
     rng = np.random.default_rng(8)
     one = record(rng, "common", 0.2, errors=errors)
     far = 6.0 * np.sqrt(np.diag(truth_of_share(0.2)))
@@ -106,7 +103,7 @@ def test_a_bias_beyond_the_truth_is_found(errors: str | None) -> None:
     assert min(v.bias.by_axis["x"].value, v.bias.by_axis["y"].value) > 1.0
 
 
-def test_the_rows_of_the_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rows_of_the_calibration(monkeypatch):
     monkeypatch.setattr(calibration_truth, "QUICK_GATES", 2)
     rows = calibration_truth.rows(True, 5)
     assert {row["question"] for row in rows} | {row["world"] for row in rows} < set(calibration_truth.ABOUT)
@@ -117,7 +114,7 @@ def test_the_rows_of_the_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- what is said ------------------------------------------------------------------------------------
 
 
-def test_the_ratio_is_that_of_the_estimate() -> None:
+def test_the_ratio_is_that_of_the_estimate():
     """A P wrong by 2 at s = .5 shows as 1.5 in the sum."""
     rng = np.random.default_rng(3)
     one = record(rng, "white", 0.499, 2.0, "independent", runs=2000, steps=1)
@@ -131,7 +128,7 @@ def test_the_ratio_is_that_of_the_estimate() -> None:
         assert v.truth.by_axis[axis] > 0.1
 
 
-def test_a_share_of_an_axis_is_of_that_axis() -> None:
+def test_a_share_of_an_axis_is_of_that_axis():
     one = record(np.random.default_rng(3), "white", 0.2, 1.0, "independent")
     truth = uncertain_truth(one)
     T = truth_of_share(0.2)
@@ -139,7 +136,7 @@ def test_a_share_of_an_axis_is_of_that_axis() -> None:
     assert truth.share("position" if "position" in truth.by_group else "x") == pytest.approx(T[0, 0] / (P + T)[0, 0])
 
 
-def test_consistent_needs_the_interval_of_the_estimate() -> None:
+def test_consistent_needs_the_interval_of_the_estimate():
     """At s = .45 the sum lies in [1 / 1.5, 1.5] where P is off by x1.7."""
     v = judge(record(np.random.default_rng(1), "white", 0.45, 1.0, "independent", runs=30, steps=1))
     plain = judge(Record("est", *_sum(record(np.random.default_rng(1), "white", 0.45, 1.0, runs=30, steps=1))))
@@ -148,12 +145,12 @@ def test_consistent_needs_the_interval_of_the_estimate() -> None:
     assert sure.status == "consistent"
 
 
-def _sum(one: Record) -> tuple[Array, Array]:
+def _sum(one):
     assert one.error is not None
     return one.error, np.asarray(one.covariance) + one.truth_covariance
 
 
-def test_more_than_half_is_undecided() -> None:
+def test_more_than_half_is_undecided():
     for errors in (None, "independent", "per-run"):
         v = judge(record(np.random.default_rng(2), "white", 0.6, 4.0, errors))
         assert v.status == "undecided"
@@ -162,7 +159,7 @@ def test_more_than_half_is_undecided() -> None:
         assert not v.answers
 
 
-def test_a_filter_that_has_fused_the_truth_is_never_too_large() -> None:
+def test_a_filter_that_has_fused_the_truth_is_never_too_large():
     v = judge(record(np.random.default_rng(2), "white", 0.2, 0.2, "independent", shared=True))
     assert v.status == "undecided"
     assert "--truth-shared" in " ".join(v.reasons)
@@ -170,7 +167,7 @@ def test_a_filter_that_has_fused_the_truth_is_never_too_large() -> None:
     assert far.status == "overconfident"
 
 
-def test_words_name_the_share_and_the_option() -> None:
+def test_words_name_the_share_and_the_option():
     v = judge(record(np.random.default_rng(2), "white", 0.2))
     assert any("20 % of the sum of both (x " in line and "--truth-errors" in line for line in v.reasons)
     declared = judge(record(np.random.default_rng(2), "white", 0.2, errors="per-run"))
@@ -179,49 +176,49 @@ def test_words_name_the_share_and_the_option() -> None:
     assert not any("truth" in line for line in exact.reasons)
 
 
-def test_json_gains_keys_only() -> None:
+def test_json_gains_keys_only():
     one = record(np.random.default_rng(2), "white", 0.2, errors="per-run")
     new, old = judge(one).statistics, judge(Record("est", *_sum(one), axes=one.axes)).statistics
     assert set(new) - set(old) == {"truth_share", "truth_share_of_axes", "truth_errors", "truth_shared"}
     assert not set(old) - set(new)
 
 
-def test_pictures_are_of_both_covariances() -> None:
+def test_pictures_are_of_both_covariances():
     one = record(np.random.default_rng(2), "white", 0.2, errors="independent")
     v = judge(one)
     drawn = of_both(one)
-    np.testing.assert_allclose(drawn.nees.mean(axis=0), v.scale.anees)
+    assert_allclose(drawn.nees.mean(axis=0), v.scale.anees)
     figures = record_figures(replace(one, t=np.arange(float(STEPS)), dof=N), v)
     assert {figure.title for figure in figures} == {"Errors and stated bounds", "NEES", "Coverage"}
     assert all(figure.caption.endswith("Covariances are those of estimate and truth together.") for figure in figures)
     (below,) = lines(panels(figures[0])[0], "2-sigma bounds")
-    np.testing.assert_allclose(-below.get_ydata(), 2.0 * np.sqrt((P + truth_of_share(0.2))[0, 0]))
+    assert_allclose(-below.get_ydata(), 2.0 * np.sqrt((P + truth_of_share(0.2))[0, 0]))
     assert of_both(drawn) is drawn
 
 
 # --- the statistics ----------------------------------------------------------------------------------
 
 
-def test_contrasts_do_not_have_what_runs_share() -> None:
+def test_contrasts_do_not_have_what_runs_share():
     rng = np.random.default_rng(4)
     S = np.stack([np.diag(1.0 + rng.random(2)) for _ in range(6 * 4)]).reshape(6, 4, 2, 2)
     e = rng.standard_normal((6, 4, 2))
     e[2, 1] = np.nan
     u, C = contrasts(e, S)
     moved, same = contrasts(e + rng.standard_normal((1, 4, 2)), S)
-    np.testing.assert_allclose(u, moved, atol=1e-12)
-    np.testing.assert_array_equal(C, same)
+    assert_allclose(u, moved, atol=1e-12)
+    assert_array_equal(C, same)
     assert np.isnan(u[0]).all()
     assert np.isfinite(u[1:, 0]).all()
     assert np.isnan(u[2, 1]).all()
-    np.testing.assert_allclose(u[3, 1], (e[3, 1] - (e[0, 1] + e[1, 1]) / 2) * np.sqrt(2 / 3))
-    np.testing.assert_allclose(C[3, 1], (S[3, 1] + (S[0, 1] + S[1, 1]) / 4) * 2 / 3)
+    assert_allclose(u[3, 1], (e[3, 1] - (e[0, 1] + e[1, 1]) / 2) * np.sqrt(2 / 3))
+    assert_allclose(C[3, 1], (S[3, 1] + (S[0, 1] + S[1, 1]) / 4) * 2 / 3)
     equal, _ = contrasts(rng.standard_normal((5, 20_000, 1)), np.ones((5, 20_000, 1, 1)))
     product = equal[1:, :, 0] @ equal[1:, :, 0].T / 20_000
-    np.testing.assert_allclose(product, np.eye(4), atol=0.05)
+    assert_allclose(product, np.eye(4), atol=0.05)
 
 
-def test_the_weights_of_the_bound_by_hand() -> None:
+def test_the_weights_of_the_bound_by_hand():
     runs, T = 10, truth_of_share(0.3)
     L = np.linalg.cholesky(P + T)
     values = np.linalg.eigvalsh(np.linalg.solve(L, np.linalg.solve(L, T).T))[::-1]
@@ -230,13 +227,13 @@ def test_the_weights_of_the_bound_by_hand() -> None:
     assert weights[0] == pytest.approx(values[0] / N + (1.0 - values[-1]) / (N * runs))
 
 
-def test_common_to_a_single_run_is_bounded() -> None:
+def test_common_to_a_single_run_is_bounded():
     truth = uncertain_truth(record(np.random.default_rng(2), "common", 0.2, errors="common", runs=1))
     assert truth.bounded
     assert judge(record(np.random.default_rng(2), "common", 0.2, errors="common", runs=1)).status == "undecided"
 
 
-def test_only_too_small_is_asked_where_conservative_is_allowed() -> None:
+def test_only_too_small_is_asked_where_conservative_is_allowed():
     settings = Settings(allow="conservative")
     assert not judge(record(np.random.default_rng(2), "white", 0.2, 0.2), settings).faults
     assert judge(record(np.random.default_rng(2), "white", 0.2, 4.0), settings).status == "overconfident"
@@ -245,14 +242,14 @@ def test_only_too_small_is_asked_where_conservative_is_allowed() -> None:
 # --- files -------------------------------------------------------------------------------------------
 
 
-def write_tum(folder: Path, runs: int = 1, steps: int = 40, ratio: float = 1.0) -> tuple[Path, Path, Path]:
+def write_tum(folder, runs=1, steps=40, ratio=1.0):
     """Poses of 6 x 6 covariance I / 100, a truth with I / 400, and the covariances of the truth apart."""
     rng = np.random.default_rng(9)
     est, truth, stated = (folder / name for name in ("est", "truth", "stated"))
     for each in (est, truth, stated):
         each.mkdir()
     for run in range(runs):
-        lines: list[list[str]] = [[], [], []]
+        lines = [[], [], []]
         for k in range(steps):
             e, v = 0.1 * np.sqrt(ratio) * rng.standard_normal(3), 0.05 * rng.standard_normal(3)
             pose = "0 0 0 1"
@@ -266,11 +263,11 @@ def write_tum(folder: Path, runs: int = 1, steps: int = 40, ratio: float = 1.0) 
     return est, truth, stated
 
 
-def test_a_trajectory_whose_truth_states_its_covariance(tmp_path: Path) -> None:
+def test_a_trajectory_whose_truth_states_its_covariance(tmp_path):
     est, truth, stated = write_tum(tmp_path, 3)
     for source in ("columns", str(stated)):
         (one,) = read_recordings(est, truth, truth_covariance=source, axes=["x", "y", "z"], truth_errors="per-run")
-        np.testing.assert_allclose(one.truth_covariance, np.broadcast_to(np.eye(3) / 400.0, (3, 40, 3, 3)))
+        assert_allclose(one.truth_covariance, np.broadcast_to(np.eye(3) / 400.0, (3, 40, 3, 3)))
         assert (one.truth_errors, one.truth_shared) == ("per-run", False)
     (ignored,) = read_recordings(est, truth, axes=["x", "y", "z"])
     assert ignored.truth_covariance is None
@@ -278,7 +275,7 @@ def test_a_trajectory_whose_truth_states_its_covariance(tmp_path: Path) -> None:
         read_recordings(est, truth, truth_covariance=str(tmp_path))
 
 
-def test_estimates_without_a_covariance_of_the_truth_are_left_out(tmp_path: Path) -> None:
+def test_estimates_without_a_covariance_of_the_truth_are_left_out(tmp_path):
     est, truth, stated = write_tum(tmp_path)
     lines = (stated / "r00.txt").read_text().splitlines()
     (stated / "r00.txt").write_text("\n".join(lines[:30]) + "\n")
@@ -288,7 +285,7 @@ def test_estimates_without_a_covariance_of_the_truth_are_left_out(tmp_path: Path
     assert v.scale.judged_steps == 30
 
 
-def test_the_verdict_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verdict_by_command(tmp_path, capsys):
     est, truth, _ = write_tum(tmp_path, 40, 6, 4.0)
     options = "--axes", "x,y,z", "--truth-covariance", "columns", "--truth-errors", "independent", "--json"
     said = json.loads(consistency(capsys, "analyse", est, "--truth", truth, *options)[0])["est"]
@@ -298,7 +295,7 @@ def test_the_verdict_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         (["--truth-errors", "white"], "--truth-errors white: must be independent, per-run or common"),
         (["--truth-errors", "common"], "the truth of est has no covariance of its own"),
@@ -310,12 +307,12 @@ def test_the_verdict_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (["--truth-covariance", "columns", "--align", "se3"], "does not go with --align: a frame that is fitted"),
     ],
 )
-def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str) -> None:
+def test_what_is_refused(tmp_path, capsys, options, message):
     est, truth, _ = write_tum(tmp_path)
     assert message in refused(capsys, "analyse", est, "--truth", truth, *options)
 
 
-def test_a_covariance_of_the_truth_that_is_none_is_refused() -> None:
+def test_a_covariance_of_the_truth_that_is_none_is_refused():
     e, S = np.zeros((2, 3, 2)), np.broadcast_to(np.eye(2), (2, 3, 2, 2))
     bad = np.broadcast_to(np.diag([1.0, -1.0]), (2, 3, 2, 2))
     with pytest.raises(cs.InputError, match="covariance of the truth in run 0, step 1 is no covariance"):
@@ -324,15 +321,15 @@ def test_a_covariance_of_the_truth_that_is_none_is_refused() -> None:
         cs.judge(e, S, truth_covariances=np.ones((2, 3, 1, 1)))
 
 
-def test_interpolated_truth_has_the_covariance_of_the_nearer_sample(tmp_path: Path) -> None:
+def test_interpolated_truth_has_the_covariance_of_the_nearer_sample(tmp_path):
     (tmp_path / "est.csv").write_text("t,a,P_a_a\n1.2,0,1\n2.7,0.5,1\n")
     (tmp_path / "truth.csv").write_text("t,a,P_a_a\n" + "".join(f"{k},0,{k}\n" for k in range(1, 5)))
     files = tmp_path / "est.csv", tmp_path / "truth.csv"
     (one,) = read_recordings(*files, state=["a"], truth_covariance="columns", max_dt=0.5)
-    np.testing.assert_array_equal(one.truth_covariance[0, :, 0, 0], [1.0, 3.0])
+    assert_array_equal(one.truth_covariance[0, :, 0, 0], [1.0, 3.0])
 
 
-def test_a_table_and_an_archive_state_it(tmp_path: Path) -> None:
+def test_a_table_and_an_archive_state_it(tmp_path):
     rng = np.random.default_rng(11)
     rows = ["run,step,a,b,P_a_a,P_a_b,P_b_b"] + [f"{r},{k},0,0,2,0,2" for r in range(3) for k in (1, 2)]
     true = ["run,step,a,b,P_a_a,P_a_b,P_b_b"]
@@ -342,13 +339,13 @@ def test_a_table_and_an_archive_state_it(tmp_path: Path) -> None:
     (tmp_path / "truth.csv").write_text("\n".join(true) + "\n")
     files = tmp_path / "est.csv", tmp_path / "truth.csv"
     (one,) = read_recordings(*files, state=["a", "b"], truth_covariance="columns")
-    np.testing.assert_array_equal(one.truth_covariance[2, 1], [[3.0, 0.5], [0.5, 3.0]])
+    assert_array_equal(one.truth_covariance[2, 1], [[3.0, 0.5], [0.5, 3.0]])
     with pytest.raises(cs.InputError, match="for tables it is 'columns'"):
         read_recordings(*files, state=["a", "b"], truth_covariance="other.csv")
     P2 = np.broadcast_to(2.0 * np.eye(2), (3, 2, 2, 2))
     np.savez(tmp_path / "e.npz", errors=v, covariances=P2, truth_covariances=one.truth_covariance)
     (archive,) = read_recordings(tmp_path / "e.npz", truth_errors="common")
-    np.testing.assert_array_equal(archive.truth_covariance, one.truth_covariance)
+    assert_array_equal(archive.truth_covariance, one.truth_covariance)
     assert archive.truth_errors == "common"
     np.savez(tmp_path / "bad.npz", errors=v, covariances=P2, truth_covariances=-one.truth_covariance)
     with pytest.raises(cs.InputError, match=r"bad: the covariance of the truth in run 0, step 1 is no covariance"):

@@ -20,7 +20,7 @@ TRUTHS = {
 }
 
 
-def ended(*words: str) -> int:
+def ended(*words):
     with pytest.raises(SystemExit) as end:
         main(list(words))
     return int(end.value.code or 0)
@@ -28,9 +28,7 @@ def ended(*words: str) -> int:
 
 @pytest.mark.parametrize("truth", TRUTHS)
 @pytest.mark.parametrize("command", ["analyse", "fit-covariance"])
-def test_positions_alone_are_no_truth_of_planar_poses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, truth: str
-) -> None:
+def test_positions_alone_are_no_truth_of_planar_poses(tmp_path, capsys, command, truth):
     (tmp_path / "est.csv").write_text(POSES if command == "analyse" else "t,v,omega\n0,1,0\n1,1,0\n")
     (tmp_path / truth).write_text(TRUTHS[truth])
     span = [] if command == "analyse" else ["--span", "1s"]
@@ -42,9 +40,7 @@ def test_positions_alone_are_no_truth_of_planar_poses(
 
 @pytest.mark.parametrize("error", [ValueError("such"), TypeError("such"), OSError("such"), ModuleNotFoundError("such")])
 @pytest.mark.parametrize("debug", [True, False])
-def test_an_unforeseen_exception_ends_in_2_with_its_kind_and_place(
-    capsys: pytest.CaptureFixture[str], error: Exception, debug: bool
-) -> None:
+def test_an_unforeseen_exception_ends_in_2_with_its_kind_and_place(capsys, error, debug):
     with mock.patch("consistency.commands.app.app", side_effect=error):
         assert ended(*["--debug"] * debug, "plan") == 2
     said = capsys.readouterr().err
@@ -55,28 +51,28 @@ def test_an_unforeseen_exception_ends_in_2_with_its_kind_and_place(
     assert debug or said.count("\n") == 1
 
 
-def test_debug_stands_before_any_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_debug_stands_before_any_command(capsys):
     assert ended("--debug", "plan", "--dof", "3", "--detect", "1.2") == 0
     assert "runs" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", [NameError, UnboundLocalError, TypeError, AttributeError, IndexError])
-def test_a_programming_error_of_ours_is_not_reworded(kind: type[Exception]) -> None:
+def test_a_programming_error_of_ours_is_not_reworded(kind):
     code = compile(
         "def parse():\n    raise KIND('ours')", str(Path(cs.__file__).parent / "referee" / "some.py"), "exec"
     )
-    names: dict[str, object] = {"KIND": kind}
+    names = {"KIND": kind}
     exec(code, names)
     with pytest.raises(kind, match="ours"), reading("file"):
         names["parse"]()  # type: ignore[operator]
 
 
 @pytest.mark.parametrize("kind", [TypeError, AttributeError, NameError, IndexError, ValueError])
-def test_whatever_a_library_raises_of_a_file_is_its_damage(kind: type[Exception]) -> None:
+def test_whatever_a_library_raises_of_a_file_is_its_damage(kind):
     with pytest.raises(cs.InputError, match=r"file: .*damaged.*of a library"), reading("file"):
         raise kind("of a library")
 
 
-def test_a_value_error_of_ours_is_the_files_fault() -> None:
+def test_a_value_error_of_ours_is_the_files_fault():
     with pytest.raises(cs.InputError, match="file: "), reading("file"):
         cs.nees(np.ones(2), -np.eye(2))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,15 @@ from consistency.diagnostics import Answer, Equivalence, Interval, Record, Setti
 from consistency.diagnostics import judge as judge_evidence
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped
 from consistency.referee.diagnostics.verdict import parts
-from consistency.referee.diagnostics.verdict.answers import ABOUT, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, answers
+from consistency.referee.diagnostics.verdict.answers import (
+    ABOUT,
+    GROUP,
+    JOINT,
+    JOINT_DISTRIBUTION,
+    MAIN,
+    SHARES,
+    answers,
+)
 from consistency.referee.diagnostics.verdict.parts import Innovations
 from consistency.referee.types import Array, Failure
 
@@ -35,16 +42,14 @@ class Case:
     nis: Array
     nis_dof: Array
 
-    def verdict(
-        self, failures: tuple[Failure, ...] = (), false_alarm: float = FALSE_ALARM, **options: Any
-    ) -> cs.Verdict:
+    def verdict(self, failures=(), false_alarm=FALSE_ALARM, **options):
         return judge(
             "f", self.error, self.covariance, nees=self.nees, nis=self.nis, nis_dof=self.nis_dof, failures=failures,
             false_alarm=false_alarm, **{"optimal_gain": True, **options},
         )  # fmt: skip
 
 
-def make(scale: float = 1.0, bias: float = 0.0, runs: int = RUNS, steps: int = STEPS) -> Case:
+def make(scale=1.0, bias=0.0, runs=RUNS, steps=STEPS):
     """Errors of covariance P (and mean ``bias`` standard deviations along x) that a filter calls P / scale.
 
     Steps of a run are as dependent as those of a filter: an autoregression with coefficient 0.9.
@@ -59,7 +64,7 @@ def make(scale: float = 1.0, bias: float = 0.0, runs: int = RUNS, steps: int = S
     return Case(error, covariance, cs.nees(error, covariance), nis, nis_dof)
 
 
-def broken(case: Case, run: int, step: int) -> Case:
+def broken(case, run, step):
     """The case with nothing from ``step`` of ``run`` on."""
     arrays = {name: value.copy() for name, value in vars(case).items()}
     for name in ("error", "covariance", "nees", "nis"):
@@ -71,7 +76,7 @@ def broken(case: Case, run: int, step: int) -> Case:
 # --- with truth ----------------------------------------------------------------------------------
 
 
-def test_statistics_of_a_calibrated_filter() -> None:
+def test_statistics_of_a_calibrated_filter():
     case = make()
     s = case.verdict(false_alarm=0.05).statistics
     assert (s["runs"], s["steps"], s["dof"], s["judged_steps"], s["left_out_steps"]) == (RUNS, STEPS, 3, STEPS, [])
@@ -90,7 +95,7 @@ def test_statistics_of_a_calibrated_filter() -> None:
     assert s["ratio"] == pytest.approx(case.nees.mean() / 3)
 
 
-def test_nees_is_worked_out_from_error_and_covariance() -> None:
+def test_nees_is_worked_out_from_error_and_covariance():
     case = make(scale=2.0)
     alone = judge("f", case.error, case.covariance, false_alarm=FALSE_ALARM)
     lied = judge("f", case.error, case.covariance, nees=case.nees / 2, false_alarm=FALSE_ALARM)
@@ -99,7 +104,7 @@ def test_nees_is_worked_out_from_error_and_covariance() -> None:
         assert verdict.status == "overconfident"
 
 
-def test_bonferroni_band_over_all_steps() -> None:
+def test_bonferroni_band_over_all_steps():
     """Its share of the false-alarm rate, as Holm's first step gives it, over the steps and two sides."""
     s = make().verdict(false_alarm=0.1, method="bonferroni").statistics
     share = next(a["share"] for a in s["answers"] if a["question"] == "scale in some step")
@@ -109,7 +114,7 @@ def test_bonferroni_band_over_all_steps() -> None:
     assert np.all(s["simultaneous"][:, 1] > s["band"][:, 1])
 
 
-def test_false_alarms_stay_below_the_stated_rate() -> None:
+def test_false_alarms_stay_below_the_stated_rate():
     """A verdict at 10 % over 200 calibrated filters: more than 40 alarms have probability below 1e-5."""
     assert stats.binom.sf(40, 200, 0.1) < 1e-5
     rng = np.random.default_rng(11)
@@ -128,7 +133,7 @@ def test_false_alarms_stay_below_the_stated_rate() -> None:
 # --- steps and runs left out -----------------------------------------------------------------------
 
 
-def test_a_run_that_fails_midway_counts_only_before() -> None:
+def test_a_run_that_fails_midway_counts_only_before():
     s = broken(make(), run=3, step=12).verdict((BROKE,)).statistics
     assert np.array_equal(s["alive"], [RUNS] * 11 + [RUNS - 1] * (STEPS - 11))
     assert s["left_out_steps"] == []
@@ -137,7 +142,7 @@ def test_a_run_that_fails_midway_counts_only_before() -> None:
     assert s["band"][11] == pytest.approx(anees_interval(3, RUNS - 1))
 
 
-def test_all_runs_failed_at_once() -> None:
+def test_all_runs_failed_at_once():
     case = make()
     for run in range(RUNS):
         case = broken(case, run, 1)
@@ -149,13 +154,13 @@ def test_all_runs_failed_at_once() -> None:
 # --- without truth ---------------------------------------------------------------------------------
 
 
-def blind(case: Case, **options: Any) -> cs.Verdict:
+def blind(case, **options):
     arrays = {"nis": case.nis, "nis_dof": case.nis_dof}
     return judge("f", None, case.covariance, **arrays, **{"optimal_gain": True, "false_alarm": FALSE_ALARM, **options})
 
 
-@pytest.mark.parametrize(("scale", "status"), [(1.0, "consistent"), (1.3, "overconfident"), (0.7, "conservative")])
-def test_without_truth_the_nis_is_judged(scale: float, status: str) -> None:
+@pytest.mark.parametrize("scale, status", [(1.0, "consistent"), (1.3, "overconfident"), (0.7, "conservative")])
+def test_without_truth_the_nis_is_judged(scale, status):
     verdict = blind(make(scale=scale))
     assert verdict.status == status
     assert "no truth" in verdict.reasons[0]
@@ -164,13 +169,13 @@ def test_without_truth_the_nis_is_judged(scale: float, status: str) -> None:
     assert verdict.statistic == verdict.statistics["nis_ratio"]
 
 
-def test_without_truth_a_failed_run_counts_too() -> None:
+def test_without_truth_a_failed_run_counts_too():
     verdict = blind(broken(make(), 3, 12), failures=(BROKE,))
     assert verdict.status == "failed"
     assert verdict.reasons[0] == "failed: 1 of 50 runs failed, first run 3 in step 12: LinAlgError: singular"
 
 
-def test_without_truth_and_innovations_there_is_no_verdict() -> None:
+def test_without_truth_and_innovations_there_is_no_verdict():
     case = make()
     verdict = blind(replace(case, nis=np.full_like(case.nis, np.nan)))
     assert verdict.status == "failed"
@@ -181,7 +186,7 @@ def test_without_truth_and_innovations_there_is_no_verdict() -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "values"),
+    "option, values",
     [
         ("false_alarm", [0.0, 1.0, -0.1, 2.0, float("nan")]),
         ("power", [0.0, 1.0, 1.5, float("nan")]),
@@ -191,13 +196,13 @@ def test_without_truth_and_innovations_there_is_no_verdict() -> None:
         ("method", ["sidak", "", "MAX"]),
     ],
 )
-def test_settings_out_of_range_are_refused_by_name(option: str, values: list[Any]) -> None:
+def test_settings_out_of_range_are_refused_by_name(option, values):
     for value in values:
         with pytest.raises(ValueError, match=f"^{option} must"):
             Settings(**{option: value})
 
 
-def test_settings_at_their_limits_are_taken() -> None:
+def test_settings_at_their_limits_are_taken():
     for options in (
         {"false_alarm": 1e-12},
         {"power": 0.999999},
@@ -208,7 +213,7 @@ def test_settings_at_their_limits_are_taken() -> None:
         assert Settings(**options)
 
 
-def test_ratios_below_one_count_as_their_inverse() -> None:
+def test_ratios_below_one_count_as_their_inverse():
     assert Settings(detect=0.5).factor == Settings(detect=2.0).factor == 2.0
     assert Settings(tolerance=0.8).tolerated == pytest.approx(1.25)
     assert Settings(tolerance=1.25).tolerated == 1.25
@@ -219,14 +224,14 @@ def test_ratios_below_one_count_as_their_inverse() -> None:
 # --- intervals ------------------------------------------------------------------------------------------
 
 
-def test_an_interval_holds_what_lies_inside() -> None:
+def test_an_interval_holds_what_lies_inside():
     interval = Interval(2.0, 1.0, 3.0)
     assert [interval.holds(x) for x in (0.99, 1.0, 2.0, 3.0, 3.01)] == [False, True, True, True, False]
     assert not Interval(1.0, float("nan"), 3.0).holds(2.0)
     assert not Interval(1.0, 1.0, float("nan")).holds(2.0)
 
 
-def test_equivalence_is_shown_at_its_level() -> None:
+def test_equivalence_is_shown_at_its_level():
     assert Equivalence(1.5, 0.05, 0.05, None).shown
     assert not Equivalence(1.5, 0.0501, 0.05, None).shown
     assert not Equivalence(1.5, float("nan"), 0.05, None).shown
@@ -235,11 +240,11 @@ def test_equivalence_is_shown_at_its_level() -> None:
 # --- the verdict ----------------------------------------------------------------------------------------
 
 
-def of(*given: Answer, **more: Any) -> Verdict:
+def of(*given, **more):
     return Verdict("f", "inconsistent", 3, 4, Settings(), given, reasons=("inconsistent: so",), **more)
 
 
-def test_faults_are_what_was_found_and_not_tolerated() -> None:
+def test_faults_are_what_was_found_and_not_tolerated():
     verdict = of(
         Answer("scale", 1e-9, 0.5, 1e-9, True, tolerated=True),
         Answer("bias", 1e-9, 0.1, 1e-8, True),
@@ -249,7 +254,7 @@ def test_faults_are_what_was_found_and_not_tolerated() -> None:
     assert verdict.p_value == pytest.approx(1e-8)  # of the bias, over its share
 
 
-def test_the_p_value_is_the_least_over_its_share() -> None:
+def test_the_p_value_is_the_least_over_its_share():
     """The rate at which the first question would just be found; Holm has nothing to give it yet."""
     verdict = of(Answer("scale", 0.02, 0.5, 0.04, True), Answer("bias", 0.01, 0.05, 0.1, False))
     assert verdict.p_value == pytest.approx(0.04)
@@ -260,7 +265,7 @@ def test_the_p_value_is_the_least_over_its_share() -> None:
     assert whole.p_value == pytest.approx(min(a.adjusted for a in found.values()))
 
 
-def test_without_truth_the_numbers_are_those_of_the_innovations() -> None:
+def test_without_truth_the_numbers_are_those_of_the_innovations():
     shown = Equivalence(1.5, 0.01, 0.05, None)
     verdict = of(innovations=Innovations(1.2, (0.9, 1.1), 400, True, np.zeros(2), 0.1, shown))
     assert verdict.statistic == 1.2
@@ -273,7 +278,7 @@ def test_without_truth_the_numbers_are_those_of_the_innovations() -> None:
     assert nothing.equivalence is None
 
 
-def test_with_truth_they_are_those_of_the_errors() -> None:
+def test_with_truth_they_are_those_of_the_errors():
     rng = np.random.default_rng(1)
     error = 1.5 * independent(rng, 40, 5, 2)
     nis = {"nis": rng.chisquare(2, (40, 5)), "nis_dof": np.full((40, 5), 2)}
@@ -290,7 +295,7 @@ def test_with_truth_they_are_those_of_the_errors() -> None:
     assert replace(verdict, status="consistent").consistent
 
 
-def test_scale_counts_the_steps_that_are_judged() -> None:
+def test_scale_counts_the_steps_that_are_judged():
     error = independent(np.random.default_rng(2), 10, 6, 2)
     error[:, 4] = np.nan
     error[3:, 2] = np.nan
@@ -300,12 +305,14 @@ def test_scale_counts_the_steps_that_are_judged() -> None:
     assert np.isnan(verdict.scale.anees).tolist() == [False] * 4 + [True, False]
 
 
-def test_every_status_has_a_meaning_and_every_question_a_share() -> None:
+def test_every_status_has_a_meaning_and_every_question_a_share():
     assert list(parts.STATUSES) == [
         "consistent", "overconfident", "conservative", "biased", "heavy-tailed", "inconsistent", "undecided", "failed",
     ]  # fmt: skip
     assert set(SHARES) == set(ABOUT)
-    two_sided = {q: s for q, s in SHARES.items() if q not in ("scale in some direction", JOINT, JOINT_DISTRIBUTION)}
+    two_sided = {
+        q: s for q, s in SHARES.items() if q not in ("scale in some direction", JOINT, JOINT_DISTRIBUTION, GROUP)
+    }
     assert SHARES[MAIN] == 0.5
     assert sum(two_sided.values()) == pytest.approx(1.0)
 
@@ -313,12 +320,12 @@ def test_every_status_has_a_meaning_and_every_question_a_share() -> None:
 # --- what is given ---------------------------------------------------------------------------------------
 
 
-def arrays(*shapes: tuple[int, ...]) -> list[Array]:
+def arrays(*shapes):
     return [np.ones(shape) for shape in shapes]
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    "given, message",
     [
         ({}, "nothing to judge"),
         ({"covariance": np.ones((3, 4, 2, 2))}, "nothing to judge"),
@@ -330,19 +337,19 @@ def arrays(*shapes: tuple[int, ...]) -> list[Array]:
         ({"error": np.ones((3, 4, 2)), "covariance": np.ones((3, 4, 2, 2)), "axes": ["x"]}, "1 names of axes for 2"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(given: dict[str, Any], message: str) -> None:
+def test_arrays_that_do_not_fit_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
         judge_evidence(Record("f", **given))
 
 
 @pytest.mark.parametrize("index", [[], [2], [-1], [0, 0]])
-def test_subsets_that_do_not_fit_are_refused(index: list[int]) -> None:
+def test_subsets_that_do_not_fit_are_refused(index):
     error = np.ones((3, 4, 2))
     with pytest.raises(ValueError, match="subset 'odd'"):
         judge_evidence(Record("f", error, identities(error)), Settings(subsets={"odd": index}))
 
 
-def test_nothing_that_is_given_is_changed() -> None:
+def test_nothing_that_is_given_is_changed():
     rng = np.random.default_rng(3)
     error = independent(rng, 25, 4, 3)
     error[2, 1] = np.nan
@@ -356,7 +363,7 @@ def test_nothing_that_is_given_is_changed() -> None:
 # --- evidence ------------------------------------------------------------------------------------------
 
 
-def test_steps_without_full_rank_are_counted_from_one(rng: np.random.Generator) -> None:
+def test_steps_without_full_rank_are_counted_from_one(rng):
     error, nees = independent(rng, 3, 6, 2), np.ones((3, 6))
     nees[0, :2] = nees[1, 3] = nees[2, 5] = np.nan
     error[2, 5] = np.nan  # a run that has ended

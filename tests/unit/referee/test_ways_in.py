@@ -1,30 +1,27 @@
 """Files as people have them: other names of columns, truth beside the estimates, other kinds, and chains of frames."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from command import refused
+from numpy.testing import assert_allclose, assert_array_equal
 from recorded import read_recordings
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.types import Array
 from consistency.testing import assert_consistent
 
 STEPS = 7
 POSE = ("x", "y", "heading")
 
 
-def matrices(n: int) -> Array:
+def matrices(n):
     root = np.random.default_rng().normal(size=(STEPS, n, n))
     return root @ np.swapaxes(root, 1, 2) + np.eye(n)
 
@@ -32,37 +29,43 @@ def matrices(n: int) -> Array:
 class Data:
     """Errors with covariances of n components, and clocks."""
 
-    def __init__(self, axes: tuple[str, ...]) -> None:
+    def __init__(self, axes):
         rng, n = np.random.default_rng(), len(axes)
         self.axes, self.P = axes, matrices(n)
         self.error, self.truth = 0.1 * rng.normal(size=(STEPS, n)), rng.normal(size=(STEPS, n))
-        self.t = 1.0 + 0.1 * np.arange(STEPS)
+        self.t, self.step = 1.0 + 0.1 * np.arange(STEPS), np.arange(1, STEPS + 1)
+        self.state = None if axes == POSE else list(axes)
 
-    def table(self, names: dict[str, Array] | None = None, own: str = "{}") -> pd.DataFrame:
+    def table(self, names=(), own="{}"):
         values = self.truth - self.error
         columns = {own.format(axis): values[:, i] for i, axis in enumerate(self.axes)}
-        return pd.DataFrame(columns | (names or {}))
+        return pd.DataFrame(columns | dict(names))
 
-    def true(self, spelling: str = "{}") -> pd.DataFrame:
+    def true(self, spelling="{}"):
         return pd.DataFrame({spelling.format(axis): self.truth[:, i] for i, axis in enumerate(self.axes)})
 
-    def stated(self, spelling: str, words: tuple[str, ...]) -> dict[str, Array]:
+    def stated(self, spelling, words):
         n = len(words)
         pairs = itertools.combinations_with_replacement(range(n), 2)
         return {spelling.format(words[i], words[j]): self.P[:, i, j] for i, j in pairs}
 
+    def read(self, columns):
+        """The record of est.csv, with these columns among the others in any order, and truth.csv, both by step."""
+        est = write("est.csv", self.table(columns).sample(frac=1, axis=1), step=self.step)
+        return cs.read(est, truth=write("truth.csv", self.true(), step=self.step), state=self.state)
 
-def write(path: str, table: pd.DataFrame, **columns: Any) -> Path:
+
+def write(path, table, **columns):
     table.assign(**columns).to_csv(path, index=False)
     return Path(path)
 
 
-def check(record: Any, data: Data) -> None:
-    np.testing.assert_allclose(record.error[0], data.error, atol=1e-9)
-    np.testing.assert_allclose(np.asarray(record.covariance[0]), data.P, rtol=1e-9)
+def check(record, data):
+    assert_allclose(record.error[0], data.error, atol=1e-9)
+    assert_allclose(np.asarray(record.covariance[0]), data.P, rtol=1e-9)
 
 
-CLOCKS: dict[str, Any] = {
+CLOCKS = {
     "time": lambda t: {"time": t},
     "timestamp": lambda t: {"timestamp": t},
     "stamp": lambda t: {"Stamp": t},
@@ -76,35 +79,35 @@ CLOCKS: dict[str, Any] = {
 
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("axes", [POSE, ("a", "b")])
-def test_a_time_by_another_name_is_t(clock: str, axes: tuple[str, ...], inside: Path) -> None:
-    data, state = Data(axes), None if axes == POSE else list(axes)
+def test_a_time_by_another_name_is_t(clock, axes, inside):
+    data = Data(axes)
     names = CLOCKS[clock](data.t)
     est = write("est.csv", data.table(data.stated("P_{}_{}", axes)), **names)
-    record = cs.read(est, truth=write("truth.csv", data.true(), **names), state=state)
+    record = cs.read(est, truth=write("truth.csv", data.true(), **names), state=data.state)
     check(record, data)
     start = 1.7e9 if clock == "since 1970" else 0.0
-    np.testing.assert_allclose(record.t, start + data.t, atol=1e-6)
+    assert_allclose(record.t, start + data.t, atol=1e-6)
     if clock == "time":  # beside t in the other file, and in memory
-        check(cs.read(est, truth=write("truth.csv", data.true(), t=data.t), state=state), data)
-        check(cs.read(pd.read_csv(est), truth=pd.read_csv("truth.csv"), state=state), data)
+        check(cs.read(est, truth=write("truth.csv", data.true(), t=data.t), state=data.state), data)
+        check(cs.read(pd.read_csv(est), truth=pd.read_csv("truth.csv"), state=data.state), data)
     assert len(list(inside.iterdir())) == 2
 
 
-def test_beside_steps_a_time_is_not_looked_at(inside: Path) -> None:
-    data, step = Data(("a", "b")), np.arange(STEPS)
-    est = write("est.csv", data.table(data.stated("P_{}_{}", data.axes)), step=step, time="at noon")
-    truth = write("truth.csv", data.true(), step=step, time=data.t + 5.0)
-    record = cs.read(est, truth=truth, state=["a", "b"])
+def test_beside_steps_a_time_is_not_looked_at(inside):
+    data = Data(("a", "b"))
+    table = data.table(data.stated("P_{}_{}", data.axes)).assign(step=data.step)
+    est = write("est.csv", table, time="at noon")
+    truth = write("truth.csv", data.true(), step=data.step, time=data.t + 5)
+    record = cs.read(est, truth=truth, state=data.state)
     check(record, data)
     assert np.isnan(record.t).all()
     with pytest.raises(cs.InputError, match=r"est\.csv, line 2: column 'time': not a number \(at noon\)"):
-        cs.read(est, truth=truth, state=["a", "b"], max_dt=0.1)
-    write("est.csv", data.table(data.stated("P_{}_{}", data.axes)), step=step, time=data.t)
-    moved = cs.read(est, truth=write("truth.csv", data.true(), time=data.t + 5.0), state=["a", "b"], time_offset=5.0)
-    check(moved, data)
+        cs.read(est, truth=truth, state=data.state, max_dt=0.1)
+    write("est.csv", table, time=data.t)
+    check(cs.read(est, truth=write("truth.csv", data.true(), time=data.t + 5), state=data.state, time_offset=5.0), data)
 
 
-def test_the_monitor_knows_a_time(inside: Path) -> None:
+def test_the_monitor_knows_a_time(inside):
     from consistency.referee.readers.formats.innovation_files import read_nis
 
     table = pd.DataFrame({"timestamp": [3.0, 2.0, 4.0], "nis": 1.0, "nis_dof": 1})
@@ -119,22 +122,18 @@ NAMES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("spelling", "words"), NAMES)
+@pytest.mark.parametrize("spelling, words", NAMES)
 @pytest.mark.parametrize("axes", [POSE, ("a", "b", "c")])
-def test_a_covariance_by_other_names(spelling: str, words: str, axes: tuple[str, ...], inside: Path) -> None:
-    data, step = Data(axes), np.arange(1, STEPS + 1)
-    labels = axes if words == "own" else tuple(words)
-    table = data.table(data.stated(spelling, labels))
-    order = np.random.default_rng().permutation(table.columns)
-    truth = write("truth.csv", data.true(), step=step)
-    record = cs.read(write("est.csv", table[order], step=step), truth=truth, state=None if axes == POSE else list(axes))
+def test_a_covariance_by_other_names(spelling, words, axes, inside):
+    data = Data(axes)
+    record = data.read(data.stated(spelling, axes if words == "own" else tuple(words)))
     check(record, data)
     assert any(note.startswith("est.csv: read ") and " as P_" in note for note in record.notes)
 
 
 @pytest.mark.parametrize("spelling", ["cov_{}{}", "P_{}{}"])
 @pytest.mark.parametrize("word", ["theta", "th", "t", "yaw", "psi", "h"])
-def test_words_for_the_heading(spelling: str, word: str, inside: Path) -> None:
+def test_words_for_the_heading(spelling, word, inside):
     data = Data(POSE)
     stated = data.stated(spelling, ("x", "y", word))
     own, true = data.table(stated), data.true()
@@ -143,78 +142,65 @@ def test_words_for_the_heading(spelling: str, word: str, inside: Path) -> None:
     check(cs.read(est, truth=write("truth.csv", true.rename(columns={"heading": "yaw"}), stamp=data.t)), data)
 
 
-def test_a_lower_triangle_by_another_name_has_to_agree(inside: Path) -> None:
-    data, step = Data(("a", "b")), np.arange(1, STEPS + 1)
-    lower = {"P21": data.P[:, 1, 0]}
-    truth = write("truth.csv", data.true(), step=step)
-    table = data.table(data.stated("P{}{}", ("1", "2")) | lower)
-    check(cs.read(write("est.csv", table, step=step), truth=truth, state=["a", "b"]), data)
+def test_a_lower_triangle_by_another_name_has_to_agree(inside):
+    data = Data(("a", "b"))
+    upper = data.stated("P{}{}", ("1", "2"))
+    check(data.read(upper | {"P21": data.P[:, 1, 0]}), data)
     with pytest.raises(cs.InputError, match="line 2: the covariance is not symmetric"):
-        cs.read(write("est.csv", table, step=step, P21=data.P[:, 1, 0] + 1), truth=truth, state=["a", "b"])
+        data.read(upper | {"P21": data.P[:, 1, 0] + 1})
 
 
-def test_of_eleven_components_the_numbers_are_apart(inside: Path) -> None:
-    axes = tuple("abcdefghijk")
-    data, step, words = Data(axes), np.arange(1, STEPS + 1), tuple(map(str, range(1, 12)))
-    truth = write("truth.csv", data.true(), step=step)
-    check(cs.read(write("est.csv", data.table(data.stated("P_{}_{}", words)), step=step), truth, state=axes), data)
-    ambiguous = data.table(data.stated("P{}{}", words))  # P111 is that of 1 and 11
+def test_of_eleven_components_the_numbers_are_apart(inside):
+    data, words = Data(tuple("abcdefghijk")), tuple(map(str, range(1, 12)))
+    check(data.read(data.stated("P_{}_{}", words)), data)
     with pytest.raises(cs.InputError, match="column 'P_a_a' is missing"):
-        cs.read(write("est.csv", ambiguous, step=step), truth, state=axes)
+        data.read(data.stated("P{}{}", words))  # P111 is that of 1 and 11
 
 
 @pytest.mark.parametrize(
     "spelling", ["var_{}", "{}_var", "variance_{}", "sd_{}", "{}_sd", "{}_std", "{}_sigma", "sd{}"]
 )
 @pytest.mark.parametrize("axes", [POSE, ("a", "b")])
-def test_variances_and_deviations_by_other_names(spelling: str, axes: tuple[str, ...], inside: Path) -> None:
-    data, step = Data(axes), np.arange(1, STEPS + 1)
+def test_variances_and_deviations_by_other_names(spelling, axes, inside):
+    data = Data(axes)
     variance = np.diagonal(data.P, axis1=1, axis2=2)
     words = ("x", "y", "theta") if axes == POSE else axes
     values = variance if "var" in spelling else np.sqrt(variance)
-    table = data.table({spelling.format(word): values[:, i] for i, word in enumerate(words)})
-    truth = write("truth.csv", data.true(), step=step)
-    record = cs.read(write("est.csv", table, step=step), truth, state=None if axes == POSE else list(axes))
+    record = data.read({spelling.format(word): values[:, i] for i, word in enumerate(words)})
     assert record.parts == tuple((i,) for i in range(len(axes)))
-    np.testing.assert_allclose(record.nees[0], (data.error**2 / variance).sum(axis=1), rtol=1e-9)
+    assert_allclose(record.nees[0], (data.error**2 / variance).sum(axis=1), rtol=1e-9)
 
 
-def test_variances_beside_cross_terms(inside: Path) -> None:
-    data, step = Data(("a", "b")), np.arange(1, STEPS + 1)
-    names = {"var_a": data.P[:, 0, 0], "var_b": data.P[:, 1, 1], "cov_ab": data.P[:, 0, 1]}
-    truth = write("truth.csv", data.true(), step=step)
-    check(cs.read(write("est.csv", data.table(names), step=step), truth, state=["a", "b"]), data)
+def test_variances_beside_cross_terms(inside):
+    data = Data(("a", "b"))
+    check(data.read({"var_a": data.P[:, 0, 0], "var_b": data.P[:, 1, 1], "cov_ab": data.P[:, 0, 1]}), data)
 
 
-def test_names_that_were_read_before_are_read_so(inside: Path) -> None:
-    data, step = Data(POSE), np.arange(1, STEPS + 1)
-    other = {f"P{i}{j}": np.ones(STEPS) for i, j in itertools.product("123", repeat=2)}
-    truth = write("truth.csv", data.true(), step=step)
+def test_names_that_were_read_before_are_read_so(inside):
+    data = Data(POSE)
     canonical = data.stated("P_{}{}", ("x", "y", "h"))
-    check(cs.read(write("est.csv", data.table(canonical | other), step=step), truth), data)
-    deviations = {f"sigma_{axis}": np.ones(STEPS) for axis in POSE}
-    record = cs.read(write("est.csv", data.table(deviations | {f"var_{axis}": np.full(STEPS, 9.0) for axis in POSE}),
-                           step=step), truth)  # fmt: skip
-    np.testing.assert_allclose(record.nees[0], (data.error**2).sum(axis=1), rtol=1e-9)
-    both = data.table(canonical).assign(x_est=9.0, theta=9.0, step=step)
-    check(cs.read(write("est.csv", both), truth), data)
+    check(data.read(canonical | {f"P{i}{j}": 1.0 for i, j in itertools.product("123", repeat=2)}), data)
+    deviations = {f"sigma_{axis}": 1.0 for axis in POSE} | {f"var_{axis}": 9.0 for axis in POSE}
+    assert_allclose(data.read(deviations).nees[0], (data.error**2).sum(axis=1), rtol=1e-9)
+    check(data.read(canonical | {"x_est": 9.0, "theta": 9.0}), data)
+    canonical.pop("P_xh")
     with pytest.raises(cs.InputError, match=r"column 'P_xh' is missing; .*--state a,b judges fewer"):
-        cs.read(write("est.csv", data.table(canonical).drop(columns="P_xh"), step=step), truth)
+        data.read(canonical)
 
 
 @pytest.mark.parametrize("spelling", ["P{}{}", "P_{}_{}"])
-def test_entries_of_a_covariance_in_space_by_number(spelling: str, inside: Path) -> None:
+def test_entries_of_a_covariance_in_space_by_number(spelling, inside):
     data = Data(("x", "y", "z", "1", "2", "3"))
     turn = {f"q{axis}": float(axis == "w") for axis in "xyzw"}
     own = data.table(data.stated(spelling, tuple("123456"))).drop(columns=["1", "2", "3"])
     true = data.true().drop(columns=["1", "2", "3"])
     est = write("est.csv", own, t=data.t, **turn)
     record = cs.read(est, truth=write("truth.csv", true, t=data.t, **turn))
-    np.testing.assert_allclose(np.asarray(record.covariance[0]), data.P, rtol=1e-9)
+    assert_allclose(np.asarray(record.covariance[0]), data.P, rtol=1e-9)
     stated = write("est.csv", own, t=data.t, **turn, **{f"sigma_{axis}": 2.0 for axis in data.axes[:3]},
                    sigma_roll=2.0, sigma_pitch=2.0, sigma_yaw=2.0)  # fmt: skip
     deviated = cs.read(stated, truth="truth.csv")  # as before
-    np.testing.assert_allclose(deviated.nees[0], (data.error[:, :3] ** 2).sum(axis=1) / 4.0, rtol=1e-9)
+    assert_allclose(deviated.nees[0], (data.error[:, :3] ** 2).sum(axis=1) / 4.0, rtol=1e-9)
 
 
 # --- truth beside the estimates ----------------------------------------------------------------------
@@ -222,7 +208,7 @@ def test_entries_of_a_covariance_in_space_by_number(spelling: str, inside: Path)
 
 @pytest.mark.parametrize("true", ["true_{}", "{}_true", "gt_{}", "{}_gt", "truth_{}", "{}_truth"])
 @pytest.mark.parametrize("own", ["{}", "{}_est", "{}_hat", "est_{}"])
-def test_truth_and_estimate_in_one_table(true: str, own: str, inside: Path) -> None:
+def test_truth_and_estimate_in_one_table(true, own, inside):
     data = Data(POSE)
     table = data.table(data.stated("P_{}{}", ("x", "y", "h")), own).join(data.true(true))
     est = write("est.csv", table.rename(columns=lambda name: name.replace("heading", "theta")), time=data.t)
@@ -230,12 +216,12 @@ def test_truth_and_estimate_in_one_table(true: str, own: str, inside: Path) -> N
     check(cs.read(pd.read_csv(est)), data)
     state = Data(("a", "b"))
     table = state.table(state.stated("P{}{}", ("1", "2")), own).join(state.true(true))
-    record = cs.read(write("est.csv", table, step=np.arange(1, STEPS + 1)), state=["a", "b"], error="vector")
+    record = cs.read(write("est.csv", table, step=state.step), state=state.state, error="vector")
     check(record, state)
     assert "est.csv: the truth stands in columns beside the estimates" in record.notes
 
 
-def in_space(data: Data, stated: dict[str, Array], true: str, own: str = "{}") -> pd.DataFrame:
+def in_space(data, stated, true, own="{}"):
     """A table of poses without turns, their truth beside them."""
     names = ["x", "y", "z", "qx", "qy", "qz", "qw"]
     still = pd.DataFrame({f"q{axis}": np.full(STEPS, float(axis == "w")) for axis in "xyzw"})
@@ -248,59 +234,55 @@ def in_space(data: Data, stated: dict[str, Array], true: str, own: str = "{}") -
 @pytest.mark.parametrize("true", ["true_{}", "{}_gt"])
 @pytest.mark.parametrize("own", ["{}", "{}_est"])
 @pytest.mark.parametrize("folder", [False, True])
-def test_truth_beside_poses_in_space(true: str, own: str, folder: bool, inside: Path) -> None:
+def test_truth_beside_poses_in_space(true, own, folder, inside):
     data = Data(("x", "y", "z", "1", "2", "3"))
     table = in_space(data, data.stated("P{}{}", tuple("123456")), true, own).assign(t=data.t)
     table.loc[2, true.format("y")] = np.nan
     Path("est").mkdir()
     est = write("est/one.csv", table)
     record = cs.read("est" if folder else est)
-    np.testing.assert_allclose(record.error[0, :, :3], np.delete(data.error[:, :3], 2, axis=0), atol=1e-9)  # type: ignore[index]
+    assert_allclose(record.error[0, :, :3], np.delete(data.error[:, :3], 2, axis=0), atol=1e-9)
     assert any("1 of 7 estimates have no truth" in note for note in record.notes)
     assert any(note.endswith("the truth stands in columns beside the estimates") for note in record.notes)
     other = write("truth.csv", data.true().iloc[:, :3], t=data.t, qx=0.0, qy=0.0, qz=0.0, qw=1.0)
-    np.testing.assert_allclose(cs.read(est, truth=other).error[0, :, :3], data.error[:, :3], atol=1e-9)  # type: ignore[index]
+    assert_allclose(cs.read(est, truth=other).error[0, :, :3], data.error[:, :3], atol=1e-9)
 
 
 @pytest.mark.parametrize("spelling", ["var_{}", "{}_var", "sd_{}", "{}_sd"])
-def test_variances_and_deviations_of_poses_in_space(spelling: str, inside: Path) -> None:
+def test_variances_and_deviations_of_poses_in_space(spelling, inside):
     data, words = Data(("x", "y", "z", "1", "2", "3")), ("x", "y", "z", "roll", "pitch", "yaw")
     stated = {spelling.format(word): np.full(STEPS, 4.0) for word in words}
     record = cs.read(write("est.csv", in_space(data, stated, "true_{}"), t=data.t), axes=words)
     variance = 4.0 if "var" in spelling else 16.0
-    np.testing.assert_allclose(np.asarray(record.covariance)[0, 3], variance * np.eye(6))
+    assert_allclose(np.asarray(record.covariance)[0, 3], variance * np.eye(6))
     assert record.parts == tuple((i,) for i in range(6))
-    other = {f"var_{word}": np.full(STEPS, 9.0) for word in words} | {
-        f"sd_{word}": np.full(STEPS, 2.0) for word in words
-    }
-    both = cs.read(
-        write("est.csv", in_space(data, other, "true_{}"), t=data.t), axes=words
-    )  # deviations count, as in the plane
-    np.testing.assert_allclose(np.asarray(both.covariance)[0, 3], 4.0 * np.eye(6))
+    other = {f"var_{word}": 9.0 for word in words} | {f"sd_{word}": np.full(STEPS, 2.0) for word in words}
+    both = cs.read(write("est.csv", in_space(data, other, "true_{}"), t=data.t), axes=words)  # as in the plane
+    assert_allclose(np.asarray(both.covariance)[0, 3], 4.0 * np.eye(6))
 
 
-def test_rows_without_a_truth_beside_them_do_not_count(inside: Path) -> None:
-    data, step = Data(("a", "b")), np.arange(1, STEPS + 1)
-    table = data.table(data.stated("P_{}_{}", data.axes)).join(data.true("true_{}")).assign(step=step)
+def test_rows_without_a_truth_beside_them_do_not_count(inside):
+    data = Data(("a", "b"))
+    table = data.table(data.stated("P_{}_{}", data.axes)).join(data.true("true_{}")).assign(step=data.step)
     table.loc[3, "true_b"] = np.nan
     two = pd.concat([table.assign(filter="one"), table.assign(filter="two", true_a=table["true_a"] + 1.0)])
-    one, two_ = read_recordings(write("est.csv", two), state=["a", "b"])
+    one, two_ = read_recordings(write("est.csv", two), state=data.state)
     expected = np.delete(data.error, 3, axis=0)
-    np.testing.assert_allclose(one.error[0], expected, atol=1e-9)  # type: ignore[index]
-    np.testing.assert_allclose(two_.error[0], expected + np.array([1.0, 0.0]), atol=1e-9)  # type: ignore[index]
-    other = write("truth.csv", data.true() + 2.0, step=step)  # a truth that is named counts
-    np.testing.assert_allclose(cs.read("est.csv", other, state=["a", "b"], filter="one").error[0], data.error + 2.0)
+    assert_allclose(one.error[0], expected, atol=1e-9)
+    assert_allclose(two_.error[0], expected + np.array([1.0, 0.0]), atol=1e-9)
+    other = write("truth.csv", data.true() + 2.0, step=data.step)  # a truth that is named counts
+    assert_allclose(cs.read("est.csv", other, state=data.state, filter="one").error[0], data.error + 2.0)
     with pytest.raises(cs.InputError, match=r"needs --truth FILE, .* or columns true_a, … beside the state"):
-        cs.read(write("est.csv", table.drop(columns="true_b")), state=["a", "b"])
+        cs.read(write("est.csv", table.drop(columns="true_b")), state=data.state)
 
 
-def test_motions_beside_their_truth_are_drives(inside: Path) -> None:
+def test_motions_beside_their_truth_are_drives(inside):
     from consistency.referee.fit_covariance.drives import read_drives
 
     data = Data(POSE)
     [drive] = read_drives(write("est.csv", data.table().join(data.true("true_{}")), t=data.t))
-    np.testing.assert_allclose(drive.truth[:, :2, 2], data.truth[:, :2])
-    np.testing.assert_allclose(drive.estimate[:, :2, 2], (data.truth - data.error)[:, :2])
+    assert_allclose(drive.truth[:, :2, 2], data.truth[:, :2])
+    assert_allclose(drive.estimate[:, :2, 2], (data.truth - data.error)[:, :2])
 
 
 # --- other kinds -------------------------------------------------------------------------------------
@@ -322,9 +304,7 @@ UNKNOWN = {
 
 
 @pytest.mark.parametrize("name", UNKNOWN)
-def test_an_unknown_kind_is_refused_with_the_way_in(
-    name: str, inside: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_kind_is_refused_with_the_way_in(name, inside, capsys):
     content, hint = UNKNOWN[name]
     Path(name).write_text(content)
     line = "numpy.savez('{}.npz', {})".format(Path(name).stem, "errors=truth - estimates, covariances=P")
@@ -340,14 +320,14 @@ def test_an_unknown_kind_is_refused_with_the_way_in(
         assert "nis=nis, nis_dof=dof" in refused(capsys, "monitor", name, "--innovations", "optimal")
 
 
-def test_a_truth_of_an_unknown_kind(inside: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_truth_of_an_unknown_kind(inside, capsys):
     np.savetxt("est.txt", np.column_stack([np.arange(3), np.zeros((3, 6)), np.ones(3)]))
     Path("truth.txt").write_text(UNKNOWN["gnss_log_1.txt"][0])
     said = refused(capsys, "analyse", "est.txt", "--truth", "truth.txt")
     assert re.search(r"truth\.txt: unknown kind of file; .*Android", said)
 
 
-def arrays(n: int = 2) -> dict[str, Array]:
+def arrays(n=2):
     rng = np.random.default_rng()
     root = rng.normal(size=(4, 5, n, n))
     P = root @ np.swapaxes(root, -1, -2) + np.eye(n)
@@ -356,46 +336,46 @@ def arrays(n: int = 2) -> dict[str, Array]:
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_files_of_matlab_are_archives(n: int, inside: Path) -> None:
+def test_files_of_matlab_are_archives(n, inside):
     given = arrays(n)
     flat = {key: each[..., 0] if n == 1 and key == "errors" else each for key, each in given.items()}
     flat["covariances"] = given["covariances"][..., 0, 0] if n == 1 else given["covariances"]  # as MATLAB has it
     names = np.array([f"axis {i}" for i in range(n)], object)
     savemat("est.mat", flat | {"axes": names, "lengths": np.array([5, 4, 5, 3])})
-    np.savez("est.npz", **given, axes=[*names], lengths=[5, 4, 5, 3])  # type: ignore[arg-type]
+    np.savez("est.npz", **given, axes=[*names], lengths=[5, 4, 5, 3])
     own, npz = cs.read("est.mat"), cs.read("est.npz")
     for key in ("error", "covariance", "nees", "nis", "nis_dof", "t"):
-        np.testing.assert_array_equal(getattr(own, key), getattr(npz, key))
+        assert_array_equal(getattr(own, key), getattr(npz, key))
     assert own.axes == npz.axes
     from consistency.referee.readers.formats.innovation_files import read_nis
 
-    np.testing.assert_array_equal(read_nis(Path("est.mat"), run=1).nis, read_nis(Path("est.npz"), run=1).nis)
+    assert_array_equal(read_nis(Path("est.mat"), run=1).nis, read_nis(Path("est.npz"), run=1).nis)
 
 
-def test_what_a_file_of_matlab_may_hold(inside: Path) -> None:
+def test_what_a_file_of_matlab_may_hold(inside):
     rng = np.random.default_rng()
     nees = rng.chisquare(3, (6, 4))
     savemat("nees.mat", {"nees": nees, "dof": 3.0, "mask": (nees > 100).astype("uint8")})
     record = cs.read("nees.mat")
-    np.testing.assert_array_equal(record.nees, nees)
+    assert_array_equal(record.nees, nees)
     assert record.dof == 3
     savemat("one.mat", {"errors": np.ones((6, 1)), "covariances": np.ones((6, 1))})  # six runs, or six steps?
     with pytest.raises(cs.InputError, match=r"'covariances' has shape \(6, 1\): one run of one component has \(1, st"):
         cs.read("one.mat")
     savemat("one.mat", {"errors": np.ones((1, 6)), "covariances": np.ones((1, 6))})
-    assert cs.read("one.mat").error.shape == (1, 6, 1)  # type: ignore[union-attr]
+    assert cs.read("one.mat").error.shape == (1, 6, 1)
     Path("new.mat").write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(600))
     with pytest.raises(cs.InputError, match=r"new\.mat: is of MATLAB 7\.3; write it with save\(\.\.\., '-v7'\)"):
         cs.read("new.mat")
 
 
-def lines(path: str, rows: list[Any]) -> Path:
+def lines(path, rows):
     Path(path).write_text("\n".join(map(json.dumps, rows)) + "\n")
     return Path(path)
 
 
 @pytest.mark.parametrize("suffix", [".jsonl", ".ndjson"])
-def test_json_lines_are_a_table(suffix: str, inside: Path) -> None:
+def test_json_lines_are_a_table(suffix, inside):
     data = Data(POSE)
     own = (data.truth - data.error).tolist()
     rows = [
@@ -412,7 +392,7 @@ def test_json_lines_are_a_table(suffix: str, inside: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    "text, said",
     [
         ('{"a": 1\n', r"line 1 is not valid JSON"),
         ('{"a": 1, "a": 2}\n', r"line 1 is not valid JSON \(key 'a' is given twice"),
@@ -423,7 +403,7 @@ def test_json_lines_are_a_table(suffix: str, inside: Path) -> None:
         ("# nothing\n", r"holds no row"),
     ],
 )
-def test_json_lines_that_are_refused(text: str, said: str, inside: Path) -> None:
+def test_json_lines_that_are_refused(text, said, inside):
     Path("est.jsonl").write_text(text)
     lines("truth.jsonl", [{"t": 0.0, "x": 0.0, "y": 0.0, "heading": 0.0}])
     with pytest.raises(cs.InputError, match=said):
@@ -433,19 +413,19 @@ def test_json_lines_that_are_refused(text: str, said: str, inside: Path) -> None
 # --- NEES of a state that grows ----------------------------------------------------------------------
 
 
-def test_nees_with_degrees_of_freedom_by_step(inside: Path) -> None:
+def test_nees_with_degrees_of_freedom_by_step(inside):
     """A right filter of 3 to 11 components is found at fault in 0.1 % of tests."""
     dof = 3 + 2 * np.minimum(np.arange(60) // 10, 4)
     nees = np.random.default_rng().chisquare(np.broadcast_to(dof, (50, 60)))
     verdict = assert_consistent(nees=nees, dof=dof)
     assert verdict.status == "consistent"
     assert verdict.scale is not None
-    np.testing.assert_allclose(verdict.scale.anees, 3.0 * (nees / dof).mean(axis=0))
+    assert_allclose(verdict.scale.anees, 3.0 * (nees / dof).mean(axis=0))
     for shape in ((50, 60), (60,)):
         np.savez("nees.npz", nees=nees, dof=np.broadcast_to(dof, shape))
         record = cs.read("nees.npz")
         assert record.dof == 3
-        np.testing.assert_allclose(record.nees, 3.0 * nees / dof)
+        assert_allclose(record.nees, 3.0 * nees / dof)
     assert any("its distribution is not judged" in text for text in cs.judge(record).reasons)
     with pytest.raises(AssertionError, match=r"overconfident: covariance too small by x1\.[45678]"):
         assert_consistent(nees=1.6 * nees, dof=dof)
@@ -459,7 +439,7 @@ def test_nees_with_degrees_of_freedom_by_step(inside: Path) -> None:
 # --- messages ----------------------------------------------------------------------------------------
 
 
-def test_times_in_messages_have_all_their_digits(inside: Path) -> None:
+def test_times_in_messages_have_all_their_digits(inside):
     pose = "0 0 0 0 0 0 1"
     Path("est.tum").write_text(f"1326030980.51 {pose}\n1326030980.53 {pose}\n1326030980.53 {pose}\n")
     with pytest.raises(cs.InputError, match=r"timestamp 1326030980\.53 is there twice"):
@@ -473,7 +453,7 @@ def test_times_in_messages_have_all_their_digits(inside: Path) -> None:
         cs.read(write("est.csv", table), truth=truth, state=["a"])
 
 
-def test_motions_of_stretches_of_other_lengths_are_no_broken_filters(inside: Path) -> None:
+def test_motions_of_stretches_of_other_lengths_are_no_broken_filters(inside):
     rng, sigma = np.random.default_rng(), 0.01
     for name, rows in (("long", 9), ("short", 5)):
         t = np.arange(float(rows))
@@ -486,14 +466,14 @@ def test_motions_of_stretches_of_other_lengths_are_no_broken_filters(inside: Pat
             Path(folder).mkdir(exist_ok=True)
             np.savetxt(f"{folder}/{name}.tum", values, fmt="%.17g")
     record = cs.read("est", truth="truth", relative=1, motions=True)
-    assert np.isfinite(record.error).all(axis=-1).sum() == 8 + 4  # type: ignore[arg-type]
+    assert np.isfinite(record.error).all(axis=-1).sum() == 8 + 4
     assert not any("broke down" in note for note in record.notes)
 
 
 # --- chains of frames --------------------------------------------------------------------------------
 
 
-def test_a_chain_of_frames_is_composed(tmp_path: Path) -> None:
+def test_a_chain_of_frames_is_composed(tmp_path):
     """map -> odom, at its own rate and off the stamps of odom -> base; base -> mast stands still; arm is apart."""
     pytest.importorskip("rosbags", reason="needs the extra 'ros'")
     from frames import write_frames
@@ -517,17 +497,17 @@ def test_a_chain_of_frames_is_composed(tmp_path: Path) -> None:
     total = turned * base * mast
     expected, total = expected[both], total[both]
     [record] = read_recordings(bag, truth_topic="map:mast")  # the estimates are at the origin
-    np.testing.assert_allclose(record.error[0, :, :3], expected, atol=1e-6)  # type: ignore[index]
-    np.testing.assert_allclose(Rotation.from_rotvec(record.error[0, :, 3:]).as_matrix(), total.as_matrix(), atol=1e-9)  # type: ignore[index]
+    assert_allclose(record.error[0, :, :3], expected, atol=1e-6)
+    assert_allclose(Rotation.from_rotvec(record.error[0, :, 3:]).as_matrix(), total.as_matrix(), atol=1e-9)
     [back] = read_recordings(bag, truth_topic="mast:map")
-    np.testing.assert_allclose(back.error[0, :, :3], -total.inv().apply(expected), atol=1e-6)  # type: ignore[index]
+    assert_allclose(back.error[0, :, :3], -total.inv().apply(expected), atol=1e-6)
     with pytest.raises(
         cs.InputError, match=r"map:arm: is no transform of /tf; .*base:mast, map:odom, odom:base, world"
     ):
         read_recordings(bag, truth_topic="map:arm")
 
 
-def test_zeros_are_no_covariance_of_the_truth(tmp_path: Path) -> None:
+def test_zeros_are_no_covariance_of_the_truth(tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra 'ros'")
     from frames import write_frames
 

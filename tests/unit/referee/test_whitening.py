@@ -4,20 +4,21 @@ from importlib import import_module
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 whitening = import_module("consistency.referee.diagnostics.records.whitening")
 n = 5
 
 
 @pytest.fixture
-def given(monkeypatch: pytest.MonkeyPatch) -> tuple[np.ndarray, np.ndarray]:
+def given(monkeypatch):
     rng = np.random.default_rng(3)
     monkeypatch.setattr(whitening, "NUMBERS", 4 * n * n)  # several blocks, of four matrices
     A = rng.normal(size=(3, 7, n, n))
     return rng.normal(size=(3, 7, n)), A @ np.swapaxes(A, -1, -2) + 0.1 * np.eye(n)
 
 
-def both(monkeypatch: pytest.MonkeyPatch, e: np.ndarray, P: object) -> tuple[np.ndarray, np.ndarray]:
+def both(monkeypatch, e, P):
     found = []
     for large in (n + 1, n):
         monkeypatch.setattr(whitening, "LARGE", large)
@@ -25,20 +26,18 @@ def both(monkeypatch: pytest.MonkeyPatch, e: np.ndarray, P: object) -> tuple[np.
     return found[0], found[1]
 
 
-def test_by_matrix_and_by_entry_agree(monkeypatch: pytest.MonkeyPatch, given: tuple[np.ndarray, np.ndarray]) -> None:
+def test_by_matrix_and_by_entry_agree(monkeypatch, given):
     e, P = given
     for matrices in (P, np.ascontiguousarray(P[0, 0])):
         by_entry, by_matrix = both(monkeypatch, e, matrices)
-        np.testing.assert_allclose(by_matrix, by_entry, rtol=1e-10, atol=1e-12)
+        assert_allclose(by_matrix, by_entry, rtol=1e-10, atol=1e-12)
     one_by_entry, one = both(monkeypatch, e[0, 0], P[0, 0])
     assert one.shape == (n,)
-    np.testing.assert_allclose(one, one_by_entry, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.cholesky(P[0, 0]) @ one, e[0, 0], rtol=1e-10, atol=1e-12)
+    assert_allclose(one, one_by_entry, rtol=1e-10, atol=1e-12)
+    assert_allclose(np.linalg.cholesky(P[0, 0]) @ one, e[0, 0], rtol=1e-10, atol=1e-12)
 
 
-def test_missing_and_indefinite_matrices_are_nan_and_no_others(
-    monkeypatch: pytest.MonkeyPatch, given: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_missing_and_indefinite_matrices_are_nan_and_no_others(monkeypatch, given):
     e, P = (np.array(part) for part in given)
     e[0, 1, 2], P[0, 3, 1, 1], P[1, 2, 0, 0], P[2, 6] = np.nan, np.nan, -1.0, 0.0
     bad = np.zeros((3, 7), bool)
@@ -47,5 +46,5 @@ def test_missing_and_indefinite_matrices_are_nan_and_no_others(
     by_entry, by_matrix = both(monkeypatch, e, P)
     assert (np.isnan(by_matrix).all(axis=-1) == bad).all()
     assert np.isfinite(by_matrix[~bad]).all()
-    np.testing.assert_allclose(by_matrix, by_entry, rtol=1e-10, atol=1e-12)
-    np.testing.assert_array_equal(e, kept)
+    assert_allclose(by_matrix, by_entry, rtol=1e-10, atol=1e-12)
+    assert_array_equal(e, kept)

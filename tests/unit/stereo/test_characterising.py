@@ -3,8 +3,6 @@
 Random tests have levels of 1e-7 an interval, so that one of them fails by chance in less than one of a million runs.
 """
 
-from __future__ import annotations
-
 import characterisation as benchmark
 import numpy as np
 import pytest
@@ -15,21 +13,18 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.node_tables import BiasMap, bilinear, hats
 from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias_map import estimate_bias, grid_of, shrunken
-from consistency.stereo.characterising.characterise import Characterisation, characterise
+from consistency.stereo.characterising.characterise import characterise
 from consistency.stereo.characterising.coordinate_fit import Levels, moving_over_rest, rate, tails
-from consistency.stereo.characterising.likelihood import LikelihoodFit, Parameters, Rows, fit, regress
+from consistency.stereo.characterising.likelihood import Parameters, Rows, fit, regress
 from consistency.stereo.characterising.log_residuals import Residuals, octaves, residuals_of, select
 
 LEVEL = 1e-7
 SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=150.0, B=0.09, disparity=(1.0, 32.0), image=(320, 240))
 
 
-def rows_of(
-    rng: np.random.Generator, tracks: int, length: int, sigma: float = 1.0, rho: float = 0.0, tau: float = 0.0
-) -> Rows:
+def rows_of(rng, tracks, length, sigma=1.0, rho=0.0, tau=0.0):
     """Residuals of tracks without gaps, about a mean of 0.3."""
     e = rng.standard_normal((tracks, length))
     for k in range(1, length):
@@ -42,7 +37,7 @@ def rows_of(
     return Rows(r, ones, ones, first, gap, np.zeros(1))
 
 
-def data_of(rng: np.random.Generator, n: int, sigma: tuple[float, float, float], track: int = 20) -> Residuals:
+def data_of(rng, n, sigma, track=20):
     """White noise all over an image, at disparities from 1 to 31 px."""
     ideal = rng.uniform((-160, -120, 1), (160, 120, 31), (n, 3))
     r = rng.standard_normal((n, 3)) * sigma
@@ -52,7 +47,7 @@ def data_of(rng: np.random.Generator, n: int, sigma: tuple[float, float, float],
 # --- functions of place ------------------------------------------------------------------------------
 
 
-def test_weights_of_nodes_interpolate_as_a_bias_map_does(rng: np.random.Generator) -> None:
+def test_weights_of_nodes_interpolate_as_a_bias_map_does(rng):
     u, v = np.array([-160.0, -20.0, 60.0, 160.0]), np.array([-120.0, 30.0, 120.0])
     matrix = rng.standard_normal((3, 4))
     at = rng.uniform(-200, 200, (50, 2))
@@ -61,7 +56,7 @@ def test_weights_of_nodes_interpolate_as_a_bias_map_does(rng: np.random.Generato
     assert np.allclose(hats(at[:, 0], u) @ u, np.clip(at[:, 0], -160, 160))
 
 
-def test_nodes_of_disparity_are_octaves_between_the_ends_of_the_data() -> None:
+def test_nodes_of_disparity_are_octaves_between_the_ends_of_the_data():
     nodes = octaves(np.linspace(3.0, 27.0, 10_001))
     assert np.allclose(nodes, [3.12, 4.0, 8.0, 16.0, 26.88])
     assert len(octaves(np.full(50, 7.0))) == 1
@@ -74,7 +69,7 @@ def test_nodes_of_disparity_are_octaves_between_the_ends_of_the_data() -> None:
 # --- likelihood --------------------------------------------------------------------------------------
 
 
-def dense(rows: Rows, a: Array, rho: float, q: float) -> tuple[Array, float]:
+def dense(rows, a, rho, q):
     """Coefficients and restricted likelihood from the whole covariance matrix."""
     sd = rows.G @ a
     place, track = np.cumsum(rows.gap), rows.track
@@ -89,8 +84,8 @@ def dense(rows: Rows, a: Array, rho: float, q: float) -> tuple[Array, float]:
     return beta, float(-0.5 * (logs + e @ W @ e + rows.ridge @ beta**2))
 
 
-@pytest.mark.parametrize(("rho", "q"), [(0.0, 0.0), (0.6, 0.0), (-0.3, 0.8), (0.4, -0.02)])
-def test_the_restricted_likelihood_is_that_of_dense_matrices(rng: np.random.Generator, rho: float, q: float) -> None:
+@pytest.mark.parametrize("rho, q", [(0.0, 0.0), (0.6, 0.0), (-0.3, 0.8), (0.4, -0.02)])
+def test_the_restricted_likelihood_is_that_of_dense_matrices(rng, rho, q):
     first = np.array([0, 5, 6, 14])
     gap = rng.integers(1, 4, 20).astype(float)
     gap[first] = 0.0
@@ -104,13 +99,13 @@ def test_the_restricted_likelihood_is_that_of_dense_matrices(rng: np.random.Gene
     assert np.isclose(found.value, value, rtol=1e-10)
 
 
-def test_impossible_parameters_have_no_likelihood(rng: np.random.Generator) -> None:
+def test_impossible_parameters_have_no_likelihood(rng):
     rows = rows_of(rng, 4, 10)
     assert regress(rows, Parameters(np.ones(1), 0.0, -0.2)) is None
     assert regress(rows, Parameters(np.ones(1), 0.999, 0.0)) is None
 
 
-def test_without_memory_the_variance_is_that_of_a_sample(rng: np.random.Generator) -> None:
+def test_without_memory_the_variance_is_that_of_a_sample(rng):
     rows = rows_of(rng, 10, 3, sigma=2.0)
     found = fit(rows, 1.0, memory=False)
     assert np.isclose(found.parameters.a[0], rows.r.std(ddof=1), rtol=1e-5)
@@ -119,10 +114,8 @@ def test_without_memory_the_variance_is_that_of_a_sample(rng: np.random.Generato
     assert np.isclose(found.regression.cov[0, 0], rows.r.var(ddof=1) / 30, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("tracks", "length", "memory"), [(12, 9, True), (2, 30, False), (1, 30, False)])
-def test_the_scatter_of_tracks_is_that_of_their_scores(
-    rng: np.random.Generator, tracks: int, length: int, memory: bool
-) -> None:
+@pytest.mark.parametrize("tracks, length, memory", [(12, 9, True), (2, 30, False), (1, 30, False)])
+def test_the_scatter_of_tracks_is_that_of_their_scores(rng, tracks, length, memory):
     """H^-1 J H^-1 with J from the slopes of each track's dense likelihood, about their mean; 0 of a single track."""
     rows = rows_of(rng, tracks, length, 1.5, 0.4 if memory else 0.0, 1.0 if memory else 0.0)
     found = fit(rows, 1.0, memory)
@@ -130,7 +123,7 @@ def test_the_scatter_of_tracks_is_that_of_their_scores(
     lag = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
     residuals = (rows.r - rows.X @ found.regression.beta).reshape(tracks, length)
 
-    def by_track(theta: Array) -> Array:
+    def by_track(theta):
         p = Parameters.of(theta, max(rows.length, 1.0))
         V = p.a[0] ** 2 * (p.rho**lag + p.ratio)
         return np.asarray(stats.multivariate_normal(cov=V).logpdf(residuals)).reshape(tracks)
@@ -144,7 +137,7 @@ def test_the_scatter_of_tracks_is_that_of_their_scores(
     assert scale > 1e-6 or tracks == 1
 
 
-def test_a_fit_is_the_top_of_the_likelihood(rng: np.random.Generator) -> None:
+def test_a_fit_is_the_top_of_the_likelihood(rng):
     rows = rows_of(rng, 60, 8, 1.5, 0.5, 1.0)
     found = fit(rows, 1.0)
     for k in range(3):
@@ -154,7 +147,7 @@ def test_a_fit_is_the_top_of_the_likelihood(rng: np.random.Generator) -> None:
             assert other.value < found.regression.value
 
 
-def test_noise_memory_and_offsets_are_told_apart(rng: np.random.Generator) -> None:
+def test_noise_memory_and_offsets_are_told_apart(rng):
     found = fit(rows_of(rng, 400, 25, 1.5, 0.5, 0.9), 1.0)
     assert coordinate_fit.noise_interval(found, LEVEL).holds(1.5)
     assert coordinate_fit.correlation(found, LEVEL).holds(0.5)
@@ -167,7 +160,7 @@ def test_noise_memory_and_offsets_are_told_apart(rng: np.random.Generator) -> No
     assert lags[0] > lags[1] > lags[3]
 
 
-def test_white_noise_without_offsets_is_found_as_such(rng: np.random.Generator) -> None:
+def test_white_noise_without_offsets_is_found_as_such(rng):
     found = fit(rows_of(rng, 300, 20), 1.0)
     assert coordinate_fit.correlation(found, LEVEL).holds(0.0)
     share = coordinate_fit.offset_share(found, LEVEL)
@@ -175,7 +168,7 @@ def test_white_noise_without_offsets_is_found_as_such(rng: np.random.Generator) 
     assert share.high < 0.1
 
 
-def test_intervals_of_heavy_tailed_noise_are_wider(rng: np.random.Generator) -> None:
+def test_intervals_of_heavy_tailed_noise_are_wider(rng):
     """Kurtosis k multiplies the variance of s^2 by 1 + k / 2: for Student's with 6 degrees of freedom, by 2.5."""
     rows = rows_of(rng, 1000, 10)
     heavy = Rows(stats.t.rvs(6, size=10_000, random_state=rng), *list(vars(rows).values())[1:])
@@ -190,13 +183,13 @@ def test_intervals_of_heavy_tailed_noise_are_wider(rng: np.random.Generator) -> 
 # --- levels, tails, rates ----------------------------------------------------------------------------
 
 
-def test_the_chances_of_all_intervals_add_up_to_the_rate() -> None:
+def test_the_chances_of_all_intervals_add_up_to_the_rate():
     levels = Levels(0.01, growth=5, bias=42)
     groups = ("sigma", "growth", "bias", "correlation", "offset", "tails")
     assert np.isclose(sum(levels.of(group) * getattr(levels, group) for group in groups), 0.01)
 
 
-def test_tails_are_those_of_student(rng: np.random.Generator) -> None:
+def test_tails_are_those_of_student(rng):
     heavy = tails(stats.t.rvs(5, size=6000, random_state=rng), LEVEL)
     assert heavy.weight.holds(0.2)
     assert heavy.weight.low > 0.05
@@ -206,7 +199,7 @@ def test_tails_are_those_of_student(rng: np.random.Generator) -> None:
     assert light.weight.value < 0.03
 
 
-def test_few_wide_errors_are_told_from_students_tails(rng: np.random.Generator) -> None:
+def test_few_wide_errors_are_told_from_students_tails(rng):
     wide = rng.random(8000) < 0.03
     found = tails(rng.standard_normal(8000) * np.where(wide, 5.0, 1.0), LEVEL)
     assert 0.02 < found.mixture.share < 0.04
@@ -217,14 +210,14 @@ def test_few_wide_errors_are_told_from_students_tails(rng: np.random.Generator) 
     assert tails(stats.t.rvs(4, size=8000, random_state=rng), LEVEL).mixture is None
 
 
-def test_a_rate_has_the_interval_of_clopper_and_pearson() -> None:
+def test_a_rate_has_the_interval_of_clopper_and_pearson():
     share = rate(3, 200, 0.01)
     assert np.isclose(share.low, stats.beta.ppf(0.005, 3, 198))
     assert np.isclose(share.high, stats.beta.ppf(0.995, 4, 197))
     assert rate(0, 200, 0.01).low == 0.0
 
 
-def test_noise_that_doubles_while_moving_has_a_ratio_of_two(rng: np.random.Generator) -> None:
+def test_noise_that_doubles_while_moving_has_a_ratio_of_two(rng):
     moving = np.arange(6000) < 3000
     w = rng.standard_normal((6000, 3)) * np.where(moving, 2.0, 1.0)[:, None]
     found = moving_over_rest(w, np.ones((6000, 3)), moving, np.arange(6000) // 20, LEVEL)
@@ -238,7 +231,7 @@ def test_noise_that_doubles_while_moving_has_a_ratio_of_two(rng: np.random.Gener
 # --- residuals and their selection -------------------------------------------------------------------
 
 
-def test_residuals_are_the_noise_alone(uvd: cs.Scenario, tilted: dict[str, list[float]]) -> None:
+def test_residuals_are_the_noise_alone(uvd, tilted):
     changes = {"truth__sensor__mount": tilted, "truth__sensor__sigma": (1e-7, 1e-7, 1e-7)}
     trial = simulate(uvd.variant("tilted", **changes))
     sensor = PicturedSensor.model_validate(SENSOR.model_dump() | {"mount": tilted})
@@ -250,7 +243,7 @@ def test_residuals_are_the_noise_alone(uvd: cs.Scenario, tilted: dict[str, list[
     assert (np.diff(data.step)[np.diff(data.track) == 0] > 0).all()
 
 
-def test_near_the_search_range_rows_are_left_out_by_their_ideal_value(rng: np.random.Generator) -> None:
+def test_near_the_search_range_rows_are_left_out_by_their_ideal_value(rng):
     data = data_of(rng, 60_000, (1.0, 1.0, 0.65))
     measured = data.ideal[:, 2] + data.r[:, 2]
     seen = data.keep((measured >= 1.0) & (measured <= 32.0))
@@ -268,7 +261,7 @@ def test_near_the_search_range_rows_are_left_out_by_their_ideal_value(rng: np.ra
     assert 3.0 < 160 - np.abs(u).max() < 5.0
 
 
-def test_mismatches_are_counted_and_are_no_noise(rng: np.random.Generator) -> None:
+def test_mismatches_are_counted_and_are_no_noise(rng):
     data = data_of(rng, 6_000, (1.0, 1.0, 0.65))
     wrong = rng.random(len(data)) < 0.02
     r = data.r + np.where(wrong[:, None], [0.0, 0.0, 25.0], 0.0)
@@ -281,14 +274,14 @@ def test_mismatches_are_counted_and_are_no_noise(rng: np.random.Generator) -> No
 # --- bias --------------------------------------------------------------------------------------------
 
 
-def test_shrinkage_is_that_of_empirical_bayes() -> None:
+def test_shrinkage_is_that_of_empirical_bayes():
     b = np.array([1.0, -2.0, 0.5, 1.5])
     w2 = np.mean(b**2) - 0.25  # largest likelihood where all have the variance 0.25
     assert np.allclose(shrunken(b, 0.25 * np.eye(4)), b * w2 / (w2 + 0.25), rtol=1e-3)
     assert np.abs(shrunken(0.01 * b, np.eye(4))).max() < 1e-4
 
 
-def test_a_bias_is_shown_where_there_is_one_and_zero_where_nothing_is_known(rng: np.random.Generator) -> None:
+def test_a_bias_is_shown_where_there_is_one_and_zero_where_nothing_is_known(rng):
     data = data_of(rng, 6000, (1.0, 1.0, 0.6))
     data = data.keep(~((data.ideal[:, 0] > 90.0) & (data.ideal[:, 1] > 50.0)))
     r = data.r.copy()
@@ -306,20 +299,20 @@ def test_a_bias_is_shown_where_there_is_one_and_zero_where_nothing_is_known(rng:
     assert np.sqrt(np.mean((of.bias.believed[2] - 0.01 * u)[known] ** 2)) < 0.15
 
 
-def test_the_test_for_a_bias_pays_for_offsets_of_tracks(rng: np.random.Generator) -> None:
+def test_the_test_for_a_bias_pays_for_offsets_of_tracks(rng):
     """Tracks with offsets scatter about zero without any bias; as if rows were independent, it would be found."""
     rows = rows_of(rng, 40, 50, 0.5, 0.0, 1.0)
     zero = Rows(rows.r - rows.r.mean(), *list(vars(rows).values())[1:])
     ideal = np.zeros((2000, 3))
     grid = grid_of(Residuals(ideal, ideal, rows.track, np.arange(2000), np.ones(2000, bool)), *[np.zeros(1)] * 2)
-    found: list[LikelihoodFit] = [fit(zero, 1.0)] * 3
+    found = [fit(zero, 1.0)] * 3
     bias = estimate_bias(found, grid, LEVEL, LEVEL)
     assert not bias.shown.any()
     # 1 / sqrt(40) from the offsets, not 1 / sqrt(2000)
     assert np.isclose(bias.half[0, 0], stats.norm.isf(LEVEL / 2) / np.sqrt(40), rtol=0.6)
 
 
-def test_a_bias_scatters_as_tracks_do_where_offsets_are_not_modelled(rng: np.random.Generator) -> None:
+def test_a_bias_scatters_as_tracks_do_where_offsets_are_not_modelled(rng):
     """40 tracks of 50 rows with offsets: 1 / 40 of their variance, 40 times what independent rows would have."""
     rows = rows_of(rng, 40, 50, 0.5, 0.0, 1.0)
     found = fit(rows, 1.0, memory=False)
@@ -331,7 +324,7 @@ def test_a_bias_scatters_as_tracks_do_where_offsets_are_not_modelled(rng: np.ran
 # --- all of it ---------------------------------------------------------------------------------------
 
 
-def test_what_is_simulated_is_recovered_in_all_parameters_together() -> None:
+def test_what_is_simulated_is_recovered_in_all_parameters_together():
     """Growth, bias map and noise of three runs at once; it fails by chance once in a million at most."""
     scenario, truth = cs.load_scenario(benchmark.SCENARIO), benchmark.real()
     world = cs_world(scenario)
@@ -344,16 +337,16 @@ def test_what_is_simulated_is_recovered_in_all_parameters_together() -> None:
     assert benchmark.bias_rms(of, truth)[2] < 0.1
 
 
-def cs_world(scenario: cs.Scenario) -> benchmark.World:
+def cs_world(scenario):
     return benchmark.World(scenario.variant("everything", truth__sensor__disparity=benchmark.EVERYTHING).truth)
 
 
-def test_too_few_data_are_refused(rng: np.random.Generator) -> None:
+def test_too_few_data_are_refused(rng):
     with pytest.raises(InputError, match="at least 100 of 5"):
         characterise(data_of(rng, 60, (1.0, 1.0, 1.0)), SENSOR, "here")
 
 
-def test_a_characterisation_says_what_it_left_out(rng: np.random.Generator) -> None:
-    of: Characterisation = characterise(data_of(rng, 3000, (1.0, 1.0, 0.5)), SENSOR, "here", strange=7)
+def test_a_characterisation_says_what_it_left_out(rng):
+    of = characterise(data_of(rng, 3000, (1.0, 1.0, 0.5)), SENSOR, "here", strange=7)
     assert of.left_out["of no landmark"] == 7
     assert of.rows + sum(of.left_out.values()) == 3007

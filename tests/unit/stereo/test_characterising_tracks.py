@@ -3,22 +3,15 @@
 Random tests have levels of 1e-7 an interval, so that one of them fails by chance in less than one of a million runs.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-import consistency as cs
 from consistency.bench.models import stereo
 from consistency.bench.scenario import Mount, PicturedSensor
 from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
 from consistency.stereo.characterising.boards import (
     Calibrated,
     Corners,
@@ -36,9 +29,7 @@ SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=F, B=B)
 LEVEL = 1e-7
 
 
-def seen_of(
-    rng: np.random.Generator, tracks: int, length: int, rho: float = 0.0, sigma: Array = SIGMA, still: bool = False
-) -> Seen:
+def seen_of(rng, tracks, length, rho=0.0, sigma=SIGMA, still=False):
     """A sensor that moves towards points 4 to 8 m ahead."""
     points = rng.uniform((4, -1.5, -1), (8, 1.5, 1), (tracks, 3))
     k = np.tile(np.arange(length), tracks)
@@ -56,17 +47,17 @@ def seen_of(
     return Seen(values, R, t, track, k, np.full(len(k), not still))
 
 
-def parts(seen: Seen) -> Array:
+def parts(seen):
     return np.tile(np.arange(3), (len(seen.z), 1))
 
 
-def test_residuals_and_leverages_are_those_of_dense_least_squares(rng: np.random.Generator) -> None:
+def test_residuals_and_leverages_are_those_of_dense_least_squares(rng):
     seen = seen_of(rng, 3, 5)
     fitted = fit_points(seen, F, B, parts(seen), np.ones(3))
     own = np.flatnonzero(seen.track == 1)
     s = np.tile(fitted.sigma, 5)
 
-    def predicted(point: Array) -> Array:
+    def predicted(point):
         local = np.einsum("nji,nj->in", seen.R[own], point - seen.t[own])
         return np.stack(stereo.project(*local, F, B), axis=-1).ravel()
 
@@ -85,7 +76,7 @@ def test_residuals_and_leverages_are_those_of_dense_least_squares(rng: np.random
     assert np.allclose(fitted.neighbours[own][1:], expected, atol=1e-5)
 
 
-def test_each_point_costs_three_degrees_of_freedom(rng: np.random.Generator) -> None:
+def test_each_point_costs_three_degrees_of_freedom(rng):
     seen = seen_of(rng, 40, 6)
     fitted = fit_points(seen, F, B, parts(seen), np.ones(3))
     assert np.isclose(fitted.free.sum(), 40 * (18 - 3))
@@ -94,7 +85,7 @@ def test_each_point_costs_three_degrees_of_freedom(rng: np.random.Generator) -> 
 
 
 @pytest.mark.parametrize("length", [3, 12])
-def test_the_noise_is_recovered_however_short_the_tracks(rng: np.random.Generator, length: int) -> None:
+def test_the_noise_is_recovered_however_short_the_tracks(rng, length):
     """Without the degrees of freedom of the points, tracks of three would seem to have 0.8 of their noise."""
     seen = seen_of(rng, 6000 // length, length)
     fitted = fit_points(seen, F, B, parts(seen), np.ones(3))
@@ -105,7 +96,7 @@ def test_the_noise_is_recovered_however_short_the_tracks(rng: np.random.Generato
         assert estimate.high / estimate.low < 1.35
 
 
-def test_tracks_of_unlike_noise_make_the_interval_wider(rng: np.random.Generator) -> None:
+def test_tracks_of_unlike_noise_make_the_interval_wider(rng):
     """Half of the tracks have three times the noise: squares scatter by tracks, as chi-square does not know."""
     seen = seen_of(rng, 200, 12)
     ideal = fit_points(seen, F, B, parts(seen), np.ones(3)).ideal
@@ -121,7 +112,7 @@ def test_tracks_of_unlike_noise_make_the_interval_wider(rng: np.random.Generator
     assert width[1] > 1.5 * width[0]
 
 
-def test_correlation_is_found_and_not_that_of_the_fit(rng: np.random.Generator) -> None:
+def test_correlation_is_found_and_not_that_of_the_fit(rng):
     white = seen_of(rng, 800, 5)
     fitted = fit_points(white, F, B, parts(white), np.ones(3))
     for k in range(3):
@@ -134,7 +125,7 @@ def test_correlation_is_found_and_not_that_of_the_fit(rng: np.random.Generator) 
     assert 0.3 < interval.low < interval.value < 0.65
 
 
-def test_a_track_with_a_mismatch_is_left_out_as_a_whole(rng: np.random.Generator) -> None:
+def test_a_track_with_a_mismatch_is_left_out_as_a_whole(rng):
     seen = seen_of(rng, 100, 8)
     z = seen.z.copy()
     z[8 * 7 + 3, 2] += 9.0
@@ -144,7 +135,7 @@ def test_a_track_with_a_mismatch_is_left_out_as_a_whole(rng: np.random.Generator
     assert set(seen.track[~good]) == {7}
 
 
-def test_at_rest_the_point_is_the_mean_of_its_track(rng: np.random.Generator) -> None:
+def test_at_rest_the_point_is_the_mean_of_its_track(rng):
     seen = seen_of(rng, 50, 6, still=True)
     fitted = fit_points(seen, F, B, parts(seen), np.ones(3))
     means = seen.z.reshape(50, 6, 3).mean(axis=1)
@@ -152,7 +143,7 @@ def test_at_rest_the_point_is_the_mean_of_its_track(rng: np.random.Generator) ->
     assert np.allclose(fitted.free, 5 / 6)
 
 
-def test_growth_and_sigma_of_tracks_in_one_characterisation(rng: np.random.Generator) -> None:
+def test_growth_and_sigma_of_tracks_in_one_characterisation(rng):
     of = characterise_posed(seen_of(rng, 500, 10), SENSOR, "here")
     assert of.bias is None
     assert [c.name for c in of.coordinates] == ["u", "v", "d"]
@@ -163,7 +154,7 @@ def test_growth_and_sigma_of_tracks_in_one_characterisation(rng: np.random.Gener
     assert any("cannot be told" in note for note in of.notes)
 
 
-def test_what_a_step_shares_is_named(rng: np.random.Generator) -> None:
+def test_what_a_step_shares_is_named(rng):
     seen = seen_of(rng, 400, 10)
     shake = rng.standard_normal((10, 3)) * [0.0, 1.0, 0.0]
     shaken = Seen(seen.z + shake[seen.step], *list(vars(seen).values())[1:])
@@ -174,7 +165,7 @@ def test_what_a_step_shares_is_named(rng: np.random.Generator) -> None:
     assert not still or float(still[0].split("v ")[1].split(",")[0]) < 0.1
 
 
-def test_errors_of_poses_are_no_noise_where_poses_are_free(rng: np.random.Generator) -> None:
+def test_errors_of_poses_are_no_noise_where_poses_are_free(rng):
     seen = seen_of(rng, 400, 8)
     shake = 0.002 * rng.standard_normal((8, 6))
     R = seen.R @ Rotation.from_rotvec(shake[seen.step, :3]).as_matrix()
@@ -186,11 +177,11 @@ def test_errors_of_poses_are_no_noise_where_poses_are_free(rng: np.random.Genera
     assert np.isclose(free.free.sum(), 400 * (24 - 3) - 6 * 7, rtol=1e-3)
 
 
-def test_points_and_poses_together_are_where_least_squares_has_them(rng: np.random.Generator) -> None:
+def test_points_and_poses_together_are_where_least_squares_has_them(rng):
     seen = seen_of(rng, 12, 4)
     fitted = fit_points(seen, F, B, parts(seen), np.ones(3), free_poses=True)
 
-    def misfit(x: Array) -> Array:
+    def misfit(x):
         poses, points = x[:24].reshape(4, 6)[seen.step], x[24:].reshape(12, 3)[seen.track]
         turn = seen.R @ Rotation.from_rotvec(poses[:, 3:]).as_matrix()
         local = np.einsum("nji,nj->in", turn, points - seen.t - poses[:, :3])
@@ -204,12 +195,12 @@ def test_points_and_poses_together_are_where_least_squares_has_them(rng: np.rand
     assert np.allclose(fitted.free.ravel(), 1.0 - np.diag(hat), atol=1e-3)
 
 
-def test_short_tracks_are_refused(rng: np.random.Generator) -> None:
+def test_short_tracks_are_refused(rng):
     with pytest.raises(InputError, match="of tracks with 3 or more"):
         characterise_posed(seen_of(rng, 300, 2), SENSOR, "here")
 
 
-def test_a_log_is_seen_from_the_mount_of_its_sensor(uvd: cs.Scenario, tilted: dict[str, Any]) -> None:
+def test_a_log_is_seen_from_the_mount_of_its_sensor(uvd, tilted):
     changes = {"truth__sensor__mount": tilted, "truth__sensor__sigma": (1e-7, 1e-7, 1e-7)}
     trial = simulate(uvd.variant("tilted", **changes))
     seen = seen_of_log([trial, trial], Mount(**tilted))
@@ -223,12 +214,12 @@ def test_a_log_is_seen_from_the_mount_of_its_sensor(uvd: cs.Scenario, tilted: di
 # --- boards ------------------------------------------------------------------------------------------
 
 
-def board() -> Array:
+def board():
     across, down = np.meshgrid(np.arange(9), np.arange(6))
     return 0.03 * np.column_stack([across.ravel(), down.ravel(), np.zeros(54)])
 
 
-def boards(rng: np.random.Generator, n: int) -> list[Array]:
+def boards(rng, n):
     """Corners (54, 3) of boards about 0.7 m ahead, in sensor axes (forward, left, up), m."""
     out = []
     for _ in range(n):
@@ -238,7 +229,7 @@ def boards(rng: np.random.Generator, n: int) -> list[Array]:
     return out
 
 
-def test_the_noise_of_corners_is_that_about_their_plane(rng: np.random.Generator) -> None:
+def test_the_noise_of_corners_is_that_about_their_plane(rng):
     """Boards of nine corners: a pose takes 6 of 27 degrees of freedom, more than chance explains."""
     nine = np.isin(board()[:, 0], [0.0, 0.12, 0.24]) & np.isin(board()[:, 1], [0.0, 0.06, 0.15])
     ideal = np.stack([np.stack(stereo.project(*points[nine].T, F, B), axis=-1) for points in boards(rng, 120)])
@@ -250,7 +241,7 @@ def test_the_noise_of_corners_is_that_about_their_plane(rng: np.random.Generator
     assert np.allclose(data.ideal[:, 2], ideal[..., 2].ravel(), atol=2.0)
 
 
-def test_pairs_without_the_board_are_named_and_the_others_used(tmp_path: Path) -> None:
+def test_pairs_without_the_board_are_named_and_the_others_used(tmp_path):
     cv2 = pytest.importorskip("cv2")
     squares = np.kron(np.indices((7, 10)).sum(axis=0) % 2, np.ones((20, 20))) * 200 + 30
     for side, shift in (("left", 30), ("right", 10)):
@@ -267,14 +258,14 @@ def test_pairs_without_the_board_are_named_and_the_others_used(tmp_path: Path) -
     assert np.allclose(corners.left[1] - corners.left[0], [5.0, 0.0], atol=0.3)
 
 
-def pixels(points: Array, f: float, k1: float, centre: tuple[float, float]) -> Array:
+def pixels(points, f, k1, centre):
     """Column and row of points in sensor axes, with radial distortion."""
     x, y = -points[:, 1] / points[:, 0], -points[:, 2] / points[:, 0]
     bent = 1.0 + k1 * (x**2 + y**2)
     return np.column_stack([f * bent * x, f * bent * y]) + centre
 
 
-def test_a_calibration_without_distortion_model_leaves_a_bias(rng: np.random.Generator) -> None:
+def test_a_calibration_without_distortion_model_leaves_a_bias(rng):
     pytest.importorskip("cv2")
     sights = boards(rng, 20)
     right = [points - [0.0, -B, 0.0] for points in sights]

@@ -1,12 +1,11 @@
 """Landmarks that leave the motion that most share, for every sensor, and what becomes of their numbers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
 from consistency.bench.models import planar, point, stereo
@@ -14,7 +13,6 @@ from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, M
 from consistency.bench.store.log import Log
 from consistency.bench.types import Trial
 from consistency.referee.pages.origin import facts
-from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import common_motion
 from consistency.stereo.visual_odometry.common_motion import screened, screened_log, screening_line
 
@@ -30,7 +28,7 @@ SENSORS = {
 }
 
 
-def seen_by(sensor: BelievedSensor, pose: Array, places: Array) -> Array:
+def seen_by(sensor, pose, places):
     """What a sensor of a robot at ``pose`` measures of points (n, 3), without noise."""
     x, y, z = point.to_sensor(*point.to_robot(*pose, *places.T), sensor.mount.packed())
     if sensor.model == "uvd":
@@ -40,7 +38,7 @@ def seen_by(sensor: BelievedSensor, pose: Array, places: Array) -> Array:
     return np.column_stack([x, y, z])[:, : sensor.size]
 
 
-def drive(sensor: BelievedSensor, rng: np.random.Generator, landmarks: bool = False) -> Trial:
+def drive(sensor, rng, landmarks=False):
     """A turning robot; landmark 0 is a car that goes its own way from step 6 on, 1 slips to another point in step 9."""
     places = np.column_stack([rng.uniform(6, 14, COUNT), rng.uniform(-4, 4, COUNT), rng.uniform(-1, 1, COUNT)])
     places[:, 2] *= not sensor.planar
@@ -59,19 +57,19 @@ def drive(sensor: BelievedSensor, rng: np.random.Generator, landmarks: bool = Fa
     )  # fmt: skip
 
 
-def gate_of(sensor: BelievedSensor) -> Array:
+def gate_of(sensor):
     """Seven standard deviations of a difference of two observations: a right one is beyond by chance in 1e-11."""
     return 7.0 * np.sqrt(2.0) * np.array(sensor.sigma)
 
 
-def pieces(trial: Trial) -> list[list[int]]:
+def pieces(trial):
     """Steps of each id, in order of the ids."""
     step = trial.step
     return [step[trial.landmark == i].tolist() for i in range(trial.n_landmarks)]
 
 
 @pytest.mark.parametrize("model", SENSORS)
-def test_a_car_and_a_slip_begin_anew_and_nothing_else(model: str) -> None:
+def test_a_car_and_a_slip_begin_anew_and_nothing_else(model):
     sensor = SENSORS[model]
     trial = drive(sensor, np.random.default_rng(71))
     found = screened([trial], Belief(motion=MOTION, sensor=sensor), gate_of(sensor))
@@ -82,12 +80,12 @@ def test_a_car_and_a_slip_begin_anew_and_nothing_else(model: str) -> None:
     assert all(each == [*range(1, STEPS + 1)] for each in steps[2:COUNT])
     assert sorted(steps[COUNT:]) == sorted([*([k] for k in range(6, STEPS + 1)), [9, 10, 11, 12]])
     assert (found.offered, found.judged, found.broken) == (COUNT * STEPS, COUNT * (STEPS - 1), 8)
-    np.testing.assert_array_equal(after.z, trial.z)
+    assert_array_equal(after.z, trial.z)
     # of an estimate by the median of 154 misfits or more a seventh is 5 standard errors
-    np.testing.assert_allclose(found.scale, np.sqrt(2.0) * np.array(sensor.sigma), rtol=0.3)
+    assert_allclose(found.scale, np.sqrt(2.0) * np.array(sensor.sigma), rtol=0.3)
 
 
-def test_odometry_that_says_another_turn_is_not_believed_more_than_the_landmarks() -> None:
+def test_odometry_that_says_another_turn_is_not_believed_more_than_the_landmarks():
     sensor = SENSORS["uvd"]
     trial = drive(sensor, np.random.default_rng(72))
     wrong = trial.controls + np.array([0.0, 0.0, 0.06])  # 3 of its standard deviations of 0.002 rad a step
@@ -96,7 +94,7 @@ def test_odometry_that_says_another_turn_is_not_believed_more_than_the_landmarks
 
 
 @pytest.mark.parametrize("model", SENSORS)
-def test_the_derivative_of_what_is_expected(model: str) -> None:
+def test_the_derivative_of_what_is_expected(model):
     sensor, rng = SENSORS[model], np.random.default_rng(77)
     points = np.column_stack([rng.uniform(6, 14, 5), rng.uniform(-4, 4, 5), rng.uniform(-1, 1, 5)])
     move = np.array([0.1, -0.05, 0.02, 0.0, 0.0, 0.0])
@@ -104,18 +102,18 @@ def test_the_derivative_of_what_is_expected(model: str) -> None:
     _, slope = common_motion._error_and_slope(points, seen, move, sensor)
     for i, step in enumerate(1e-6 * np.eye(6)):
         ends = [common_motion._error_and_slope(points, seen, move + s * step, sensor)[0] for s in (1, -1)]
-        np.testing.assert_allclose(slope[:, :, i], (ends[1] - ends[0]) / 2e-6, rtol=1e-5, atol=1e-5)
+        assert_allclose(slope[:, :, i], (ends[1] - ends[0]) / 2e-6, rtol=1e-5, atol=1e-5)
 
 
-def test_a_bearing_may_cross_half_a_turn() -> None:
+def test_a_bearing_may_cross_half_a_turn():
     sensor, points = SENSORS["range-bearing"], np.array([[8.0, 1.0, 0.0], [9.0, -1.0, 0.0]])
     seen, _ = common_motion._expected(points, sensor)
     beyond = seen + np.array([0.0, 2.0 * np.pi])
     error, _ = common_motion._error_and_slope(points, beyond, np.zeros(6), sensor)
-    np.testing.assert_allclose(error, 0.0, atol=1e-12)
+    assert_allclose(error, 0.0, atol=1e-12)
 
 
-def test_a_landmark_that_was_not_seen_a_step_before_is_not_judged() -> None:
+def test_a_landmark_that_was_not_seen_a_step_before_is_not_judged():
     sensor = SENSORS["uvd"]
     trial = drive(sensor, np.random.default_rng(78))
     step = np.repeat(np.arange(1, STEPS + 1), COUNT)
@@ -130,7 +128,7 @@ def test_a_landmark_that_was_not_seen_a_step_before_is_not_judged() -> None:
     assert (found.judged, found.broken) == (COUNT * (STEPS - 1) - 4, 7)
 
 
-def test_what_few_landmarks_say_of_the_noise() -> None:
+def test_what_few_landmarks_say_of_the_noise():
     """The fit takes after four landmarks: without their leverage misfits in v are 0.45 of the noise, with it 0.84."""
     sensor = SENSORS["uvd"]
     trials = []
@@ -144,7 +142,7 @@ def test_what_few_landmarks_say_of_the_noise() -> None:
     assert ((ratio > 0.73) & (ratio < 1.1)).all()
 
 
-def test_roll_pitch_and_height_are_no_disagreement() -> None:
+def test_roll_pitch_and_height_are_no_disagreement():
     """The robot rocks by a degree a step, which moves pixels by 7 px, and believes its odometry to be perfect."""
     sensor = SENSORS["uvd"]
     sure = BelievedMotion(sigma_v=1e-3, sigma_omega=1e-4)
@@ -154,7 +152,7 @@ def test_roll_pitch_and_height_are_no_disagreement() -> None:
     assert screened([shaken], Belief(motion=sure, sensor=sensor), gate_of(sensor)).broken == 8
 
 
-def test_two_landmarks_tell_nothing() -> None:
+def test_two_landmarks_tell_nothing():
     """Any motion fits them; the car is not found, and nothing else is lost."""
     sensor = SENSORS["uvd"]
     trial = drive(sensor, np.random.default_rng(74))
@@ -163,7 +161,7 @@ def test_two_landmarks_tell_nothing() -> None:
     assert screened([alone], Belief(motion=MOTION, sensor=sensor), gate_of(sensor)).judged == STEPS - 1
 
 
-def test_numbers_of_landmarks_that_are_known_and_of_things() -> None:
+def test_numbers_of_landmarks_that_are_known_and_of_things():
     """Landmarks first, then their new numbers, then things: 14 is none, and begins anew like a landmark."""
     sensor = SENSORS["xyz"]
     trial = drive(sensor, np.random.default_rng(75), landmarks=True)
@@ -177,16 +175,16 @@ def test_numbers_of_landmarks_that_are_known_and_of_things() -> None:
     log = replace(log, landmarks=table[["landmark", "x", "y", "z"]])
     after = screened_log(log, gate_of(sensor))
     first, second = after.trials
-    np.testing.assert_array_equal(first.landmark, second.landmark)
+    assert_array_equal(first.landmark, second.landmark)
     assert len(first.landmarks) == COUNT + 1  # type: ignore[arg-type]
-    np.testing.assert_array_equal(first.landmarks[COUNT], trial.landmarks[1])  # type: ignore[index]
+    assert_array_equal(first.landmarks[COUNT], trial.landmarks[1])  # type: ignore[index]
     assert first.labels.tolist() == [*range(100, 114), 114, 7, *range(115, 122)]  # type: ignore[union-attr]
     step = np.repeat(np.arange(1, STEPS + 1), COUNT)
     assert (first.landmark[(trial.landmark == 1) & (step >= 9)] == COUNT).all()
     assert (first.landmark[(trial.landmark == 0) & (step < 6)] == COUNT + 1).all()
-    np.testing.assert_array_equal(first.spurious, known.spurious)
+    assert_array_equal(first.spurious, known.spurious)
     assert set(first.things) == {COUNT + 1, *range(COUNT + 2, COUNT + 9)}
-    np.testing.assert_array_equal(after.landmarks.set_index("landmark").loc[114], trial.landmarks[1])  # type: ignore[index]
+    assert_array_equal(after.landmarks.set_index("landmark").loc[114], trial.landmarks[1])  # type: ignore[index]
     assert after.screening["broken"] == 16
     assert "screen: 16 of 308 observations" in screening_line(after)
     assert ("Screened", "16 of 308 observations leave the common motion") in facts({"screening": after.screening})
@@ -194,7 +192,7 @@ def test_numbers_of_landmarks_that_are_known_and_of_things() -> None:
 
 
 @pytest.mark.parametrize("gate", ["2,2", "2,2,0", "2,2,nan", "a,b,c", ""])
-def test_an_unusable_gate(gate: str) -> None:
+def test_an_unusable_gate(gate):
     sensor = SENSORS["uvd"]
     log = Log("log", [drive(sensor, np.random.default_rng(76))], Belief(motion=MOTION, sensor=sensor), None)
     with pytest.raises(
@@ -203,7 +201,7 @@ def test_an_unusable_gate(gate: str) -> None:
         screened_log(log, gate)
 
 
-def test_a_linear_world_is_not_screened() -> None:
+def test_a_linear_world_is_not_screened():
     world = cs.load_scenario("linear-gaussian")
     trial, belief = cs.simulate(world, run=0, seed=5), world.belief
     with pytest.raises(cs.InputError, match="a sensor 'linear' cannot be screened"):

@@ -1,12 +1,10 @@
 """Calibrations, image folders and truths of the usual data sets, and what is said about damaged ones."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scene import SIZE, K, drive, write_kitti
 from scipy.spatial.transform import Rotation
 
@@ -33,7 +31,7 @@ distortion_coefficients: [{k}, 0.0, 0.0, 0.0]
 """
 
 
-def opencv_file(path: Path, **changes: object) -> Path:
+def opencv_file(path, **changes):
     """A calibration as OpenCV itself writes it; a change to None leaves a key out."""
     R = rotation(0.01, -0.02, 0.015)
     keys = {"K1": K, "D1": np.zeros((1, 5)), "K2": 1.01 * K + np.diag([0, 0, -0.01]), "D2": np.zeros((1, 5)), "R": R,
@@ -46,7 +44,7 @@ def opencv_file(path: Path, **changes: object) -> Path:
     return path
 
 
-def euroc_folder(folder: Path, k: float = 0.0, second: float = 0.11) -> Path:
+def euroc_folder(folder, k=0.0, second=0.11):
     for camera, x in (("cam0", 0.0), ("cam1", second)):
         (folder / "mav0" / camera / "data").mkdir(parents=True)
         (folder / "mav0" / camera / "sensor.yaml").write_text(EUROC.format(x=x, k=k))
@@ -59,7 +57,7 @@ def euroc_folder(folder: Path, k: float = 0.0, second: float = 0.11) -> Path:
     return folder
 
 
-def test_a_line_of_images_without_a_name_is_refused(tmp_path: Path) -> None:
+def test_a_line_of_images_without_a_name_is_refused(tmp_path):
     table = euroc_folder(tmp_path) / "mav0" / "cam1" / "data.csv"
     table.write_text(table.read_text()[: table.read_text().rindex(",")])
     with pytest.raises(cs.InputError, match=r"times must be whole nanoseconds.*without the name of an image"):
@@ -67,7 +65,7 @@ def test_a_line_of_images_without_a_name_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def kitti(tmp_path: Path) -> Path:
+def kitti(tmp_path):
     write_kitti(tmp_path / "seq", drive(3), np.zeros((900, 900), np.uint8))
     return tmp_path / "seq"
 
@@ -76,24 +74,24 @@ def kitti(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("names", [("P0: ", "P1: "), ("", "")])
-def test_kitti_calibration_with_and_without_names(tmp_path: Path, names: tuple[str, str]) -> None:
+def test_kitti_calibration_with_and_without_names(tmp_path, names):
     path = tmp_path / "calib.txt"
     path.write_text("\n".join(name + row for name, row in zip(names, ROWS, strict=True)) + "\nTr: 1 2 3\n")
     rig = rectify(read_kitti(path), (1226, 370)).rig
-    np.testing.assert_allclose(rig.t, [0.5, 0.0, 0.0])
-    np.testing.assert_allclose(rig.K_left, [[700, 0, 600], [0, 700, 180], [0, 0, 1]])
+    assert_allclose(rig.t, [0.5, 0.0, 0.0])
+    assert_allclose(rig.K_left, [[700, 0, 600], [0, 700, 180], [0, 0, 1]])
 
 
-def test_kitti_colour_images_go_with_the_colour_cameras(tmp_path: Path) -> None:
+def test_kitti_colour_images_go_with_the_colour_cameras(tmp_path):
     path = tmp_path / "calib.txt"
     row = "700 0 600 {} 0 700 180 0 0 0 1 0"
     path.write_text("\n".join(f"P{i}: {row.format(x)}" for i, x in enumerate((0, -350, 42, -280))))
-    np.testing.assert_allclose(read_calibration(path, "image_0", "image_1").T, [-0.5, 0, 0])
-    np.testing.assert_allclose(read_calibration(path, "image_2", "image_3").T, [-0.46, 0, 0])
+    assert_allclose(read_calibration(path, "image_0", "image_1").T, [-0.5, 0, 0])
+    assert_allclose(read_calibration(path, "image_2", "image_3").T, [-0.46, 0, 0])
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    "text, said",
     [
         ("P0: 1 2 3\nP1: 1 2 3\n", "key 'P0': must be 12 finite numbers"),
         (f"P0: {ROWS[0]}\nPX: {ROWS[1]}\n", "key 'P1' is missing; there: P0, PX"),
@@ -103,7 +101,7 @@ def test_kitti_colour_images_go_with_the_colour_cameras(tmp_path: Path) -> None:
         ("", "key 'P0' is missing; there: nothing"),
     ],
 )
-def test_unusable_kitti_calibration(tmp_path: Path, text: str, said: str) -> None:
+def test_unusable_kitti_calibration(tmp_path, text, said):
     path = tmp_path / "calib.txt"
     path.write_text(text)
     with pytest.raises(cs.InputError, match=said) as error:
@@ -111,40 +109,40 @@ def test_unusable_kitti_calibration(tmp_path: Path, text: str, said: str) -> Non
     assert str(path) in str(error.value)
 
 
-def test_opencv_calibration_is_bouguets(tmp_path: Path) -> None:
+def test_opencv_calibration_is_bouguets(tmp_path):
     calibration = read_calibration(opencv_file(tmp_path / "stereo.yml"))
-    np.testing.assert_allclose(calibration.R, rotation(0.01, -0.02, 0.015), atol=1e-12)
-    np.testing.assert_allclose(-calibration.R.T @ calibration.T, [0.2, 0.004, 0.001], atol=1e-12)
+    assert_allclose(calibration.R, rotation(0.01, -0.02, 0.015), atol=1e-12)
+    assert_allclose(-calibration.R.T @ calibration.T, [0.2, 0.004, 0.001], atol=1e-12)
     rectification = rectify(calibration, SIZE)
     rig = rectification.rig
     assert rectification.maps is not None
-    np.testing.assert_allclose(rig.R, np.eye(3))
+    assert_allclose(rig.R, np.eye(3))
     assert rig.t[0] == pytest.approx(np.linalg.norm([0.2, 0.004, 0.001]))
 
 
-def test_every_way_in_which_opencv_writes_numbers(tmp_path: Path) -> None:
+def test_every_way_in_which_opencv_writes_numbers(tmp_path):
     """Matrices of floats and integers, a bare number, a list (by hand here) and a text that is not needed."""
     T = [-0.2, 0.004, 0.001]
     changes = {"K1": K.astype(np.float32), "K2": K.astype(np.int32), "T": None, "R": None, "D1": None, "D2": None}
     path = opencv_file(tmp_path / "stereo.yaml", **changes, image_width=640, image_height=480.0, made="by hand")
     path.write_text(f"{path.read_text()}T: {T}\n")
     calibration = read_calibration(path)
-    np.testing.assert_array_equal([calibration.K_left, calibration.K_right], [K, K])
-    np.testing.assert_array_equal(calibration.T, T)
+    assert_array_equal([calibration.K_left, calibration.K_right], [K, K])
+    assert_array_equal(calibration.T, T)
     assert calibration.image_size == (640, 480)
 
 
-def test_a_calibration_without_the_first_line_of_opencv(tmp_path: Path) -> None:
+def test_a_calibration_without_the_first_line_of_opencv(tmp_path):
     """Written by hand: plain YAML, with lists and with tables of rows, cols and data."""
     rows = "[700.0, 0, 320, 0, 700, 240, 0, 0, 1]"
     text = f"K1: {rows}\nK2: {{rows: 3, cols: 3, data: {rows}}}\nT: [-0.2, 0, 0]\n"
     (tmp_path / "stereo.yaml").write_text(text)
     calibration = read_calibration(tmp_path / "stereo.yaml")
-    np.testing.assert_array_equal(calibration.K_left, calibration.K_right)
+    assert_array_equal(calibration.K_left, calibration.K_right)
     assert calibration.K_left[0, 2] == 320.0
 
 
-def test_rectified_pixels_of_a_point_are_those_of_the_rectified_rig(tmp_path: Path) -> None:
+def test_rectified_pixels_of_a_point_are_those_of_the_rectified_rig(tmp_path):
     D = np.array([[-0.2, 0.05, 1e-3, -5e-4, 0.0]])
     c = read_calibration(opencv_file(tmp_path / "stereo.yml", D1=D, D2=0.9 * D))
     rectification = rectify(c, SIZE)
@@ -159,11 +157,11 @@ def test_rectified_pixels_of_a_point_are_those_of_the_rectified_rig(tmp_path: Pa
     for image, (u, v) in zip(rectification.apply(*images), (wanted[:2], wanted[2:]), strict=True):
         weight = image / image.sum()
         found = (weight * np.arange(SIZE[0])).sum(), (weight.T * np.arange(SIZE[1])).sum()
-        np.testing.assert_allclose(found, (u, v), atol=0.15)  # a blob of 3 px is magnified unevenly
+        assert_allclose(found, (u, v), atol=0.15)  # a blob of 3 px is magnified unevenly
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    "changes, said",
     [
         ({"K1": None}, r"key 'K1' is missing; known keys: K1 = camera_matrix_1"),
         ({"T": None}, "key 'T' is missing"),
@@ -180,13 +178,13 @@ def test_rectified_pixels_of_a_point_are_those_of_the_rectified_rig(tmp_path: Pa
         ({"R": None, "Rot": np.eye(3)}, "'Rot' is unknown while 'R' is missing"),
     ],
 )
-def test_unusable_opencv_calibration(tmp_path: Path, changes: dict[str, object], said: str) -> None:
+def test_unusable_opencv_calibration(tmp_path, changes, said):
     path = opencv_file(tmp_path / "stereo.yml", **changes)
     with pytest.raises(cs.InputError, match=said):
         rectify(read_calibration(path), SIZE)
 
 
-def test_one_file_of_euroc(tmp_path: Path) -> None:
+def test_one_file_of_euroc(tmp_path):
     path = tmp_path / "sensor.yaml"
     path.write_text("T_BS: [1]\nintrinsics: [1, 1, 1, 1]\n")
     with pytest.raises(cs.InputError, match="is one of the two files of EuRoC; --calibration takes the folder"):
@@ -198,7 +196,7 @@ MATRIX = "!!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 1., 0., 
 
 @pytest.mark.parametrize("first", ["", "%YAML:1.0\n---\n", "%YAML 1.2\n---\n"])
 @pytest.mark.parametrize(
-    ("text", "said"),
+    "text, said",
     [
         ("a: [1", "cannot be read as YAML"),
         ("- 1", "no 'key: value'"),
@@ -208,7 +206,7 @@ MATRIX = "!!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 1., 0., 
         ("K1: [ 1., .nan ]", "key 'K1': holds a number that is not finite"),
     ],
 )
-def test_a_file_that_is_no_calibration(tmp_path: Path, first: str, text: str, said: str) -> None:
+def test_a_file_that_is_no_calibration(tmp_path, first, text, said):
     path = tmp_path / "stereo.yaml"
     path.write_text(first + text + "\n")
     with pytest.raises(cs.InputError, match=said) as error:
@@ -217,21 +215,21 @@ def test_a_file_that_is_no_calibration(tmp_path: Path, first: str, text: str, sa
     assert "\n" not in str(error.value)
 
 
-def test_a_matrix_of_opencv_without_all_its_numbers(tmp_path: Path) -> None:
+def test_a_matrix_of_opencv_without_all_its_numbers(tmp_path):
     (tmp_path / "stereo.yaml").write_text(f"%YAML:1.0\n---\nK1: {MATRIX}\n")
     with pytest.raises(cs.InputError, match="key 'K1': must be numbers, or a matrix with rows, cols and data"):
         read_calibration(tmp_path / "stereo.yaml")
 
 
-def test_euroc_layout(tmp_path: Path) -> None:
+def test_euroc_layout(tmp_path):
     sequence = read_sequence(euroc_folder(tmp_path))
     assert (sequence.format, len(sequence), sequence.timed) == ("euroc", 3, True)
-    np.testing.assert_allclose(np.diff(sequence.t), 0.05, atol=1e-6)
-    np.testing.assert_allclose(sequence.rectification.rig.t, [0.11, 0, 0], atol=1e-12)
+    assert_allclose(np.diff(sequence.t), 0.05, atol=1e-6)
+    assert_allclose(sequence.rectification.rig.t, [0.11, 0, 0], atol=1e-12)
     assert read_sequence(euroc_folder(tmp_path / "bent", k=-0.2)).rectification.maps is not None
 
 
-def test_unusable_euroc(tmp_path: Path) -> None:
+def test_unusable_euroc(tmp_path):
     folder = euroc_folder(tmp_path / "a")
     path = folder / "mav0" / "cam1" / "sensor.yaml"
     text = path.read_text()
@@ -252,17 +250,17 @@ def test_unusable_euroc(tmp_path: Path) -> None:
 # --- sequences -----------------------------------------------------------------------------------
 
 
-def test_kitti_layout(kitti: Path) -> None:
+def test_kitti_layout(kitti):
     sequence = read_sequence(kitti)
     assert (sequence.format, len(sequence), sequence.timed) == ("kitti", 3, True)
-    np.testing.assert_allclose(sequence.t, [0, 0.1, 0.2])
+    assert_allclose(sequence.t, [0, 0.1, 0.2])
     assert [image.shape for image in sequence.pair(1)] == [SIZE[::-1]] * 2
     (kitti / "times.txt").unlink()
     assert np.diff(read_sequence(kitti, rate=4.0).t).tolist() == [0.25, 0.25]
     assert not read_sequence(kitti).timed
 
 
-def test_plain_folders_and_patterns(tmp_path: Path, kitti: Path) -> None:
+def test_plain_folders_and_patterns(tmp_path, kitti):
     calibration = opencv_file(tmp_path / "stereo.yml")
     (kitti / "image_0").rename(kitti / "left")
     (kitti / "image_1").rename(kitti / "right")
@@ -277,7 +275,7 @@ def test_plain_folders_and_patterns(tmp_path: Path, kitti: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    "change, said",
     [
         (lambda f: (f / "image_1" / "000001.png").unlink(), "000001.png: has no partner of the other camera"),
         (lambda f: (f / "image_0" / "000002.png").unlink(), "image_1/000002.png: has no partner"),
@@ -292,13 +290,13 @@ def test_plain_folders_and_patterns(tmp_path: Path, kitti: Path) -> None:
                 "need --calibration"),
     ],
 )  # fmt: skip
-def test_unusable_folder(kitti: Path, change: Callable[[Path], object], said: str) -> None:
+def test_unusable_folder(kitti, change, said):
     change(kitti)
     with pytest.raises(cs.InputError, match=said):
         read_sequence(kitti)
 
 
-def test_a_gap_in_frames_without_times(kitti: Path) -> None:
+def test_a_gap_in_frames_without_times(kitti):
     for side in ("image_0", "image_1"):
         (kitti / side / "000002.png").rename(kitti / side / "000003.png")
     assert len(read_sequence(kitti)) == 3  # times.txt tells when they were
@@ -307,7 +305,7 @@ def test_a_gap_in_frames_without_times(kitti: Path) -> None:
         read_sequence(kitti)
 
 
-def test_plain_pairs_of_different_numbers(kitti: Path) -> None:
+def test_plain_pairs_of_different_numbers(kitti):
     (kitti / "image_0").rename(kitti / "left")
     (kitti / "image_1").rename(kitti / "right")
     (kitti / "left" / "000001.png").unlink()
@@ -318,7 +316,7 @@ def test_plain_pairs_of_different_numbers(kitti: Path) -> None:
         read_sequence(kitti, kitti / "calib.txt")
 
 
-def test_images_of_different_sizes(kitti: Path) -> None:
+def test_images_of_different_sizes(kitti):
     path = kitti / "image_1" / "000001.png"
     assert cv2.imwrite(str(path), np.zeros((100, 200), np.uint8))
     with pytest.raises(cs.InputError, match=r"000001\.png: has 200 x 100 px, other images 480 x 320 px"):
@@ -326,7 +324,7 @@ def test_images_of_different_sizes(kitti: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    "options, said",
     [
         ({"format": "ros"}, "--format ros: must be one of kitti"),
         ({"rate": -1.0}, "--rate -1.0"),
@@ -335,7 +333,7 @@ def test_images_of_different_sizes(kitti: Path) -> None:
         ({"left": "/image_0/*", "right": "image_1/*"}, "must be patterns below"),
     ],
 )
-def test_unusable_options(kitti: Path, options: dict[str, object], said: str) -> None:
+def test_unusable_options(kitti, options, said):
     with pytest.raises(cs.InputError, match=said):
         read_sequence(kitti, kitti / "calib.txt", **options)  # type: ignore[arg-type]
 
@@ -343,18 +341,18 @@ def test_unusable_options(kitti: Path, options: dict[str, object], said: str) ->
 # --- truth ---------------------------------------------------------------------------------------
 
 
-def test_truth_in_three_forms_is_the_same(kitti: Path, tmp_path: Path) -> None:
+def test_truth_in_three_forms_is_the_same(kitti, tmp_path):
     sequence, poses = read_sequence(kitti), drive(3)
     R, t = np.array([p.R for p in poses]), np.array([p.t for p in poses])
     tum = np.column_stack([sequence.t, t, Rotation.from_matrix(R).as_quat()])
     np.savetxt(tmp_path / "truth.tum", tum)
     for path in (kitti / "poses.txt", tmp_path / "truth.tum"):
         found_R, found_t = read_truth(path, sequence)
-        np.testing.assert_allclose(found_R, R, atol=1e-8)
-        np.testing.assert_allclose(found_t, t, atol=1e-8)
+        assert_allclose(found_R, R, atol=1e-8)
+        assert_allclose(found_t, t, atol=1e-8)
 
 
-def test_euroc_truth_is_of_the_body(tmp_path: Path) -> None:
+def test_euroc_truth_is_of_the_body(tmp_path):
     sequence = read_sequence(euroc_folder(tmp_path))
     turn = Rotation.from_euler("z", 90, degrees=True)
     x, y, z, w = turn.as_quat()
@@ -362,15 +360,15 @@ def test_euroc_truth_is_of_the_body(tmp_path: Path) -> None:
     path = tmp_path / "data.csv"
     path.write_text("#ns,px,py,pz,qw,qx,qy,qz\n" + "\n".join(rows) + "\n")
     R, t = read_truth(path, sequence)
-    np.testing.assert_allclose(R[1], turn.as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(t[1], [1 - 0.2, 0.0, 0.3], atol=1e-12)  # the camera at (0, 0.2, 0.3) of the body
+    assert_allclose(R[1], turn.as_matrix(), atol=1e-12)
+    assert_allclose(t[1], [1 - 0.2, 0.0, 0.3], atol=1e-12)  # the camera at (0, 0.2, 0.3) of the body
     path.write_text("\n".join(rows[:2]) + "\n")
     with pytest.raises(cs.InputError, match="1 of 3 frames have no truth"):
         read_truth(path, sequence)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    "text, said",
     [
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", "1 poses for 3 frames"),
         ("2 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "a rotation that is none"),
@@ -378,17 +376,17 @@ def test_euroc_truth_is_of_the_body(tmp_path: Path) -> None:
         ("0 0 0 0 0 0 0 2\n", "quaternion has length"),
     ],
 )
-def test_unusable_truth(kitti: Path, text: str, said: str) -> None:
+def test_unusable_truth(kitti, text, said):
     (kitti / "poses.txt").write_text(text)
     with pytest.raises(cs.InputError, match=said):
         read_truth(kitti / "poses.txt", read_sequence(kitti))
 
 
 @pytest.mark.parametrize("kind", [str, Path])
-def test_an_image_is_read_by_its_path(tmp_path: Path, kind: Callable[[Path], str | Path]) -> None:
+def test_an_image_is_read_by_its_path(tmp_path, kind):
     grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
     assert cv2.imwrite(str(tmp_path / "image.png"), grey)
-    np.testing.assert_array_equal(read_image(kind(tmp_path / "image.png"), (4, 3)), grey)
+    assert_array_equal(read_image(kind(tmp_path / "image.png"), (4, 3)), grey)
     with pytest.raises(cs.InputError, match="has 4 x 3 px, other images 3 x 4 px"):
         read_image(kind(tmp_path / "image.png"), (3, 4))
     with pytest.raises(cs.InputError, match="no such image"):

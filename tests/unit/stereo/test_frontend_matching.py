@@ -1,15 +1,13 @@
 """Matching on descriptors made by hand: mutual, ratio, epipolar gate, and the circle."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import consistency as cs
 from consistency.referee.geometry import rotation
-from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.features import (
     Features,
     StereoFeatures,
@@ -30,24 +28,24 @@ TURNED = StereoRig(
 )
 
 
-def unit(rng: np.random.Generator, count: int) -> Array:
+def unit(rng, count):
     values = rng.normal(size=(count, 128)).astype(np.float32)
     return values / np.linalg.norm(values, axis=1, keepdims=True)
 
 
-def features(uv: Array, descriptors: Array) -> Features:
+def features(uv, descriptors):
     return Features(uv, np.ones(len(uv)), descriptors)
 
 
-def points(rng: np.random.Generator, count: int) -> Array:
+def points(rng, count):
     return np.column_stack([rng.uniform(-3, 3, count), rng.uniform(-1, 1, count), rng.uniform(6, 40, count)])
 
 
-def test_matches_are_each_others_nearest_and_unambiguous(rng: np.random.Generator) -> None:
+def test_matches_are_each_others_nearest_and_unambiguous(rng):
     first = unit(rng, 6)
     order = rng.permutation(6)
     second = first[order]
-    np.testing.assert_array_equal(mutual_matches(first, second), np.column_stack([np.arange(6), np.argsort(order)]))
+    assert_array_equal(mutual_matches(first, second), np.column_stack([np.arange(6), np.argsort(order)]))
     twice = np.concatenate([second, second[:1]])  # the nearest has an equal rival: ratio test
     assert order[0] not in mutual_matches(first, twice)[:, 0]
     both = np.concatenate([first, first[:1]])  # two of the first would take the same one
@@ -55,32 +53,32 @@ def test_matches_are_each_others_nearest_and_unambiguous(rng: np.random.Generato
     assert mutual_matches(first, second[:0]).shape == (0, 2)
 
 
-def test_what_is_not_allowed_is_no_match_and_no_rival(rng: np.random.Generator) -> None:
+def test_what_is_not_allowed_is_no_match_and_no_rival(rng):
     first = unit(rng, 3)
     second = np.concatenate([first, first])
     allowed = np.tile(np.eye(3, dtype=bool), 2)
     assert len(mutual_matches(first, second)) == 0
     assert len(mutual_matches(first, second, allowed)) == 0  # the copies are allowed too
     allowed[:, 3:] = False
-    np.testing.assert_array_equal(mutual_matches(first, second, allowed), [[0, 0], [1, 1], [2, 2]])
+    assert_array_equal(mutual_matches(first, second, allowed), [[0, 0], [1, 1], [2, 2]])
     assert len(mutual_matches(first, second, np.zeros_like(allowed))) == 0
 
 
 @pytest.mark.parametrize("rig", [RECTIFIED, TURNED])
-def test_a_point_lies_on_its_epipolar_line_and_another_one_does_not(rig: StereoRig, rng: np.random.Generator) -> None:
+def test_a_point_lies_on_its_epipolar_line_and_another_one_does_not(rig, rng):
     uv = rig.project(points(rng, 50))
     assert np.diag(epipolar_gate(rig, uv[:, :2], uv[:, 2:], 1e-2)).all()
     below = uv[:, 2:] + [0.0, 5.0]
     assert not np.diag(epipolar_gate(rig, uv[:, :2], below, 2.0)).any()
 
 
-def test_in_rectified_images_the_right_column_is_not_greater() -> None:
+def test_in_rectified_images_the_right_column_is_not_greater():
     left = np.array([[100.0, 50.0]])
     right = np.array([[90.0, 50.0], [101.0, 50.0], [103.0, 50.0]])
-    np.testing.assert_array_equal(epipolar_gate(RECTIFIED, left, right, 2.0), [[True, True, False]])
+    assert_array_equal(epipolar_gate(RECTIFIED, left, right, 2.0), [[True, True, False]])
 
 
-def test_what_counts_as_rectified() -> None:
+def test_what_counts_as_rectified():
     assert is_rectified(RECTIFIED)
     assert not is_rectified(TURNED)
     tilted = StereoRig(K, K, np.eye(3), np.array([0.5, 0.01, 0.0]), (1200, 360))
@@ -90,7 +88,7 @@ def test_what_counts_as_rectified() -> None:
     )  # KITTI's colour cameras
 
 
-def test_bands_of_rows_change_nothing(rng: np.random.Generator) -> None:
+def test_bands_of_rows_change_nothing(rng):
     uv = RECTIFIED.project(points(rng, 800)) + rng.normal(0, 0.4, (800, 4))
     one = unit(rng, 800)
     other = one + rng.normal(0, 0.1, one.shape).astype(np.float32)
@@ -98,10 +96,10 @@ def test_bands_of_rows_change_nothing(rng: np.random.Generator) -> None:
     left, right = features(uv[:, :2], one), features(uv[:, 2:], other)
     whole = mutual_matches(one, other, epipolar_gate(RECTIFIED, left.uv, right.uv))
     assert len(whole) > 500
-    np.testing.assert_array_equal(stereo_matches(RECTIFIED, left, right).pairs, whole)
+    assert_array_equal(stereo_matches(RECTIFIED, left, right).pairs, whole)
 
 
-def test_a_circle_must_close(rng: np.random.Generator) -> None:
+def test_a_circle_must_close(rng):
     descriptors = unit(rng, 20)
     uv = np.zeros((20, 2))
     same = features(uv, descriptors)
@@ -110,14 +108,14 @@ def test_a_circle_must_close(rng: np.random.Generator) -> None:
     order = rng.permutation(20)
     after = StereoFeatures(features(uv, descriptors[order]), features(uv, descriptors[order]), pairs)
     closed = circular_matches(before, after)
-    np.testing.assert_array_equal(closed, np.column_stack([np.arange(20), np.argsort(order)]))
+    assert_array_equal(closed, np.column_stack([np.arange(20), np.argsort(order)]))
     crossed = StereoFeatures(after.left, after.right, np.column_stack([np.arange(20), np.roll(np.arange(20), 1)]))
     assert len(circular_matches(before, crossed)) == 0
     none = StereoFeatures(same, same, pairs[:0])
     assert circular_matches(before, none).shape == circular_matches(none, before).shape == (0, 2)
 
 
-def test_images_of_any_kind_become_grey() -> None:
+def test_images_of_any_kind_become_grey():
     colour = np.zeros((4, 5, 3), np.uint8)
     colour[..., 1] = 200
     assert grey(colour).dtype == np.uint8
@@ -130,7 +128,7 @@ def test_images_of_any_kind_become_grey() -> None:
             grey(wrong, "my image")
 
 
-def test_without_opencv_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_opencv_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(cs.InputError, match="an image needs opencv-python-headless: pip install "):
         opencv()

@@ -1,17 +1,14 @@
 """Drives of KITTI raw and calibrations of BoofCV, as they come."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from drives import write_drive
+from numpy.testing import assert_allclose
 from scene import BASELINE, SIZE, K, drive, texture, write_kitti
 
 import consistency as cs
@@ -35,10 +32,10 @@ R_0, R_1 = rotation(0.01, 0.02, -0.01), rotation(-0.02, 0.01, 0.015)  # of the c
 T_1 = np.array([-0.5, 0.01, 0.02])
 
 
-def cam_to_cam(**changes: str | None) -> str:
+def cam_to_cam(**changes):
     """calib_cam_to_cam.txt; a change to None leaves a key out."""
     P_1 = K @ np.column_stack([np.eye(3), [-BASELINE, 0.0, 0.0]])
-    rows: dict[str, Any] = {"corner_dist": [0.1]}
+    rows = {"corner_dist": [0.1]}
     for name, K_own, R, T, P in (("00", 1.1 * K, R_0, np.zeros(3), np.column_stack([K, np.zeros(3)])),
                                  ("01", 1.2 * K, R_1, T_1, P_1)):  # fmt: skip
         K_own[2, 2] = 1.0
@@ -50,7 +47,7 @@ def cam_to_cam(**changes: str | None) -> str:
 
 
 @pytest.fixture(scope="module")
-def day(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def day(tmp_path_factory):
     """The folder of a day with one drive of eight frames."""
     day = tmp_path_factory.mktemp("raw") / "2011_09_26"
     seq = day.parent / "seq"
@@ -66,12 +63,12 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return day
 
 
-def test_a_drive_of_kitti_raw_becomes_a_log(day: Path, tmp_path: Path) -> None:
+def test_a_drive_of_kitti_raw_becomes_a_log(day, tmp_path):
     """Over midnight; the calibration lies in the folder of the day."""
     folder = day / "2011_09_26_drive_0001_sync"
     sequence = read_sequence(folder)
     assert sequence.format == "kitti-raw"
-    np.testing.assert_allclose(sequence.t, 0.1 * np.arange(8), atol=1e-9)
+    assert_allclose(sequence.t, 0.1 * np.arange(8), atol=1e-9)
     assert sequence.rectification.rig.baseline == pytest.approx(BASELINE)
     other = raw_drive(tmp_path / "2011_09_26", "00")  # its packets and calibrations beside these images
     for name in ("image_00", "image_01"):
@@ -91,11 +88,11 @@ def test_a_drive_of_kitti_raw_becomes_a_log(day: Path, tmp_path: Path) -> None:
     assert f"truth from {other}; next: consistency analyse" in "\n".join(summary.lines(tmp_path / "true"))
     R, t = read_truth(other, read_sequence(other))
     written = np.loadtxt(tmp_path / "true/truth.tum")
-    np.testing.assert_allclose(written[:, 1:4], (t - t[0]) @ R[0], atol=1e-9)
+    assert_allclose(written[:, 1:4], (t - t[0]) @ R[0], atol=1e-9)
     assert read_log(tmp_path / "true").trials[0].truth is not None
 
 
-def raw_drive(day: Path, camera: str, **changes: str | None) -> Path:
+def raw_drive(day, camera, **changes):
     """A drive with packets, calibrations and five dark images of a camera and the one to its right."""
     folder = write_drive(day / f"{day.name}_drive_0002_sync")
     stamps = (folder / "oxts/timestamps.txt").read_text().splitlines()
@@ -117,7 +114,7 @@ def raw_drive(day: Path, camera: str, **changes: str | None) -> Path:
 
 
 @pytest.mark.parametrize("camera", ["00", "02"])
-def test_oxts_of_a_drive_is_the_truth_of_the_rectified_camera(tmp_path: Path, camera: str) -> None:
+def test_oxts_of_a_drive_is_the_truth_of_the_rectified_camera(tmp_path, camera):
     """As pykitti has it; frames 10 to 14 of the packets."""
     pykitti = pytest.importorskip("pykitti", reason="pykitti is not installed")
     folder = raw_drive(tmp_path / "2011_09_26", camera)
@@ -127,11 +124,11 @@ def test_oxts_of_a_drive_is_the_truth_of_the_rectified_camera(tmp_path: Path, ca
     other = pykitti.raw(str(tmp_path), "2011_09_26", "0002")
     mount = np.linalg.inv(getattr(other.calib, f"T_cam{int(camera)}_imu"))
     true = np.array([packet.T_w_imu @ mount for packet in other.oxts[10:15]])
-    np.testing.assert_allclose(R[0].T @ R, true[0, :3, :3].T @ true[:, :3, :3], atol=1e-6)
-    np.testing.assert_allclose((t - t[0]) @ R[0], (true[:, :3, 3] - true[0, :3, 3]) @ true[0, :3, :3], atol=1e-5)
+    assert_allclose(R[0].T @ R, true[0, :3, :3].T @ true[:, :3, :3], atol=1e-6)
+    assert_allclose((t - t[0]) @ R[0], (true[:, :3, 3] - true[0, :3, 3]) @ true[0, :3, :3], atol=1e-5)
 
 
-def test_images_between_packets_and_beyond_them(tmp_path: Path) -> None:
+def test_images_between_packets_and_beyond_them(tmp_path):
     """Half way between two packets, and half a period before the first and after the last."""
     folder = raw_drive(tmp_path / "2011_09_26", "00")
     stamps, poses = drive_poses(folder, "camera")
@@ -143,17 +140,17 @@ def test_images_between_packets_and_beyond_them(tmp_path: Path) -> None:
     R, t = read_truth(folder, sequence)
     body = sequence.calibration.body_from_left
     t = t - R @ body[:3, :3].T @ body[:3, 3]  # of camera 0
-    np.testing.assert_allclose(t[[1, 3]], poses[[0, -1], :3, 3], atol=1e-9)
-    np.testing.assert_allclose(t[2], poses[:2, :3, 3].mean(axis=0), atol=1e-6)
+    assert_allclose(t[[1, 3]], poses[[0, -1], :3, 3], atol=1e-9)
+    assert_allclose(t[2], poses[:2, :3, 3].mean(axis=0), atol=1e-6)
     for outer, inner, next_one in ((0, 1, poses[1]), (4, 3, poses[-2])):  # drives on as in the step beside it
-        np.testing.assert_allclose(t[outer] - t[inner], (t[inner] - next_one[:3, 3]) / 2, atol=0.01)
+        assert_allclose(t[outer] - t[inner], (t[inner] - next_one[:3, 3]) / 2, atol=0.01)
     late = np.datetime64(int(stamps[-1] + 3 * half), "ns")
     times.write_text(times.read_text().rsplit("\n", 2)[0] + "\n" + str(late).replace("T", " ") + "\n")
     with pytest.raises(cs.InputError, match=r"1 of 5 frames have no packet within 0\.11 s"):
         read_truth(folder, read_sequence(folder))
 
 
-def test_a_drive_whose_calibrations_are_missing_has_no_truth(tmp_path: Path) -> None:
+def test_a_drive_whose_calibrations_are_missing_has_no_truth(tmp_path):
     """What is missing is said; a truth that is asked for is refused."""
     folder = raw_drive(tmp_path / "2011_09_26", "00")
     (tmp_path / "2011_09_26/calib_velo_to_cam.txt").unlink()
@@ -173,27 +170,27 @@ def test_a_drive_whose_calibrations_are_missing_has_no_truth(tmp_path: Path) -> 
         read_truth(folder, sequence)
 
 
-def test_the_camera_before_rectification_is_where_its_calibration_puts_it(tmp_path: Path) -> None:
+def test_the_camera_before_rectification_is_where_its_calibration_puts_it(tmp_path):
     """x_left = R_0 x_0 + T_0, with camera 0 the body."""
     path = tmp_path / "calib_cam_to_cam.txt"
     path.write_text(cam_to_cam(T_00="0.1 0.2 0.3"))
     body = read_calibration(path, "image_00", "image_01", FULL).body_from_left
     point = np.array([1.0, -2.0, 5.0])
-    np.testing.assert_allclose(body[:3, :3] @ (R_0 @ point + [0.1, 0.2, 0.3]) + body[:3, 3], point, atol=1e-9)
+    assert_allclose(body[:3, :3] @ (R_0 @ point + [0.1, 0.2, 0.3]) + body[:3, 3], point, atol=1e-9)
     P_0 = K @ np.column_stack([np.eye(3), [0.06, 0.004, -0.003]])
     path.write_text(cam_to_cam(P_rect_00=" ".join(f"{x:.12e}" for x in P_0.ravel())))
     body = read_calibration(path, "image_00", "image_01", SIZE).body_from_left
     assert body is not None
-    np.testing.assert_allclose(body, [[1, 0, 0, -0.06], [0, 1, 0, -0.004], [0, 0, 1, 0.003], [0, 0, 0, 1]], atol=1e-9)
+    assert_allclose(body, [[1, 0, 0, -0.06], [0, 1, 0, -0.004], [0, 0, 1, 0.003], [0, 0, 0, 1]], atol=1e-9)
 
 
-def test_images_of_kitti_raw_before_rectification(tmp_path: Path) -> None:
+def test_images_of_kitti_raw_before_rectification(tmp_path):
     """x_i = R_i x_0 + T_i, so that x_1 = R x_0' + T of the left camera's axes; the size of the images decides."""
     path = tmp_path / "calib_cam_to_cam.txt"
     path.write_text(cam_to_cam(D_01="-0.2 0.05 0.003 0.004 -0.01"))
     c = read_calibration(path, "image_00", "image_01", FULL)
-    np.testing.assert_allclose(c.R, R_1 @ R_0.T, atol=1e-9)
-    np.testing.assert_allclose(c.T, T_1, atol=1e-9)
+    assert_allclose(c.R, R_1 @ R_0.T, atol=1e-9)
+    assert_allclose(c.T, T_1, atol=1e-9)
     assert c.K_left[0, 0] == pytest.approx(1.1 * K[0, 0])
     assert c.D_left.tolist() == pytest.approx([-0.3, 0.1, 0.001, 0.002, -0.05])
     assert c.D_right.tolist() == pytest.approx([-0.2, 0.05, 0.003, 0.004, -0.01])
@@ -206,7 +203,7 @@ def test_images_of_kitti_raw_before_rectification(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    "changes, said",
     [
         ({"P_rect_01": None}, "key 'P_rect_01' is missing"),
         ({"P_rect_01": "1 2 3"}, "key 'P_rect_01': must be 12 finite numbers"),
@@ -214,7 +211,7 @@ def test_images_of_kitti_raw_before_rectification(tmp_path: Path) -> None:
         ({"P_rect_00": " ".join(["0"] * 12)}, "matrix of its camera is singular"),
     ],
 )
-def test_an_unusable_calibration_of_kitti_raw(tmp_path: Path, changes: dict[str, str | None], said: str) -> None:
+def test_an_unusable_calibration_of_kitti_raw(tmp_path, changes, said):
     path = tmp_path / "calib_cam_to_cam.txt"
     path.write_text(cam_to_cam(**changes))
     with pytest.raises(cs.InputError, match=said) as error:
@@ -222,7 +219,7 @@ def test_an_unusable_calibration_of_kitti_raw(tmp_path: Path, changes: dict[str,
     assert str(error.value).startswith(str(path))
 
 
-def test_an_unusable_drive_of_kitti_raw(day: Path, tmp_path: Path) -> None:
+def test_an_unusable_drive_of_kitti_raw(day, tmp_path):
     folder = tmp_path / "drive"
     for camera in ("image_00", "image_01"):
         (folder / camera).mkdir(parents=True)
@@ -245,10 +242,10 @@ def test_an_unusable_drive_of_kitti_raw(day: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sigma", "holds"),
+    "sigma, holds",
     [((30.0, 30.0, 1.9), True), ((33.0, 1.0, 0.1), False), ((1.0, 33.0, 0.1), False), ((1.0, 1.0, 2.1), False)],
 )
-def test_a_plane_holds_where_landmarks_are_off_by_less_than_a_tenth(sigma: tuple[float, ...], holds: bool) -> None:
+def test_a_plane_holds_where_landmarks_are_off_by_less_than_a_tenth(sigma, holds):
     """Of f = 320 px, and of the disparity of 20 px in the median; a turn about up is no tilt, 2 degrees ahead are."""
     turns = [RelativePose.from_vector(np.deg2rad([0, 0, 0, *angles])) for angles in ((0, 5, 0), (2, 0, 0), (1, 0, 1))]
     ahead = [RelativePose(turn.R, np.array([0.0, 0.0, 1.0])) for turn in turns]
@@ -259,7 +256,7 @@ def test_a_plane_holds_where_landmarks_are_off_by_less_than_a_tenth(sigma: tuple
     plane = plane_of(motions, trial, Belief(motion=BelievedMotion(sigma_v=1.0, sigma_omega=1.0), sensor=sensor))
     assert plane.limit == (32.0, 32.0, 2.0)
     assert plane.holds is holds
-    np.testing.assert_allclose(np.rad2deg(plane.tilts), [0.0, 2.0, np.sqrt(2.0)], atol=1e-3)
+    assert_allclose(np.rad2deg(plane.tilts), [0.0, 2.0, np.sqrt(2.0)], atol=1e-3)
     assert plane.leaving == 1
     assert "1 of 3 motions tilt the camera by more than 1.7 deg (1.4 in the median, 2 at most)" in plane.line
 
@@ -267,7 +264,7 @@ def test_a_plane_holds_where_landmarks_are_off_by_less_than_a_tenth(sigma: tuple
 # --- BoofCV ----------------------------------------------------------------------------------------
 
 
-def boofcv() -> dict[str, Any]:
+def boofcv():
     """What BoofCV writes of a stereo calibration."""
     lens = {"width": 640, "height": 480, "fx": 500.0, "fy": 501.0, "skew": 0.0, "cx": 320.0, "cy": 240.0}
     bend = {"radial": [-0.25, 0.1], "t1": 0.001, "t2": -0.002}
@@ -275,27 +272,27 @@ def boofcv() -> dict[str, Any]:
     R = rotation(0.01, -0.02, 0.015)
     pose = {"rotation": R.ravel().tolist(), "x": 0.12, "y": 0.001, "z": -0.002}
     parts = {"model": "stereo_camera", "version": 0, "left": camera, "right": camera, "rightToLeft": pose}
-    apart: dict[str, Any] = json.loads(json.dumps(parts))  # YAML would write what both cameras share as an alias
+    apart = json.loads(json.dumps(parts))  # YAML would write what both cameras share as an alias
     return apart
 
 
-def write(path: Path, data: dict[str, Any]) -> Path:
+def write(path, data):
     path.write_text("# Intrinsic and extrinsic parameters for a stereo camera pair\n" + yaml.safe_dump(data))
     return path
 
 
-def test_a_calibration_of_boofcv(tmp_path: Path) -> None:
+def test_a_calibration_of_boofcv(tmp_path):
     c = read_calibration(write(tmp_path / "stereo.yaml", boofcv()))
     R, t = rotation(0.01, -0.02, 0.015), np.array([0.12, 0.001, -0.002])
     p = np.array([0.3, -0.2, 4.0])  # in the left camera
-    np.testing.assert_allclose(c.R @ p + c.T, R.T @ (p - t), atol=1e-12)
-    np.testing.assert_allclose(c.D_left, [-0.25, 0.1, 0.001, -0.002, 0.0])
-    np.testing.assert_allclose(c.K_right, [[500, 0, 320], [0, 501, 240], [0, 0, 1]])
+    assert_allclose(c.R @ p + c.T, R.T @ (p - t), atol=1e-12)
+    assert_allclose(c.D_left, [-0.25, 0.1, 0.001, -0.002, 0.0])
+    assert_allclose(c.K_right, [[500, 0, 320], [0, 501, 240], [0, 0, 1]])
     assert c.image_size == (640, 480)
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "said"),
+    "place, value, said",
     [
         (("left", "model"), "omnidirectional_universal", "key 'left.model': omnidirectional_universal is not pinhole"),
         (("left", "pinhole"), None, "key 'left.pinhole' is missing"),
@@ -308,7 +305,7 @@ def test_a_calibration_of_boofcv(tmp_path: Path) -> None:
         (("rightToLeft",), 3, "key 'rightToLeft' is missing"),
     ],
 )
-def test_an_unusable_calibration_of_boofcv(tmp_path: Path, place: tuple[str, ...], value: Any, said: str) -> None:
+def test_an_unusable_calibration_of_boofcv(tmp_path, place, value, said):
     data = boofcv()
     part = data
     for key in place[:-1]:

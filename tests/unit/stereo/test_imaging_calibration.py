@@ -1,17 +1,14 @@
 """Tables of a sensor from errors of known noise and bias, and images against observations made from their tables."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.types import Array
 from consistency.stereo.rendered_images.calibration import (
     Biases,
     Growth,
-    TrackMeans,
     bias_map,
     disparity_growth,
     track_means,
@@ -27,18 +24,18 @@ FINE = np.array([-100.0, -45.0, 10.0, 65.0, 120.0]), np.array([-90.0, -45.0, 0.0
 CAMERA = StereoCamera.distorted(0.005)
 
 
-def tracks_of(truth: Array, z: Array, track: Array) -> Tracks:
+def tracks_of(truth, z, track):
     zero = np.zeros(len(track), int)
     return Tracks(zero, zero, track, z, truth, truth, zero.astype(float), zero + POINT, zero)
 
 
-def places(rng: np.random.Generator, count: int) -> Array:
+def places(rng, count):
     return np.column_stack([
         rng.uniform(-100, 140, count), rng.uniform(-110, 110, count), rng.uniform(2.25, 13.5, count),
     ])  # fmt: skip
 
 
-def simulated(rng: np.random.Generator, growth: Growth, biases: Biases, sigma: float, at: Array, n: int = 30) -> Tracks:
+def simulated(rng, growth, biases, sigma, at, n=30):
     """Observations from tables as a scenario holds them: truth, bias at its place, and noise that grows."""
     truth, track = np.repeat(at, n, axis=0), np.repeat(np.arange(len(at)), n)
     noise = rng.standard_normal(truth.shape) * 0.02
@@ -48,7 +45,7 @@ def simulated(rng: np.random.Generator, growth: Growth, biases: Biases, sigma: f
     return tracks_of(truth, truth + bias + own + noise, track)
 
 
-def observed(growth: Growth, biases: Biases, sigma: float, at: Array, n: int = 30, seed: int = 0) -> Tracks:
+def observed(growth, biases, sigma, at, n=30, seed=0):
     """Observations of landmarks at these places (u, v, d) by a scenario whose truth holds the tables.
 
     The robot hardly moves. What a table over the place does not tell stays the same along a track.
@@ -74,19 +71,19 @@ def observed(growth: Growth, biases: Biases, sigma: float, at: Array, n: int = 3
     return tracks_of(at[trial.landmark], trial.z, trial.landmark)
 
 
-def off(a: Array, b: Array, covariance: Array) -> float:
+def off(a, b, covariance):
     """p value of a chi-square test that two estimates are of one thing."""
     e = np.ravel(a - b)
     return float(stats.chi2.sf(e @ np.linalg.solve(covariance, e), len(e)))
 
 
-def known() -> tuple[Growth, Biases]:
+def known():
     sd, bias = np.array([0.05, 0.08, 0.2, 0.15]), np.random.default_rng(1).normal(size=(3, 3, 3))
     growth = Growth(NODES, sd, np.zeros((4, 4)), 1.0)
     return growth, Biases(U, V, bias, np.zeros((3, 3, 3)), np.zeros((9, 9)), np.full(3, 0.03))
 
 
-def test_a_known_growth_and_map_are_recovered(rng: np.random.Generator) -> None:
+def test_a_known_growth_and_map_are_recovered(rng):
     """400 tracks; each table by a chi-square test (false alarm 1e-6)."""
     growth, biases = known()
     means = track_means(simulated(rng, growth, biases, 0.65, places(rng, 400)))
@@ -95,13 +92,13 @@ def test_a_known_growth_and_map_are_recovered(rng: np.random.Generator) -> None:
     assert (found.standard_error < 0.1 * growth.sd).all()
     for k in range(3):
         assert off(placed.bias[..., k], biases.bias[..., k], placed.rest[k] ** 2 * placed.covariance) > 1e-6
-    np.testing.assert_allclose(placed.standard_error[1, 1], placed.rest * np.sqrt(placed.covariance[4, 4]))
+    assert_allclose(placed.standard_error[1, 1], placed.rest * np.sqrt(placed.covariance[4, 4]))
     assert placed.standard_error.max() < 0.05
     assert found.spread < 1.6
-    np.testing.assert_allclose(placed.rest[:2], 0.03, rtol=0.3)
+    assert_allclose(placed.rest[:2], 0.03, rtol=0.3)
 
 
-def test_standard_errors_are_those_of_repetition(rng: np.random.Generator) -> None:
+def test_standard_errors_are_those_of_repetition(rng):
     """60 repetitions of 150 tracks: mean squared standardised error 1 +- 6 sqrt(2 / 60) for each (below 1e-8)."""
     growth, biases = known()
     scores = []
@@ -114,10 +111,10 @@ def test_standard_errors_are_those_of_repetition(rng: np.random.Generator) -> No
                 ((placed.bias - biases.bias) / placed.standard_error)[1, 2, 2],
             ]
         )
-    np.testing.assert_allclose(np.square(scores).mean(axis=0), 1.0, atol=6 * np.sqrt(2 / 60))
+    assert_allclose(np.square(scores).mean(axis=0), 1.0, atol=6 * np.sqrt(2 / 60))
 
 
-def test_heavy_tails_widen_the_interval(rng: np.random.Generator) -> None:
+def test_heavy_tails_widen_the_interval(rng):
     at = places(rng, 300)
     truth, track = np.repeat(at, 30, axis=0), np.repeat(np.arange(300), 30)
     errors = {"gauss": rng.standard_normal(truth.shape), "tails": rng.standard_t(3, truth.shape) / np.sqrt(3)}
@@ -126,16 +123,16 @@ def test_heavy_tails_widen_the_interval(rng: np.random.Generator) -> None:
     assert (tails.standard_error > 1.3 * gauss.standard_error).all()
 
 
-def test_means_of_tracks_by_hand() -> None:
+def test_means_of_tracks_by_hand():
     truth = np.zeros((5, 3))
     z = np.array([[1.0, 0, 0], [3.0, 0, 0], [5.0, 0, 6], [1.0, 1, 1], [1.0, 1, 1]])
     means = track_means(tracks_of(truth, z, np.array([7, 7, 7, 9, 9])))
     assert means.count.tolist() == [3]
-    np.testing.assert_allclose(means.mean, [[3.0, 0.0, 2.0]])
-    np.testing.assert_allclose(means.variance, [[4.0, 0.0, 12.0]])
+    assert_allclose(means.mean, [[3.0, 0.0, 2.0]])
+    assert_allclose(means.variance, [[4.0, 0.0, 12.0]])
 
 
-def test_both_levels_agree() -> None:
+def test_both_levels_agree():
     """Tables from images in a scenario make observations whose tables are those of other images.
 
     Chi-square tests (false alarm 1e-7 each, were all errors Gaussian). One node of the growth moved by two fifths of
@@ -163,12 +160,12 @@ def test_both_levels_agree() -> None:
         assert off(wrong, bias.bias[..., k], scatter) < 1e-3
 
 
-def image_means(seed: int, stops: Stops) -> TrackMeans:
+def image_means(seed, stops):
     tracks = stand(Chain(Spread(60, 8, 6)), CAMERA, stops, np.random.default_rng(seed), 2).kept
     return track_means(tracks.take(tracks.label != MISMATCH))
 
 
-def test_the_map_is_that_of_the_cameras() -> None:
+def test_the_map_is_that_of_the_cameras():
     """Bias of d at the corners against the exact projections, of tracks and by the map, to 0.15 px."""
     pytest.importorskip("cv2")
     means = image_means(14, Stops(farthest=2.0, nearest=1.0, step=0.1, images=3))
@@ -182,7 +179,7 @@ def test_the_map_is_that_of_the_cameras() -> None:
     assert np.sqrt(np.mean(np.square(placed.table().at(u, v) - exact), axis=0)).max() < 0.15
 
 
-def test_what_cannot_be_calibrated_is_said(rng: np.random.Generator) -> None:
+def test_what_cannot_be_calibrated_is_said(rng):
     growth, biases = known()
     tracks = simulated(rng, growth, biases, 0.65, places(rng, 30))
     means = track_means(tracks)

@@ -1,13 +1,11 @@
 """The stages on images whose answer is known, and the chain's truth, labels and refusals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scripts import experiment
 
 import consistency as cs
-from consistency.referee.types import Array
 from consistency.stereo.rendered_images import chain as module
 from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import (
@@ -28,7 +26,6 @@ from consistency.stereo.rendered_images.render import film
 from consistency.stereo.rendered_images.scene import Layer, Plain, RandomTexture, Scene
 from consistency.stereo.rendered_images.stages import (
     BlockMatching,
-    Correspondence,
     GoodFeatures,
     Klt,
     KltAcross,
@@ -52,11 +49,11 @@ CAMERA = StereoCamera()
 WRONG = StereoCamera(Camera(lens=Lens(0.005)), Camera(lens=Lens(-0.005), turned=(0.001, 0.002, 0.001)))
 
 
-def wall(distance: float = 2.0, seed: int = 0) -> Scene:
+def wall(distance=2.0, seed=0):
     return Scene((Layer.facing(distance, RandomTexture.draw(np.random.default_rng(seed))),))
 
 
-def pair(scene: Scene, noise: float = 0.0, pose: Array | None = None) -> tuple[Array, Array]:
+def pair(scene, noise=0.0, pose=None):
     frame = next(film(scene, CAMERA, [np.zeros(6) if pose is None else pose], np.random.default_rng(1), noise))
     return frame.left, frame.right
 
@@ -64,8 +61,8 @@ def pair(scene: Scene, noise: float = 0.0, pose: Array | None = None) -> tuple[A
 # --- stages ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("matcher", "within"), [(BlockMatching(), 0.15), (SemiGlobal(), 0.35), (KltAcross(), 0.05)])
-def test_matchers_measure_the_disparity_of_a_wall(matcher: Correspondence, within: float) -> None:
+@pytest.mark.parametrize("matcher, within", [(BlockMatching(), 0.15), (SemiGlobal(), 0.35), (KltAcross(), 0.05)])
+def test_matchers_measure_the_disparity_of_a_wall(matcher, within):
     """f B / x = 6.75 px at 2 m; without noise, SGBM is drawn to whole pixels."""
     left, right = pair(wall())
     uv = np.stack(np.meshgrid(np.arange(-100, 101, 25.0), np.arange(-90, 91, 30.0)), axis=-1).reshape(-1, 2)
@@ -75,22 +72,22 @@ def test_matchers_measure_the_disparity_of_a_wall(matcher: Correspondence, withi
 
 
 @pytest.mark.parametrize("matcher", [BlockMatching((1, 5)), SemiGlobal((8, 20)), KltAcross((8, 32))])
-def test_what_is_outside_the_search_is_not_found(matcher: Correspondence) -> None:
+def test_what_is_outside_the_search_is_not_found(matcher):
     left, right = pair(wall())
     assert np.isnan(matcher.measure(left, right, np.array([[20.0, 0.0], [60.0, 30.0]]))).all()
 
 
-def test_a_tracker_follows_a_shift() -> None:
+def test_a_tracker_follows_a_shift():
     """From 2 m, 0.02 m to the left: features move right by 1.5 px."""
     before, _ = pair(wall())
     after, _ = pair(wall(), pose=np.array([0.0, 0.02, 0.0, 0, 0, 0]))
     uv = GoodFeatures(30).choose(before)
     there, found = Klt(agreement=0.2).follow(before, after, uv, uv)
     assert found.all()
-    np.testing.assert_allclose(there - uv, np.tile([1.5, 0.0], (len(uv), 1)), atol=0.05)
+    assert_allclose(there - uv, np.tile([1.5, 0.0], (len(uv), 1)), atol=0.05)
 
 
-def test_a_tracker_that_does_not_agree_with_itself_loses_the_feature() -> None:
+def test_a_tracker_that_does_not_agree_with_itself_loses_the_feature():
     """The second image is of another wall."""
     before, after = pair(wall())[0], pair(wall(seed=9))[0]
     uv = GoodFeatures(30).choose(before)
@@ -98,7 +95,7 @@ def test_a_tracker_that_does_not_agree_with_itself_loses_the_feature() -> None:
     assert strict.sum() < 0.5 * lax.sum()
 
 
-def test_features_are_spread_over_the_image() -> None:
+def test_features_are_spread_over_the_image():
     """Strong texture in one corner takes all features, unless they are spread."""
     corner = Layer.facing(2.0, RandomTexture.draw(np.random.default_rng(3), contrast=40.0), (1.3, 0.9), (1.2, 1.0))
     weak = Layer.facing(3.0, RandomTexture.draw(np.random.default_rng(4), contrast=6.0))
@@ -111,7 +108,7 @@ def test_features_are_spread_over_the_image() -> None:
     assert len(cells) >= 18
 
 
-def test_left_right_check_finds_what_only_one_image_sees() -> None:
+def test_left_right_check_finds_what_only_one_image_sees():
     """Beside a near pole the left image shows wall that the right one does not."""
     near = Layer.facing(1.0, RandomTexture.draw(np.random.default_rng(5)), (-1 / 3, 0.0), (0.3, 9.0))
     left, right = pair(Scene((*wall(4.0).layers, near)), 2.0)
@@ -128,7 +125,7 @@ def test_left_right_check_finds_what_only_one_image_sees() -> None:
     assert shares[0] < 0.5 < 0.9 < shares[1]
 
 
-def test_dissimilarity_is_small_for_one_place_at_two_depths() -> None:
+def test_dissimilarity_is_small_for_one_place_at_two_depths():
     image, other = pair(wall())[0], pair(wall(), pose=pose_at(0.4))[0]  # 2 m, then 1.6 m: 1.25 times as large
     uv = GoodFeatures(20).choose(image) * 0.5
     one = np.ones(len(uv))
@@ -145,21 +142,21 @@ def test_dissimilarity_is_small_for_one_place_at_two_depths() -> None:
 # --- the chain ---------------------------------------------------------------------------------
 
 
-def test_without_stages_that_err_only_the_cameras_do() -> None:
+def test_without_stages_that_err_only_the_cameras_do():
     """Known projection and disparity: what is measured is what the cameras give, and with right ones the truth."""
     chain = Chain(tracking=KnownProjection(), correspondence=KnownDisparity())
     poses = np.stack([pose_at(0.1 * k) for k in range(4)])
     for camera in (CAMERA, WRONG):
         scene = wall()
         tracks = chain.run(film(scene, camera, poses, np.random.default_rng(2)), scene, camera)
-        np.testing.assert_allclose(tracks.z, tracks.real, atol=1e-6)
+        assert_allclose(tracks.z, tracks.real, atol=1e-6)
         if camera is CAMERA:
-            np.testing.assert_allclose(tracks.errors, 0.0, atol=1e-6)
+            assert_allclose(tracks.errors, 0.0, atol=1e-6)
         else:
             assert np.abs(tracks.errors).max() > 0.3
 
 
-def test_truth_is_the_projection_of_the_feature_point_at_the_nominal_pose() -> None:
+def test_truth_is_the_projection_of_the_feature_point_at_the_nominal_pose():
     """A feature at u in the first image, on a wall at 2 m, is at u 2 / (2 - s) after s m; d is 13.5 / (2 - s)."""
     poses = np.stack([pose_at(0.05 * k) for k in range(5)])
     actual = poses + np.array([0, 0, 0, 0, 0, 0.002])
@@ -171,14 +168,14 @@ def test_truth_is_the_projection_of_the_feature_point_at_the_nominal_pose() -> N
         start = first.truth[np.searchsorted(first.track, own.track)]
         growth = 2.0 / (2.0 - 0.05 * frame)
         # turned by 2 mrad the feature's point is a little nearer or farther than a wall that faces the nominal pose
-        np.testing.assert_allclose(own.truth[:, 2], 13.5 / (2.0 - 0.05 * frame), rtol=1e-9)
-        np.testing.assert_allclose(own.truth[:, :2], growth * start[:, :2], rtol=1e-6)
+        assert_allclose(own.truth[:, 2], 13.5 / (2.0 - 0.05 * frame), rtol=1e-9)
+        assert_allclose(own.truth[:, :2], growth * start[:, :2], rtol=1e-6)
         heading = own.errors[:, 0].mean()  # a heading to the left moves the image to the right
         assert heading == pytest.approx(0.3 * (1 + np.mean((own.truth[:, 0] / 150) ** 2)), abs=0.1)
         assert np.abs(own.z - own.real)[:, :2].max() < 0.8
 
 
-def test_a_feature_that_comes_nearer_is_compared_at_its_size() -> None:
+def test_a_feature_that_comes_nearer_is_compared_at_its_size():
     """From 2 m to 1.4 m: patches zoomed by the measured disparity stay alike."""
     scene, poses = wall(), [pose_at(0.1 * k) for k in range(7)]
     tracks = Chain(tracking=KnownProjection()).run(
@@ -187,7 +184,7 @@ def test_a_feature_that_comes_nearer_is_compared_at_its_size() -> None:
     assert np.median(tracks.dissimilarity[tracks.frame == 6]) < 0.25
 
 
-def test_tracks_say_which_observations_are_kept() -> None:
+def test_tracks_say_which_observations_are_kept():
     chain = Chain(correspondence=BlockMatching((1, 7)), filters=(LeftRightCheck(), TrackResidual(-1.0)))
     scene = wall(2.2)
     poses = np.stack([pose_at(0.2 * k) for k in range(3)])  # 6.1, 6.75, 7.5 px: at last beyond the search
@@ -198,16 +195,16 @@ def test_tracks_say_which_observations_are_kept() -> None:
     assert len(tracks.kept) == (tracks.flag == KEPT).sum() == 0
 
 
-def test_labels_tell_points_junctions_mismatches_and_drift(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_labels_tell_points_junctions_mismatches_and_drift(monkeypatch):
     scene, rng = wall(), np.random.default_rng(5)
     jump = np.array([0.0, 3.0])
 
     class Jumping:
-        def follow(self, before: Array, after: Array, uv: Array, true: Array) -> tuple[Array, Array]:
+        def follow(self, before, after, uv, true):
             return true + jump * (np.arange(len(uv)) == 0)[:, None], np.ones(len(uv), bool)
 
     class Wrong(KnownDisparity):
-        def measure(self, left: Array, right: Array, uv: Array) -> Array:
+        def measure(self, left, right, uv):
             return np.where(np.arange(len(uv)) == 1, 9.75, 6.75)
 
     monkeypatch.setattr(module, "KnownDisparity", type("Other", (), {}))  # so that the chain asks the matcher
@@ -219,7 +216,7 @@ def test_labels_tell_points_junctions_mismatches_and_drift(monkeypatch: pytest.M
     assert (labels[2:] == POINT).all()
 
 
-def test_a_junction_is_where_two_depths_meet() -> None:
+def test_a_junction_is_where_two_depths_meet():
     near = Layer.facing(2.0, Plain(20.0), (0.0, 0.0), (0.4, 0.4))  # 30 px about the middle
     scene = Scene((Layer.facing(5.0, Plain(200.0)), near))
     uv = np.array([[15.0, 0.0], [15.0, 15.0], [0.0, 0.0], [40.0, 0.0], [15.0, 30.0]])
@@ -228,7 +225,7 @@ def test_a_junction_is_where_two_depths_meet() -> None:
     assert not at_junction(Scene((scene.layers[0], poster)), CAMERA, np.zeros(6), uv).any()
 
 
-def test_the_crossing_of_a_pole_and_an_edge_is_no_rigid_point() -> None:
+def test_the_crossing_of_a_pole_and_an_edge_is_no_rigid_point():
     """Tracked without error, a point fits to 1e-6 px; the crossing of edges at two depths does not.
 
     A point whose v is now 0.5 px too high and now too low is 0.35 px rms off over u and v.
@@ -249,49 +246,49 @@ def test_the_crossing_of_a_pole_and_an_edge_is_no_rigid_point() -> None:
     assert np.isnan(drives.rigid_residual(tracks.take(tracks.frame < 2), poses, CAMERA)[1]).all()
 
 
-def test_joined_tracks_keep_their_own_numbers() -> None:
+def test_joined_tracks_keep_their_own_numbers():
     scene = wall()
     parts = [Chain().run(film(scene, CAMERA, [np.zeros(6)], np.random.default_rng(k)), scene, CAMERA) for k in range(2)]
     both = join_tracks(parts)
     assert len(np.unique(both.track)) == sum(len(np.unique(part.track)) for part in parts)
     assert both.sequence.tolist() == [0] * len(parts[0]) + [1] * len(parts[1])
-    np.testing.assert_array_equal(both.z, np.concatenate([part.z for part in parts]))
+    assert_array_equal(both.z, np.concatenate([part.z for part in parts]))
 
 
 # --- protocols ---------------------------------------------------------------------------------
 
 
-def test_the_stops_of_experiment_2() -> None:
+def test_the_stops_of_experiment_2():
     distances = Stops().distances
     assert len(distances) == 101
-    np.testing.assert_allclose(distances[[0, 1, -1]], [6.0, 5.95, 1.0])
+    assert_allclose(distances[[0, 1, -1]], [6.0, 5.95, 1.0])
 
 
-def test_standing_does_not_depend_on_the_number_of_threads() -> None:
+def test_standing_does_not_depend_on_the_number_of_threads():
     stops = Stops(farthest=2.0, nearest=1.0, step=1.0, images=2)
     one, two = (stand(Chain(), CAMERA, stops, np.random.default_rng(6), workers) for workers in (1, 2))
-    np.testing.assert_array_equal(one.z, two.z)
+    assert_array_equal(one.z, two.z)
     assert np.unique(one.sequence).tolist() == [0, 1]
-    np.testing.assert_allclose(one.truth[one.sequence == 1, 2], 13.5)
+    assert_allclose(one.truth[one.sequence == 1, 2], 13.5)
     assert np.unique(one.frame).tolist() == [0, 1, 2]
 
 
-def test_a_retreat_goes_from_near_to_far() -> None:
+def test_a_retreat_goes_from_near_to_far():
     tracks = drives.retreat(Chain(), CAMERA, Stops(farthest=2.0, step=0.1), np.random.default_rng(7))
     d = [tracks.truth[tracks.frame == frame, 2] for frame in (0, 10)]
-    np.testing.assert_allclose(d[0], 13.5)
-    np.testing.assert_allclose(d[1], 6.75)
+    assert_allclose(d[0], 13.5)
+    assert_allclose(d[1], 6.75)
 
 
-def test_shaking_turns_and_does_not_move() -> None:
+def test_shaking_turns_and_does_not_move():
     """2,000 poses: the sd within 6 standard errors (false alarm below 1e-8)."""
     turned = drives.shaken(np.zeros((2000, 6)), 0.01, np.random.default_rng(8))
     assert not turned[:, :3].any()
-    np.testing.assert_allclose(turned[:, 3:].std(axis=0), 0.01, rtol=6 / np.sqrt(4000))
+    assert_allclose(turned[:, 3:].std(axis=0), 0.01, rtol=6 / np.sqrt(4000))
     assert not drives.shaken(np.zeros((5, 6)), 0.0, np.random.default_rng(8)).any()
 
 
-def test_scenes_have_depths_and_junctions(rng: np.random.Generator) -> None:
+def test_scenes_have_depths_and_junctions(rng):
     tracks = drives.drive(Chain(Spread(30, 6, 5)), CAMERA, drives.office(rng), rng, images=3)
     assert np.ptp(tracks.truth[tracks.frame == 0, 2]) > 0.5
     scene = drives.partition(rng)
@@ -304,7 +301,7 @@ def test_scenes_have_depths_and_junctions(rng: np.random.Generator) -> None:
 # --- bad input ---------------------------------------------------------------------------------
 
 
-def test_stages_are_known_by_name() -> None:
+def test_stages_are_known_by_name():
     chain = Chain.of(
         "shi-tomasi",
         "none",
@@ -316,7 +313,7 @@ def test_stages_are_known_by_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("role", "name", "settings", "message"),
+    "role, name, settings, message",
     [
         ("matching", "sgbm", {}, "no role 'matching'; known: selection, tracking, correspondence, filter"),
         ("tracking", "sift", {}, "no tracking 'sift'; known: klt, none"),
@@ -328,12 +325,12 @@ def test_stages_are_known_by_name() -> None:
         ),
     ],
 )
-def test_a_stage_that_does_not_exist_is_refused(role: str, name: str, settings: dict[str, int], message: str) -> None:
+def test_a_stage_that_does_not_exist_is_refused(role, name, settings, message):
     with pytest.raises(cs.InputError, match=message):
         stage(role, name, **settings)
 
 
-def test_a_search_that_misses_the_scene_is_refused() -> None:
+def test_a_search_that_misses_the_scene_is_refused():
     scene = wall(2.0)
     with pytest.raises(cs.InputError, match=r"search: 8 to 32 px misses every depth .* from 6\.8 to 6\.8 px; widen"):
         Chain(correspondence=BlockMatching((8, 32))).run(
@@ -343,7 +340,7 @@ def test_a_search_that_misses_the_scene_is_refused() -> None:
         BlockMatching((5, 5)).measure(*pair(scene), np.zeros((1, 2)))
 
 
-def test_an_image_that_is_too_small_is_refused() -> None:
+def test_an_image_that_is_too_small_is_refused():
     small = np.zeros((20, 30), np.uint8)
     with pytest.raises(cs.InputError, match="30 x 20 px is too small for blocks of 15 px and the search"):
         BlockMatching().measure(small, small, np.zeros((1, 2)))
@@ -355,6 +352,6 @@ def test_an_image_that_is_too_small_is_refused() -> None:
         GoodFeatures().choose(small)
 
 
-def test_no_frames_are_refused() -> None:
+def test_no_frames_are_refused():
     with pytest.raises(cs.InputError, match="frames: there is none"):
         Chain().run([], wall(), CAMERA)

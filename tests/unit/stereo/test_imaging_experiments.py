@@ -1,14 +1,9 @@
 """The experiments on rendered images, cut to a few images: all findings come, and a report shows their tables."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 from painted import by_title, lines, panels
 from scripts import experiment
 
@@ -25,17 +20,17 @@ pytest.importorskip("cv2")
 
 
 @pytest.fixture
-def noise(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def noise(monkeypatch):
     module = experiment("e24_image_noise")
     for name, value in {"IMAGES": 6, "WALLS": 1, "RESIDUALS": (0.0, 0.005), "DRAWS": 20}.items():
         monkeypatch.setattr(module, name, value)
-    stops: Callable[..., Stops] = lambda **given: Stops(**({"farthest": 1.4, "step": 0.2} | given))  # noqa: E731
+    stops = lambda **given: Stops(**({"farthest": 1.4, "step": 0.2} | given))  # noqa: E731
     monkeypatch.setattr(module, "Stops", stops)
     return module
 
 
 @pytest.fixture
-def moving(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def moving(monkeypatch):
     module = experiment("e25_image_tracks")
     for name, value in {"WALLS": 2, "SCENES": 1, "VIEWS": 5, "IMAGES": 4, "ROBOTS": 1, "DRAWS": 20}.items():
         monkeypatch.setattr(module, name, value)
@@ -44,7 +39,7 @@ def moving(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return module
 
 
-def test_noise_of_disparity(noise: ModuleType) -> None:
+def test_noise_of_disparity(noise):
     study = cs.Study(seed=3, jobs=1)
     findings = {finding.id: finding for finding in noise.main(study)}
     assert set(findings) == set(noise.FINDINGS)
@@ -64,13 +59,13 @@ def test_noise_of_disparity(noise: ModuleType) -> None:
     assert (density["density"] * (density["high"] - density["low"])).sum() == pytest.approx(1.0, abs=0.05)
 
 
-def test_only_what_is_asked_for_is_run(noise: ModuleType) -> None:
+def test_only_what_is_asked_for_is_run(noise):
     study = cs.Study(jobs=1, only=["fig7-8"])
     assert [finding.id for finding in noise.main(study)] == ["fig7-8"]
     assert set(study.tables) == {"images_bias"}
 
 
-def test_tracks_and_their_report(moving: ModuleType, noise: ModuleType, tmp_path: Path) -> None:
+def test_tracks_and_their_report(moving, noise, tmp_path):
     study = cs.Study(seed=3, jobs=1)
     found = moving.main(study)
     assert [finding.id for finding in found] == list(moving.FINDINGS)
@@ -90,12 +85,12 @@ def test_tracks_and_their_report(moving: ModuleType, noise: ModuleType, tmp_path
     assert len(headings) == len(images.EXHIBITS)
     curves = lines(figures["Noise of disparity"][0])
     stops = study.tables["images_stops"].sort_values("disparity")
-    np.testing.assert_allclose(curves[3].get_ydata(), stops[stops["residual"] == 0.005]["within"])
-    np.testing.assert_allclose(curves[4].get_ydata(), stops[stops["residual"] == 0.005]["pooled"])
+    assert_allclose(curves[3].get_ydata(), stops[stops["residual"] == 0.005]["within"])
+    assert_allclose(curves[4].get_ydata(), stops[stops["residual"] == 0.005]["pooled"])
     kept = lines(figures["Features kept at each stop"][0])
-    np.testing.assert_allclose(kept[2].get_ydata(), stops[stops["residual"] == 0.005]["features"])
+    assert_allclose(kept[2].get_ydata(), stops[stops["residual"] == 0.005]["features"])
     lags = lines(figures["Whiteness"][0])[-1]
-    np.testing.assert_allclose(lags.get_ydata(), study.tables["images_fig5a_lags"]["autocorrelation"])
+    assert_allclose(lags.get_ydata(), study.tables["images_fig5a_lags"]["autocorrelation"])
     for title in "Errors of disparity about track means", "Errors of tracking":
         height, edges, _ = figures[title][0].patches[0].get_data()
         assert (height * np.diff(edges)).sum() == pytest.approx(1.0, abs=0.05)
@@ -105,7 +100,7 @@ def test_tracks_and_their_report(moving: ModuleType, noise: ModuleType, tmp_path
     assert len(points.get_xdata()) == (~features["junction"]).sum()
     survivors = figures["Tracks over images"][2]
     moving_only = study.tables["images_exp1"].query("camera == 'moving'")
-    np.testing.assert_allclose(lines(survivors, "moving")[0].get_ydata(), moving_only["tracks"])
+    assert_allclose(lines(survivors, "moving")[0].get_ydata(), moving_only["tracks"])
     largest = study.tables["images_bias"].query("left == 'k1 +-0.005'")["bias_d"].abs().max()
     (row,) = (cells for cells in rows_of(tables["Largest biases of disparity"]) if cells[0] == "k1 +-0.005")
     assert row[1] == row[2] == f"{largest:.2f}"  # one wall
@@ -120,12 +115,12 @@ def test_tracks_and_their_report(moving: ModuleType, noise: ModuleType, tmp_path
     assert rows_of(tables["Junctions beside points"])[1][2] == f"{median:.2f}"
 
 
-def rows_of(table: Table) -> tuple[tuple[object, ...], ...]:
+def rows_of(table):
     [(_, rows)] = table.groups
     return rows
 
 
-def test_a_report_without_images_has_no_section(tmp_path: Path) -> None:
+def test_a_report_without_images_has_no_section(tmp_path):
     study = cs.Study(jobs=1)
     study.tables["images_exp1"] = pd.DataFrame({"frame": [0.0], "tracks": [3.0], "rms_u": [0.1]})
     study.write(tmp_path / "out", [], 0.0)
@@ -135,15 +130,13 @@ def test_a_report_without_images_has_no_section(tmp_path: Path) -> None:
     assert not shown(build_report(tmp_path / "out"), images.EXHIBITS)
 
 
-def test_a_junction_ranks_above_a_point(moving: ModuleType) -> None:
+def test_a_junction_ranks_above_a_point(moving):
     table = pd.DataFrame({"junction": [True, True, False, False], "residual": [3.0, 1.0, 2.0, 0.5]})
     assert moving.above(table, "residual") == 0.75
 
 
-def test_without_opencv_the_experiments_are_left_out(
-    noise: ModuleType, moving: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def missing() -> None:
+def test_without_opencv_the_experiments_are_left_out(noise, moving, monkeypatch, capsys):
+    def missing():
         raise cs.InputError("images need OpenCV")
 
     for module in (noise, moving):
@@ -152,30 +145,30 @@ def test_without_opencv_the_experiments_are_left_out(
     assert capsys.readouterr().err.count("images need OpenCV") == 2
 
 
-def tracks_with(errors: np.ndarray, track: np.ndarray, label: np.ndarray | None = None) -> Tracks:
+def tracks_with(errors, track, label=None):
     """Kept observations with these errors (M, 3) about a truth that is not zero."""
     zero, truth = np.zeros(len(track), int), np.tile([10.0, 20.0, 5.0], (len(track), 1))
     label = zero + POINT if label is None else label
     return Tracks(zero, zero, track, truth + errors, truth, truth, zero.astype(float), label, zero)
 
 
-def test_scatter_about_the_means_of_tracks(moving: ModuleType) -> None:
+def test_scatter_about_the_means_of_tracks(moving):
     errors = np.array([[1.0, 0, 5], [3.0, 0, 5], [2.0, 3, 5], [7.0, 7, 7], [9.0, 9, 9], [50.0, 50, 50]])
     labels = np.array([POINT] * 5 + [MISMATCH])
     squares, spare = moving.scatter(tracks_with(errors, np.array([4, 4, 4, 8, 8, 8]), labels))
-    np.testing.assert_allclose(squares, [[2.0, 6.0, 0.0], [2.0, 2.0, 2.0]])
+    assert_allclose(squares, [[2.0, 6.0, 0.0], [2.0, 2.0, 2.0]])
     assert spare.tolist() == [2, 1]
 
 
-def test_noise_ratios_are_those_simulated(moving: ModuleType, rng: np.random.Generator) -> None:
+def test_noise_ratios_are_those_simulated(moving, rng):
     """60 tracks of 20 images, sd 3, 1 and 0.5 times that at rest; each by six standard errors (below 1e-8)."""
     track, sd = np.repeat(np.arange(60), 20), np.array([3.0, 1.0, 0.5])
     offsets = rng.standard_normal((60, 3))[track]  # constant along a track: no noise
     fast, slow = (tracks_with(k * 0.1 * rng.standard_normal((1200, 3)) + offsets, track) for k in (sd, 1.0))
     table = moving.noise_ratios(fast, slow, rng)
     error = np.sqrt(2.0 / (2.0 * 60 * 19))  # of the ratio of two sd
-    np.testing.assert_allclose(table["ratio"] / sd, 1.0, atol=6 * error)
-    np.testing.assert_allclose(table["moving"], 0.1 * sd, rtol=6 * error)
+    assert_allclose(table["ratio"] / sd, 1.0, atol=6 * error)
+    assert_allclose(table["moving"], 0.1 * sd, rtol=6 * error)
     half = (table["high"] - table["low"]) / 2 / table["ratio"]
-    np.testing.assert_allclose(half, 2.935 * error, rtol=0.4)  # quantile of 0.5 % / 3
+    assert_allclose(half, 2.935 * error, rtol=0.4)  # quantile of 0.5 % / 3
     assert (table["low"] < table["ratio"]).all()

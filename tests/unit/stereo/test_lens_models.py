@@ -1,29 +1,25 @@
 """The experiment on lens models: what the truth and each belief hold, and that its rules can fail."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 from scripts import experiment
 
 import consistency as cs
 from consistency.bench.scenario import PicturedSensor
-from consistency.stereo.characterising.characterise import Characterisation, characterise
+from consistency.stereo.characterising.characterise import characterise
 from consistency.stereo.characterising.log_residuals import Residuals
 
 SIGMA = (0.2, 0.15, 0.3)
 
 
 @pytest.fixture(scope="module")
-def lens() -> ModuleType:
+def lens():
     return experiment("e26_lens_models")
 
 
-def found(rng: np.random.Generator, slope: float, f: float = 480.0) -> Characterisation:
+def found(rng, slope, f=480.0):
     """A camera whose bias of d grows with u by ``slope``; white noise all over the image."""
     sensor = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=f, B=0.094, image=(640, 360))
     ideal = rng.uniform((-320, -180, 20), (320, 180, 100), (3000, 3))
@@ -33,9 +29,7 @@ def found(rng: np.random.Generator, slope: float, f: float = 480.0) -> Character
     return characterise(Residuals(r, ideal, row // 50, row % 50, row < 0), sensor, "test", alone=True)
 
 
-def test_truth_is_what_was_found_and_a_belief_holds_all_of_it_or_its_pooled_noise(
-    lens: ModuleType, rng: np.random.Generator
-) -> None:
+def test_truth_is_what_was_found_and_a_belief_holds_all_of_it_or_its_pooled_noise(lens, rng):
     of = found(rng, 0.003)
     full, alone = lens.beliefs("poor", of).values()
     assert full.truth == alone.truth
@@ -43,8 +37,8 @@ def test_truth_is_what_was_found_and_a_belief_holds_all_of_it_or_its_pooled_nois
     (bias,) = full.truth.sensor.effects
     place = np.array([-300.0, 0.0, 200.0]), np.array([-100.0, 0.0, 100.0])
     known = full.belief.sensor.bias.at(*place)
-    np.testing.assert_allclose(known, np.array([[0.0, 0.0, 0.003 * u] for u in place[0]]), atol=0.1)
-    np.testing.assert_allclose(bias.at(*place), known)
+    assert_allclose(known, np.array([[0.0, 0.0, 0.003 * u] for u in place[0]]), atol=0.1)
+    assert_allclose(bias.at(*place), known)
     assert full.belief.sensor.sigma == full.truth.sensor.sigma == pytest.approx(SIGMA, rel=0.15)
     assert full.truth.sensor.rig == (full.belief.sensor.f, full.belief.sensor.B) == (480.0, 0.094)
     assert full.truth.sensor.image == (640, 360)
@@ -55,9 +49,7 @@ def test_truth_is_what_was_found_and_a_belief_holds_all_of_it_or_its_pooled_nois
     assert alone.belief.sensor.disparity_growth is None
 
 
-def test_all_lens_models_share_one_camera(
-    lens: ModuleType, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_lens_models_share_one_camera(lens, rng, monkeypatch):
     """Three runs of one filter: a row a world, with the bias of each lens model and the rig of the full one."""
     monkeypatch.setattr(lens, "FILTERS", ("ekf-uvd",))
     known = {"full": found(rng, 0.0), "poor": found(rng, 0.003, 500.0)}
@@ -74,10 +66,10 @@ def test_all_lens_models_share_one_camera(
     assert sensors.loc[("poor", "d"), "bias"] == pytest.approx(0.96, abs=0.5)
     nodes = study.tables["lens_models_bias"]
     own = nodes[nodes["model"] == "poor"]
-    np.testing.assert_allclose(own["bias_d"], 0.003 * own["u"], atol=0.5)  # five standard errors in a corner
+    assert_allclose(own["bias_d"], 0.003 * own["u"], atol=0.5)  # five standard errors in a corner
 
 
-def table_of(lens: ModuleType, status: str = "consistent", p: float = 1e-4) -> pd.DataFrame:
+def table_of(lens, status="consistent", p=1e-4):
     rows = [
         (model, belief, name, "biased" if belief == lens.BELIEFS[1] else "consistent", 3.0, 0.1, 1e-4)
         for model in ("full", *lens.POOR)
@@ -90,7 +82,7 @@ def table_of(lens: ModuleType, status: str = "consistent", p: float = 1e-4) -> p
     return table
 
 
-def test_the_rules_can_fail(lens: ModuleType) -> None:
+def test_the_rules_can_fail(lens):
     study, usual = cs.Study(), table_of(lens, "biased")
     assert lens.with_map(study, table_of(lens)).verdict == "reproduced"
     assert lens.with_map(study, usual).verdict == "not reproduced"
@@ -104,9 +96,7 @@ def test_the_rules_can_fail(lens: ModuleType) -> None:
     assert lens.with_noise(study, of_full).verdict == "reproduced"
 
 
-def test_without_images_or_opencv_it_is_left_out(
-    lens: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_images_or_opencv_it_is_left_out(lens, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("CONSISTENCY_DATA", raising=False)
     monkeypatch.setattr(lens, "opencv", lambda: None)
     assert lens.main(cs.Study()) == []
@@ -114,7 +104,7 @@ def test_without_images_or_opencv_it_is_left_out(
     assert lens.main(cs.Study()) == []
     assert capsys.readouterr().err.count("set CONSISTENCY_DATA to the folder that holds chessboard_9cm") == 2
 
-    def missing() -> None:
+    def missing():
         raise cs.InputError("images need OpenCV")
 
     monkeypatch.setattr(lens, "opencv", missing)

@@ -1,10 +1,5 @@
 """The experiments on synthetic matches, cut to a few repetitions: all findings come, and their rules can fail."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -19,7 +14,7 @@ rigs = experiment("published_rig")
 
 
 @pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def figures(monkeypatch):
     module = experiment("e10_front_end_synthetic")
     for name, value in {"REPETITIONS": 4, "FEWER": 1, "OTHERS": ((3.0, 1.0),), "SAMPLES_23": 100}.items():
         monkeypatch.setattr(module, name, value)
@@ -27,14 +22,14 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 @pytest.fixture
-def first_order(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def first_order(monkeypatch):
     module = experiment("e12_first_order")
     for name, value in {"DEPTHS": (3.0,), "BASELINES": (1.0,), "NOISES": (0.25,), "RUNS": 12, "POINTS": 8}.items():
         monkeypatch.setattr(module, name, value)
     return module
 
 
-def test_figures(figures: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures(figures, monkeypatch):
     study = cs.Study(seed=3)
     assert figures.interval(study).verdict == "reproduced"
     found = {finding.id: finding for finding in (figures.figure_22(study), *figures.figure_23(study))}
@@ -50,7 +45,7 @@ def test_figures(figures: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     assert figures.interval(study).verdict == "not reproduced"
 
 
-def test_a_deep_scene_is_not_reproduced(figures: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_deep_scene_is_not_reproduced(figures, monkeypatch):
     """At 30 m and 2 px the disparity's noise is a third of it: the rule of fig. 2.2 must fail."""
     monkeypatch.setattr(figures, "POINT", np.array([2.0, -1.0, 24.0]))
     monkeypatch.setattr(figures, "DEPTHS_22", (24.0,))
@@ -59,7 +54,7 @@ def test_a_deep_scene_is_not_reproduced(figures: ModuleType, monkeypatch: pytest
     assert figures.figure_22(cs.Study(seed=3)).verdict == "not reproduced"
 
 
-def test_map(first_order: ModuleType) -> None:
+def test_map(first_order):
     study = cs.Study(seed=3)
     findings = first_order.main(study)
     assert [finding.id for finding in findings] == list(first_order.FINDINGS)
@@ -71,7 +66,7 @@ def test_map(first_order: ModuleType) -> None:
     }  # fmt: skip
 
 
-def test_the_drawn_band_is_the_rule(figures: ModuleType) -> None:
+def test_the_drawn_band_is_the_rule(figures):
     """Counts at its ends are accepted by the binomial test, those beside them are not."""
     low, high = figures.accepted_counts(200)
     p = [stats.binomtest(count, 200, figures.REGION).pvalue for count in (low - 1, low, high, high + 1)]
@@ -79,7 +74,7 @@ def test_the_drawn_band_is_the_rule(figures: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("name", ["e10", "e12"])
-def test_the_report_shows_the_tables(name: str, figures: ModuleType, first_order: ModuleType, tmp_path: Path) -> None:
+def test_the_report_shows_the_tables(name, figures, first_order, tmp_path):
     study = cs.Study(seed=3)
     found = figures.main(study) if name == "e10" else first_order.main(study)
     study.write(tmp_path / "out", found, 1.0)
@@ -88,7 +83,7 @@ def test_the_report_shows_the_tables(name: str, figures: ModuleType, first_order
     assert (front_end.cells_of(report) is not None) == (name == "e12")
 
 
-def test_points_that_all_images_see(rng: np.random.Generator) -> None:
+def test_points_that_all_images_see(rng):
     rig = rigs.published_rig(0.2)
     assert rig.baseline == pytest.approx(0.2)
     p = rigs.common_points(rng, rig, rigs.MOTION, 200, 2.0, 6.0)

@@ -1,13 +1,10 @@
 """A motion from matched pixels: degrees of freedom of what is left after the pose."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from rigs import MOTION, RIG
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.relative_motion import (
     ESTIMATORS,
     MotionSettings,
@@ -22,7 +19,7 @@ EQUATIONS = {"reprojection": 5, "svd": 3, "horn": 3}  # of a point: eight pixels
 NOISE = (0.2, 0.6)  # px, in the first and the second frame
 
 
-def matches(rng: np.random.Generator, points: int, outliers: int = 0) -> tuple[Array, Array, Array, Array]:
+def matches(rng, points, outliers=0):
     """Pixels of points at one distance, and their noise; the first ``outliers`` are elsewhere in the second frame."""
     p = rng.uniform([-1, -1, 6], [1, 1, 7], (points, 3))
     moved = MOTION.inverse().apply(p)
@@ -34,7 +31,7 @@ def matches(rng: np.random.Generator, points: int, outliers: int = 0) -> tuple[A
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("outliers", [0, 7])
-def test_six_degrees_of_freedom_are_the_pose(rng: np.random.Generator, estimator: str, outliers: int) -> None:
+def test_six_degrees_of_freedom_are_the_pose(rng, estimator, outliers):
     """Of the inliers' equations six are used up; an inlier is outside the gate of 10 sigma with probability 1e-21."""
     found = estimate_motion(RIG, *matches(rng, 30, outliers), MotionSettings(gate=10.0, estimator=estimator), rng)
     assert not found.inliers[:outliers].any()
@@ -42,7 +39,7 @@ def test_six_degrees_of_freedom_are_the_pose(rng: np.random.Generator, estimator
     assert found.dof == EQUATIONS[estimator] * found.inliers.sum() - 6
 
 
-def test_residuals_have_their_degrees_of_freedom(rng: np.random.Generator) -> None:
+def test_residuals_have_their_degrees_of_freedom(rng):
     """The chi2 of 120 motions of 8 points together is within 4.5 sigma of its degrees of freedom: 7e-6.
 
     Without the six of each pose these would be 7 sigma away.
@@ -54,7 +51,7 @@ def test_residuals_have_their_degrees_of_freedom(rng: np.random.Generator) -> No
 
 
 @pytest.mark.parametrize("estimator", ["svd", "horn"])
-def test_chi2_of_a_registration_by_hand(rng: np.random.Generator, estimator: str) -> None:
+def test_chi2_of_a_registration_by_hand(rng, estimator):
     uv0, uv1, sigma0, sigma1 = matches(rng, 20, 3)
     found = estimate_motion(RIG, uv0, uv1, sigma0, sigma1, MotionSettings(gate=10.0, estimator=estimator), rng)
     chi2 = 0.0
@@ -69,7 +66,7 @@ def test_chi2_of_a_registration_by_hand(rng: np.random.Generator, estimator: str
     assert found.chi2 == pytest.approx(chi2)
 
 
-def test_a_small_disparity_off_the_epipolar_line_is_not_near() -> None:
+def test_a_small_disparity_off_the_epipolar_line_is_not_near():
     """Least squares puts a match of 0.1 px whose rows differ by 1 px at the depth of 10 px."""
     K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
     shifted = K.copy()

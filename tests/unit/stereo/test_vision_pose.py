@@ -1,9 +1,5 @@
 """Relative poses, their angles, and covariances through composition."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,25 +10,24 @@ from consistency.referee.errors import InputError
 from consistency.stereo.visual_odometry.relative_pose import rotation_derivatives
 from consistency.vision import GimbalLockError, RelativePose, compose, invert, register_svd, registration_covariance
 
-Array = np.ndarray[Any, Any]
 A = np.array([0.3, -0.2, 0.9, 0.5, -0.7, 2.0])
 B = np.array([-1.0, 0.4, 2.0, -1.2, 0.3, -2.8])
 LOCKED = RelativePose(Rotation.from_euler("ZYX", [0.3, np.pi / 2, 0.1]).as_matrix(), np.zeros(3))
 
 
-def covariance(rng: np.random.Generator) -> Array:
+def covariance(rng):
     root = rng.normal(size=(6, 6))
     return root @ root.T
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
-def test_angles_are_those_of_scipy(roll: float, pitch: float, yaw: float) -> None:
+def test_angles_are_those_of_scipy(roll, pitch, yaw):
     pose = RelativePose(Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix(), np.zeros(3))
     assert pose.rpy == pytest.approx([roll, pitch, yaw], abs=1e-9)
     assert np.abs(RelativePose.from_vector(pose.vector).R - pose.R).max() < 1e-12
 
 
-def test_derivatives_of_the_rotation() -> None:
+def test_derivatives_of_the_rotation():
     h = 1e-6
     first, second = rotation_derivatives(RelativePose.from_vector(A))
     for k in range(3):
@@ -42,21 +37,21 @@ def test_derivatives_of_the_rotation() -> None:
         assert second[k] == pytest.approx(slopes, abs=1e-9)
 
 
-def test_composition_and_inverse() -> None:
+def test_composition_and_inverse():
     a, b, p = RelativePose.from_vector(A), RelativePose.from_vector(B), np.array([[1.0, 2.0, 3.0]])
     assert a.compose(b).apply(p) == pytest.approx(a.apply(b.apply(p)))
     assert a.inverse().apply(a.apply(p)) == pytest.approx(p)
     assert a.compose(b).matrix == pytest.approx(a.matrix @ b.matrix)
 
 
-def test_covariance_of_composition_and_inverse(rng: np.random.Generator) -> None:
+def test_covariance_of_composition_and_inverse(rng):
     """J S J' with J from differences."""
     S_a, S_b = covariance(rng), covariance(rng)
 
-    def composed(x: Array) -> Array:
+    def composed(x):
         return RelativePose.from_vector(x[:6]).compose(RelativePose.from_vector(x[6:])).vector
 
-    def inverted(x: Array) -> Array:
+    def inverted(x):
         return RelativePose.from_vector(x).inverse().vector
 
     J = slopes(composed, np.concatenate([A, B]))
@@ -70,7 +65,7 @@ def test_covariance_of_composition_and_inverse(rng: np.random.Generator) -> None
     assert stated != pytest.approx(S_a, rel=0.1)
 
 
-def test_gimbal_lock_is_named(rng: np.random.Generator) -> None:
+def test_gimbal_lock_is_named(rng):
     p2 = rng.normal(size=(5, 3))
     assert np.abs(register_svd(LOCKED.apply(p2), p2).R - LOCKED.R).max() < 1e-9  # the motion itself is no problem
     for what in (
@@ -92,12 +87,12 @@ def test_gimbal_lock_is_named(rng: np.random.Generator) -> None:
         (np.eye(3), np.array([0, np.inf, 0]), "t: not finite"),
     ],
 )
-def test_a_pose_that_is_none(R: Array, t: Array, message: str) -> None:
+def test_a_pose_that_is_none(R, t, message):
     with pytest.raises(InputError, match=message):
         RelativePose(R, t)
 
 
-def test_a_covariance_that_is_none() -> None:
+def test_a_covariance_that_is_none():
     pose = RelativePose.from_vector(A)
     with pytest.raises(InputError, match="S_b: not positive"):
         compose(pose, np.eye(6), pose, -np.eye(6))
@@ -105,5 +100,5 @@ def test_a_covariance_that_is_none() -> None:
         RelativePose.from_vector(np.zeros(5))
 
 
-def slopes(fun: Any, x: Array, h: float = 1e-6) -> Array:
+def slopes(fun, x, h=1e-6):
     return np.array([(fun(x + h * e) - fun(x - h * e)) / (2 * h) for e in np.eye(len(x))]).T

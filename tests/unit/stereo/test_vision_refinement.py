@@ -1,9 +1,5 @@
 """Maximum-likelihood poses: what they gain, robust losses, and refusals."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from rigs import MOTION, RIG
@@ -24,22 +20,21 @@ from consistency.vision import (
     triangulation_covariance,
 )
 
-Array = np.ndarray[Any, Any]
 S = 0.25 * np.eye(4)
 
 
 @pytest.fixture
-def matches(rng: np.random.Generator) -> tuple[Array, Array]:
+def matches(rng):
     p = rng.uniform([-2, -1.5, 4], [2, 1.5, 12], (60, 3))
     uv1, uv2 = RIG.project(p), RIG.project(MOTION.inverse().apply(p))
     return uv1 + rng.normal(0, 0.5, (60, 4)), uv2 + rng.normal(0, 0.5, (60, 4))
 
 
-def initial(uv1: Array, uv2: Array) -> RelativePose:
+def initial(uv1, uv2):
     return register_svd(triangulate(RIG, uv1), triangulate(RIG, uv2))
 
 
-def test_weights_pay(matches: tuple[Array, Array]) -> None:
+def test_weights_pay(matches):
     """The stated covariance of unweighted registration is larger than the weighted one's, and that the bundle's."""
     uv1, uv2 = matches
     p1, p2 = triangulate(RIG, uv1), triangulate(RIG, uv2)
@@ -52,7 +47,7 @@ def test_weights_pay(matches: tuple[Array, Array]) -> None:
 
 
 @pytest.mark.parametrize("robust", ["huber", "cauchy"])
-def test_an_outlier_loses_its_weight(robust: Any, matches: tuple[Array, Array]) -> None:
+def test_an_outlier_loses_its_weight(robust, matches):
     uv1, uv2 = matches
     clean = refine_reprojection(RIG, uv1, uv2, initial(uv1, uv2), S)
     assert clean.weights.tolist() == [1.0] * 60
@@ -66,7 +61,7 @@ def test_an_outlier_loses_its_weight(robust: Any, matches: tuple[Array, Array]) 
     assert found.weights[:3].max() < 0.3 < 0.6 < np.median(found.weights)
 
 
-def test_matches_must_fit(matches: tuple[Array, Array]) -> None:
+def test_matches_must_fit(matches):
     uv1, uv2 = matches
     start = initial(uv1, uv2)
     with pytest.raises(InputError, match="uv1, uv2: 60, 59 rows"):
@@ -81,7 +76,7 @@ def test_matches_must_fit(matches: tuple[Array, Array]) -> None:
         refine_reprojection(RIG, uv1, uv2, RelativePose(np.eye(3), np.array([0.0, 0.0, -50.0])), S)
 
 
-def test_noise_must_be_some(matches: tuple[Array, Array]) -> None:
+def test_noise_must_be_some(matches):
     uv1, uv2 = matches
     start = initial(uv1, uv2)
     with pytest.raises(InputError, match="S_uv: not positive definite"):
@@ -92,13 +87,13 @@ def test_noise_must_be_some(matches: tuple[Array, Array]) -> None:
         refine_reprojection(RIG, uv1, uv2, start, S, robust="tukey")  # type: ignore[arg-type]
 
 
-def test_a_minimum_that_is_not_reached(matches: tuple[Array, Array], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_minimum_that_is_not_reached(matches, monkeypatch):
     uv1, uv2 = matches
     monkeypatch.setattr(module, "STEPS", 2)
     with pytest.raises(ConvergenceError, match="no minimum in 2 steps"):
         refine_reprojection(RIG, uv1, uv2, initial(uv1, uv2), S)
 
 
-def test_the_theorem_needs_a_minimum() -> None:
+def test_the_theorem_needs_a_minimum():
     with pytest.raises(DegenerateError, match="no minimum"):
         implicit_covariance(np.diag([1.0, -1.0]), np.ones((1, 2, 1)), np.ones((1, 1, 1)))

@@ -1,18 +1,16 @@
 """Errors that all motions of a drive share: their derivatives, and what a part of a drive tells about them."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import posterior
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.odometry import bridged
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, diagonal_covariances
 from consistency.stereo.visual_odometry.shared import RIG, SHARED, SharedError, fit_shared, perturbed, sensitivities
@@ -27,7 +25,7 @@ NAMES = list(SHARED)
 PRIOR = np.array(list(SHARED.values()))
 
 
-def motion(rig: StereoRig, pose: RelativePose, rng: np.random.Generator) -> RelativeMotion:
+def motion(rig, pose, rng):
     """Of exact pixels: the refined pose is ``pose``."""
     z = rng.uniform(5.0, 30.0, POINTS)
     p = np.column_stack([rng.uniform(-0.7, 0.7, POINTS) * z, rng.uniform(-0.2, 0.2, POINTS) * z, z])
@@ -37,17 +35,17 @@ def motion(rig: StereoRig, pose: RelativePose, rng: np.random.Generator) -> Rela
     return RelativeMotion(pose, 1e-6 * np.eye(6), inliers, 1.0, 1, uv0, uv1, sigma, sigma, rows)
 
 
-def difference(pose: RelativePose, true: RelativePose) -> Array:
+def difference(pose, true):
     return np.concatenate([pose.t - true.t, Rotation.from_matrix(pose.R @ true.R.T).as_rotvec()])
 
 
-def drive(rng: np.random.Generator, n: int = 3) -> list[RelativeMotion]:
+def drive(rng, n=3):
     poses = [RelativePose.from_vector(np.array([0.05, -0.02, 1.2 + 0.1 * k, 0.01, -0.03 * k, 0.02])) for k in range(n)]
     return [motion(TURNED, pose, rng) for pose in poses]
 
 
 @pytest.mark.parametrize("name", NAMES[:RIG])
-def test_a_wrong_rig_errs_by_its_derivative(name: str, rng: np.random.Generator) -> None:
+def test_a_wrong_rig_errs_by_its_derivative(name, rng):
     """Pixels of one rig, refined with another; by 1 % of a prior sigma the second order is below 1 % of the error."""
     motions = drive(rng)
     k = NAMES.index(name)
@@ -58,18 +56,18 @@ def test_a_wrong_rig_errs_by_its_derivative(name: str, rng: np.random.Generator)
         wrong = refine_reprojection(perturbed(TURNED, change), m.uv0, m.uv1, m.pose, S, robust="cauchy").pose
         error = difference(wrong, m.pose)
         expected = derivative[:, :RIG] @ change
-        np.testing.assert_allclose(error, expected, atol=0.01 * np.abs(expected).max() + 1e-9)
+        assert_allclose(error, expected, atol=0.01 * np.abs(expected).max() + 1e-9)
 
 
-def test_what_a_changed_rig_is() -> None:
+def test_what_a_changed_rig_is():
     rig = perturbed(TURNED, np.array([0.01, 2.0, -3.0, 0.02, 0.001, 0.0, 0.0]))
-    np.testing.assert_allclose(rig.K_left, [[707.0, 0.0, 602.0], [0.0, 707.0, 177.0], [0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(rig.t, 1.02 * TURNED.t)
-    np.testing.assert_allclose(TURNED.R.T @ rig.R, Rotation.from_rotvec([0.001, 0.0, 0.0]).as_matrix(), atol=1e-12)
+    assert_allclose(rig.K_left, [[707.0, 0.0, 602.0], [0.0, 707.0, 177.0], [0.0, 0.0, 1.0]])
+    assert_allclose(rig.t, 1.02 * TURNED.t)
+    assert_allclose(TURNED.R.T @ rig.R, Rotation.from_rotvec([0.001, 0.0, 0.0]).as_matrix(), atol=1e-12)
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_a_wrong_mounting_errs_by_its_derivative(axis: int, rng: np.random.Generator) -> None:
+def test_a_wrong_mounting_errs_by_its_derivative(axis, rng):
     """The truth is of a body that is turned against the camera: T_true = X' T X."""
     motions = drive(rng)
     J = sensitivities(TURNED, motions, 0.1 * np.arange(4.0))
@@ -77,21 +75,19 @@ def test_a_wrong_mounting_errs_by_its_derivative(axis: int, rng: np.random.Gener
     X = Rotation.from_rotvec(turn).as_matrix()
     for m, derivative in zip(motions, J, strict=True):
         true = RelativePose(X.T @ m.pose.R @ X, X.T @ m.pose.t)
-        np.testing.assert_allclose(
-            np.abs(difference(m.pose, true)), np.abs(derivative[:, RIG:-1] @ turn), rtol=1e-3, atol=1e-12
-        )
+        assert_allclose(np.abs(difference(m.pose, true)), np.abs(derivative[:, RIG:-1] @ turn), rtol=1e-3, atol=1e-12)
         signs = np.sign(difference(m.pose, true) * (derivative[:, RIG:-1] @ turn))
         assert set(signs[np.abs(derivative[:, RIG:-1] @ turn) > 1e-10]) <= {1.0} or set(signs) <= {-1.0, 0.0}
 
 
-def test_a_late_clock_errs_by_the_change_of_the_motion(rng: np.random.Generator) -> None:
+def test_a_late_clock_errs_by_the_change_of_the_motion(rng):
     """The motions grow by 0.1 m a frame of 0.1 s: 10 ms are 10 mm."""
     J = sensitivities(TURNED, drive(rng), 0.1 * np.arange(4.0))
-    np.testing.assert_allclose(0.01 * J[:, 2, -1], 0.01, rtol=0.01)
+    assert_allclose(0.01 * J[:, 2, -1], 0.01, rtol=0.01)
     assert not sensitivities(TURNED, drive(rng, 1), 0.1 * np.arange(2.0))[:, :, -1].any()  # nothing to change from
 
 
-def test_a_bridge_errs_as_its_neighbours_do(rng: np.random.Generator) -> None:
+def test_a_bridge_errs_as_its_neighbours_do(rng):
     """Measured with another rig and bridged again, by the rule of ``bridged``; small turns, to 1 % of the largest."""
     t = np.cumsum([0.0, 0.1, 0.15, 0.1, 0.15, *np.full(8, 0.1)])
     motions, change = drive(rng, 12), 0.01 * PRIOR[:RIG]
@@ -102,21 +98,21 @@ def test_a_bridge_errs_as_its_neighbours_do(rng: np.random.Generator) -> None:
     for k in (0, 3):
         error = difference(bridged(wrong, t)[k].pose, before[k].pose)
         expected = J[k, :, :RIG] @ change
-        np.testing.assert_allclose(error, expected, atol=0.02 * np.abs(expected).max())
+        assert_allclose(error, expected, atol=0.02 * np.abs(expected).max())
         assert np.abs(expected).max() > 1e-6
-        np.testing.assert_array_equal(J[k, 3:, RIG:-1], before[k].pose.R - np.eye(3))
+        assert_array_equal(J[k, 3:, RIG:-1], before[k].pose.R - np.eye(3))
     with pytest.raises(InputError, match="all are bridges"):
         sensitivities(TURNED, [dataclasses.replace(m, fault="dark") for m in motions], t)
 
 
-def remeasured(m: RelativeMotion, change: Array) -> RelativeMotion:
+def remeasured(m, change):
     """The same pixels, with a rig that is ``change`` (7,) off."""
     S = diagonal_covariances(m.sigma0)
     pose = refine_reprojection(perturbed(TURNED, change), m.uv0, m.uv1, m.pose, S, robust="cauchy").pose
     return dataclasses.replace(m, pose=pose)
 
 
-def simulated(rng: np.random.Generator, n: int, J: Array | None = None) -> tuple[Array, Array, Array, Array, Array]:
+def simulated(rng, n, J=None):
     """Errors of n motions, their J and S, what is shared and the floor."""
     J = rng.normal(size=(n, 6, len(PRIOR))) if J is None else J
     theta = PRIOR * rng.normal(size=len(PRIOR))
@@ -126,13 +122,13 @@ def simulated(rng: np.random.Generator, n: int, J: Array | None = None) -> tuple
     return errors, J, S, theta, floor
 
 
-def test_the_likelihood_is_that_of_all_errors_together(rng: np.random.Generator) -> None:
+def test_the_likelihood_is_that_of_all_errors_together(rng):
     """By the dense covariance of 5 motions; mean and covariance by regression; the slope by central differences."""
     errors, J, S, _, floor = simulated(rng, 5, J=1e-2 * rng.normal(size=(5, 6, len(PRIOR))))
     S = S * rng.uniform(0.5, 2.0, (5, 1, 1)) + 1e-9
     rows, Pi = J.reshape(30, -1), np.diag(PRIOR**2)
 
-    def minus_twice(log_floor: Array) -> float:
+    def minus_twice(log_floor):
         V = block_diag(*(S + np.diag(np.exp(2.0 * log_floor)))) + rows @ Pi @ rows.T
         return float(np.linalg.slogdet(V)[1] + errors.ravel() @ np.linalg.solve(V, errors.ravel()))
 
@@ -140,23 +136,23 @@ def test_the_likelihood_is_that_of_all_errors_together(rng: np.random.Generator)
     assert value == pytest.approx(minus_twice(np.log(floor)), rel=1e-9)
     steps = 1e-5 * np.eye(6)
     by_differences = [(minus_twice(np.log(floor) + h) - minus_twice(np.log(floor) - h)) / 2e-5 for h in steps]
-    np.testing.assert_allclose(slope, by_differences, rtol=1e-5, atol=1e-5)
+    assert_allclose(slope, by_differences, rtol=1e-5, atol=1e-5)
     V = block_diag(*(S + np.diag(floor**2))) + rows @ Pi @ rows.T
     gain = Pi @ rows.T @ np.linalg.inv(V)
-    np.testing.assert_allclose(mean, gain @ errors.ravel(), rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(covariance, Pi - gain @ rows @ Pi, rtol=1e-4, atol=1e-9)
+    assert_allclose(mean, gain @ errors.ravel(), rtol=1e-7, atol=1e-12)
+    assert_allclose(covariance, Pi - gain @ rows @ Pi, rtol=1e-4, atol=1e-9)
 
 
-def test_shared_errors_and_floor_are_found(rng: np.random.Generator) -> None:
+def test_shared_errors_and_floor_are_found(rng):
     """2,000 motions: theta within 6 of its standard deviations, a floor within 6 x 1.6 % (false alarm below 1e-7)."""
     errors, J, S, theta, floor = simulated(rng, 2000)
     fit = fit_shared(errors, J, S)
     off = fit.mean - theta
     assert off @ np.linalg.solve(fit.covariance, off) < 75.0  # chi-square with 11 degrees of freedom: 1e-11
-    np.testing.assert_allclose(fit.floor, floor, rtol=0.1)
+    assert_allclose(fit.floor, floor, rtol=0.1)
 
 
-def test_predictions_of_other_motions_are_honest() -> None:
+def test_predictions_of_other_motions_are_honest():
     """300 drives of 20 motions, one more predicted: the mean NEES is 6, and more as the floor is an estimate of 20.
 
     With f degrees of freedom left to each of its variances it is 6 f / (f - 2): 6.7 to 7.5 for 20 to 10. Beyond the
@@ -172,7 +168,7 @@ def test_predictions_of_other_motions_are_honest() -> None:
     assert 5.0 < np.mean(nees) < 9.0
 
 
-def test_what_cannot_be_fitted(rng: np.random.Generator) -> None:
+def test_what_cannot_be_fitted(rng):
     errors, J, S, *_ = simulated(rng, FEWEST - 1)
     with pytest.raises(cs.InputError, match=r"of 11 motions, at least 12 are needed"):
         fit_shared(errors, J, S)
@@ -182,10 +178,10 @@ def test_what_cannot_be_fitted(rng: np.random.Generator) -> None:
     assert (fit_shared(errors, J, S).floor > 0.0).all()
 
 
-def test_a_prediction_has_all_three_parts(rng: np.random.Generator) -> None:
+def test_a_prediction_has_all_three_parts(rng):
     J, S = rng.normal(size=(2, 6, len(PRIOR))), np.tile(np.eye(6), (2, 1, 1))
     root = rng.normal(size=(len(PRIOR),) * 2)
     shared = SharedError(PRIOR, root @ root.T, np.arange(1.0, 7.0))
     bias, P = shared.predict(J, S)
-    np.testing.assert_allclose(bias[1], J[1] @ PRIOR)
-    np.testing.assert_allclose(P[1], S[1] + J[1] @ root @ root.T @ J[1].T + np.diag(np.arange(1.0, 7.0) ** 2))
+    assert_allclose(bias[1], J[1] @ PRIOR)
+    assert_allclose(P[1], S[1] + J[1] @ root @ root.T @ J[1].T + np.diag(np.arange(1.0, 7.0) ** 2))

@@ -1,7 +1,5 @@
 """Small inverses, and what importing the front-end loads."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from consistency.stereo.visual_odometry.cameras import batch_inverses
 
 
 @pytest.mark.parametrize("m", [2, 3, 6])
-def test_inverses_are_lapacks(m: int, rng: np.random.Generator) -> None:
+def test_inverses_are_lapacks(m, rng):
     root = rng.normal(size=(40, m, m))
     C = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(m)
     inverse, definite = batch_inverses.symmetric_inverses(C)
@@ -18,7 +16,7 @@ def test_inverses_are_lapacks(m: int, rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("m", [2, 3, 6])
-def test_what_is_not_positive_definite_is_told(m: int, rng: np.random.Generator) -> None:
+def test_what_is_not_positive_definite_is_told(m, rng):
     turn = np.linalg.qr(rng.normal(size=(m, m)))[0]
     for k in range(m):
         values = np.ones(m)

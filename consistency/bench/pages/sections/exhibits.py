@@ -85,6 +85,24 @@ def all_findings(report: Report) -> tuple[Block, ...]:
     return (findings_table(report.findings, "Findings", caption),) if report.findings else ()
 
 
+def findings_on_paper(report: Report) -> tuple[Block, ...]:
+    """The same without the rules."""
+    if not report.findings:
+        return ()
+    rows = [
+        (
+            Stack(str(finding["id"]), (), bold=True),
+            Stack(str(finding["claim"]), (Small(str(finding["source"] or "")),)),
+            str(finding["published"]),
+            str(finding["measured"]),
+            Status(outcome(str(finding["source"] or ""), str(finding["verdict"]))),
+        )
+        for finding in report.findings
+    ]
+    caption = "The rule by which each is accepted, fixed before this run, stands in the HTML page"
+    return (table(OF_FINDINGS, rows, "Findings", caption=caption, style="prose"),)
+
+
 def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:
     below = []
     if finding["accept"]:

@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.pages.sections.report_input import Report, Track
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.document.blocks import Block, Column, Figure, Name, Table, Text, table
+from consistency.bench.pages.sections.anees import anees_curves
+from consistency.bench.pages.sections.report_input import STEREO, Report, Study, Track
+from consistency.referee.diagnostics.verdict.parts import STATUSES, Interval
+from consistency.referee.diagnostics.words.numbers import short
+from consistency.referee.document.blocks import (
+    Block,
+    Column,
+    Figure,
+    Heading,
+    Name,
+    Reasons,
+    Table,
+    Text,
+    table,
+)
 from consistency.referee.document.colours import BAND, EXPECTED, solid
 from consistency.referee.document.judged_filters import BRIEF, cells, columns
+from consistency.referee.document.wording import listed
+from consistency.referee.pages.origin import facts
 from consistency.referee.pages.verdicts import judgement, method
 from consistency.referee.show.painting import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
 
@@ -19,6 +34,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
 TITLE = "Which filter tells the truth about its uncertainty, and where?"
+QUESTION = (
+    "Herath, Kodagoda and Dissanayake (2007), Stereo Vision Based SLAM: Issues and Solutions, ask whether EKF and UKF "
+    "SLAM by a small stereo pair are consistent: whether their errors are as large as their covariances state. They "
+    "find that no filter they tried is at a baseline of 9 cm. Valencia and Andrade-Cetto (2018), SLAM Front-End, "
+    "propagate the covariance of stereo visual odometry in closed form and check it by its NEES."
+)
+ORIGIN = ("Command", "Date", "Git commit", "Runs", "Seed")  # facts on the first page
+ON_PAPER = ("ANEES of the pose", "NEES of the pose")  # figures of a study
 LABEL = "covariance ratio (truth / stated)"
 ROOM = 1.5  # factor between the outermost values and the edges of the picture
 WIDTHS = ("0.9fr", "auto", "auto")
@@ -41,11 +64,62 @@ class Place:
 def opening(report: Report) -> tuple[Block, ...]:
     """A row of the picture for each world, a row of the table for each filter in it.
 
-    Nothing where there is one study, whose verdicts are at hand anyway.
+    Before them, where the stereo sensor of the paper is one of the worlds, the papers' question and the NEES of all
+    filters there. Nothing where there is one study, whose verdicts are at hand anyway.
     """
     if len(report.studies) < 2 or not any(study.has_truth for study in report.studies):
         return ()
-    return _picture(report), _table(report)
+    main = report.main
+    question: tuple[Block, ...] = ()
+    if main is not None:
+        (curves,) = anees_curves(main)
+        question = Text(QUESTION), replace(curves, title=f"NEES over time at a baseline of {_baseline(main)}", level=2)
+    return *question, _origin(report), _picture(report), _table(report)
+
+
+def _origin(report: Report) -> Text:
+    """When and by which command the numbers were made, in one line."""
+    said = dict(facts(report.manifest))
+    parts = [f"{name.lower()}: {said[name]}" for name in ORIGIN if name in said]
+    return Text(f"{'; '.join(parts)}.", lead="Origin.")
+
+
+def main_sentence(studies: Sequence[Study]) -> str:
+    """Who is honest on the paper's stereo sensor, and who is not; empty where it was not run."""
+    main = next((study for study in studies if study.name == STEREO), None)
+    if main is None:
+        return ""
+    parts = []
+    for status in STATUSES:
+        ratios = {track.name: _ratio(track) for track in main.tracks if track.verdict.status == status}
+        if not ratios:
+            continue
+        known = sorted(ratio.value for ratio in ratios.values() if ratio is not None)
+        size = ""
+        if known:
+            size = f" (x{short(known[0])})" if len(known) == 1 else f" (by x{short(known[0])} to x{short(known[-1])})"
+        parts.append(f"{listed(list(ratios))} {'is' if len(ratios) == 1 else 'are'} {status}{size}")
+    return f"At a baseline of {_baseline(main)}, {'; '.join(parts)}."
+
+
+def on_paper(study: Study, blocks: Sequence[Block]) -> tuple[Block, ...]:
+    """What the PDF shows of one of several studies: its verdicts, their first sentences, and its first figures."""
+    figures = [block for block in blocks if isinstance(block, Figure) and block.title in ON_PAPER]
+    return *(_brief(block) for block in judgement(study) if not isinstance(block, Heading)), *figures
+
+
+def _brief(block: Block) -> Block:
+    if not isinstance(block, Reasons):
+        return block
+    return Reasons(tuple(replace(entry, others=()) for entry in block.entries))
+
+
+def _baseline(study: Study) -> str:
+    scenario = study.results.scenario
+    assert scenario is not None
+    rig = scenario.truth.sensor.rig
+    assert rig is not None
+    return f"{100.0 * rig[1]:.3g} cm"
 
 
 def _table(report: Report) -> Table:

@@ -14,6 +14,8 @@ from consistency.referee.types import Array
 if TYPE_CHECKING:
     from consistency.bench.store.results import Tables
 
+STEREO = "herath2007-stereo"  # the sensor of the paper, with its baseline of 9 cm
+
 
 @dataclass(frozen=True)
 class Track(Estimator):
@@ -47,5 +49,11 @@ class Report:
 
     @property
     def title(self) -> str:
-        name = "reproduction" if "studies" in self.manifest else self.studies[0].name
-        return f"Filter consistency: {name}"
+        if "studies" in self.manifest:
+            return "Stereo vision based SLAM: which filter tells the truth about its uncertainty?"
+        return f"Filter consistency: {self.studies[0].name}"
+
+    @property
+    def main(self) -> Study | None:
+        """The study of the paper's stereo sensor, where there is one."""
+        return next((study for study in self.studies if study.name == STEREO), None)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.judging.fault_location import Answers, any_found, from_step, location_of
-from consistency.referee.diagnostics.judging.hypothesis_tests import Tests
+from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, sided_p_value
 from consistency.referee.diagnostics.questions.band import Band, simultaneous_band
 from consistency.referee.diagnostics.questions.bias import hotelling
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
 from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
+from consistency.referee.diagnostics.records.groups import spans_of
 from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
@@ -24,6 +26,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     AXIS,
     BIAS,
     DIRECTION,
+    GROUP,
     MAIN,
     SHAPE,
     SHARES,
@@ -37,8 +40,10 @@ from consistency.referee.diagnostics.verdict.parts import (
     Answer,
     Axes,
     Bias,
+    ByGroup,
     Equivalence,
     ErrorParts,
+    Group,
     Interval,
     Location,
     Scale,
@@ -61,9 +66,9 @@ def error_parts(
     location = location_of(sample, band, faults, ordered=record.landmarks is None, detect=settings.factor)
     scaled = at_share(given, settings)
     scale = scale_of(sample, tests, scaled, location, shown)
-    tails = tails_of(tests, record.run_numbers)
+    tails, by_group = tails_of(tests, record.run_numbers), by_group_of(record, sample, tests, given, settings)
     if sample.errors is None:
-        return ErrorParts(scale, location, tails=tails)
+        return ErrorParts(scale, location, tails=tails, by_group=by_group)
     return ErrorParts(
         scale,
         location,
@@ -72,6 +77,7 @@ def error_parts(
         shape_of(sample, tests, faults, scaled.false_alarm),
         tails,
         accuracy_of(sample),
+        by_group,
     )
 
 
@@ -88,7 +94,7 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     """Answers with faults of the scale marked as tolerated whose ratio is shown to lie within the tolerance."""
     if settings.tolerance is None:
         return tuple(given)
-    R, steps = settings.tolerated, sample.longest
+    R, steps, dof = settings.tolerated, sample.longest, sample.dof
     if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
         return tuple(given)
     tolerated = {MAIN}
@@ -98,6 +104,9 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
             tolerated.add(AXIS)
     if tests.largest is not None and tests.largest.ratio.high <= R:
         tolerated.add(DIRECTION)
+    by_group = [sample.in_group(number) for number in range(len(tests.groups))]
+    if all(equivalence(one.means, dof, one.longest, settings, R, weights=one.counts).shown for one in by_group):
+        tolerated.add(GROUP)
     curve = anees(sample.nees)
     if not ((curve > tests.band.high * R) | (curve < tests.band.low / R)).any():
         tolerated.add(STEP)
@@ -153,6 +162,48 @@ def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
     if tests.largest is None:
         return Axes(errors.names, errors.groups, inflation)
     return Axes(errors.names, errors.groups, inflation, tests.largest.ratio, tests.largest.direction)
+
+
+def by_group_of(
+    record: Record, sample: Sample, tests: Tests, given: Sequence[Answer], settings: Settings
+) -> ByGroup | None:
+    """Ratio and status of each group of runs and steps that has a step; None without groups.
+
+    Once some group is found at fault, each one is named whose own p value times the number of groups is at most the
+    false-alarm rate. Nothing is judged where the question of groups was not asked.
+    """
+    groups = sample.groups
+    if groups is None:
+        return None
+    found = [sample.in_group(number) for number in range(len(groups.names))]
+    there = sum(len(one.means) > 0 for one in found)
+    answer = next((answer for answer in given if answer.question == GROUP), None)
+    is_found = answer is not None and answer.found and not answer.tolerated
+    both_sides = replace(settings, allow=None) if record.reduced else settings
+    factor = max(settings.factor, settings.tolerated)
+    confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
+    by_group, spans = [], None if groups.edges is None else spans_of(groups.edges)
+    for number, (name, one) in enumerate(zip(groups.names, found, strict=True)):
+        if not len(one.means):
+            continue
+        shown = equivalence(one.means, sample.dof, one.longest, both_sides, factor, weights=one.counts)
+        p_value, status = float("nan"), ""
+        if answer is not None:
+            p_value = min(1.0, sided_p_value(tests.groups[number], settings) * there)
+            is_wrong = is_found and p_value <= settings.false_alarm
+            status = _status_of_group(tests.groups[number].ratio, is_wrong, shown)
+        ratio = ratio_interval(one.means, sample.dof, confidence, one.counts)
+        span = None if spans is None else spans[number]
+        by_group.append(Group(name, len(one.means), int(one.counts.sum()), ratio, p_value, shown, status, span))
+    without = int((sample.counted & (groups.index < 0)).sum())
+    return ByGroup(groups.column, tuple(by_group), groups.outcome, without)
+
+
+def _status_of_group(ratio: float, is_wrong: bool, shown: Equivalence) -> str:
+    """One word for a group."""
+    if is_wrong:
+        return "overconfident" if ratio > 1.0 else "conservative"
+    return "consistent" if shown.shown else "undecided"
 
 
 def bias_of(sample: Sample, step: int | None, location: Location, answers: Answers) -> Bias:

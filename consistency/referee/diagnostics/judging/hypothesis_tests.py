@@ -18,6 +18,7 @@ from consistency.referee.diagnostics.statistics.nees import Pit, pit
 from consistency.referee.diagnostics.verdict.answers import (
     AXIS,
     DIRECTION,
+    GROUP,
     MAIN,
     STEP,
     Settings,
@@ -43,6 +44,7 @@ class Tests:
     matrix: Array | None = None  # mean product of whitened errors, scaled
     bias_step: int | None = None  # 1..T, with the smallest p value
     shape_step: int | None = None
+    groups: tuple[MeanTest, ...] = ()  # of each group of runs and steps
 
 
 def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], scale: float | None = None) -> Tests:
@@ -76,6 +78,9 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
             p[DIRECTION] = largest.p_value
         else:
             matrix, shape_step = _test_shape(whitened, in_steps, p)
+    groups = group_tests(sample)
+    if groups:
+        p[GROUP], _ = least_of_steps(np.array([sided_p_value(test, settings) for test in groups]))
     distribution = pit(sample.nees, sample.dof)
     if not settings.one_sided:
         p["distribution"] = _distribution(sample, settings, distribution)
@@ -84,7 +89,7 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
     if sample.nees.shape[1] > 1:
         p[STEP] = band.p_value
-    return Tests(p, main, band, distribution, axes, largest, outlier, matrix, bias_step, shape_step)
+    return Tests(p, main, band, distribution, axes, largest, outlier, matrix, bias_step, shape_step, groups)
 
 
 def sided_p_value(test: MeanTest, settings: Settings) -> float:
@@ -100,6 +105,17 @@ def axis_tests(sample: Sample) -> dict[str, MeanTest]:
         key: scale_test(sample.group_means(index), len(index), sample.longest)
         for key, index in sample.known_errors.groups.items()
     }
+
+
+def group_tests(sample: Sample) -> tuple[MeanTest, ...]:
+    """Test of the scale in each group of runs and steps by itself; none where groups do not convict."""
+    if sample.groups is None or sample.groups.outcome:
+        return ()
+    tests = []
+    for number in range(len(sample.groups.names)):
+        found = sample.in_group(number)
+        tests.append(scale_test(found.means, sample.dof, found.longest, weights=found.counts))
+    return tuple(tests)
 
 
 def _distribution(sample: Sample, settings: Settings, distribution: Pit) -> float:

@@ -63,6 +63,7 @@ def findings_of_parts(record: Record, settings: Settings, verdict_of: Callable[[
         parts=parts,
         lost=lost,
         location=None,
+        by_group=None,
         shape=None,
         tails=None,
         accuracy=accuracy,

@@ -9,12 +9,13 @@ import numpy as np
 
 from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, run_tests, sided_p_value
 from consistency.referee.diagnostics.questions.sample import Sample
-from consistency.referee.diagnostics.questions.scale import scale_test, spreads_more, spreads_more_in_steps
+from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test, spreads_more, spreads_more_in_steps
 from consistency.referee.diagnostics.statistics.nees import anees
 from consistency.referee.diagnostics.verdict.answers import (
     AXIS,
     BIAS,
     DIRECTION,
+    GROUP,
     INNOVATIONS,
     JOINT,
     MAIN,
@@ -178,18 +179,23 @@ def _without_bias(given: Sequence[Answer], settings: Settings, sample: Sample) -
 
 def _status_of_sample(settings: Settings, faults: set[str], sample: Sample, tests: Tests) -> str:
     """The status by the errors of a sample: of the scale only where it is no matter of a few large errors."""
+    of_groups = _sides(settings, tests.groups) if GROUP in faults else set()
     if MAIN in faults:
         if not _robust(sample.means(), sample.dof, sample.longest, settings, 1):
             return "heavy-tailed"
         if AXIS in faults and _contradicted(settings, sample, tests):
             return "inconsistent"
-        return _side(tests.main.ratio)
+        return _status_of_sides({_side(tests.main.ratio), *of_groups})
     heavy = "outliers" in faults or (STEP in faults and _heavy_steps(sample, tests))
     if STEP in faults and not heavy:
-        return _status_of_steps(settings, faults, sample, tests)
+        return _status_of_sides({_status_of_steps(settings, faults, sample, tests), *of_groups})
     if AXIS in faults or DIRECTION in faults:
         if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
-            return _status_of_axes(settings, tests)
+            return _status_of_sides({_status_of_axes(settings, tests), *of_groups})
+        heavy = True
+    if GROUP in faults and not heavy:
+        if _robust_group(sample, tests, settings):
+            return _status_of_sides(of_groups)
         heavy = True
     if heavy:
         return "heavy-tailed"
@@ -219,9 +225,11 @@ def _heavy_steps(sample: Sample, tests: Tests) -> bool:
     return len(outside) > 0
 
 
-def _robust(means: Array, dof: int, steps: int, settings: Settings, questions: int) -> bool:
+def _robust(
+    means: Array, dof: int, steps: int, settings: Settings, questions: int, weights: Array | None = None
+) -> bool:
     """Is the scale found at fault too where the runs differ more than Gaussian errors can?"""
-    test = scale_test(means, dof, steps, gaussian=not spreads_more(means, dof))
+    test = scale_test(means, dof, steps, not spreads_more(means, dof), weights)
     return bool(sided_p_value(test, settings) * questions <= SHARES[MAIN] * settings.false_alarm)
 
 
@@ -234,17 +242,34 @@ def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
     return False
 
 
+def _robust_group(sample: Sample, tests: Tests, settings: Settings) -> bool:
+    """Is some group found at fault too where the runs differ more than Gaussian errors can?"""
+    for number, test in enumerate(tests.groups):
+        one = sample.in_group(number)
+        found = sided_p_value(test, settings) * len(tests.groups) <= settings.false_alarm
+        if found and _robust(one.means, sample.dof, one.longest, settings, len(tests.groups), one.counts):
+            return True
+    return False
+
+
 def _status_of_axes(settings: Settings, tests: Tests) -> str:
     """Axes that err in one direction name the status, those that err in both do not."""
     if settings.one_sided:
         return "overconfident"
-    sides = set()
-    for test in tests.axes.values():
-        if test.p_value * len(tests.axes) <= settings.false_alarm:
-            sides.add(_side(test.ratio))
+    return _status_of_sides(_sides(settings, list(tests.axes.values())))
+
+
+def _sides(settings: Settings, tests: Sequence[MeanTest]) -> set[str]:
+    """The sides on which any of the ``tests`` err."""
+    wrong = [test for test in tests if sided_p_value(test, settings) * len(tests) <= settings.false_alarm]
+    return {_side(test.ratio) for test in wrong}
+
+
+def _status_of_sides(sides: set[str]) -> str:
+    """The side on which all err that do, and otherwise that they err on both."""
     if len(sides) != 1:
         return "inconsistent"
-    return sides.pop()
+    return next(iter(sides))
 
 
 def _contradicted(settings: Settings, sample: Sample, tests: Tests) -> bool:

@@ -187,6 +187,7 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
     )
     return replace(
         record, **arrays, covariance=P[0, log.start : end].reshape(pieces, length, *P.shape[2:]), times=times,
+        groups=None if record.groups is None else record.groups.in_pieces(slice(log.start, end), pieces),
         t=np.full(length, np.nan), runs=np.arange(1, pieces + 1), unit="piece", caption=CAPTION,
         notes=(*record.notes, note),
         unavailable=BIAS, unshown=_unshown(memory, pieces, length, parts),

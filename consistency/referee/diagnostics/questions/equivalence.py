@@ -29,6 +29,7 @@ def equivalence(
     low_is_fault: bool = True,
     unseen: float = 0.0,
     share: float = 0.0,
+    weights: Array | None = None,
     is_whole: bool = False,
 ) -> Equivalence:
     """Two one-sided tests that the ratio of true to stated covariance lies in [1 / factor, factor].
@@ -48,6 +49,7 @@ def equivalence(
     low_is_fault : whether a ratio below 1 is a fault, which more runs may find
     unseen : share of the NEES that ``means`` may lack; the ratio is then as much larger on its upper side
     share : of errors of the truth in the covariances of ``means``; the ratio is of the others
+    weights : (runs,), of the runs in the mean; None where they are equal
     is_whole : the interval of the two tests is worked out, too
     """
     factor = settings.factor if factor is None else factor
@@ -55,19 +57,19 @@ def equivalence(
 
     def p_below(ratio: float) -> float:
         size = (share + (1.0 - share) * ratio) * (1.0 - unseen)
-        return scale_test(means / size, dof, steps, gaussian=False).below if size > 0 else 1.0
+        return scale_test(means / size, dof, steps, False, weights).below if size > 0 else 1.0
 
     def p_above(ratio: float) -> float:
-        return scale_test(means / (share + (1.0 - share) * ratio), dof, steps, gaussian=False).above
+        return scale_test(means / (share + (1.0 - share) * ratio), dof, steps, False, weights).above
 
     below, above = p_below(factor), p_above(1.0 / factor)
     interval = None
     if is_whole and len(means) and not share:
-        interval = interval_of_tests(p_below, p_above, float(means.mean()), 1.0 - settings.power)
+        interval = interval_of_tests(p_below, p_above, float(np.average(means, weights=weights)), 1.0 - settings.power)
     runs = None
     if top > 1.0:
         nearer = min(top, 1.0 / bottom) if share and not settings.one_sided else top
-        runs = deciding_runs(scale_test(means, dof, steps, gaussian=False), nearer, settings, low_is_fault)
+        runs = deciding_runs(scale_test(means, dof, steps, False, weights), nearer, settings, low_is_fault)
     return replace(equivalent(below, above, factor, settings, runs), interval=interval)
 
 

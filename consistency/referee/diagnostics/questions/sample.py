@@ -10,12 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
+from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.validity import negative
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, whiten, whiten_group
 from consistency.referee.diagnostics.verdict.answers import Settings
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
 
@@ -53,6 +54,18 @@ class Centre(NamedTuple):
         return np.where(counted[..., None], (error - self.mean) * self.factor, np.nan)
 
 
+class InGroup(NamedTuple):
+    """Runs that have a step in a group."""
+
+    means: Array  # (runs,), mean NEES over dof of their steps there
+    counts: Indices  # (runs,), of these steps
+
+    @property
+    def longest(self) -> int:
+        """Steps of the run that has most."""
+        return int(self.counts.max(initial=0))
+
+
 @dataclass(frozen=True)
 class Sample:
     """NEES of N runs in T steps; with errors where they are known.
@@ -63,6 +76,7 @@ class Sample:
     nees: Array  # (N, T), NaN where nothing counts
     dof: int
     errors: Errors | None = None
+    groups: Groups | None = None
 
     @property
     def known_errors(self) -> Errors:
@@ -79,6 +93,16 @@ class Sample:
         """Mean NEES over dof of each run that has any of ``steps``, (runs,)."""
         means, counts = run_means(self.nees[:, steps])
         return np.asarray(means[counts > 0] / self.dof)
+
+    def in_group(self, number: int) -> InGroup:
+        """The runs that have a step in a group."""
+        assert self.groups is not None
+
+        def of_block(nees: Array, index: Indices) -> Array:
+            return means_and_counts(np.where(index == number, nees, np.nan))
+
+        means, counts = by_runs(of_block, self.nees, self.groups.index).T
+        return InGroup(np.asarray(means[counts > 0] / self.dof), counts[counts > 0].astype(np.int64))
 
     @property
     def longest(self) -> int:
@@ -121,7 +145,7 @@ class Sample:
         for here in of_runs(self.counted):
             w = whiten(centre.about(e.error[here], self.counted[here]), e.covariance[here])
             e.whitened[here], self.nees[here] = w, squared_length(w)
-        return Sample(self.nees, self.dof, replace(e, centre=centre))
+        return Sample(self.nees, self.dof, replace(e, centre=centre), self.groups)
 
 
 def sample_of(record: Record, settings: Settings) -> Sample | None:
@@ -137,7 +161,7 @@ def sample_of(record: Record, settings: Settings) -> Sample | None:
             return None
         if not record.dof:
             raise ValueError("nees needs dof, the dimension of the error")
-        return Sample(record.nees, record.dof)
+        return Sample(record.nees, record.dof, groups=record.groups)
     names = names_of(record)
     groups = component_groups(names, settings.subsets)
     error, P = record.error, np.asarray(record.covariance, float)
@@ -150,7 +174,7 @@ def sample_of(record: Record, settings: Settings) -> Sample | None:
         nees[here] = np.where(counted, squared_length(w), np.nan)
         w[~np.isfinite(nees[here])] = np.nan
         whitened[here] = w
-    return Sample(nees, error.shape[-1], Errors(record, whitened, names, groups))
+    return Sample(nees, error.shape[-1], Errors(record, whitened, names, groups), record.groups)
 
 
 def names_of(record: Record) -> tuple[str, ...]:

@@ -56,7 +56,7 @@ def mean_test(nees: Array, dof: int) -> MeanTest:
     return scale_test(means[counts > 0] / dof, dof, int(counts.max(initial=0)))
 
 
-def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> MeanTest:
+def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True, weights: Array | None = None) -> MeanTest:
     """Test that run means of the NEES over its degrees of freedom, Y_i (runs,), have the mean 1.
 
     A run's mean NEES is a sum of dependent chi-squares. It is approximated by chi-square(nu) / nu with
@@ -81,23 +81,49 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
     dof : dimension of the error
     steps : of the longest run
     gaussian : False lets nu fall below ``dof``, where only errors with heavy tails can have it
+    weights : (runs,), of the runs in the mean, see :class:`Weighted`; None where they are equal
     """
     runs = len(means)
     if runs == 0:
         return MeanTest(0, float("nan"), float("nan"), float("inf"), float("nan"), float("nan"))
-    ratio = float(means.mean())
-    nu, spread = float(dof), float("inf")
-    if runs >= FEW and (steps > 1 or not gaussian) and means.min() > 0:
-        by_spread, left_out = _log_nu_of_means(means)
-        by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / runs)
-        by_spread = _at_most_skewness(by_spread, ratio, dof)
-        by_likelihood, error = _log_nu_of_gamma(means)
-        safe = by_spread - float(np.sqrt(variance)), float(by_likelihood - error)
+    weighted = weighted_of(means, weights)
+    ratio, least = weighted.ratio, dof / weighted.squares
+    nu, spread = float(least), float("inf")
+    if runs >= FEW * weighted.squares and (steps > 1 or not gaussian) and means.min() > 0:
+        by_spread, left_out = _log_nu_of_means(weighted.values)
+        by_spread, variance = _at_mean_one(by_spread, left_out, weighted.values, 2.0 / runs)
+        by_spread = _at_most_skewness(by_spread, ratio, dof * weighted.squares / weighted.cubes)
+        by_likelihood, error = _log_nu_of_gamma(means, weighted.weights)
+        safe = by_spread - float(np.sqrt(variance)), float(by_likelihood - error - np.log(weighted.squares))
         log_nu = min(*safe, float(np.log(dof * steps)))
-        if log_nu > np.log(dof) or not gaussian:
+        if log_nu > np.log(least) or not gaussian:
             nu, spread = float(np.exp(log_nu)), 2.0 / variance
     above, below = _tails(ratio, runs * nu, spread)
     return MeanTest(runs, ratio, nu, spread, above, below)
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """Run means Y_i that count with weights w_i of mean 1.
+
+    Where the number of a run's steps that count depends on what is measured later, the mean of all Y_i does not have
+    the mean of Y, but the sum of w_i (Y_i - 1) has the mean 0 if w_i is proportional to that number.
+    """
+
+    ratio: float  # R, mean of w Y
+    values: Array  # (runs,), R + w (Y - R), which spread as the terms of R do
+    squares: float = 1.0  # mean of w^2: as many runs of equal weight would spread so much less
+    cubes: float = 1.0  # mean of w^3
+    weights: Array | None = None  # (runs,), w; None where all are 1
+
+
+def weighted_of(means: Array, weights: Array | None = None) -> Weighted:
+    """Run means (runs,) with their weights (runs,), or with equal ones."""
+    if weights is None or weights.min() == weights.max():
+        return Weighted(float(means.mean()), means)
+    w = weights / weights.mean()
+    ratio = float((w * means).mean())
+    return Weighted(ratio, ratio + w * (means - ratio), float(np.square(w).mean()), float((w**3).mean()), w)
 
 
 def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
@@ -148,34 +174,39 @@ def acceptance(test: MeanTest, dof: int, false_alarm: float, allow: str | None =
     return low, float(distributions.chi2.isf(special.ndtr(-z), k)) * dof / k
 
 
-def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -> Interval:
+def ratio_interval(
+    means: Array, dof: int = 1, confidence: float = CONFIDENCE, weights: Array | None = None
+) -> Interval:
     """Ratio of true to stated covariance (1 is right) and its interval, from the runs' mean NEES over dof (runs,).
 
     From 20 runs on the spread between the runs is taken as it is, so that neither dependence between steps nor heavy
     tails make the interval too short. Fewer runs do not determine their spread well: then the spread of runs whose
     steps are all the same is used, or the observed one if it is larger. Without a run the interval is NaN.
+    ``weights`` (runs,) are those of :class:`Weighted`.
     """
     means = np.asarray(means, float)
     if not len(means):
         return UNKNOWN
-    ratio, tail = float(means.mean()), 0.5 * (1.0 - confidence)
+    weighted = weighted_of(means, weights)
+    ratio, tail, least = weighted.ratio, 0.5 * (1.0 - confidence), dof / weighted.squares
     if not means.max() > 0:
         return Interval(ratio, ratio, ratio)
-    nu, spread = float(dof), float("inf")
+    nu, spread, enough = float(least), float("inf"), len(means) >= FEW * weighted.squares
     if len(means) > 1 and means.max() > means.min():
-        log_nu, left_out = _log_nu_of_means(means)
-        if len(means) >= FEW:
+        log_nu, left_out = _log_nu_of_means(weighted.values)
+        if enough:
             variance = max(_jackknife(left_out, left_out), 2.0 / len(means))
             nu, spread = float(np.exp(log_nu)), max(2.0 / variance, LEAST)
         else:
             nu = min(nu, float(np.exp(log_nu)))
-    elif len(means) >= FEW:
+    elif enough:
         return Interval(ratio, ratio, ratio)
     z, k = float(distributions.t.isf(tail, spread)), len(means) * nu
     low, high = (float(distributions.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
     upper = ratio * k / max(high, 1e-300)
-    for _ in range(ITERATIONS if len(means) >= FEW and nu > dof else 0):  # the spread of means whose ratio is upper
-        skewed = len(means) * max(float(dof), float(np.exp(_at_most_skewness(np.log(nu), ratio / upper, dof))))
+    for _ in range(ITERATIONS if enough and nu > least else 0):  # the spread of means whose ratio is upper
+        log_nu = _at_most_skewness(np.log(nu), ratio / upper, dof * weighted.squares / weighted.cubes)
+        skewed = len(means) * max(float(least), float(np.exp(log_nu)))
         upper = ratio * skewed / max(float(distributions.chi2.ppf(special.ndtr(-z), skewed)), 1e-300)
     return Interval(ratio, ratio * k / low, upper)
 
@@ -191,19 +222,26 @@ def _log_nu_of_means(means: Array) -> tuple[float, Array]:
     return float(np.log(2.0 / cv) - np.log1p(cv / runs)), np.log(2.0 * left**2 / np.maximum(variance, smallest))
 
 
-def _log_nu_of_gamma(means: Array) -> tuple[Array, Array]:
+def _log_nu_of_gamma(means: Array, weights: Array | None = None) -> tuple[Array, Array]:
     """log(2 a) of the Gamma distribution of shape a most likely to have made ``means`` (runs, ...), and its error.
 
-    The error is the standard error by the expected information, 1 / (N (a^2 trigamma(a) - a)); (...) both.
+    The error is the standard error by the expected information, 1 / (N (a^2 trigamma(a) - a)); (...) both. With
+    ``weights`` (runs,) of a mean each run counts by its weight squared, as in the variance of the mean.
     """
-    gap = np.maximum(np.log(means.mean(axis=0)) - np.log(means).mean(axis=0), 1e-12)
+    runs: float = len(means)
+    if weights is None:
+        gap = np.log(means.mean(axis=0)) - np.log(means).mean(axis=0)
+    else:
+        share = np.square(weights) / np.square(weights).sum()
+        gap, runs = np.log(share @ means) - share @ np.log(means), 1.0 / np.square(share).sum()
+    gap = np.maximum(gap, 1e-12)
     log_a = np.log((3.0 - gap + np.sqrt((gap - 3.0) ** 2 + 24.0 * gap)) / (12.0 * gap))  # Minka (2002), to 1.5 %
     for _ in range(5):  # Newton in log a
         a = np.exp(log_a)
         log_a = log_a - np.clip((log_a - special.psi(a) - gap) / (1.0 - a * special.polygamma(1, a)), -2.0, 2.0)
     a = np.exp(np.minimum(log_a, np.log(LARGE)))
     information = np.where(a < LARGE, a * a * special.polygamma(1, a) - a, 0.5)
-    return np.log(2.0) + log_a, 1.0 / np.sqrt(len(means) * information)
+    return np.log(2.0) + log_a, 1.0 / np.sqrt(runs * information)
 
 
 def _left_out_mean(means: Array) -> Array:
@@ -227,7 +265,7 @@ def _at_mean_one(log_nu: float, left_out: Array, means: Array, floor: float) -> 
     return log_nu + min(-slope * float(np.clip(np.log(means.mean()), -reach, reach)), 0.0), variance
 
 
-def _at_most_skewness(log_nu: float, ratio: float, dof: int) -> float:
+def _at_most_skewness(log_nu: float, ratio: float, dof: float) -> float:
     """log nu at a mean of 1, where ``ratio`` below 1 was seen and some runs may have errors that do not change.
 
     A run mean is a sum of chi-squares whose weights are 1 / dof at most, so that its third cumulant is at most 4 / dof

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.skipping import Skip, Skipped, without_first
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
@@ -89,6 +90,8 @@ class Record:
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
     unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
+    by: Array | None = None  # (runs, steps), values of a column; of words their numbers. NaN where there is none
+    groups: Groups | None = None  # (runs, steps), of that column, in which the size of the errors is asked, too
     skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
 
     # what a fit to the truth leaves of the errors
@@ -113,6 +116,7 @@ class Record:
     truth_covariance: Array | None = None  # (runs, steps, n, n), of the truth itself; NaN where it has none
     truth_errors: str | None = None  # declared: its errors are "independent", "per-run" or "common" to all runs
     truth_shared: bool = False  # declared: the estimator has fused the truth
+    trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 
     # beside the errors
     world: Record | None = None  # errors of the same runs as differences in the world, where ``error`` is another
@@ -155,7 +159,8 @@ class Record:
         failures = tuple(failure for failure in self.failures if failure.run in numbers)
         world = None if self.world is None else self.world.of_runs(rows)
         guesses = {kind: one.of_runs(rows) for kind, one in self.guesses.items()}
-        return replace(self, **arrays, runs=numbers, failures=failures, world=world, guesses=guesses)
+        groups = None if self.groups is None else self.groups[rows]
+        return replace(self, **arrays, runs=numbers, failures=failures, world=world, guesses=guesses, groups=groups)
 
     def first_runs(self, runs: int) -> Record:
         """Runs 0 to ``runs`` - 1."""
@@ -202,6 +207,7 @@ class Record:
             self.name, self.error[there][:, None], self.covariance[there][:, None], self.nees[there][:, None],
             self.dof, failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures),
             axes=self.axes, parts=self.parts, runs=number[there], unit="window", skipped=self.skipped,
+            groups=None if self.groups is None else self.groups[there, None],
         )  # fmt: skip
 
     @property
@@ -255,7 +261,7 @@ def shown_by(function: str, *arguments: Any) -> Any:
 def arrays_of(record: Record) -> dict[str, Any]:
     """Arrays over runs and steps that a record has, by name."""
     names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times",
-             "truth_covariance", "path")  # fmt: skip
+             "truth_covariance", "path", "by")  # fmt: skip
     return {name: array for name in names if (array := getattr(record, name)) is not None}
 
 

@@ -8,7 +8,7 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
+from consistency.referee.diagnostics.verdict.answers import GROUP, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, shares_of
 
 LARGEST = 10**7  # runs; more is refused as a mistake
 
@@ -65,6 +65,25 @@ def gate_runs(
     if lost is None:
         return runs
     return max(runs, lost_runs(lost, power))
+
+
+def group_runs(
+    dof: int,
+    detect: float,
+    groups: int,
+    false_alarm: float = FALSE_ALARM,
+    power: float = POWER,
+    allow: str | None = None,
+) -> int:
+    """Runs in each of so many ``groups`` with which a verdict finds a covariance wrong by ``detect`` in one of them.
+
+    This is :func:`required_runs` at the share of ``false_alarm`` that a verdict gives to groups, divided by their
+    number. Raises the same exceptions, and ValueError with fewer than two groups.
+    """
+    if groups < 2:
+        raise ValueError(f"groups must be at least 2, got {groups}")
+    share = shares_of([question for question in SHARES if question not in (JOINT, JOINT_DISTRIBUTION)])[GROUP]
+    return required_runs(dof, detect, share * false_alarm / groups, power, two_sided=allow is None)
 
 
 def share_limit(lost: int, runs: int, confidence: float = CONFIDENCE) -> float:

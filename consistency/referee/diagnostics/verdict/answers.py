@@ -17,6 +17,7 @@ SCALE = (MAIN, STEP, AXIS, DIRECTION)
 BIAS = ("bias", "bias in some step")
 SHAPE = ("shape", "shape in some step")
 INNOVATIONS = ("innovation scale", "innovation whiteness")
+GROUP = "scale in some group"
 JOINT, JOINT_DISTRIBUTION = "scale of pose and map", "distribution of pose and map"
 # Share of the false-alarm rate of each question; those that are asked share what the main one leaves. Half goes to
 # the mean over the trajectory, so that the number of runs planned for a covariance ratio does not depend on what
@@ -26,6 +27,7 @@ SHARES = {
     STEP: 0.1,
     AXIS: 0.1,
     DIRECTION: 0.1,
+    GROUP: 0.2,
     "bias": 0.05,
     "bias in some step": 0.05,
     "shape": 0.05,
@@ -42,6 +44,7 @@ ABOUT = {
     STEP: "ANEES of every step against its simultaneous band",
     AXIS: "the same mean for each axis and subset by itself",
     DIRECTION: "largest eigenvalue of the mean whitened second moment, where only too small a covariance is a fault",
+    GROUP: "mean NEES of each run over its steps in a group, for each group by itself",
     "bias": "Hotelling's T-squared of the mean whitened error of a trajectory",
     "bias in some step": "Hotelling's T-squared of every step",
     "shape": "mean products of different whitened components over a trajectory",

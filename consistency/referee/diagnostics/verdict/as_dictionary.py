@@ -11,6 +11,7 @@ from consistency.referee.diagnostics.verdict.parts import (
     Accuracy,
     Axes,
     Bias,
+    ByGroup,
     EarlyEnds,
     Equivalence,
     Innovations,
@@ -207,6 +208,25 @@ def truth_numbers(truth: TruthShare | None) -> Numbers:
         "truth_errors": truth.errors,
         "truth_shared": truth.shared,
     }
+
+
+def group_numbers(by: ByGroup | None) -> Numbers:
+    if by is None:
+        return {}
+    groups = [
+        {
+            "name": group.name,
+            "status": group.status,
+            "runs": group.runs,
+            "steps": group.steps,
+            "ratio": group.ratio.value,
+            "ratio_interval": tuple(group.ratio[1:]),
+            "p_value": group.p_value,
+            "equivalence": equivalence_numbers(group.equivalence),
+        }
+        for group in by.groups
+    ]
+    return {"by": {"column": by.column, "groups": groups, "outcome": by.outcome, "without": by.without}}
 
 
 def plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 
 from consistency.referee.types import Array, Indices
 
+SIDES = {"overconfident": 1, "conservative": -1}  # statuses of a covariance that is too small, or too large
 TINY = 1e-12  # ratio of an error that is rounding
 # chance to call runs that end early lost where they end for reasons that have nothing to do with their errors
 EARLY = 1e-3
@@ -111,6 +112,38 @@ class Axes:
     inflation: Mapping[str, Interval] = field(default_factory=dict)  # of each group, simultaneous 95 %
     largest: Interval | None = None  # inflation in the worst direction, where one-sided
     direction: Array | None = None  # (n,), of whitened errors
+
+
+@dataclass(frozen=True)
+class Group:
+    """Size of the errors against the stated covariance in one group of runs and steps."""
+
+    name: str
+    runs: int  # that have a step in the group
+    steps: int  # of all runs
+    ratio: Interval  # of true to stated covariance, simultaneous 95 % over the groups
+    p_value: float  # corrected for the number of groups
+    equivalence: Equivalence
+    status: str  # overconfident, conservative, consistent or undecided; "" where nothing is judged
+    span: tuple[float, float] | None = None  # of numbers: above the first, up to the second; None of words
+
+
+@dataclass(frozen=True)
+class ByGroup:
+    """The groups of a column."""
+
+    column: str
+    groups: tuple[Group, ...]  # without those that no step belongs to
+    outcome: str = ""  # why the column selects on the outcome, so that nothing is judged; "" if it does not
+    without: int = 0  # steps that have no value, and belong to no group
+
+    @property
+    def worst(self) -> Group:
+        """The group at fault that is clearest; without a fault, the group whose ratio is farthest from 1."""
+        wrong = [group for group in self.groups if group.status in SIDES]
+        if wrong:
+            return min(wrong, key=lambda group: (group.p_value, -abs(_log(group.ratio.value))))
+        return max(self.groups, key=lambda group: abs(_log(group.ratio.value)))
 
 
 @dataclass(frozen=True)
@@ -300,3 +333,8 @@ class ErrorParts(NamedTuple):
     shape: Shape | None = None
     tails: Tails | None = None
     accuracy: Accuracy | None = None
+    by_group: ByGroup | None = None
+
+
+def _log(ratio: float) -> float:
+    return float(np.log(max(ratio, TINY)))

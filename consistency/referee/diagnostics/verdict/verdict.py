@@ -19,6 +19,7 @@ from consistency.referee.diagnostics.verdict.parts import (
     Answer,
     Axes,
     Bias,
+    ByGroup,
     EarlyEnds,
     Equivalence,
     Innovations,
@@ -59,6 +60,7 @@ class Findings:
     innovations: Innovations | None = None
     location: Location | None = None
     accuracy: Accuracy | None = None
+    by_group: ByGroup | None = None  # where the record has groups
     landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
     joint: JointScore | None = None  # of the verdict on a map
     times: Array | None = None  # (steps,), s, NaN where a step has none; None where no file has them
@@ -262,7 +264,9 @@ class Verdict(Findings):
         numbers |= dictionary.ends_numbers(self.ends) | dictionary.skipped_numbers(self.skipped)
         if self.guesses:
             numbers["guesses"] = {kind: guess._asdict() for kind, guess in self.guesses.items()}
-        numbers |= dictionary.truth_numbers(self.truth)
+        numbers |= dictionary.truth_numbers(self.truth) | dictionary.group_numbers(self.by_group)
+        if of_parts := {name: part.by_group for name, part in self.parts.items() if part.by_group is not None}:
+            numbers["by_part"] = {name: dictionary.group_numbers(by)["by"] for name, by in of_parts.items()}
         if self.convention is not None or self.notes:
             numbers |= {"convention": self.convention, "align": self.align, "notes": list(self.notes)}
         if self.world is not None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.judging.error_parts import VISIBLE
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
-from consistency.referee.diagnostics.verdict.parts import TINY, Answer, Innovations, Interval, JointScore
+from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Answer, Innovations, Interval, JointScore
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import (
     is_uncertain,
@@ -22,7 +22,6 @@ from consistency.referee.diagnostics.words.numbers import (
 NOTABLE = 0.3  # difference of correlations that stands out in one step
 MOST = 3  # axes that a sentence names with their figures
 NAMED = 0.1  # part of a unit vector that a sentence names
-SIDES = {"overconfident": 1, "conservative": -1}  # to which the whole errs
 
 Faults = Mapping[str, Answer]
 NamedRatio = tuple[str, Interval]

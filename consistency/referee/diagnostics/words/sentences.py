@@ -10,8 +10,8 @@ from consistency.referee.diagnostics.judging.status import clear, smaller
 from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
-from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, JOINT, SCALE, SHAPE, Settings
-from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Location, Scale, Within
+from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, GROUP, JOINT, SCALE, SHAPE, Settings
+from consistency.referee.diagnostics.verdict.parts import ByGroup, Equivalence, Innovations, Location, Scale, Within
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.words.faults import (
     MOST,
@@ -25,6 +25,7 @@ from consistency.referee.diagnostics.words.faults import (
     shape_text,
     tails_text,
 )
+from consistency.referee.diagnostics.words.groups import faults_of_groups, groups_without_fault, lines_of_groups
 from consistency.referee.diagnostics.words.numbers import (
     SMALLEST_P,
     is_or_are,
@@ -155,6 +156,7 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
     if v.parts:
         return _faults_of_parts(v)
     of_scale, of_bias = _any_of(SCALE, faults), _any_of(BIAS, faults)
+    is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
     found: list[tuple[str, Collection[str]]] = []  # sentences, with the questions that they answer
     contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in faults
     if v.status == "heavy-tailed" or "outliers" in faults or (contrary and not opposite(v, faults)):
@@ -171,13 +173,15 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
     parts = [text for text, _ in found]
     if v.status == "heavy-tailed":
         parts.append(f"in the mean the covariance ratio is {ratio_text(s.inflation)}")
+    if v.by_group is not None:
+        parts.append(_groups(v.by_group, faults))
     if len(faults) == 1:
         parts += [ALONE[question] for question in faults if question in ALONE]
     if "innovation scale" in faults and v.innovations is not None:
         parts.append(innovations_text(v, v.innovations))
     if "innovation whiteness" in faults:
         parts.append("innovations correlated over steps")
-    if of_scale and not of_bias and v.status != "heavy-tailed" and _any_of(BIAS, [a.question for a in v.answers]):
+    if (of_scale or GROUP in faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
 
@@ -188,6 +192,13 @@ def _rank(v: Findings, faults: Faults, questions: Collection[str]) -> tuple[bool
     p = min((faults[question].adjusted for question in questions if question in faults), default=1.0)
     order = (SCALE, BIAS, SHAPE)
     return questions is not named and questions != named, max(p, SMALLEST_P), [*order, questions].index(questions)
+
+
+def _groups(by: ByGroup, faults: Faults) -> str:
+    """The worst group where one is at fault, otherwise what is shown of the groups."""
+    if GROUP in faults:
+        return faults_of_groups(by)
+    return groups_without_fault(by)
 
 
 def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
@@ -216,6 +227,8 @@ def _no_fault(v: Findings, s: Scale) -> str:
     worst = clear(v.worst_axis)
     if worst is not None:
         axis = f" (worst axis: {worst[0]}, {ratio_text(worst[1])})"
+    if v.by_group is not None:
+        axis += f"; {groups_without_fault(v.by_group)}"
     if shown.shown:
         return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
     do = "do"
@@ -320,6 +333,8 @@ def _levels(v: Findings, s: Scale) -> list[str]:
         lines.append(f"covariance ratio of the worst axis: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
     elif _any_of(SCALE, v.faults) and v.worst_axis is not None:
         lines.append(f"no axis is shown to be wrong by itself: the fault is {combination_text(v)}; of all {of_all}")
+    if v.by_group is not None:
+        lines += lines_of_groups(v.by_group, v.unit)
     if v.lost is not None and _has_lost(v) and (v.lost.count or v.settings.lost is not None):
         lines.append(
             f"lost {v.unit}s: {v.lost.count} of {v.lost.runs} failed or have a mean NEES above {short(v.lost.bound)}; "
@@ -332,6 +347,8 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     for name, part in v.parts.items():
         if part.scale is not None and part.location is not None:
             lines.append(f"{name}: {_level(part, part.scale, part.location)}")
+        if part.by_group is not None:
+            lines += [f"{name}: {line}" for line in lines_of_groups(part.by_group, v.unit)]
     return lines
 
 

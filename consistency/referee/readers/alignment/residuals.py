@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import ENOUGH, inflation_of_mean, left_covariances
-from consistency.referee.diagnostics.verdict.answers import BIAS, INNOVATIONS, MAIN, SHARES, STEP
+from consistency.referee.diagnostics.verdict.answers import BIAS, GROUP, INNOVATIONS, MAIN, SHARES, STEP
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.frame_fit import Sound, frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
@@ -141,7 +141,8 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
         return Aligned(out, notes=(note,), caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
     added = len(some) * (max(float(np.linalg.eigvalsh(M)[:, -1].max()) for M in left.covariances) - 1.0)
     if added > COMMON:
-        return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}, nor are single steps", unavailable=(STEP, *BIAS))
+        caption = f"{what}: {OF_ALL}, nor are single steps"
+        return Aligned(out, notes=(note,), caption=caption, unavailable=(STEP, GROUP, *BIAS))
     if inflation_of_mean(residuals, bases) > 1.0 + COMMON:
         return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}, nor is a bias: {NO_MEAN}", unavailable=BIAS)
     return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from consistency.referee.diagnostics.records.groups import on_steps
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR
@@ -66,14 +67,16 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
     if kind is None:
         raise InputError(f"{path}: needs {KINDS}; it holds {', '.join(sorted(arrays)) or 'nothing'}")
     unknown = sorted(set(arrays) - set(kind) - OPTIONAL)
-    if unknown:
+    if unknown and r.by is None:
         raise InputError(f"{path}: key '{unknown[0]}' does not go with {', '.join(kind)}; needs {KINDS}")
     if r.error is not None and kind != OF_POSES:
         raise InputError(f"--error: {path} holds {kind[0]}, whose convention is settled already")
     if r.relative is not None and kind != OF_POSES:
         raise InputError(f"{path}: --relative needs the keys {', '.join(OF_POSES)}, of poses or motions")
     if kind == OF_NEES:
-        return _of_nees(path, arrays)
+        found = _of_nees(path, arrays)
+        assert found.nees is not None
+        return replace(found, by=_column(path, arrays, r, found.nees.shape))
     if kind == OF_ERRORS:
         truth, declared = _array(path, arrays, "errors", 3), ""
         estimates = np.where(np.isfinite(truth), 0.0, np.nan)
@@ -82,6 +85,7 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
         declared = _convention(r, estimates.shape[-1])
         _require_poses(path, estimates, declared, r)
     runs, steps, n = estimates.shape
+    by = _column(path, arrays, r, (runs, steps))
     covariances = _matrices(path, arrays, "covariances", (runs, steps, n, n))
     there = _known(path, arrays, runs, steps)
     if kind == OF_POSES:
@@ -108,7 +112,7 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
             replace(
                 one, covariance=P, stated=np.ones(length, bool), manifold=manifold_of(convention),
                 convention=convention, run=run, true_covariance=T, nis=at(nis, its), nis_dof=at(dof, its),
-                cross=at(cross, its),
+                cross=at(cross, its), by=at(by, its),
             )
         )  # fmt: skip
     causes = []
@@ -120,6 +124,18 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
         causes = turns(path.stem, axes, gap, covariances, remedy)
     definition = PLANAR[declared] if declared else ""
     return Estimator(path.stem, path, poses, axes, declared, definition, causes=causes, t=clock)
+
+
+def _column(path: Path, arrays: dict[str, Array], r: Reading, shape: tuple[int, ...]) -> Array | None:
+    """Cells of the key of ``--by``, (runs, steps); a value for each run stands in all of its steps."""
+    if r.by is None or r.by_file is not None:
+        return None
+    if r.by not in arrays:
+        raise InputError(f"--by {r.by}: {path} has no such key; it holds {', '.join(sorted(arrays))}")
+    try:
+        return on_steps(arrays[r.by], shape)
+    except ValueError as error:
+        raise InputError(f"{path}: key '{r.by}' {error}") from None
 
 
 def _of_poses(path: Path, arrays: dict[str, Array]) -> Estimator:

@@ -24,6 +24,7 @@ from consistency.referee.readers.formats.table_columns import (
     cross_covariances,
     has_own,
     nis_columns,
+    own_column,
     require_columns,
     stated_covariance,
     stated_deviations,
@@ -238,7 +239,7 @@ def _estimator(
         truth.numbers(key), np.column_stack([truth.numbers(axis, finite=True) for axis in axes]),
         manifold_of(convention), convention, 0.0 if by_step else r.tolerance, cross, of_truth,
         files=(sheet.path, truth.path), numbered=by_step, clock=_clock(sheet), true_clock=_clock(truth), nis=nis,
-        nis_dof=dof,
+        nis_dof=dof, by=own_column(sheet, r),
     )  # fmt: skip
     of_runs = _by_run(sheet, runs, poses)
     if "run" in truth:

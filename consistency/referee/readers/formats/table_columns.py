@@ -10,6 +10,7 @@ from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.named_columns import DEVIATIONS, naming
 from consistency.referee.readers.formats.sheet import TableRows, are_dof
+from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.types import Array, Indices
@@ -127,6 +128,16 @@ def require_columns(sheet: TableRows, axes: tuple[str, ...]) -> None:
         raise InputError(
             f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}; {naming(missing[0])}{hint}"
         )
+
+
+def own_column(sheet: TableRows, r: Reading) -> Array | None:
+    """Cells of the column of ``--by``, (N,); None where it is of another file, or not asked for."""
+    if r.by is None or r.by_file is not None:
+        return None
+    if r.by not in sheet:
+        hint = "a table with t or run and the column goes with --by-file"
+        raise InputError(f"--by {r.by}: {sheet.path} has no such column; there are: {sheet.columns}; {hint}")
+    return sheet.data[r.by]
 
 
 def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:

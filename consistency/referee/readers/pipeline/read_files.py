@@ -14,21 +14,26 @@ from typing import Any, cast
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
-from consistency.referee.parsing import require_name
 from consistency.referee.readers.declared_axes import in_axes_of_estimates
 from consistency.referee.readers.formats.file_kinds import (
-    ARCHIVES,
     TRAJECTORIES,
     is_bag,
     is_drive,
-    is_foreign,
     table_files,
     trajectory_files,
-    unknown_kind,
 )
 from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.pipeline.kinds import OF_BAGS, OF_TRAJECTORIES, Found, kind_of
+from consistency.referee.readers.pipeline.by_column import grouped, of_record
+from consistency.referee.readers.pipeline.kinds import (
+    OF_BAGS,
+    OF_TRAJECTORIES,
+    Found,
+    found_in,
+    is_program_runs,
+    refuse_options,
+)
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
+from consistency.referee.readers.runs_to_record import with_failed_runs
 from consistency.referee.readers.truth_matching import Estimator
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
@@ -50,6 +55,8 @@ def is_recording(path: Path, reading: Reading) -> bool:
         The path is a results folder, with an option for other files; or a folder of neither kind.
     """
     given = reading.given()
+    if is_program_runs(path):
+        return True
     if path.is_dir() and not (path / "manifest.json").exists():
         recording = bool(trajectory_files(path) or table_files(path)) or is_bag(path) or bool(given)
         if not recording:
@@ -84,8 +91,8 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
         return None if table is None else Path(table)
 
     sheet, true = rows(estimates, "estimates"), rows(truth, "truth")
-    r = _checked(replace(reading, truth=cast(Any, true)))
-    _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
+    r = checked_options(replace(reading, truth=cast(Any, true)))
+    refuse_options(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
     return _read("tables", r, lambda options: _records(read_tables(sheet, options), options))
 
 
@@ -101,7 +108,12 @@ def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Rec
     InputError
         Something cannot be used: names file, line, column or option, and what is allowed.
     """
-    return _read(str(estimates), _checked(reading or Reading()), lambda r: _by_kind(estimates, r))
+    r = reading or Reading()
+    if is_program_runs(estimates):
+        from consistency.referee.readers.pipeline.program_runs import study_in, with_options
+
+        r = with_options(study_in(estimates), r)
+    return _read(str(estimates), checked_options(r), lambda r: _by_kind(estimates, r))
 
 
 def _read(name: str, r: Reading, read: Callable[[Reading], list[Record]]) -> list[Record]:
@@ -144,30 +156,27 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
     return [in_pieces(record, pieces or None) for record in records]
 
 
+def records_of_found(found: Found, r: Reading) -> list[Record]:
+    """Records of what readers gave, with what the options declare of their truth."""
+    return _declared(_records(found, r), r)
+
+
 def _records(found: Found, r: Reading) -> list[Record]:
     """Records of what a reader gives."""
     records: list[Record] = []
     for one in found:
         if isinstance(one, Estimator):
-            records.extend(records_of(in_axes_of_estimates(one, r), r))
+            records += [
+                replace(with_failed_runs(record, one.failed), trials=one.trials)
+                for record in records_of(in_axes_of_estimates(one, r), r)
+            ]
         else:
-            records.append(one)
+            records.append(grouped(*of_record(one, r), r))
     return records
 
 
 def _by_kind(estimates: Path, r: Reading) -> list[Record]:
-    if not estimates.exists():
-        raise InputError(f"{estimates}: no such file")
-    require_name(estimates.name, "file")
-    if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
-        raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
-    kind = kind_of(estimates, r)
-    _refuse(estimates, r, *(OF_BAGS if kind is None else kind.refused))
-    if kind is None:
-        raise unknown_kind(estimates)
-    if r.truth is not None and is_foreign(r.truth):
-        raise unknown_kind(r.truth)
-    records = _records(kind.read(estimates, r, False), r)
+    records = _records(found_in(estimates, r), r)
     if r.truth is None or not is_drive(r.truth):
         return records
     of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
@@ -194,7 +203,7 @@ def pieces_asked(r: Reading) -> int | None:
     return int(r.split)
 
 
-def _checked(r: Reading) -> Reading:
+def checked_options(r: Reading) -> Reading:
     """Options that go together, whatever the file; numbers are floats, and no alignment is None."""
     windows_asked(r)
     if r.error not in (None, GUESS, *CONVENTIONS):
@@ -216,6 +225,9 @@ def _checked(r: Reading) -> Reading:
         from consistency.referee.readers.truth_covariance import require_truth_options
 
         require_truth_options(r)
+    for name in ("by_file", "bins"):
+        if r.given([name]) and r.by is None:
+            raise InputError(f"{flag_of(name)}: goes with --by COLUMN")
     if r.align not in (None, *ALIGNMENTS):
         raise InputError(f"--align {r.align}: must be one of {', '.join(ALIGNMENTS)}")
     align = None if r.align == "none" else r.align
@@ -225,11 +237,3 @@ def _checked(r: Reading) -> Reading:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     pieces_asked(r)  # refused before anything is read
     return replace(r, time_offset=offset, align=align)
-
-
-def _refuse(path: Path, r: Reading, *names: str) -> None:
-    if given := r.given(names):
-        keys = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}
-        kept = path.suffix.lower() in ARCHIVES and given[0] in keys
-        instead = f", an archive; it has a key '{keys[given[0]]}' in its place" if kept else ""
-        raise InputError(f"{flag_of(given[0])}: does not go with {path}{instead}")

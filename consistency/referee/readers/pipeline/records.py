@@ -17,6 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.pipeline.by_column import NO_TRUTH, beside_states, grouped, with_values
 from consistency.referee.readers.places import exact, refuse
 from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
 from consistency.referee.readers.truth_matching import (
@@ -56,13 +57,16 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     InputError
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
+    if e.innovations_alone and r.by is not None:
+        raise InputError(f"--by {r.by}: {e.path} {NO_TRUTH}")
     if e.innovations_alone:
         return [_innovations(e)]
     require_radians(str(e.path), e.runs)
     judged = _named(e, r)
+    e, column = with_values(e, r, judged)
     relative = windows_asked(r)
     if relative is not None:
-        return [_windows(e, judged, r, relative)]
+        return [grouped(_windows(e, judged, r, relative), column, r)]
     shift, clocks, moved = _clocks_and_frames(e, r, judged)
     runs = moved.runs
     known = [_known(e, p, r, shift) for p in runs]
@@ -84,6 +88,8 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     notes += [*clocks, *moved.notes, *causes]
     if e.convention:
         notes.append(f"error convention {e.convention}: {e.definition}")
+    if column is not None:
+        column = beside_states(column, e, judged, runs, known)
     tracks, t, numbering = _in_columns(e, runs, known, tracks)
     notes += numbering
     records = []
@@ -97,7 +103,7 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
         record = replace(moved.on(record), causes=tuple(causes), files=files)
         if e.stated.alone:
             record = each_alone(record)
-        records.append(record)
+        records.append(grouped(record, column, r))
         notes, causes = [], []
     return records
 
@@ -203,7 +209,7 @@ def _track(e: Estimator, p: Poses, known: Known, shift: float) -> Track:
     rows, width, P = known.rows, e.position, p.covariance
     return Track(
         p.run, rows, p.place.at(rows), p.error_of(rows, known.truth), P if len(rows) == len(P) else P[rows],
-        at(p.nis, rows), at(p.nis_dof, rows), t=None if e.t is not None else _times(p, rows),
+        at(p.nis, rows), at(p.nis_dof, rows), by=at(p.by, rows), t=None if e.t is not None else _times(p, rows),
         truth_covariance=p.truth_covariances(known, shift),
         path=np.stack([known.truth[:, :width], p.estimate[rows, :width]], axis=1) if width else None,
     )  # fmt: skip
@@ -351,7 +357,7 @@ def _windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative
         stretches.append(
             Stretch(
                 p.run, str(p.files[0]), p.place, p.seconds + r.shift, p.estimate, p.covariance, p.cross,
-                known[-1].rows, known[-1].truth, p.convention,
+                known[-1].rows, known[-1].truth, p.convention, p.by,
             )
         )  # fmt: skip
     of = str(e.covariances or e.path)

@@ -19,7 +19,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble
-from consistency.referee.readers.truth_matching import common_times
+from consistency.referee.readers.truth_matching import at, common_times
 from consistency.referee.readers.windows import MARGINAL, Relative, windows
 from consistency.referee.types import Array, Indices
 
@@ -47,6 +47,7 @@ class Stretch:
     rows: Indices  # (k,), with truth
     truth: Array  # (k, m)
     convention: str  # of the error that the covariances are of
+    by: Array | None = None  # (N,), values of the column that makes groups
 
     @property
     def d(self) -> int:
@@ -95,7 +96,7 @@ def windows_of(stretch: Stretch, relative: Relative) -> Windows:
         first, last = np.append(first, max(sound - 1, 0)), np.append(last, sound)
         error = np.concatenate([error, np.full((1, error.shape[1]), 0.0 if finite else np.nan)])
         covariance = np.concatenate([covariance, np.full((1, *s.covariance.shape[1:]), np.nan)])
-    track = Track(s.run, np.arange(len(last)), s.place.at(last), error, covariance, t=s.t[first])
+    track = Track(s.run, np.arange(len(last)), s.place.at(last), error, covariance, t=s.t[first], by=at(s.by, first))
     return Windows(track, error, covariance, s.t[last], left_out)
 
 

@@ -1,0 +1,360 @@
+"""N runs of a program: done in parallel, read as they come, looked at on the way, and judged."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import queue
+import shutil
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.diagnostics.judge_record import judge, looks, progress_text
+from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
+from consistency.referee.diagnostics.verdict.answers import Settings
+from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.errors import InputError
+from consistency.referee.gating.checked_arrays import planned_dof, rate_shares
+from consistency.referee.programs.process import Processes, Stopped, run_program
+from consistency.referee.programs.study_folder import new_folder, opened, require_usable, write_manifest
+from consistency.referee.programs.words import Program, seed_of
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.pipeline.kinds import found_in
+from consistency.referee.readers.pipeline.program_runs import (
+    PATHS,
+    ProgramRun,
+    ProgramStudy,
+    Runs,
+    kind_of_failure,
+    log_lines,
+    runs_in,
+    without_log,
+)
+from consistency.referee.readers.pipeline.read_files import GUESS, checked_options, records_of_found
+from consistency.referee.readers.truth_matching import Estimator
+from consistency.referee.system.progress import Advance, progress, say
+
+ALIKE = 3  # first runs that failed alike stop a study
+PROOF = 2  # first runs whose tables must differ
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many runs there are, and how each is done and judged."""
+
+    runs: int | None = None  # None: as many as a verdict takes, planned from the first run
+    until_decided: bool = False
+    max_runs: int | None = None
+    seed: int = 0
+    jobs: int = -1
+    timeout: float | None = None  # s
+    check_seed: bool = False
+    keep: str = "all"  # files of the runs; "failed" keeps only the numbers of the others
+    inputs: Sequence[Path] = ()  # recorded files or folders, one for each run
+    settings: Settings = field(default_factory=Settings)
+    skip: Skip | None = None
+    optimal_gain: bool = False
+
+    @property
+    def workers(self) -> int:
+        """Number of runs at a time."""
+        if self.jobs != -1:
+            return self.jobs
+        if hasattr(os, "sched_getaffinity"):
+            return len(os.sched_getaffinity(0))
+        return os.cpu_count() or 1
+
+
+def run_study(
+    program: Program,
+    plan: Plan,
+    out: Path,
+    estimates: str = "estimates.csv",
+    reading: Reading | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> tuple[list[Record], dict[str, Verdict]]:
+    """Run a program N times, each in a folder of its own in ``out``, and judge what it wrote.
+
+    Parameters
+    ----------
+    estimates : file of the estimates in the folder of a run, with placeholders
+    reading : options of that file
+
+    Returns
+    -------
+    A record and a verdict for each estimator
+
+    Raises
+    ------
+    InputError
+        Options that do not go together; ``out`` cannot be used; the first runs all failed alike, or wrote the same
+        table; no run can be judged.
+    """
+    r = _required(plan, reading or Reading())
+    require_usable(out, resume, overwrite)
+    out = Path(os.path.abspath(out))
+    program.warn_of_relative_paths()
+    if not program.uses_run:
+        what = "{input}" if plan.inputs else "{seed}"
+        say(
+            f"consistency: no word of the command holds {what}; runs then differ only if the program reads it by itself"
+        )
+    with opened(out, _manifest(program, plan, estimates, r), resume) as study:
+        loop = _Loop(program, plan, study, r)
+        loop.do_runs()
+        records, verdicts = loop.judged()
+        write_manifest(out, {**loop.fields, "complete": True})
+    return records, verdicts
+
+
+def _required(plan: Plan, r: Reading) -> Reading:
+    """The options, checked before any work."""
+    if plan.runs is not None and plan.runs < 1:
+        raise InputError(f"--runs must be at least 1, got {plan.runs}")
+    if plan.jobs == 0 or plan.jobs < -1:
+        raise InputError(f"--jobs must be at least 1, or -1 for one a core, got {plan.jobs}")
+    if plan.timeout is not None and not 0.0 < plan.timeout < 1e9:
+        raise InputError(f"--timeout must be a positive number of seconds, got {plan.timeout:g}")
+    if plan.until_decided and plan.runs is not None:
+        raise InputError("--until-decided finds the number of runs; give --max-runs instead of --runs")
+    if plan.keep not in ("all", "failed"):
+        raise InputError(f"--keep must be 'all' or 'failed', got '{plan.keep}'")
+    if plan.max_runs is not None and not plan.until_decided:
+        raise InputError("--max-runs goes with --until-decided")
+    if plan.inputs and (plan.runs is not None or plan.until_decided):
+        raise InputError("--runs and --until-decided do not go with --each, which has a run for each file")
+    if r.error == GUESS:
+        raise InputError(f"--error {GUESS}: goes with 'consistency analyse DIR' when the runs are there")
+    if os.name == "nt":
+        raise InputError("monte-carlo needs process groups of POSIX; on Windows run it in WSL")
+    return checked_options(r)
+
+
+def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[str, Any]:
+    given = {each.name: getattr(r, each.name) for each in fields(r)}
+    reading = {name: str(value) if name in PATHS else value for name, value in given.items() if value is not None}
+    here = program.here
+    return {
+        "words": list(program.words), "files": program.files(), "cwd": program.cwd and str(program.cwd),
+        "seed": plan.seed, "inputs": [os.path.relpath(path, here) for path in plan.inputs] or None,
+        "estimates": estimates, "reading": reading, "runs": plan.runs, "until_decided": None, "complete": False,
+        "keep": plan.keep,
+    }  # fmt: skip
+
+
+class _Loop:
+    """Runs in progress and done, and what is known of them so far."""
+
+    def __init__(self, program: Program, plan: Plan, study: ProgramStudy, r: Reading) -> None:
+        self.program, self.plan, self.study, self.options = program, plan, study, r
+        self.fields = {key: value for key, value in study.manifest.items() if key in _KEYS}
+        self.runs = Runs(study, r, found_in)
+        self.logs: dict[int, ProgramRun] = {}
+        self.total = len(plan.inputs) or plan.runs
+        self.design: Design | None = None
+        self.names: list[str] = []
+        self.decided: dict[str, Verdict] = {}
+        self.counts: Iterator[int] = iter(())
+        self.next_look: int | None = None
+        self.advance: Advance | None = None
+        self.processes = Processes()
+        self.idle: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    def do_runs(self) -> None:
+        """Do the runs that are missing.
+
+        Raises
+        ------
+        InputError
+            The first runs all failed alike, or wrote the same table, or none can be judged.
+        """
+        with ExitStack() as stack:
+            for run in runs_in(self.study.folder).values():
+                self._take(run, stack)
+            self._start_all(stack)
+        if not self.runs.found:
+            raise self._all_failed()
+
+    def _start_all(self, stack: ExitStack) -> None:
+        workers = self.plan.workers
+        for worker in range(workers):
+            self.idle.put(worker)
+        missing = (run for run in itertools.count() if run not in self.logs)
+        pending: set[Future[ProgramRun]] = set()
+        pool = stack.enter_context(ThreadPoolExecutor(workers))
+        try:
+            if self.plan.check_seed:
+                self._check_seed(stack)
+            run = next(missing)
+            while not self._is_decided:
+                while len(pending) < self._at_once(workers) and not self._is_enough(run):
+                    pending.add(pool.submit(self._done, run, new_folder(self.study.folder, run)))
+                    run = next(missing)
+                if not pending:
+                    break
+                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    self._take(future.result(), stack)
+        finally:
+            self.processes.close()  # also runs beyond the one that decided
+            pool.shutdown(cancel_futures=True)
+
+    def _at_once(self, workers: int) -> int:
+        """Runs at a time: few until the first ones have shown that the program works."""
+        return workers if len(self.runs.found) >= PROOF else min(workers, PROOF)
+
+    def _is_enough(self, run: int) -> bool:
+        return self.total is not None and run >= self.total
+
+    @property
+    def _is_decided(self) -> bool:
+        return bool(self.names) and len(self.decided) == len(self.names)
+
+    def _done(self, run: int, folder: Path) -> ProgramRun:
+        """Do a run, in a thread."""
+        worker = self.idle.get()
+        try:
+            values = self._values(run, folder, worker)
+            return run_program(self.program, folder, run, values, self.plan.timeout, self.processes)
+        except Stopped:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        finally:
+            self.idle.put(worker)
+
+    def _values(self, run: int, folder: Path, worker: int) -> dict[str, str]:
+        """What stands for each placeholder."""
+        values = {
+            "run": str(run), "seed": str(seed_of(self.plan.seed, run)), "out": str(folder),
+            "here": str(self.program.here), "worker": str(worker),
+        }  # fmt: skip
+        if self.plan.inputs:
+            path = self.plan.inputs[run]
+            values |= {"input": str(path), "name": path.stem}
+        return values
+
+    # --- what a run says -----------------------------------------------------------------------------
+
+    def _take(self, run: ProgramRun, stack: ExitStack) -> None:
+        """Read a finished run, stop where the program cannot work, and look if it is time."""
+        self.logs[run.run] = run
+        records = self.runs.take(run)
+        if records and self.plan.keep == "failed" and not any(record.failures for record in records):
+            self.runs.delete_files(run)
+        if records and not self.names:
+            self._plan_runs(records, stack)
+        elif self.advance is not None:
+            self.advance(1)
+        if (
+            not self.runs.found
+            and len(self.runs.failed) >= ALIKE
+            and len(set(map(kind_of_failure, self.runs.failed.values()))) == 1
+        ):
+            raise self._all_failed()
+        if len(self.runs.found) == PROOF and records:
+            self._require_different()
+        self._look()
+
+    def _plan_runs(self, records: Sequence[Record], stack: ExitStack) -> None:
+        """Plan the number of runs, or looks, from the dimension of the first run's errors."""
+        settings, dof = self.plan.settings, min(planned_dof(record) for record in records)
+        rate = settings.false_alarm / max(rate_shares(record) for record in records)
+        self.names = [record.name for record in records]
+        planned = gate_runs(dof, settings.detect, rate, settings.power, settings.allow, settings.lost)
+        if self.plan.until_decided:
+            looked: dict[str, Any] = {
+                "dof": dof, "detect": settings.detect, "false_alarm": settings.false_alarm, "power": settings.power,
+                "max_runs": self.plan.max_runs,
+            }  # fmt: skip
+            looked |= {} if settings.lost is None else {"lost": settings.lost}
+            self.design = sequential_design(**looked)
+            self.counts = looks(self.design, self.names, self._record, self.decided)
+            self.next_look = next(self.counts)
+            self.total = self.plan.max_runs
+            self.fields |= {"until_decided": looked}
+        elif self.total is None:
+            self.total = planned
+        self.fields |= {"runs": self.total}
+        write_manifest(self.study.folder, self.fields)
+        self.advance = stack.enter_context(progress("runs", self.total or planned))
+        self.advance(len(self.logs))
+
+    def _look(self) -> None:
+        """Look at the first runs, where as many are there as the next look takes."""
+        while self.next_look is not None and self.runs.first >= self.next_look:
+            runs = self.next_look
+            self.next_look = next(self.counts, None)
+            say(f"{runs} runs: {progress_text(self.decided, self.names)}")
+
+    def _record(self, runs: int, name: str) -> Record:
+        """Record of the first runs of an estimator."""
+        return next(record for record in self._records(runs) if record.name == name)
+
+    def _records(self, runs: int | None) -> list[Record]:
+        records = records_of_found(self.runs.estimators(runs), self.options)
+        records = [record.without_first(self.plan.skip) for record in records]
+        return [replace(record, optimal_gain=self.plan.optimal_gain) for record in records]
+
+    def judged(self) -> tuple[list[Record], dict[str, Verdict]]:
+        """Records and verdicts of all runs; those of a study until decided up to the first missing run."""
+        records = self._records(self.runs.first if self.design else None)
+        return records, {record.name: judge(record, self.plan.settings, self.design, True) for record in records}
+
+    # --- programs that cannot work -------------------------------------------------------------------
+
+    def _all_failed(self) -> InputError:
+        """Message that no run can be judged, after the last lines of the first one's log."""
+        first, why = min(self.runs.failed.items())
+        log = self.logs[first].log
+        for line in log_lines(log, 10):
+            say(f"  {line}")
+        count = len(self.runs.failed)
+        which = f"the first {count} runs failed" if count > 1 else "the first run failed"
+        return InputError(f"{which}: {without_log(why)}; the log is {log}")
+
+    def _require_different(self) -> None:
+        (one, first), (other, second) = sorted(self.runs.found.items())[:PROOF]
+        if not _are_same(first, second):
+            return
+        what = "{input}" if self.plan.inputs else "{seed}"
+        raise InputError(f"runs {one} and {other} wrote the same table; does your program use {what}?")
+
+    def _check_seed(self, stack: ExitStack) -> None:
+        """Do run 0 twice, and say whether its tables are the same."""
+        if 0 not in self.logs:
+            self._take(self._done(0, new_folder(self.study.folder, 0)), stack)
+        folder = self.study.folder / "run 0 again"
+        shutil.rmtree(folder, ignore_errors=True)
+        again = Runs(self.study, self.options, found_in)
+        again.take(self._done(0, folder))
+        shutil.rmtree(folder, ignore_errors=True)
+        if 0 not in self.runs.found or 0 not in again.found:
+            say("--check-seed: run 0 failed, so that its tables cannot be compared")
+        elif _are_same(self.runs.found[0], again.found[0]):
+            say("--check-seed: run 0 done twice gave the same table; the program is reproducible")
+        else:
+            say("--check-seed: run 0 done twice gave different tables; the program is not reproducible by {seed}")
+
+
+_KEYS = ("words", "files", "cwd", "seed", "inputs", "estimates", "reading", "runs", "until_decided", "complete", "keep")
+
+
+def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:
+    """Whether two runs have the same estimates and truth, to the last digit."""
+    return [_digits(each) for each in one] == [_digits(each) for each in other]
+
+
+def _digits(one: Estimator) -> list[bytes]:
+    p = one.runs[0]
+    arrays = (p.t, p.estimate, p.truth, p.nis)
+    return [np.ascontiguousarray(array).tobytes() for array in arrays if array is not None]

@@ -1,0 +1,197 @@
+"""The column of ``--by``: its values in every row of the estimates, and the groups of a record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from consistency.referee.diagnostics.records.groups import BINS, Column, column_of, groups_of, on_steps
+from consistency.referee.diagnostics.records.outcome import made_from_errors, selects_on_outcome
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.errors import InputError
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Known, Poses
+from consistency.referee.types import Array, Indices
+
+if TYPE_CHECKING:
+    from consistency.referee.readers.formats.sheet import TableRows
+
+ENOUGH = 5000  # rows that show what a column is made from
+ROTATION = range(3, 6)  # components of a pose in space
+NO_TRUTH = "has no truth, so that there are no errors to group"
+NO_COLUMNS = "has no columns of its own; --by-file FILE names a table with the column and t or run"
+
+
+def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estimator, Column | None]:
+    """The estimator with the values of the column in each row, and the column of all rows; None without ``--by``.
+
+    Raises
+    ------
+    InputError
+        The files have no such column, or no time at which to look it up.
+    """
+    if r.by is None:
+        return e, None
+    runs = list(e.runs)
+    if r.by_file is not None:
+        sheet = _sheet(r)
+        runs = [replace(p, by=_looked_up(sheet, r.by, p.run, p.seconds)) for p in runs]
+    elif any(p.by is None for p in runs):
+        raise InputError(f"--by {r.by}: {e.path} {NO_COLUMNS}")
+    cells = [p.by for p in runs if p.by is not None]
+    column = column_of(r.by, np.concatenate(cells))
+    column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
+    ends = np.cumsum([0, *map(len, cells)])
+    parts = zip(runs, ends, ends[1:], strict=False)
+    return replace(e, runs=[replace(p, by=column.values[start:end]) for p, start, end in parts]), column
+
+
+def of_record(record: Record, r: Reading) -> tuple[Record, Column | None]:
+    """A record that its reader has made, with the values of the column."""
+    if r.by is None:
+        return record, None
+    cells = record.by
+    if r.by_file is not None:
+        sheet = _sheet(r)
+        cells = np.stack([_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers])
+    if cells is None:
+        raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
+    column = column_of(r.by, cells)
+    column = replace(column, outcome=selects_on_outcome(column, record.axes))
+    return replace(record, by=column.values), column
+
+
+def beside_states(
+    column: Column, e: Estimator, judged: Sequence[int], runs: Sequence[Poses], known: Sequence[Known]
+) -> Column:
+    """The column, marked where its values are those of a judged component of the truth or the estimate, or a sigma."""
+    some = [k.of(_some(len(k.rows), len(runs))) for k in known]
+    rows = list(zip(runs, some, strict=True))
+    values = np.concatenate([p.by[k.rows] for p, k in rows if p.by is not None])
+    states = [] if e.convention == "" else _columns_of(e, judged)  # errors of an archive stand in the place of a truth
+    truth, estimate = (
+        np.concatenate([state[:, states] for state in of_runs])
+        for of_runs in ([k.truth for k in some], [p.estimate[k.rows] for p, k in rows])
+    )
+    P = np.concatenate([p.covariance[k.rows] for p, k in rows])[:, judged][:, :, judged]
+    axes = [e.axes[i] for i in judged]
+    return replace(column, outcome=selects_on_outcome(replace(column, values=values), axes, truth, estimate, P))
+
+
+def _columns_of(e: Estimator, judged: Sequence[int]) -> list[int]:
+    """Columns of a state that are judged components; of rotations in space, which are quaternions, none."""
+    if not e.in_space:
+        return list(judged)
+    return [i if i < ROTATION.start else i + 1 for i in judged if i not in ROTATION]
+
+
+def _some(count: int, parts: int = 1) -> Indices:
+    """At most ``ENOUGH`` of so many rows in all, evenly chosen."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, max(ENOUGH // parts, 2))).astype(np.int64))
+
+
+def grouped(record: Record, column: Column | None, r: Reading, option: str = "--by") -> Record:
+    """The record with its groups; itself without a column.
+
+    Raises
+    ------
+    InputError
+        The column is made from the errors, or makes no groups.
+    """
+    if column is None or record.by is None:
+        return record
+    if record.nees is None:
+        raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
+    counted = np.isfinite(record.nees)
+    if not counted.any():
+        return record
+    run, step = (places[_some(int(counted.sum()))] for places in np.nonzero(counted))
+    error = None if record.error is None else record.error[run, step]
+    if why := made_from_errors(column.name, record.by[run, step], error, record.nees[run, step]):
+        raise InputError(
+            f"{option} {column.name}: the column is made from the errors ({why}), and groups of small and of large "
+            "errors differ in any estimator; take a column that was fixed before the error was, or rename one that is "
+            "only called so"
+        )
+    try:
+        groups = groups_of(replace(column, values=record.by), BINS if r.bins is None else r.bins, counted)
+    except ValueError as wrong:
+        raise InputError(f"{option} {column.name}: {wrong}") from None
+    return replace(record, groups=groups)
+
+
+def with_groups(
+    record: Record, by: ArrayLike | Mapping[str, ArrayLike] | None, bins: int | Sequence[float] | None
+) -> Record:
+    """The record with groups of an array in memory; see :func:`consistency.judge`.
+
+    Raises
+    ------
+    InputError
+        As :func:`grouped`; the array has another shape, or bins are given without one.
+    """
+    if by is None:
+        raise InputError("bins: goes with by=")
+    named = by if isinstance(by, Mapping) else {"array": by}
+    if len(named) != 1:
+        raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(named)} names")
+    ((name, values),) = named.items()
+    if record.nees is None:
+        raise InputError(f"by: {record.name} {NO_TRUTH}")
+    try:
+        column = column_of(name, on_steps(values, record.nees.shape))
+    except ValueError as wrong:
+        raise InputError(f"by: {wrong}") from None
+    column = replace(column, outcome=selects_on_outcome(column, record.axes, covariance=record.covariance))
+    return grouped(replace(record, by=column.values), column, Reading(bins=bins), "by")
+
+
+# --- a table of its own -------------------------------------------------------------------------------
+
+
+def _sheet(r: Reading) -> TableRows:
+    """The table of ``--by-file``, with the column and what it is looked up by.
+
+    Raises
+    ------
+    InputError
+        It lacks one of them.
+    """
+    from consistency.referee.readers.formats.other_names import with_clock
+    from consistency.referee.readers.formats.sheet import read_sheet
+
+    assert r.by is not None
+    assert r.by_file is not None
+    sheet = with_clock(read_sheet(r.by_file), required=False)
+    if r.by not in sheet:
+        raise InputError(f"--by {r.by}: {r.by_file} has no such column; there are: {sheet.columns}")
+    if "t" not in sheet and "run" not in sheet:
+        raise InputError(f"{r.by_file}: column 't' or 'run' is missing; there are: {sheet.columns}")
+    return sheet
+
+
+def _looked_up(sheet: TableRows, name: str, run: int, t: Array) -> Array:
+    """Cells of a column for the rows of a run at times ``t`` (N,), s: the last one at or before each."""
+    rows = np.arange(len(sheet))
+    if "run" in sheet:
+        rows = np.flatnonzero(sheet.numbers("run", whole=True) == run)
+        if not len(rows):
+            raise InputError(f"{sheet.path}: holds no run {run}")
+    cells = sheet.data[name][rows]
+    if "t" not in sheet:
+        if len(rows) > 1:
+            where = sheet.place(int(rows[1]))
+            raise InputError(f"{where}: run {run} has several rows; they need a column t")
+        return np.repeat(cells, len(t))
+    if np.isnan(t).any():
+        raise InputError(f"--by-file {sheet.path}: the estimates have no times at which to look up its column t")
+    times = sheet.numbers("t", finite=True)[rows]
+    order = np.argsort(times, kind="stable")
+    place = np.searchsorted(times[order], t + ROUNDING, side="right") - 1
+    found = cells[order][np.maximum(place, 0)]
+    found[place < 0] = np.nan if cells.dtype.kind == "f" else None
+    return np.asarray(found)

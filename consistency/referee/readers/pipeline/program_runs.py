@@ -1,0 +1,355 @@
+"""The folder of ``consistency monte-carlo``: runs of a program, each with its files in a folder of its own.
+
+A run is finished when its ``run.json`` has been renamed into its folder. What a program wrote is read as any other
+file; a run whose files cannot be read has failed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import re
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.errors import InputError
+from consistency.referee.parsing import one_line
+from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.pipeline.kept_numbers import NUMBERS, keep_numbers, kept_numbers
+from consistency.referee.readers.pipeline.records import records_of
+from consistency.referee.readers.pipeline.run_folders import merged
+from consistency.referee.readers.places import CutNote, listed
+from consistency.referee.readers.truth_matching import Estimator, Poses
+from consistency.referee.system.folders import read_manifest
+
+RUN_KIND = "run of a program"  # of run.json: a program may write a file of that name itself
+LOG = "program.log"  # standard output and error of a run
+RUN_FILE = "run.json"
+PATHS = ("truth", "covariance")  # options of files, each with a path of its own for every run
+OF_NUMBERS = ("axes", "relative", "windows", "align", "split", "truth_errors", "truth_shared")  # options
+Reader = Callable[[Path, Reading], Sequence[Estimator | Record]]
+LATE = 1.5  # steps of the estimates: the truth may go on by less than two
+
+
+def filled(text: str, values: Mapping[str, str]) -> str:
+    """A text with ``{run}``, ``{seed}``, ... replaced by their values; all other braces stay."""
+    if not values:
+        return text
+    return re.sub(r"\{(" + "|".join(values) + r")\}", lambda match: values[match[1]], text)
+
+
+@dataclass(frozen=True)
+class ProgramRun:
+    """A finished run: its folder, what stands for ``{run}``, ``{seed}``, ... and how the program ended."""
+
+    folder: Path
+    run: int
+    values: Mapping[str, str]
+    failure: str  # why the program failed; "" if it ended well
+    seconds: float = 0.0
+
+    @property
+    def log(self) -> Path:
+        return self.folder / LOG
+
+    @property
+    def known(self) -> Mapping[str, str]:
+        """What stands for each placeholder, also after the folder was moved."""
+        return {**self.values, "out": str(self.folder)}
+
+    @property
+    def source(self) -> str:
+        """What the run was made of: the name of its recorded file, or its seed."""
+        return self.values.get("name", self.values["seed"])
+
+
+def run_of(folder: Path) -> ProgramRun | None:
+    """The finished run in a folder; None if it is not finished."""
+    path = folder / RUN_FILE
+    if not path.is_file():
+        return None
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["kind"] != RUN_KIND:
+            return None
+        return ProgramRun(folder, int(data["run"]), data["values"], data["failure"], data["seconds"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def runs_in(folder: Path) -> dict[int, ProgramRun]:
+    """Finished runs of a study by their number, in order."""
+    found = [run_of(each) for each in sorted((folder / "runs").glob("*"))]
+    return {one.run: one for one in sorted((one for one in found if one is not None), key=lambda one: one.run)}
+
+
+@dataclass(frozen=True)
+class ProgramStudy:
+    """What the manifest of a folder of runs says."""
+
+    folder: Path
+    manifest: Mapping[str, Any]
+
+    @cached_property
+    def reading(self) -> Reading:
+        """Options by which the files of each run are read."""
+        given: dict[str, Any] = dict(self.manifest["reading"])
+        given |= {name: Path(given[name]) for name in PATHS if name in given}
+        return Reading(**given)
+
+    @property
+    def estimates(self) -> str:
+        """File of the estimates of each run, with placeholders."""
+        return str(self.manifest["estimates"])
+
+    @property
+    def name(self) -> str:
+        """Name of an estimator that is called after its file."""
+        stem = Path(self.estimates).stem
+        return stem if "{" not in stem else "estimates"
+
+    @property
+    def design(self) -> Design | None:
+        """Looks at growing numbers of runs, if the runs went on until decided."""
+        plan = self.manifest["until_decided"]
+        return sequential_design(**plan) if plan else None
+
+    @property
+    def unfinished(self) -> str:
+        """How many runs are there, where some are missing."""
+        if self.manifest["complete"]:
+            return ""
+        asked = self.manifest["runs"]
+        of = f" of {asked}" if asked else ""
+        return f"only {len(runs_in(self.folder))}{of} runs are there"
+
+    def files_of(self, run: ProgramRun, r: Reading) -> tuple[Path, Reading]:
+        """The estimates of a run, and the options by which they are read, with its own truth.
+
+        A relative path is in the folder of the run; with a recorded file's ``{name}`` or ``{input}`` in it, it is
+        where the user stood.
+        """
+        own: dict[str, Any] = {}
+        for name in PATHS:
+            path = getattr(r, name)
+            if path is not None:
+                recorded = "input" in run.values and ("{name}" in str(path) or "{input}" in str(path))
+                base = Path(run.values["here"]) if recorded else run.folder
+                own[name] = base / filled(str(path), run.known)
+        return run.folder / filled(self.estimates, run.known), replace(r, **own)
+
+
+def study_in(folder: Path) -> ProgramStudy:
+    """The study in a folder; raises InputError where its manifest is damaged."""
+    manifest = read_manifest(folder)
+    keys = ("reading", "estimates", "until_decided", "complete", "runs", "keep")
+    if missing := [key for key in keys if key not in manifest]:
+        raise InputError(f"{folder / 'manifest.json'}: key '{missing[0]}' is missing; run it again with --overwrite")
+    return ProgramStudy(folder, manifest)
+
+
+def with_options(study: ProgramStudy, r: Reading) -> Reading:
+    """The options by which the runs were read, with those that are given in their place.
+
+    Raises
+    ------
+    InputError
+        An option of files that were deleted.
+    """
+    deleted = [name for name in r.given() if name not in OF_NUMBERS]
+    if study.manifest["keep"] == "failed" and deleted:
+        raise InputError(f"{flag_of(deleted[0])}: {study.folder} has the numbers alone that were read (--keep failed)")
+    return replace(study.reading, **{each.name: value for each in fields(r) if (value := getattr(r, each.name))})
+
+
+# --- from runs to estimators -----------------------------------------------------------------------
+
+
+def read_program_runs(folder: Path, r: Reading, found_in: Reader) -> list[Estimator]:
+    """The estimators of all finished runs in a folder; those of a study until decided up to the first missing run.
+
+    Raises
+    ------
+    InputError
+        No run can be judged.
+    """
+    study = study_in(folder)
+    runs = Runs(study, r, found_in)
+    for run in runs_in(folder).values():
+        runs.take(run)
+    if not runs.found:
+        why = next(iter(runs.failed.values()), "none is finished; the same command with --resume goes on")
+        raise InputError(f"{folder}: no run can be judged: {why}")
+    return runs.estimators(runs.first if study.design else None)
+
+
+class Runs:
+    """Runs of a program as they come, each read once.
+
+    Parameters
+    ----------
+    found_in : what the reader of any file gives, by its path and options
+    """
+
+    def __init__(self, study: ProgramStudy, r: Reading, found_in: Reader) -> None:
+        self.study, self.options, self._found_in = study, r, found_in
+        self.found: dict[int, Sequence[Estimator]] = {}
+        self.failed: dict[int, str] = {}
+        self.trials: dict[int, str] = {}
+
+    def take(self, run: ProgramRun) -> list[Record]:
+        """Read a run, and return its records; none if it has failed."""
+        if run.failure:
+            self.failed[run.run] = with_log(run.failure, run)
+            return []
+        try:
+            found = self._found(run)
+            records = [record for one in found for record in records_of(one, self.options)]
+            _require_whole(records)
+        except InputError as error:
+            self.failed[run.run] = with_log(str(error).replace(f"{run.folder}/", ""), run)
+            return []
+        self.found[run.run] = [_without_folder(one, run.folder) for one in found]
+        self.trials[run.run] = f"{run.source} {_digest(found)}"
+        return records
+
+    def delete_files(self, run: ProgramRun) -> None:
+        """Keep the numbers that were read of a run in place of its files, unless these end before their truth."""
+        if _ends_early(self.found[run.run][0].runs[0]):
+            return
+        estimates, r = self.study.files_of(run, self.options)
+        if not (run.folder / NUMBERS).exists():
+            keep_numbers(run.folder, self.found[run.run])
+        for path in (estimates, r.truth, r.covariance):
+            if path is None or not path.is_relative_to(run.folder):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+    def _found(self, run: ProgramRun) -> list[Estimator]:
+        if (run.folder / NUMBERS).exists():
+            return kept_numbers(run.folder)
+        estimates, r = self.study.files_of(run, self.options)
+        for path, option in ((estimates, "--estimates"), (r.truth, "--truth"), (r.covariance, "--covariance")):
+            if path is not None and not path.exists():
+                raise InputError(_nothing(path, option, run))
+        return merged({run.run: self._found_in(estimates, r)}, self.study.name)
+
+    @property
+    def first(self) -> int:
+        """How many of runs 0, 1, ... are there, up to the first that is missing."""
+        return next(run for run in itertools.count() if run not in self.found and run not in self.failed)
+
+    def estimators(self, count: int | None = None) -> list[Estimator]:
+        """The estimators of the first ``count`` runs by number, or of all that are there."""
+        found = {run: one for run, one in sorted(self.found.items()) if count is None or run < count}
+        failed = {run: why for run, why in self.failed.items() if count is None or run < count}
+        if not self.study.manifest.get("inputs"):
+            early = _early(found)
+            failed |= early
+            found = {run: one for run, one in found.items() if run not in early}
+        return [replace(one, trials=self.trials) for one in merged(found, self.study.name, failed)]
+
+
+def with_log(why: str, run: ProgramRun, lines: int = 3) -> str:
+    """A reason with the last lines of a run's log."""
+    last = log_lines(run.log, lines)
+    return f"{why}; its log ends: {one_line(' | '.join(last), 300)}" if last else why
+
+
+def without_log(why: str) -> str:
+    """A reason without the lines of a log."""
+    return why.partition("; its log ends: ")[0]
+
+
+def kind_of_failure(why: str) -> str:
+    """A reason without its numbers and log: what failures that are alike have in common."""
+    return re.sub(r"\d+", "#", without_log(why))
+
+
+def failures_in_words(records: Sequence[Record], folder: Path) -> list[str]:
+    """A sentence for each kind of failure, with the runs that failed so and the log of the first."""
+    kinds: dict[str, dict[int, str]] = {}
+    for record in records:
+        for failure in record.failures:
+            kinds.setdefault(kind_of_failure(failure.reason), {})[failure.run] = failure.reason
+    runs = runs_in(folder) if kinds else {}
+    said = []
+    for of_runs in kinds.values():
+        first, why = min(of_runs.items())
+        which = f"{plural(len(of_runs), 'run')} failed ({listed(sorted(of_runs))})"
+        said.append(f"{which}: {without_log(why)}; log {runs[first].log}")
+    return said
+
+
+def log_lines(path: Path, lines: int) -> list[str]:
+    """The last lines of a log that are not empty."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - 16384))
+            text = file.read().decode("utf-8", "replace")
+    except OSError:
+        return []
+    return [line.rstrip() for line in text.splitlines() if line.strip()][-lines:]
+
+
+def _nothing(path: Path, option: str, run: ProgramRun) -> str:
+    """Message that a file of a run is not there."""
+    if not path.is_relative_to(run.folder):
+        return f"{option}: {path} is not there"
+    relative = path.relative_to(run.folder)
+    here = Path(run.values["here"]) / relative
+    if option != "--estimates" and here.exists():
+        return f"the program wrote no {relative}; for the one where you stand write {option} {{here}}/{relative}"
+    others = sorted(each.name for each in run.folder.iterdir() if each.name not in (LOG, RUN_FILE))
+    wrote = f" ({option}); it wrote {', '.join(others[:5])}" if others else f" ({option}), and nothing else"
+    return f"the program wrote no {relative}{wrote}"
+
+
+def _without_folder(one: Estimator, folder: Path) -> Estimator:
+    """An estimator whose notes name the files of a run as any run has them."""
+    notes, causes = ([text.replace(f"{folder}/", "") for text in texts] for texts in (one.notes, one.causes))
+    return replace(one, notes=notes, causes=causes)
+
+
+def _require_whole(records: Sequence[Record]) -> None:
+    """Refuse a file whose last line is cut short: the program has ended."""
+    for record in records:
+        for note in record.notes:
+            if isinstance(note, CutNote):
+                raise InputError(f"{note.rpartition(': ')[0]}: its last line is cut short")
+
+
+def _early(found: Mapping[int, Sequence[Estimator]]) -> dict[int, str]:
+    """Runs whose estimates end before their truth, unless those of all runs do, and why they count as failed."""
+    early = {run: why for run, of_run in found.items() if (why := _ends_early(of_run[0].runs[0]))}
+    return {} if len(early) == len(found) else early
+
+
+def _ends_early(p: Poses) -> str:
+    if len(p.t) < 2 or not len(p.true_t):
+        return ""
+    period = float(np.median(np.diff(p.t)))
+    if p.true_t[-1] - p.t[-1] <= LATE * period:
+        return ""
+    return f"its estimates end at {p.t[-1]:.6g}, its truth at {p.true_t[-1]:.6g}"
+
+
+def _digest(found: Sequence[Estimator]) -> str:
+    """Digest of the truth of a run."""
+    p, digest = found[0].runs[0], hashlib.sha256()
+    for array in (p.true_t, p.truth):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]

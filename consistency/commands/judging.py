@@ -102,7 +102,9 @@ def analyse_command(
     is_file = report is not None and report.suffix.lower() in FORMATS.keys() - {".html", ".json"}  # a folder has both
     require_written(overwrite, report, "--report")
     if report is not None:
-        overwrite = require_report(report, is_file, overwrite)
+        from consistency.referee.pages.write_pages import require_report
+
+        overwrite = require_report(report, overwrite)
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
         source = files_source(path, recordings)
@@ -148,19 +150,6 @@ def analyse_command(
         print(f"consistency: {refused}", file=sys.stderr)
     if is_failed:
         raise typer.Exit(1)
-
-
-def require_report(report: Path, is_file: bool, overwrite: bool) -> bool:
-    """Refuse, before any work, a report that cannot be written; return whether it replaces what is there."""
-    from consistency.referee.pages.write_pages import is_own_report, require_writable
-    from consistency.referee.system.folders import require_free
-
-    replaces = overwrite or is_own_report(report)
-    if is_file:
-        require_writable(report, replaces)
-    else:
-        require_free(report, replaces, "verdict", "--report")
-    return replaces
 
 
 def _refuse_unfinished(path: Path, source: Source, command: str, fail_on: str | None) -> None:

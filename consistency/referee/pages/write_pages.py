@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
-from consistency.referee.show import rendered
+from consistency.referee.show import FORMATS, rendered
 from consistency.referee.system.atomic import write_whole
 
 if TYPE_CHECKING:
@@ -101,6 +101,29 @@ def write_text_file(document: Document, path: Path) -> Path:
     """
     write_file(path, f"{rendered(document, path)}{MARK}".encode())
     return path
+
+
+def require_report(report: Path, overwrite: bool) -> bool:
+    """Refuse, before any work, a report that cannot be written; return whether it replaces what is there.
+
+    Raises
+    ------
+    InputError
+        Something is there that is no report of a verdict, without ``overwrite``; or the system refuses.
+    """
+    from consistency.referee.system.folders import require_free
+
+    replaces = overwrite or is_own_report(report)
+    if is_one_file(report):
+        require_writable(report, replaces)
+    else:
+        require_free(report, replaces, "verdict", "--report")
+    return replaces
+
+
+def is_one_file(report: Path) -> bool:
+    """Whether a report is one file; a folder has the HTML page and the JSON."""
+    return report.suffix.lower() in FORMATS.keys() - {".html", ".json"}
 
 
 def is_own_report(path: Path) -> bool:

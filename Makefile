@@ -40,13 +40,13 @@ test-all: .venv/.done
 
 calibrate: .venv/.done
 	$(BIN)/python benchmarks/calibration.py \
-		--out reports/reference/calibration.json --docs docs/referee.md
+		--out reports/reference/calibration.json --docs docs/reference/rates.md
 
 calibrate-quick: .venv/.done
 	$(BIN)/python benchmarks/calibration.py --quick
 
 calibrate-alignment: .venv/.done
-	$(BIN)/python benchmarks/alignment.py --docs docs/align.md
+	$(BIN)/python benchmarks/alignment.py --docs docs/reference/rates.md
 
 calibrate-alignment-quick: .venv/.done
 	$(BIN)/python benchmarks/alignment.py --quick

@@ -2,7 +2,7 @@
 
 A draw is 60 runs of a planar estimator in the world of the truth, or in another that is turned about z and shifted: in
 one of its own for each run, or in one of all. ``make calibrate-alignment`` measures all rows and writes the table of
-docs/align.md; ``--quick`` measures few draws of each row with fresh
+docs/reference/rates.md; ``--quick`` measures few draws of each row with fresh
 random numbers, writes nothing, and fails where a rate is beyond its promise, by chance less than once in 5,000 times.
 """
 

@@ -1,8 +1,8 @@
 """How fast is it? Ours against filterpy, Stone Soup, bare BLAS and its own targets, side by side in one run.
 
 ``bench.py [--out FILE] [--full] [--only GROUP ...]`` prints a table and writes it as JSON. The ratios are the result:
-seconds are those of one machine, medians of interleaved repetitions on one BLAS thread. docs/bench.md says how to
-read it.
+seconds are those of one machine, medians of interleaved repetitions on one BLAS thread. benchmarks/README.md
+says how to read it.
 """
 
 from __future__ import annotations

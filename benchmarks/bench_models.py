@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from bench_trials import Case, twin_state
 
-from consistency.bench.filters.textbook.basics import motion_jacobians, move, process_noise
-from consistency.bench.filters.textbook.sensors import PointSensor
+from consistency.bench.filters.textbook.basics import PointSensor, motion_jacobians, move, process_noise
 from consistency.bench.models import point, stereo
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Control

@@ -1,7 +1,8 @@
 """Does the referee keep its promises? False alarms, power and wrong all-clears, counted over thousands of verdicts.
 
 ``make calibrate`` measures all rows and writes reports/reference/calibration.json, which the appendix of every report
-shows, and the table of docs/referee.md. ``make calibrate-quick`` measures fewer gates of fewer rows with fresh random
+shows, and the table of
+docs/reference/rates.md. ``make calibrate-quick`` measures fewer gates of fewer rows with fresh random
 numbers, writes nothing, and fails where a promise is broken: by chance less than once in 5,000 runs.
 
 Worlds are in ``calibration_worlds.py`` and promises in ``calibration_cases.py``; ``calibration_monitor.py`` and

@@ -11,7 +11,7 @@ from calibration_worlds import HEAVY, LOGS, WORLDS
 from consistency.diagnostics import gate_runs
 
 FALSE_ALARM, POWER, DETECT = 0.05, 0.95, 1.5
-QUICK_FAILURE = 2e-4  # chance that the quick rows of a referee that keeps its promises fail
+QUICK_FAILURE = 2e-4  # probability that the quick rows of a referee that keeps its promises fail
 MANY, SHOWING = 100, 50  # runs
 MOST = 500  # runs of --until-decided
 HEADLINE = 0.85  # of the planned runs, least share of verdicts named after the scale

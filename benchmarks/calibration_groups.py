@@ -16,6 +16,8 @@ from calibration_gates import Draw, first_order, row, shared, standard
 import consistency as cs
 from consistency.diagnostics import Record, Settings, Verdict, judge
 from consistency.errors import InputError
+from consistency.referee.diagnostics.questions.equivalence import equivalence
+from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.records.groups import column_of, groups_of
 from consistency.referee.diagnostics.statistics.number_of_runs import group_runs
 from consistency.referee.diagnostics.verdict.answers import GROUP
@@ -23,6 +25,7 @@ from consistency.referee.types import Array
 
 GATES, CONTROLS, POWERS = 1000, 200, 500
 QUICK_GATES, QUICK_CONTROLS, QUICK_POWERS = 60, 12, 40
+CLEARS, QUICK_CLEARS = 1000, 100
 RATIO, OF, FOUND, NAMED, STEPS = 1.5, 5, 0.9, 0.95, 20
 FALSE, CLEAR, OUTCOME = "groups, false alarm", "groups, wrong all-clear", "groups, selected on the outcome"
 FINDS, NAMES = "groups, power", "groups, the right one named"
@@ -200,7 +203,7 @@ ABOUT = {
 
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
-    return [*_false(quick, seed), *_outcome(quick, seed), *_power(quick, seed)]
+    return [*_false(quick, seed), *_clear(quick, seed), *_outcome(quick, seed), *_power(quick, seed)]
 
 
 def grouped(error: Array, covariance: Array, values: Array, bins: int | Sequence[float]) -> Verdict:
@@ -217,6 +220,31 @@ def _false(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
             rng = np.random.default_rng((seed, 121, k, runs))
             found = sum(GROUP in grouped(*of.draw(rng, runs), of.bins).faults for _ in range(gates))
             yield row(world, FALSE, 1.0, runs, FALSE_ALARM, "<=", gates, found)
+
+
+def _clear(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
+    """Groups, of studies in which all have a ratio at either end of the interval, that are called consistent."""
+    studies, settings = QUICK_CLEARS if quick else CLEARS, Settings(FALSE_ALARM, DETECT, POWER)
+    for k, world in enumerate(list(QUICK_WORLDS) if quick else list(WORLDS)):
+        of, runs = WORLDS[world], WORLDS[world].runs[-1]
+        for ratio in (DETECT, 1.0 / DETECT):
+            rng, count, found = np.random.default_rng((seed, 124, k, int(ratio > 1.0))), 0, 0
+            for _ in range(studies):
+                error, covariance, values = of.draw(rng, runs)
+                n, nees = error.shape[-1], ratio * _nees(error, covariance)
+                groups = groups_of(column_of("by", values), of.bins, np.isfinite(nees))
+                sample = Sample(nees, n, groups=groups)
+                number = int(rng.integers(len(groups.names)))
+                one = sample.in_group(number)
+                if len(one.means):
+                    count += 1
+                    found += equivalence(one.means, n, one.longest, settings, weights=one.counts).shown
+            yield row(world, CLEAR, ratio, runs, round(1.0 - POWER, 3), "<=", count, found)
+
+
+def _nees(error: Array, covariance: Array) -> Array:
+    """Of errors whose covariances are diagonal, (R, T)."""
+    return np.asarray((error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)).sum(axis=-1))
 
 
 def _outcome(quick: bool, seed: int) -> Iterator[dict[str, Any]]:

@@ -1,6 +1,6 @@
 """Does the monitor keep its promise? Alarms of right Kalman filters, and how long a fault goes unseen.
 
-``calibration.py`` takes its rows from here; run alone, this script prints the tables of docs/monitor.md. Two linear
+``calibration.py`` takes its rows from here; run alone, this script prints its tables. Two linear
 filters, each exactly right for what it filters:
 
 - ``position``: three random walks with gains of 0.2, 0.5 and 0.8, all measured in every step (3 degrees of freedom,

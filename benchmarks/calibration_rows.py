@@ -88,7 +88,10 @@ def rows_of(table: dict[str, Any]) -> list[Row]:
 
 
 def markdown(table: dict[str, Any]) -> str:
-    """The table as docs/referee.md has it: questions, then worlds by what is asked in all of them, the rest, worlds."""
+    """The table as docs/reference/rates.md has it: questions, then worlds by what is asked in all of them, the rest.
+
+    What each world is stands in the appendix of every report.
+    """
     rows = rows_of(table)
     grid = [row for row in rows if row.question in EVERYWHERE and row.world in WORLDS]
     columns = list(dict.fromkeys(_column(row) for row in grid))
@@ -102,7 +105,6 @@ def markdown(table: dict[str, Any]) -> str:
         for row in rows if row not in grid
     ]  # fmt: skip
     lines += ["", *_table(["question", "world", "ratio", "runs", "promised", "measured", "gates"], others)]
-    lines += ["", *_table(["world", "what it is"], [[name, about] for name, about in table["worlds"].items()])]
     return "\n".join(lines)
 
 

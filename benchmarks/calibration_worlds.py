@@ -200,7 +200,7 @@ def laplace(draw: Draw, correlation: float = 0.0) -> Gate:
 def left_poses(draw: Draw) -> tuple[Array, Array, Array]:
     """True and estimated poses (R, T, 3) and covariances (R, T, 3, 3) of a robot that drives 1 m a step.
 
-    Its heading wanders 0.5 rad a step and is known from a compass, anew in each step; the position comes from a Kalman
+    Its heading wanders 0.5 rad a step and is known from a compass, again in each step; the position comes from a Kalman
     filter, whose errors change slowly in the world and fast in the body. Log(estimate^-1 truth) is exactly N(0, P).
     """
     heading = headings(draw)

@@ -28,7 +28,7 @@ from consistency.bench.filters.methods.ekf import parts
 from consistency.bench.models.motion import dead_reckoning, unicycle_jacobian, unicycle_noise
 from consistency.bench.types import Estimates
 
-SURE = 0.01  # chance that a rate exactly as stated is called broken
+SURE = 0.01  # probability that a rate exactly as stated is called broken
 EXACT = {"sigma_v": 0.001, "sigma_omega": 0.001}  # m/s, rad/s: in 500 s the heading errs by 0.03 rad at most
 
 
@@ -48,7 +48,7 @@ class DeadReckoning(Compiled):
         return True
 
     def outlook(self, trial: Any, belief: Any) -> Outlook:
-        return Outlook(self.name, is_ready=True, is_shared=True, seconds=0.0)
+        return Outlook(self.name, is_ready=True, is_shared=True, size=0)
 
     def run(self, trial: Any, belief: Any, halt: Any = None) -> Estimates:
         controls, T = np.asarray(trial.controls, float), trial.steps

@@ -44,7 +44,7 @@ PER_M = (4e-4, 2e-4, 4e-6)  # m^2/m and rad^2/m: x, y, yaw
 PER_RAD = (4e-4, 1e-4, 2e-5)  # m^2/rad and rad^2/rad
 WITHIN, SHARE, OWN = (0.7, 1.5), 0.80, 0.5  # of the true variance; of fits; of the variance of a window
 COVERED = (0.90, 0.98)
-WRONG, SURE = 0.05, 0.01  # share of wrong "consistent"; chance that a promise kept exactly is called broken
+WRONG, SURE = 0.05, 0.01  # share of wrong "consistent"; probability that a promise kept exactly is called broken
 FRESH = 40  # drives that tell the true ratio of a fit
 
 

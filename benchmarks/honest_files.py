@@ -1,6 +1,6 @@
 """Files of every kind, drawn at random: how often is an honest one found at fault, and is x2 in P found?
 
-``python benchmarks/honest_files.py [--draws N] [--only TEXT]`` prints the table of docs/files.md. A draw is a study of
+``python benchmarks/honest_files.py [--draws N] [--only TEXT]`` prints a table of verdicts. A draw is a study of
 50 runs with a covariance of its own, written as the system writes it and read as a user's file. What one file makes
 several verdicts of is counted by the verdict that is at fault most often.
 """

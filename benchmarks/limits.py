@@ -5,7 +5,7 @@
 
 Filters are right, and the share of gates is counted in which a fault is found nevertheless, at a stated 5 %. Of
 deviations alone one axis is wrong, by as much as a verdict promises to find with a power of 95 %, and the share is
-counted in which it is found. No other row is held to a promise: the list in docs/referee.md, Limits, says how far off
+counted in which it is found. No other row is held to a promise: docs/reference/rates.md says how far off
 the rate may be there.
 """
 

@@ -36,7 +36,7 @@ SIGMA = {"SE(2)": (0.02, 0.03, 0.004), "SE(3)": (0.02, 0.03, 0.02, 0.002, 0.003,
 DECLARED = {"SE(2)": "so2", "SE(3)": "so3"}
 AXES = {"SE(2)": ("x", "y", "heading"), "SE(3)": ("x", "y", "z", "roll", "pitch", "yaw")}
 MEMORY = 0.9  # correlation of the errors of neighbouring poses
-RATE, SURE = 0.05, 0.01  # false-alarm rate of a verdict; chance that rates exactly as stated are called broken
+RATE, SURE = 0.05, 0.01  # false-alarm rate of a verdict; probability that rates exactly as stated are called broken
 NOISES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.8)  # rad: heading over a window, stated
 
 

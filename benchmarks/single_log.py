@@ -30,7 +30,7 @@ WORLDS = [
 ]  # fmt: skip  # correlation, steps, components
 PROMISED = 50.0  # correlation times of the NEES in a log from which on its interval is held to 95 %
 PILOTS = [(0.0, 1000, 3), (0.95, 1000, 3), (0.95, 1000, 6)]
-RATE, SURE = 0.05, 0.01  # of what is promised; chance that rates exactly as promised are called broken
+RATE, SURE = 0.05, 0.01  # of what is promised; probability that rates exactly as promised are called broken
 ROWS = len(WORLDS) + len(PILOTS)
 SETTINGS = Settings(RATE)
 

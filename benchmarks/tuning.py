@@ -31,7 +31,7 @@ from consistency.bench.tuning.tune import fitted
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
 
-SURE = 0.01  # chance that a rate exactly as stated is called broken
+SURE = 0.01  # probability that a rate exactly as stated is called broken
 COVERAGE, FALSE_ALARM = 0.95, 0.05
 FACTOR = 4.0  # believed variances are off by it at most
 SPEED = (("linear-gaussian", "kf"), ("herath2007-stereo", "ekf-uvd"))

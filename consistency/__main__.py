@@ -10,8 +10,8 @@ from typing import Any, NoReturn
 
 GLANCE = 0.1  # s between looks, for a signal that another thread was given
 SHOW_CURSOR = "\x1b[?25h"
-GOES_ON = "; finished runs are kept where there are any: the same command goes on, 'run' with --resume"
-PROGRAMS_GO_ON = "; finished runs are kept: the same command with --resume goes on"
+GOES_ON = "; finished runs are kept where there are any: the same command continues, 'run' with --resume"
+PROGRAMS_GO_ON = "; finished runs are kept: the same command with --resume continues"
 
 
 class Command(threading.Thread):

@@ -1,4 +1,4 @@
-"""Monte Carlo studies: trials through filters, on this machine or on others, and the scripts of experiments."""
+"""Monte Carlo studies: filters on trials, on this machine or on others, and the scripts of experiments."""
 
 from consistency.referee.extras import explained_import
 

@@ -92,10 +92,10 @@ def assert_consistent(
         judged by itself, at a false-alarm rate that all share, see :func:`consistency.judge`
     nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances; ``dof`` may be of
         each step, (steps,) or (runs, steps), where the state grows or shrinks
-    false_alarm : chance to fail a right filter; 0.001 unless an argument, marker or session sets it
+    false_alarm : probability of rejecting a correct filter; 0.001 unless an argument, marker or session sets it
     detect : ratio of true to stated covariance, in all steps, that must not pass (1.5)
-    power : chance that a filter at ``detect`` does not pass (0.95)
-    tolerance : a ratio shown to lie in [1 / tolerance, tolerance] is no fault; nothing is tolerated by default
+    power : probability that a filter at ``detect`` does not pass (0.95)
+    tolerance : a ratio shown to lie in [1 / tolerance, tolerance] is not a fault; nothing is tolerated by default
     allow : "conservative" accepts a covariance that is too large
     lost : share of lost runs that must not pass. A run is lost if it failed, or if its mean NEES is above
         :func:`consistency.diagnostics.lost_bound` at ``false_alarm`` over the number of runs. No limit by default
@@ -232,9 +232,9 @@ def assert_not_worse(
     filter, than : names of the candidate and its reference, in results given as ``errors_a``
     reference : other results, or a baseline or its file, in place of the same results; ``than`` is then ``filter``
         unless it is given. Trials of another scenario or seed are compared as independent samples.
-    false_alarm : chance to fail a candidate that is as consistent as the reference
+    false_alarm : probability of rejecting a candidate that is as consistent as the reference
     detect : a covariance ratio farther from 1 by this factor must be found
-    power : chance to find it
+    power : probability of finding it
     axes : names of the components
     skip : first steps of each run to leave out of both, as in :func:`assert_consistent`
     name : of the candidate, for messages

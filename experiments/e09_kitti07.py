@@ -4,7 +4,7 @@
 
 ``--data`` is a file of tracks (.npz, course ECE276A), or a folder with one such file and one .txt of true poses:
 0027.npz and kitti07_gt.txt, or those of another drive (KITTI's licence, CC BY-NC-SA: not shipped). What is in them and
-how it becomes a log: docs/kitti07.md.
+how it becomes a log: docs/reference/recorded.md.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ NAMES = {"0027": "kitti07"}  # of drives, by their file; others are called as it
 ORIGIN, LICENCE = "KITTI, tracks of course ECE276A", "CC BY-NC-SA 3.0"
 FILTERS = ("ukf-xyz", "ukf-uvd", "ekf-xyz", "ekf-uvd")  # slowest first
 SETTLED = 20  # steps: before, the covariance is nearly singular across the track (start known, no lateral noise)
-ALARM = 0.05  # chance that a consistent filter is called inconsistent, over all steps at once
+ALARM = 0.05  # probability that a consistent filter is called inconsistent, over all steps at once
 INSIDE = 0.80  # share of steps within 2 sigma; 0.954 expected, 3 sigma away if only 20 stretches are independent
 FLOOR = 0.9  # of the floor: no honest filter is below 1, a tenth is left to linearisation
 WORSE = 2.0  # factor in mean NEES over the worse of two selections of cut tracks, which alone differ by a factor of 8

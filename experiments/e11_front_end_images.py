@@ -50,7 +50,7 @@ KITTI, EUROC, MINNIE = data.KITTI, data.EUROC, data.MINNIE
 SAMPLES = 1000  # of the Monte Carlo simulation, sec. 2.3.3.2
 CLEAR = 6.0  # sigma of the disparity that a point has in a simulation, so that no sample is at infinity
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-ALARM = 0.05  # chance that right covariances are called wrong, all samples of a finding together
+ALARM = 0.05  # probability that right covariances are called wrong, all samples of a finding together
 LIMIT = {"kitti t": 0.020, "kitti R": 0.03, "euroc t": 0.001, "minnie t": 0.015}  # m, degrees
 FACTOR = 2.0  # in the mean NEES of motions that the noise model was not fitted to
 

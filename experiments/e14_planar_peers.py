@@ -1,7 +1,7 @@
 """Do the planar filters have the NEES and RMSE that other people's simulators of SLAM gave?
 
 The numbers of the peers are those of their own code, run unchanged in GNU Octave 7.3 with fixed seeds; the worlds have
-their parameters (scenarios/README.md). What is compared, and what cannot be: docs/planar.md.
+their parameters (scenarios/README.md). What is compared, and what cannot be: docs/reference/recorded.md.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ PEERS = {
     ),
 }
 # --- rules -----------------------------------------------------------------------------------
-ALARM = 0.05  # chance that some number of some peer is called different if none is
+ALARM = 0.05  # probability that some number of some peer is called different if none is
 NUMBERS = ("nees", "position", "heading")
 COMPARED = len(NUMBERS) * sum(len(rows) for rows in PEERS.values())
 LIMIT = NormalDist().inv_cdf(1.0 - ALARM / COMPARED / 2.0)  # standard errors, Bonferroni

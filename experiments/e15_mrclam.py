@@ -3,7 +3,7 @@
     python experiments/e15_mrclam.py --data DIR --out DIR [--jobs J] [--overwrite]
 
 DIR of ``--data`` holds folders MRCLAM_DatasetN (Leung et al. 2011, public research data of UTIAS: not shipped). How a
-recording becomes a log: docs/planar.md.
+recording becomes a log: docs/reference/recorded.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Where does a filter on triangulated points put a landmark that it watches from one place for ever?
 
-The closed forms are derived in docs/static-limit.md.
+The closed forms are derived in docs/consistent.md.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ FINDINGS = ("static-limit", "static-growth", "static-lateral", "static-predicted
 DEPTHS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # m, straight ahead
 NEAR = (1.0, 2.0, 3.0, 4.0)  # where a disparity of 0 is 5 sigma away: beyond, a triangulated point has no mean
 OBSERVATIONS = 2000  # of a run: the estimate's own error is then a fiftieth of that of one observation
-ALARM = 1e-3  # chance that a right closed form fails a finding, by chance at any depth
+ALARM = 1e-3  # probability that a right closed form fails a finding, by chance at any depth
 
 COMMON = {
     "scenario": "none",
-    "source": f"{OURS}, docs/static-limit.md",
+    "source": f"{OURS}, docs/consistent.md",
     "published": "in brackets beside what is measured",
 }
 ACCEPT = (

@@ -1,7 +1,7 @@
 """Is the chapter's noise of disparity a constant bias, and what does a filter make of one?
 
 The world of herath2007-stereo, in which a residual distortion of the lenses gives disparities the pooled standard
-deviation of the chapter, and what is drawn anew in each image is as small as a correlation of images makes it.
+deviation of the chapter, and what is drawn again in each image is as small as a correlation of images makes it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FINDINGS = ("bias-or-noise", "bias-survivors")
 LONG = True
 
 POOLED = 0.65  # px, sd of a disparity in Herath 2007 sec. 4.5
-SIGMA_D = 0.044  # px, of what is drawn anew, far off: fig5c on rendered images, docs/images.md
+SIGMA_D = 0.044  # px, of what is drawn again, far off: fig5c on rendered images, docs/reference/sensor.md
 GROWTH = {"disparity": (2.25, 13.5), "ratio": (1.0, 3.0)}  # and its growth to 0.133 px, there
 NODES_U, NODES_V = np.linspace(-160.0, 160.0, 17), np.linspace(-120.0, 120.0, 13)  # px, of a calibrated map
 NOMINAL = 6.0  # px, the disparity that the map is made for: about the mean of the trial

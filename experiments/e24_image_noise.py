@@ -1,6 +1,6 @@
 """Does the noise of disparity in rendered images behave as a robot saw it before a wall, and what is the 0.65 px?
 
-Experiment 2 of Herath et al. (2007) sec. 3.3 and its figures 4, 5, 7 and 8: docs/images.md.
+Experiment 2 of Herath et al. (2007) sec. 3.3 and its figures 4, 5, 7 and 8: docs/reference/sensor.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import MISMATCH, Chain, Tracks
 from consistency.stereo.rendered_images.stages import LeftRightCheck
 from consistency.stereo.rendered_images.stops import Stops, stand
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 drives = sibling(__file__, "image_drives")
 

@@ -1,6 +1,6 @@
 """What do tracking, junctions and each stage of the chain do to u, v and d in rendered images of a moving camera?
 
-Experiment 1 and figures 3, 6 and 9 of Herath et al. (2007): docs/images.md.
+Experiment 1 and figures 3, 6 and 9 of Herath et al. (2007): docs/reference/sensor.md.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from consistency.stereo.rendered_images.stages import (
     TrackResidual,
 )
 from consistency.stereo.rendered_images.stops import Stops, pose_at, stand
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 drives = sibling(__file__, "image_drives")
 
@@ -53,7 +53,7 @@ RESIDUAL, TURNED = 0.005, (0.002, 0.002, 0.001)  # what a rectification leaves: 
 LEVEL, DRAWS = 0.01, 400
 RATIO_DRAWS = 4000  # for an interval whose ends are quantiles of 0.2 %
 NEAR = 1.25  # factor between an sd of one sequence of 16 features and the printed one, which is such an sd, too
-APART = 0.8  # chance that a junction ranks above a point
+APART = 0.8  # probability that a junction ranks above a point
 ADDS = 0.25  # by which the sum of the stages' mean squares may miss that of the whole chain
 
 
@@ -172,7 +172,7 @@ def figure_9_of(study: cs.Study, table: pd.DataFrame, column: str, name: str, cl
         id=name,
         source=f"{SOURCE}, sec. 4.3 and fig. 9",
         claim=claim,
-        statistic=f"chance that the {column} of a junction is greater than that of a point, after {VIEWS} images",
+        statistic=f"probability that the {column} of a junction is greater than that of a point, after {VIEWS} images",
         published="physically non-existent; a measure of dissimilarity is a possible method",
         measured=f"{whole:.2f} ({low:.2f} to {high:.2f}, {1 - LEVEL:.0%} interval); medians {medians[True]:.2f}{unit} "
         f"of {int(table['junction'].sum())} junctions, {medians[False]:.2f}{unit} of {int((~table['junction']).sum())} "

@@ -29,7 +29,7 @@ from consistency.stereo.characterising.bias_map import GRID
 from consistency.stereo.characterising.boards import MODELS, find_corners, of_model
 from consistency.stereo.characterising.characterise import Characterisation
 from consistency.stereo.characterising.sensor_text import believed_sensor
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 FINDINGS = ("chessboard-map", "chessboard-noise")
 LONG = True

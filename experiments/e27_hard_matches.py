@@ -24,8 +24,7 @@ import consistency as cs
 from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, opencv
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, estimate_motion
 from consistency.vision import RelativePose, StereoRig, triangulate
 

@@ -11,7 +11,7 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.filters.methods.robocentric import PARKED, ROBOCENTRIC, compiled
+from consistency.bench.filters.methods.robocentric import compiled
 from consistency.bench.filters.textbook.inverse_range import Corrections
 from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
 from consistency.bench.runs.findings import script
@@ -23,7 +23,7 @@ from consistency.referee.types import Array
 FINDINGS = ("consistent-elsewhere",)
 LONG = True
 
-OURS, BESIDE = PARKED.name, "robocentric-ekf-uvd"
+OURS, BESIDE = "parked-ekf-uvd", "robocentric-ekf-uvd"
 REMEDIES = ("recency", "curvature", "promptness", "spread", "patience", "moments", "tempering", "adrift")
 BEFORE = compiled(RobotCentredKalman("before", Corrections()._replace(**dict.fromkeys(REMEDIES, False))))
 TIMED = 3  # times that each filter takes a trial, by turns; the fastest counts
@@ -159,7 +159,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
 
 def judged(study: cs.Study, scenario: cs.Scenario) -> list[tuple[dict[str, Any], Array]]:
     """A row for each filter, and its NEES in each run over 3, of all steps and of the last tenth, (2, runs)."""
-    results = cs.run_trials(scenario, [PARKED, BEFORE, ROBOCENTRIC], study.runs, study.seed, study.jobs)
+    results = cs.run_trials(scenario, [OURS, BEFORE, BESIDE], study.runs, study.seed, study.jobs)
     found = cs.analyse(results, confidence=1.0 - FALSE_ALARM)
     records = {name: record_of(results, name) for name in found}
     beside, cost = log_rmse(records[BESIDE], (0, 1)), costs(scenario, study.seed)
@@ -170,7 +170,7 @@ def costs(scenario: cs.Scenario, seed: int) -> dict[str, float]:
     """CPU time of a step in ms by filter."""
     trial, best = cs.simulate(scenario, seed=seed), dict[str, float]()
     for _ in range(TIMED):
-        for filter_ in (PARKED, BEFORE, ROBOCENTRIC):
+        for filter_ in (cs.get_filter(OURS), BEFORE, cs.get_filter(BESIDE)):
             started = time.process_time()
             filter_.run(trial, scenario.belief)
             spent = 1e3 * (time.process_time() - started) / trial.steps

@@ -1,4 +1,4 @@
-"""Stereo tracks of a KITTI drive (course ECE276A) as a planar log; why each step is there: docs/kitti07.md.
+"""Stereo tracks of a KITTI drive (course ECE276A) as a planar log; why each step is there: docs/reference/recorded.md.
 
 Only :func:`planar_truth` reads the ground truth: controls, observations and where a track is cut come from the
 recording alone. Pixels are (u, v, d): right of the principal point, below it, left minus right column.
@@ -30,7 +30,7 @@ SIGMA_PX = (1.0, 3.3, 0.7)  # rms of u, v, d against the planar truth; v carries
 MAX_AGE = 12  # observations of a landmark: beyond, drift exceeds 1 px rms
 MIN_LIFE = 2  # observations: fewer tell a filter nothing
 MIN_DISPARITY = 8.0  # px, 47 m: sigma_d / d below 9 %
-GATE_PX = np.array([2.0, 2.0, 1.0])  # misfit in u, v, d from frame to frame where a landmark begins anew
+GATE_PX = np.array([2.0, 2.0, 1.0])  # misfit in u, v, d from frame to frame where a landmark restarts
 SLOTS = 4  # landmarks seen at once
 BANDS = 3  # image columns that the slots are spread over
 SIZES = {  # px, rectified images by their focal length in px: calib_cam_to_cam.txt of the five days of KITTI raw
@@ -141,7 +141,7 @@ def log_of(data: Recording, slots: int = SLOTS, gated: bool = True) -> tuple[Tri
     Parameters
     ----------
     slots : landmarks seen at once, at most
-    gated : whether a landmark begins anew where it leaves the common motion
+    gated : whether a landmark restarts where it leaves the common motion
     """
     mount = Mount(position=tuple(data.lever), rotation=roll_pitch_heading(data.axes.T @ CAMERA))
     searched = MIN_DISPARITY, float(data.size[0])  # the tracker has no other limit than the image
@@ -219,7 +219,7 @@ def roll_pitch_heading(turn: Array) -> tuple[float, float, float]:
 def fresh_observations(data: Recording) -> pd.DataFrame:
     """Rows (track, step, z0, z1, z2, piece) of every track up to its first stale copy.
 
-    When the tracker looked for new corners it stored every old track's last pixels once more, and went on
+    When the tracker looked for new corners it stored every old track's last pixels once more, and continued
     from there on another point of the scene: the number stays, the landmark changes.
     """
     track, step = np.nonzero((data.features != -1).all(axis=0))

@@ -1,4 +1,4 @@
-"""One robot of UTIAS MRCLAM as a planar log; why each step is there: docs/planar.md.
+"""One robot of UTIAS MRCLAM as a planar log; why each step is there: docs/reference/recorded.md.
 
 Leung, Halpern, Barfoot & Liu (2011), "The UTIAS multi-robot cooperative localization and mapping dataset",
 IJRR 30(8). The first part of a recording is for calibration: the ground truth there says how odometry and camera are

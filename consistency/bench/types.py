@@ -71,7 +71,7 @@ class Trial:
     first: Indices  # (T + 1,)
     landmark: Indices  # (M,), id in 0..n_landmarks-1
     z: Array  # (M, s)
-    n_landmarks: int  # number of ids, those of things that are no landmark included: at least N
+    n_landmarks: int  # number of ids, those of things that are not landmarks included: at least N
     truth: Array | None = None  # (T + 1, 3): x, y, heading (not wrapped)
     landmarks: Array | None = None  # (N, 3), true positions in the world
     source: Indices | None = None  # (M,), in 0..N-1 or -1
@@ -106,7 +106,7 @@ class Trial:
 
     @property
     def things(self) -> Indices:
-        """Ids (things,) that are no landmark in any of their rows, sorted: what a score of the map leaves out."""
+        """Ids (things,) that are not landmarks in any of their rows, sorted: what a score of the map leaves out."""
         if self.source is None:
             return np.zeros(0, np.int64)
         return np.setdiff1d(self.landmark, self.source)

@@ -20,7 +20,7 @@ FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENO
 
 app = typer.Typer(
     cls=CommandGroup,
-    help="Do the errors of your estimator have the covariance that it states? 'analyse' judges its files.",
+    help="Check whether an estimator's covariance matches its errors: 'consistency analyse FILES --truth TRUTH'.",
     context_settings={"help_option_names": HELP},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -30,7 +30,7 @@ app = typer.Typer(
 @app.callback(invoke_without_command=True)
 def _main(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Show it and exit.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an unforeseen exception.")] = False,
 ) -> None:
     if version:

@@ -16,20 +16,27 @@ def characterise_command(
         Path, typer.Argument(metavar="LOG|IMAGES", help="Log folder with truth, or folder of stereo pairs.")
     ],
     out: Annotated[Path, typer.Option("--out", help="sensor.toml to write, for a belief or a log.")],
-    report: Annotated[Path | None, typer.Option("--report", help="Folder to write with report.html and .pdf.")] = None,
+    report: Annotated[Path | None, typer.Option("--report", help="Folder for report.html and report.pdf.")] = None,
     grid: Annotated[
         str | None, typer.Option("--grid", metavar="KxL", help="Nodes of the bias map, across and down [5x4].")
     ] = None,
-    at_rest: Annotated[bool, typer.Option("--at-rest", help="The sensor stood still all the time.")] = False,
+    at_rest: Annotated[
+        bool, typer.Option("--at-rest", help="Declare that the sensor stood still all the time.")
+    ] = False,
     free_poses: Annotated[
-        bool, typer.Option("--free-poses", help="Fit the pose of each step, so that its error is no noise.")
+        bool,
+        typer.Option("--free-poses", help="Also fit the pose of each step, so that its error does not count as noise."),
     ] = False,
     calibration: Annotated[
-        Path | None, typer.Option("--calibration", help="Of images: a file or folder, as 'frontend' takes it.")
+        Path | None, typer.Option("--calibration", help="Calibration of images: a file or folder, as for 'frontend'.")
     ] = None,
-    truth: Annotated[Path | None, typer.Option("--truth", help="True poses of images, as 'frontend' does.")] = None,
-    format: Annotated[str | None, typer.Option("--format", help="kitti, euroc or opencv [by the folders].")] = None,
-    left: Annotated[str | None, typer.Option("--left", help="Pattern of plain left images, as 'left/*.png'.")] = None,
+    truth: Annotated[Path | None, typer.Option("--truth", help="True poses of images, as for 'frontend'.")] = None,
+    format: Annotated[
+        str | None, typer.Option("--format", help="Layout: kitti, euroc or opencv [by the folders].")
+    ] = None,
+    left: Annotated[
+        str | None, typer.Option("--left", help="Pattern of plain left images, such as 'left/*.png'.")
+    ] = None,
     right: Annotated[str | None, typer.Option("--right", help="Pattern of plain right images.")] = None,
     board: Annotated[
         str | None, typer.Option("--board", metavar="KxL", help="Inner corners of a chessboard in leftN, rightN.")
@@ -40,9 +47,11 @@ def characterise_command(
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of RANSAC, for images without a board [0].")] = None,
     as_json: AsJson = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --out and --report.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Overwrite existing files of --out and --report.")
+    ] = False,
 ) -> None:
-    """Measure a stereo sensor: noise, growth with disparity, bias map, tails, whiteness, each with an interval."""
+    """Measure a stereo sensor: noise, growth, bias, tails. Every number has an interval."""
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free
     from consistency.stereo.characterising.from_log import SourceOptions

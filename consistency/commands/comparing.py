@@ -35,20 +35,24 @@ def compare_command(
     path: Judged,
     files: Reading,
     other: Annotated[
-        Path | None, typer.Argument(metavar="[OTHER]", help="Earlier ones in the same form, or a file of 'baseline'.")
+        Path | None, typer.Argument(metavar="[OTHER]", help="Earlier files in the same form, or a file of 'baseline'.")
     ] = None,
     filters: Annotated[
         list[str] | None,
         typer.Option(
-            "--filter", metavar="NAME", help="Without OTHER: the first against the rest. With it: this filter in both."
+            "--filter",
+            metavar="NAME",
+            help="Filters to compare, the first with the rest; with OTHER, the filter to use in both.",
         ),
     ] = None,
     false_alarm: FalseAlarm = FALSE_ALARM,
     skip: Skip = None,
     as_json: AsJson = False,
-    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'worse': exit 1 if the first is.")] = None,
+    fail_on: Annotated[
+        str | None, typer.Option("--fail-on", help="'worse': exit with status 1 if the first is worse.")
+    ] = None,
 ) -> None:
-    """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
+    """Compare a filter with another, or with an earlier version. On the same trials, the comparison is run by run."""
     from consistency.referee.verdicts.baselines import is_baseline
     from consistency.referee.verdicts.command_settings import skip_asked
     from consistency.referee.verdicts.compare_sources import compare_filters, compare_with, document
@@ -96,9 +100,9 @@ def baseline_command(
     out: Annotated[Path, typer.Option("--out", help="JSON file to write; small enough for version control.")],
     files: Reading,
     skip: Skip = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")] = False,
 ) -> None:
-    """Keep what a later 'compare' needs of results, one row a run."""
+    """Store what a later 'compare' needs, one row a run."""
     from consistency.referee.verdicts.baselines import baseline as summarise
     from consistency.referee.verdicts.baselines import write_baseline
 

@@ -27,7 +27,9 @@ KEPT = (
 def fit_covariance_command(
     path: Annotated[
         Path,
-        typer.Argument(metavar="ESTIMATES", help=f"Poses of an odometry: {ESTIMATES}; a folder has a drive a file."),
+        typer.Argument(
+            metavar="ESTIMATES", help=f"Poses of an odometry: {ESTIMATES}; a folder has a file for each drive."
+        ),
     ],
     files: Reading,
     span: Annotated[
@@ -39,36 +41,39 @@ def fit_covariance_command(
         typer.Option(
             "--held-out",
             metavar="A,B|half",
-            help="Drives that are judged and not fitted, or second halves [each drive by the fit of the others].",
+            help="Drives to judge and not to fit, or 'half' of each [each drive by the fit of the others].",
         ),
     ] = None,
     axes: Annotated[
-        int | None, typer.Option("--axes", help="3 (x, y, yaw) or 6; a number here, names in 'analyse' [of the poses].")
+        int | None, typer.Option("--axes", help="Number of axes: 3 (x, y, yaw) or 6 [those of the poses].")
     ] = None,
     motions: Annotated[
-        bool, typer.Option("--motions", help="Each row is the motion since the row before, not a pose.")
+        bool, typer.Option("--motions", help="Read each row as the motion since the row before.")
     ] = False,
     second: Annotated[
-        Path | None, typer.Option("--second", help="Another estimator's poses of these drives: are errors the truth's?")
+        Path | None,
+        typer.Option("--second", help="Poses of another estimator of these drives, to separate errors of the truth."),
     ] = None,
     no_correct: Annotated[
-        bool, typer.Option("--no-correct", help="Leave mean errors of scale and heading in.")
+        bool, typer.Option("--no-correct", help="Do not correct mean errors of scale and heading.")
     ] = False,
     by_turn: Annotated[
-        bool, typer.Option("--by-turn", help="Correct a way that each turn adds, too, as of wheels that slip.")
+        bool, typer.Option("--by-turn", help="Also correct a displacement that each turn adds, such as wheel slip.")
     ] = False,
     cautious: Annotated[
         float | None,
         typer.Option(
-            "--cautious", metavar="P", help="Raise all covariances, so that P of new drives have no larger ones."
+            "--cautious", metavar="P", help="Raise all covariances so that they suffice for a share P of new drives."
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for noise.toml, motions, snippets, page.")] = None,
     as_json: AsJson = False,
-    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless consistent.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
+    fail_on: Annotated[
+        str | None, typer.Option("--fail-on", help="'inconsistent': exit with status 1 unless consistent.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing folder of --out.")] = False,
 ) -> None:
-    """Fit a covariance to odometry that states none, and judge it on drives that chose nothing."""
+    """Fit a covariance to odometry that states none. Judge it on other drives."""
     from dataclasses import replace
 
     from consistency.referee.fit_covariance.drives import read_drives

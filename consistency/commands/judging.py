@@ -47,45 +47,51 @@ def analyse_command(
     ] = None,
     false_alarm: Annotated[
         float | None,
-        typer.Option("--false-alarm", help=f"Chance to find a fault in a filter that has none [{FALSE_ALARM}]."),
+        typer.Option("--false-alarm", help=f"Probability of finding a fault in a correct filter [{FALSE_ALARM}]."),
     ] = None,
     detect: Annotated[
         float | None,
         typer.Option(
-            "--detect", help=f"Consistent is a covariance ratio shown inside [1/R, R] [{DETECT}].", metavar="R"
+            "--detect", help=f"Say 'consistent' only if the ratio is shown to lie in [1/R, R] [{DETECT}].", metavar="R"
         ),
     ] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option("--tolerance", help="A covariance ratio shown inside [1/R, R] is no fault.", metavar="R"),
+        typer.Option("--tolerance", help="Accept a ratio that is shown to lie in [1/R, R].", metavar="R"),
     ] = None,
     lost: Annotated[
         float | None,
-        typer.Option("--lost", help="Consistent is also a share of lost runs shown to be this at most.", metavar="P"),
+        typer.Option(
+            "--lost", help="Say 'consistent' only if the share of lost runs is shown to be at most P.", metavar="P"
+        ),
     ] = None,
     innovations: Annotated[
         str | None,
-        typer.Option("--innovations", help="'optimal': of an optimal gain without a gate, so that they are judged."),
+        typer.Option(
+            "--innovations", help="'optimal': declare an optimal, ungated gain; innovations are then tested too."
+        ),
     ] = None,
     confidence: Annotated[
-        float | None, typer.Option("--confidence", help="1 less the --false-alarm, in its place.")
+        float | None,
+        typer.Option("--confidence", help="Confidence level; alternative to --false-alarm (1 - false alarm)."),
     ] = None,
     skip: Skip = None,
     report: Annotated[
         Path | None,
-        typer.Option("--report", help="Folder for an HTML and a PDF page on files, or FILE.xml (JUnit) or FILE.md."),
+        typer.Option("--report", help="Folder for an HTML and a PDF page, or FILE.xml (JUnit), or FILE.md."),
     ] = None,
     verbose: Annotated[
         bool, typer.Option("--verbose", help="Show p values of all questions and credibility indices, too.")
     ] = False,
     as_json: AsJson = False,
-    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
+    fail_on: Annotated[
+        str | None, typer.Option("--fail-on", help="'inconsistent': exit with status 1 unless all are consistent.")
+    ] = None,
     overwrite: Annotated[
-        bool,
-        typer.Option("--overwrite", help="Overwrite what is not a report of this command, too."),
+        bool, typer.Option("--overwrite", help="Overwrite files that are no report of this.")
     ] = False,
 ) -> None:
-    """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
+    """Check whether stated covariances match the errors. Explain the verdict."""
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.command_settings import settings_of, skip_asked
@@ -156,7 +162,7 @@ def _refuse_unfinished(path: Path, source: Source, command: str, fail_on: str | 
     """Say that runs are missing; refuse them with ``--fail-on``."""
     if not source.unfinished:
         return
-    text = f"{path}: {source.unfinished}; the same 'consistency {command}' with --resume goes on"
+    text = f"{path}: {source.unfinished}; the same 'consistency {command}' with --resume continues"
     if fail_on:
         raise InputError(f"--fail-on: {text}")
     print(f"consistency: {text}", file=sys.stderr)
@@ -170,12 +176,12 @@ def report_command(
     files: Reading,
     html: Annotated[
         Path | None,
-        typer.Option("--html", help="HTML file [default: PATH/report.html; of estimates PATH-report.html]."),
+        typer.Option("--html", help="HTML file [default: PATH/report.html; for estimates PATH-report.html]."),
     ] = None,
-    pdf: Annotated[Path | None, typer.Option("--pdf", help="PDF file [beside the default HTML file].")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    pdf: Annotated[Path | None, typer.Option("--pdf", help="PDF file [default: beside the HTML file].")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")] = False,
 ) -> None:
-    """Write a report of results as one offline HTML file and a PDF."""
+    """Write a report as one offline HTML file and a PDF."""
     from consistency.referee.pages.write_pages import require_pages, write_file_pages
     from consistency.referee.verdicts.sources import files_source, judge_all
 
@@ -199,22 +205,25 @@ def report_command(
 
 def plan_command(
     scenario: Annotated[
-        str | None, typer.Argument(metavar="[SCENARIO]", help="Run a short pilot of it to learn how steps depend.")
+        str | None,
+        typer.Argument(
+            metavar="[SCENARIO]", help="Scenario of a short pilot, which shows how steps depend on each other."
+        ),
     ] = None,
     filters: Annotated[
         list[str] | None, typer.Option("--filter", metavar="NAME", help="Filter of the pilot; may be repeated.")
     ] = None,
     like: Annotated[
-        Path | None, typer.Option("--like", metavar="RESULTS", help="Results to learn from, in place of a pilot.")
+        Path | None, typer.Option("--like", metavar="RESULTS", help="Results to use instead of a pilot.")
     ] = None,
-    pilot_runs: Annotated[int, typer.Option("--pilot-runs", help="Runs of the pilot.")] = 40,
+    pilot_runs: Annotated[int, typer.Option("--pilot-runs", help="Number of runs of the pilot.")] = 40,
     seed: Seed = 0,
     detect: Annotated[float, typer.Option("--detect", help=f"{DETECT_HELP.capitalize()}.")] = DETECT,
     dof: Annotated[int, typer.Option("--dof", help="Dimension of the error; 3 for a planar pose.")] = 3,
     false_alarm: FalseAlarm = FALSE_ALARM,
     power: Power = POWER,
     allow: Annotated[
-        str | None, typer.Option("--allow", help="'conservative': a covariance too large is no fault.")
+        str | None, typer.Option("--allow", help="'conservative': accept a covariance that is too large.")
     ] = None,
     lost: Annotated[float | None, typer.Option("--lost", help=f"{LOST_HELP.capitalize()}.", metavar="P")] = None,
     groups: Annotated[
@@ -222,7 +231,7 @@ def plan_command(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
+    """Compute how many runs a verdict needs. Without a pilot, the number holds however steps depend on each other."""
     from consistency.referee.document.needed_runs import plan_lines
     from consistency.referee.verdicts.command_settings import plan as plan_runs
 

@@ -10,7 +10,7 @@ from consistency.referee.extras import missing, remedy
 
 
 def list_command(as_json: AsJson = False) -> None:
-    """Scenarios, filters, experiments and sweeps."""
+    """List scenarios, filters, experiments and sweeps."""
     from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
     from consistency.bench.filters.guard.plain_rules import KINDS
     from consistency.referee.system.shipped import summaries

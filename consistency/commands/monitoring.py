@@ -28,32 +28,33 @@ def monitor_command(
     ],
     innovations: Annotated[
         str | None,
-        typer.Option("--innovations", help="'optimal': declares the optimal gain, without which nothing is judged."),
+        typer.Option("--innovations", help="'optimal': declare the optimal gain, without which nothing is judged."),
     ] = None,
     false_alarm: Annotated[
-        float, typer.Option("--false-alarm", help="Chance that a right filter ever raises an alarm.")
+        float, typer.Option("--false-alarm", help="Probability that a correct filter ever raises an alarm.")
     ] = GATE_FALSE_ALARM,
     tolerance: Annotated[
-        float, typer.Option("--tolerance", help="Scales of the NIS up to this ratio are no fault; 1 is the exact test.")
+        float, typer.Option("--tolerance", help="Accept scales of the NIS up to this ratio; 1 is the exact test.")
     ] = 1.2,
     gate: Annotated[
         float | None, typer.Option("--gate", help="Probability of the filter's chi-square gate, such as 0.99.")
     ] = None,
     mission: Annotated[
-        int | None, typer.Option("--mission", help="Innovations of the whole mission, if known.")
+        int | None, typer.Option("--mission", help="Number of innovations of the whole mission, if known.")
     ] = None,
     filter_name: Annotated[
-        str | None, typer.Option("--filter", help="Which, if FILE holds several; of a flight log the sensor.")
+        str | None, typer.Option("--filter", help="Filter to use if FILE holds several; for flight logs, the sensor.")
     ] = None,
     run: Annotated[
-        int | None, typer.Option("--run", help="Which, if FILE holds several; of a flight log the EKF's instance.")
+        int | None,
+        typer.Option("--run", help="Run to use if FILE holds several; for flight logs, the instance of the EKF."),
     ] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="NIS and evidence as .png, .pdf or .svg.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the plot if it exists.")] = False,
+    plot: Annotated[Path | None, typer.Option("--plot", help="Plot of NIS and evidence, .png, .pdf or .svg.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing plot.")] = False,
     as_json: AsJson = False,
-    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit with status 1 on an alarm.")] = None,
 ) -> None:
-    """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
+    """Watch the innovations of a deployed filter. Raise an alarm if their size is not what the filter states."""
     from consistency.referee.document.alarms import monitor_document
     from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash

@@ -72,7 +72,7 @@ def monte_carlo_command(
     as_json: AsJson = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
 ) -> None:
-    """Run any program many times, each time with another {seed}, and judge the estimates that it writes.
+    """Run any program many times, and judge its estimates. Each run has another {seed}.
 
     COMMAND, behind --, is the program with its arguments, in which {run}, {seed}, {out}, {here} and {worker} are
     replaced. Each run has a folder of its own in --out, {out}, where the program is started; {here} is the folder of

@@ -5,7 +5,7 @@ A command is a function of Typer in a module of this folder, and a row here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
 from typing import Any, cast
 
@@ -89,6 +89,23 @@ ROWS = (
 )
 # fmt: on
 COMMANDS = {row.name: row for row in ROWS}
+GROUPS = {  # of the list of commands; a command that stands in none is in the first
+    "Judge your own estimator": (),
+    "The stereo SLAM test bench": ("list", "simulate", "run", "reproduce", "sweep", "challenge", "tune"),
+    "Stereo images": ("frontend", "characterise"),
+}
+PANELS = {  # of the options of commands that read files; an option that stands in none is in the last
+    "Needed first": (
+        "truth", "covariance", "error", "state", "align", "relative", "skip", "false_alarm", "report", "fail_on",
+    ),
+    "What to read": (
+        "covariance_order", "axes", "topic", "truth_topic", "body", "truth_covariance", "truth_errors", "truth_shared",
+        "filters", "split", "motions",
+    ),
+    "How to align": ("max_dt", "time_offset", "lever_arm", "windows"),
+    "What to ask": ("detect", "tolerance", "lost", "innovations", "confidence", "by"),
+    "What to write": (),
+}  # fmt: skip
 
 
 class MarkedCommand(TyperCommand):
@@ -99,6 +116,31 @@ class MarkedCommand(TyperCommand):
     def get_short_help_str(self, limit: int = 45) -> str:
         mark = f"[{','.join(self.lacks)}] " if self.lacks else ""
         return mark + super().get_short_help_str(limit - len(mark))
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """The options of a command that reads files in panels, and those of others in one list."""
+        names = [parameter.name for parameter in self.get_params(ctx)]
+        if "truth_covariance" not in names:
+            super().format_options(ctx, formatter)
+            return
+        records: dict[str, list[tuple[str, str]]] = {"Arguments": [], **{panel: [] for panel in PANELS}}
+        for panel, parameter in in_panels(self.get_params(ctx)):
+            if (record := parameter.get_help_record(ctx)) is not None:
+                records[panel].append(record)
+        for panel in filter(records.get, records):
+            with formatter.section(panel):
+                formatter.write_dl(records[panel])
+
+
+def in_panels(parameters: Iterable[Any]) -> list[tuple[str, Any]]:
+    """Parameters with their panels, in the order that a panel has; arguments and what stands in none keep theirs."""
+    order = {name: (panel, place) for panel, names in PANELS.items() for place, name in enumerate(names)}
+    *_, last = PANELS
+    found = []
+    for place, parameter in enumerate(parameters):
+        panel, at = order.get(parameter.name, (last, place))
+        found.append(("Arguments" if parameter.param_type_name == "argument" else panel, at, parameter))
+    return [(panel, parameter) for panel, _, parameter in sorted(found, key=lambda each: each[1])]
 
 
 class Loaded(Mapping[str, Any]):
@@ -134,6 +176,15 @@ class CommandGroup(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Each command with a line, in its group."""
+        others = {name for names in GROUPS.values() for name in names}
+        limit = formatter.width - 6 - max(map(len, COMMANDS))
+        for group, names in GROUPS.items():
+            shown = names or [name for name in COMMANDS if name not in others]
+            with formatter.section(group):
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(limit)) for name in shown])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Refuse a command without its packages, before its options are looked at; its help is there."""

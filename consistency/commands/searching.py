@@ -32,11 +32,11 @@ def sweep_command(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder to write; one with a part of the same sweep goes on.")
+        Path | None, typer.Option("--out", help="Output folder; one with part of the same sweep is continued.")
     ] = None,
     filters: Annotated[
         list[str] | None,
-        typer.Option("--filter", metavar="NAME", help="In place of the file's filters; may be repeated."),
+        typer.Option("--filter", metavar="NAME", help="Filter, instead of those in the file; may be repeated."),
     ] = None,
     jobs: Jobs = -1,
     backend: BackendName = "local",
@@ -47,7 +47,7 @@ def sweep_command(
         bool, typer.Option("--overwrite", help="Run cells again that were made with other settings or code.")
     ] = False,
 ) -> None:
-    """A grid of scenarios, each filter in each until decided; then a map of where which filter is consistent."""
+    """Run filters over a grid of scenarios; map the verdicts. Each cell is run until decided."""
     from consistency.bench.runs.backends.choosing import executor_for
     from consistency.bench.sweeps.plan import load_sweep
     from consistency.bench.sweeps.regime import regime_of, write_regime
@@ -77,33 +77,37 @@ def sweep_command(
 def tune_command(
     filter_name: Annotated[str, typer.Option("--filter", help="Filter name (see 'list').")],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
-    log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
+    log: Annotated[Path | None, typer.Option("--log", help="Folder of a recorded log, instead of a scenario.")] = None,
     groups: Annotated[
         str,
-        typer.Option("--groups", metavar="A,B", help="Noises with one factor each, as Q.v,Q.omega,R; '+' joins."),
+        typer.Option("--groups", metavar="A,B", help="Noises with one factor each, such as Q.v,Q.omega,R; '+' joins."),
     ] = "Q,R",
     runs: Annotated[
-        int | None, typer.Option("--runs", help="Runs to fit on, and as many fresh ones to judge on [50].")
+        int | None, typer.Option("--runs", help="Number of runs for the fit, and of new ones for the verdict [50].")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the noise [0].")] = None,
     jobs: Jobs = -1,
     timeout: Annotated[
-        float | None, typer.Option("--timeout", help="Seconds a run of a filter that is not compiled.")
+        float | None, typer.Option("--timeout", help="Time limit of a run, s, for filters that are not compiled.")
     ] = None,
     false_alarm: FalseAlarm = FALSE_ALARM,
     detect: Annotated[
-        float, typer.Option("--detect", help="Consistent is a covariance ratio shown inside [1/R, R].", metavar="R")
+        float,
+        typer.Option("--detect", help="Say 'consistent' only if the ratio is shown to lie in [1/R, R].", metavar="R"),
     ] = DETECT,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the tuned scenario or sensor.toml, and tuning.json.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an output folder of 'tune'.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Overwrite an existing output folder of 'tune'.")
+    ] = False,
     as_json: AsJson = False,
     fail_on: Annotated[
-        str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless the tuned filter is consistent.")
+        str | None,
+        typer.Option("--fail-on", help="'inconsistent': exit with status 1 unless the tuned filter is consistent."),
     ] = None,
 ) -> None:
-    """Fit the process and measurement noise of a filter, and judge it before and after on data the fit has not seen."""
+    """Fit Q and R of a filter, and judge it before and after. The verdicts are on data that the fit has not seen."""
     from consistency.bench.scenario import load_scenario
     from consistency.bench.store.log import read_log
     from consistency.bench.tuning.result import KIND, tuning_data, tuning_lines, tuning_verdicts, write
@@ -151,15 +155,19 @@ def challenge_command(
             metavar="NAME=...",
         ),
     ] = None,
-    minutes: Annotated[float | None, typer.Option("--minutes", help="Time for all of it [5].")] = None,
+    minutes: Annotated[
+        float | None, typer.Option("--minutes", help="Time limit of search and confirmation, minutes [5].")
+    ] = None,
     trials: Annotated[
         int | None,
-        typer.Option("--trials", help="Trials of the search instead of --minutes; the same result on each machine."),
+        typer.Option(
+            "--trials", help="Number of trials of the search, instead of --minutes; the same result on every machine."
+        ),
     ] = None,
     seed: Seed = 0,
-    jobs: Annotated[int, typer.Option("--jobs", help="Workers; -1 is one a core.")] = -1,
+    jobs: Annotated[int, typer.Option("--jobs", help="Number of workers; -1 is one for each core.")] = -1,
     false_alarm: Annotated[
-        float, typer.Option("--false-alarm", help="Chance that a right filter is found overconfident.")
+        float, typer.Option("--false-alarm", help="Probability of finding a correct filter overconfident.")
     ] = FALSE_ALARM,
     detect: Annotated[
         float, typer.Option("--detect", help="Ratio of true to stated covariance that the confirmation must find.")
@@ -167,21 +175,21 @@ def challenge_command(
     out: Annotated[
         Path | None, typer.Option("--out", help="Scenario file to write [default: challenge-FILTER.toml].")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")] = False,
     as_json: AsJson = False,
     fail_on: Annotated[
-        str | None, typer.Option("--fail-on", help="'found': exit 1 if the filter is found overconfident.")
+        str | None, typer.Option("--fail-on", help="'found': exit with status 1 if the filter is found overconfident.")
     ] = None,
 ) -> None:
-    """Look for the world in which a filter is most overconfident, and confirm it on fresh runs."""
-    from consistency.bench.challenging.challenge import Plan
-    from consistency.bench.challenging.challenge import challenge as challenge_filter
-    from consistency.bench.challenging.challenge_text import (
+    """Find the world where a filter is most overconfident. Confirm it on new runs."""
+    from consistency.bench.challenging.challenge import (
+        Plan,
         challenge_data,
         challenge_lines,
         require_writable,
         write_scenario,
     )
+    from consistency.bench.challenging.challenge import challenge as challenge_filter
 
     require_word("--fail-on", fail_on, "found")
     if minutes is None and trials is None:

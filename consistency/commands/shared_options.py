@@ -19,39 +19,43 @@ if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.record import Record
     from consistency.referee.document.blocks import Document
 
-Out = Annotated[Path, typer.Option("--out", help="Folder to write; must not exist.")]
+Out = Annotated[Path, typer.Option("--out", help="Output folder; must not exist.")]
 Runs = Annotated[int, typer.Option("--runs", help="Number of Monte Carlo runs.")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the noise.")]
-Jobs = Annotated[int, typer.Option("--jobs", help="Workers; -1 is one a core. The result does not depend on it.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output folder of this bench.")]
-AsJson = Annotated[bool, typer.Option("--json", help="For programs.")]
+Jobs = Annotated[
+    int, typer.Option("--jobs", help="Number of workers; -1 is one for each core. Results do not depend on it.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing output folder of this bench.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ESTIMATES = ".csv, .parquet, .npz, TUM, ROS bags"
 Judged = Annotated[Path, typer.Argument(metavar="PATH", help=f"Folder written by 'run', or estimates: {ESTIMATES}.")]
-Power = Annotated[float, typer.Option("--power", help="Chance to find that ratio.")]
-FalseAlarm = Annotated[float, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none.")]
-BackendName = Annotated[
-    str, typer.Option("--backend", help="Where runs are done: local; dask or slurm (docs/cluster.md).")
-]
+Power = Annotated[float, typer.Option("--power", help="Probability of finding that ratio.")]
+FalseAlarm = Annotated[float, typer.Option("--false-alarm", help="Probability of finding a fault in a correct filter.")]
+BackendName = Annotated[str, typer.Option("--backend", help="Where to run: local; dask or slurm (docs/long-runs.md).")]
 Scheduler = Annotated[
     str | None,
-    typer.Option("--scheduler", help="For dask: tcp://HOST:PORT, tls://HOST:PORT or a scheduler file [this machine]."),
+    typer.Option(
+        "--scheduler", help="Scheduler for dask: tcp://HOST:PORT, tls://HOST:PORT or a scheduler file [this machine]."
+    ),
 ]
 SchedulerWait = Annotated[
-    float | None, typer.Option("--scheduler-wait", help="For dask: seconds to wait for the scheduler [60].")
+    float | None, typer.Option("--scheduler-wait", help="Seconds to wait for the scheduler of dask [60].")
 ]
 SlurmOptions = Annotated[
     list[str] | None,
     typer.Option(
-        "--slurm", metavar="KEY=VALUE", help="For slurm: partition=short, time=60 (minutes); may be repeated."
+        "--slurm",
+        metavar="KEY=VALUE",
+        help="Option for slurm, such as partition=short or time=60 (minutes); may be repeated.",
     ),
 ]
 LOST_HELP = "share of lost runs that must be excluded"
 Skip = Annotated[
     str | None,
-    typer.Option("--skip", metavar="N|Ns", help="Leave the first N steps, or seconds (2s), of each run out."),
+    typer.Option("--skip", metavar="N|Ns", help="Leave out the first N steps, or seconds (2s), of each run."),
 ]
 DETECT_HELP = "ratio of true to stated covariance that must be found"
-SCENARIO = "Built-in name (see 'list') or path of a .toml file."
+SCENARIO = "Built-in name (see 'list') or path to a .toml file."
 
 
 def given_options(**options: Any) -> dict[str, Any]:
@@ -66,7 +70,7 @@ def require_word(option: str, value: str | None, word: str) -> None:
 
 
 def require_written(overwrite: bool, out: Path | None, option: str) -> None:
-    """Refuse --overwrite where nothing is written, for want of ``option``."""
+    """Refuse --overwrite where nothing is written, without ``option``."""
     if overwrite and out is None:
         raise InputError(f"--overwrite goes with {option}: nothing else is written")
 

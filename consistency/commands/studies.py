@@ -31,10 +31,10 @@ def simulate_command(
     out: Out,
     runs: Runs = 1,
     seed: Seed = 0,
-    form: Annotated[str, typer.Option("--format", help="Of the tables: parquet or csv; both are read.")] = "parquet",
+    form: Annotated[str, typer.Option("--format", help="Format of the tables: parquet or csv.")] = "parquet",
     overwrite: Overwrite = False,
 ) -> None:
-    """Write truth, controls and observations of a scenario: a log for any filter, ours or not."""
+    """Simulate a scenario, and write it as a log. A log has truth, controls and observations, for any filter."""
     from consistency.bench.runs.montecarlo import simulate_log
     from consistency.bench.scenario import load_scenario
 
@@ -46,45 +46,50 @@ def simulate_command(
 def run_command(
     out: Out,
     filters: Annotated[
-        list[str], typer.Option("--filter", metavar="NAME", help="Filter name, or FILTER+gate; again for more.")
+        list[str],
+        typer.Option("--filter", metavar="NAME", help="Filter (see 'list'), or FILTER+gate; may be repeated."),
     ],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
-    log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
+    log: Annotated[Path | None, typer.Option("--log", help="Folder of a recorded log, instead of a scenario.")] = None,
     screen: Annotated[
         str | None,
         typer.Option(
             "--screen",
             metavar="U,V,D",
-            help="Landmarks of a log begin anew that leave the common motion by more, in px.",
+            help="Restart a landmark's track when it deviates from the common motion by more than this (px).",
         ),
     ] = None,
     runs: Annotated[int | None, typer.Option("--runs", help="Number of Monte Carlo runs [default: 50].")] = None,
     until_decided: Annotated[
-        bool, typer.Option("--until-decided", help="As many runs as the verdict takes, instead of --runs.")
+        bool, typer.Option("--until-decided", help="Run until the verdict is clear, instead of --runs.")
     ] = False,
-    max_runs: Annotated[int | None, typer.Option("--max-runs", help="Most runs of --until-decided.")] = None,
+    max_runs: Annotated[
+        int | None, typer.Option("--max-runs", help="Maximum number of runs for --until-decided.")
+    ] = None,
     detect: Annotated[float | None, typer.Option("--detect", help=f"For --until-decided: {DETECT_HELP} [1.5]")] = None,
     false_alarm: Annotated[
-        float | None, typer.Option("--false-alarm", help="For --until-decided: chance to fail a right filter [0.05].")
+        float | None,
+        typer.Option("--false-alarm", help="For --until-decided: probability of rejecting a correct filter [0.05]."),
     ] = None,
     lost: Annotated[float | None, typer.Option("--lost", help=f"For --until-decided: {LOST_HELP}.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the noise [default: 0].")] = None,
     jobs: Jobs = -1,
     timeout: Annotated[
         float | None,
-        typer.Option("--timeout", help="Seconds a run, after which it is killed; filters that are not compiled only."),
+        typer.Option("--timeout", help="Time limit of a run, s, for filters that are not compiled."),
     ] = None,
     memory: Annotated[
-        float | None, typer.Option("--memory", metavar="GIB", help="GiB that such a filter may allocate in a run.")
+        float | None,
+        typer.Option("--memory", metavar="GIB", help="Memory that such a filter may allocate in a run, GiB."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run in --out.")] = False,
     overwrite: Overwrite = False,
     backend: BackendName = "local",
     scheduler: Scheduler = None,
     scheduler_wait: SchedulerWait = None,
     slurm: SlurmOptions = None,
 ) -> None:
-    """Put simulated trials, or a recorded log, through filters."""
+    """Run filters on simulated trials or a recorded log."""
     from consistency.bench.runs.analyse_results import analyse
     from consistency.bench.runs.backends.choosing import executor_for
     from consistency.bench.runs.montecarlo import resolve_filters, run_log, run_trials
@@ -108,7 +113,7 @@ def run_command(
     results: Results | StoredResults
     verdicts = None
     if resume and overwrite:
-        raise InputError("--resume goes on with what --overwrite would replace; give one of them")
+        raise InputError("--resume continues with what --overwrite would replace; give one of them")
     if log is not None and (runs is not None or seed is not None or until_decided):
         raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
     with executor_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out) as executor:
@@ -146,16 +151,16 @@ def run_command(
 def reproduce_command(
     only: Annotated[
         list[str] | None,
-        typer.Option("--only", metavar="NAME", help="Only this finding or experiment; may be repeated."),
+        typer.Option("--only", metavar="NAME", help="Finding or experiment to re-run; may be repeated."),
     ] = None,
-    long: Annotated[bool, typer.Option("--all", help="Also experiments that take from minutes to hours.")] = False,
+    long: Annotated[bool, typer.Option("--all", help="Include experiments that take minutes to hours.")] = False,
     runs: Runs = 50,
     seed: Seed = 0,
     jobs: Jobs = -1,
     out: Out = Path("reports/reproduce"),
     overwrite: Overwrite = False,
 ) -> None:
-    """Set each published finding beside what is measured here; exit 1 if a published one is not reproduced."""
+    """Re-run the published findings and compare. Exit with status 1 if a published one is not reproduced."""
     from consistency.bench.pages import write_reports
     from consistency.bench.runs.findings import findings_table
     from consistency.bench.runs.findings import reproduce as reproduce_findings

@@ -44,7 +44,7 @@ def write_commands(app: Sphinx) -> None:
     listing = []
     for name, body in pages.items():
         body = re.sub(r"^\* .*", lambda line: OPTION.sub(r"`\g<0>`", line[0]), body, flags=re.MULTILINE)
-        body = re.sub(r"\bdocs/([\w-]+\.md)", r"[\g<0>](../../\1)", body)
+        body = re.sub(r"\bdocs/([\w/-]+\.md)", r"[\g<0>](../../\1)", body)
         body = EXAMPLES.sub(lambda found: f"**Examples**:\n\n```console\n{plain(found[1])}```\n", body)
         write_changed(FOLDER / "commands" / f"{name}.md", f"# consistency {name}\n{body}")
         listing.append(f"- [{name}]({name}.md): {body.strip().splitlines()[0]}")

@@ -17,7 +17,7 @@ from sphinx.pycode import parser
 
 NAMES = ("Parameters", "Other Parameters", "Attributes")
 RESULTS = ("Returns", "Yields")
-PAGE = re.compile(r"\bdocs/([\w-]+)\.md")
+PAGE = re.compile(r"\bdocs/([\w/-]+)\.md")
 FIELDS = ("attribute", "data", "property")
 RULE = re.compile(r"-{3,}\s*$")
 

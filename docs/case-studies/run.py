@@ -64,7 +64,7 @@ def python() -> str:
 
 
 def environment(name: str) -> Path:
-    """The Python of an environment with the core and a set of versions; made anew if the set has changed."""
+    """The Python of an environment with the core and a set of versions; made again if the set has changed."""
     where, done = ROOT / f".env-{name}", ROOT / f".env-{name}/versions"
     there = where / "bin/python"
     if not done.exists() or done.read_text() != str(SETS[name]):

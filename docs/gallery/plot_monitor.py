@@ -1,8 +1,8 @@
 """
-A monitor of innovations in service
+A monitor of innovations of a deployed filter
 ===================================
 
-A filter in service has no truth, but it has innovations. From step 600 on their variance is twice what the filter
+A deployed filter has no truth, but it has innovations. From step 600 on their variance is twice what the filter
 states. The alarm of the monitor is false with probability 0.1 % or less, however long the mission; it says
 since when (shaded).
 """

@@ -28,17 +28,24 @@ DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 # Commands and code that are only parsed: page, what they begin with, and why.
 STUDY = "takes from half a minute to hours even with two runs; tests of its experiment run its parts"
 REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
+CLUSTER = "needs a cluster; tests/smoke/test_dask_cli.py and unit/bench/test_slurm.py stand in"
 NOT_RUN = [
     ("docs/any-program.md", "", "needs MATLAB, Julia and ROS; tests/smoke/test_cpp_example.py runs what is in C++"),
     ("docs/case-studies.md", "python docs/case-studies", "needs the libraries; tests/oracle/test_case_studies_live.py"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
-    ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and unit/bench/test_slurm.py stand in"),
+    ("docs/long-runs.md", "openssl", CLUSTER),
+    ("docs/long-runs.md", "export", CLUSTER),
+    ("docs/long-runs.md", "for role", CLUSTER),
+    ("docs/long-runs.md", "done", CLUSTER),
+    ("docs/long-runs.md", "dask", CLUSTER),
+    ("docs/long-runs.md", "from dask", CLUSTER),
+    ("docs/long-runs.md", "consistency run herath2007-stereo --filter ukf-uvd --runs 200000", CLUSTER),
     ("docs/consistent.md", "consistency reproduce", STUDY),
-    ("docs/conventions.md", "", "tests/unit/referee/test_conventions.py runs all of it"),
+    ("docs/reference/conventions.md", "", "tests/unit/referee/test_conventions.py runs all of it"),
     ("docs/extending.md", "", "tests/unit/test_extending.py follows it in a copy of the package"),
-    ("docs/files.md", "consistency analyse drive.bag", "tests/unit/referee/test_bags.py writes and judges such bags"),
-    ("docs/files.md", "consistency analyse drive --truth-topic", "tests/unit/referee/test_bags.py"),
-    ("docs/files.md", "consistency analyse drives --truth-topic", "tests/unit/referee/test_bags.py"),
+    ("docs/reference/file-kinds.md", "consistency analyse drive.bag", "tests/unit/referee/test_bags.py"),
+    ("docs/reference/file-kinds.md", "consistency analyse drive --truth-topic", "tests/unit/referee/test_bags.py"),
+    ("docs/reference/file-kinds.md", "consistency analyse drives --truth-topic", "tests/unit/referee/test_bags.py"),
     ("docs/files.md", "consistency analyse keyframes.csv", "tests/unit/referee/test_relative.py has cross-covariances"),
     ("docs/files.md", "consistency analyse est.tum", "tests/oracle/test_gtsam_windows.py has such marginals"),
     ("docs/files.md", "joint = marginals", "tests/oracle/test_gtsam_windows.py does the same"),
@@ -46,13 +53,10 @@ NOT_RUN = [
     ("docs/front-end.md", "from consistency.vision import fit_shared", "tests/unit/stereo/test_vision_shared.py"),
     ("docs/front-end.md", "python experiments/e11", REAL),
     ("docs/gates.md", "from consistency.testing import assert_program", "tests/smoke/test_cpp_example.py has one"),
-    ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/bench/test_guards.py runs such"),
-    ("docs/kitti07.md", "", REAL),
-    ("docs/planar.md", "", f"{STUDY}; e15: {REAL}"),
+    ("docs/filters.md", "consistency run", "compiles two guarded filters; tests/unit/bench/test_guards.py runs such"),
+    ("docs/reference/recorded.md", "", f"{STUDY}; e15: {REAL}"),
     ("docs/regime.md", "consistency sweep regime --out regime --filter", "compiles two more filters for one cell"),
-    ("docs/sensor.md", "consistency reproduce", STUDY),
-    ("docs/static-limit.md", "consistency reproduce", STUDY),
-    ("docs/tuning.md", "import numpy", "tests/unit/bench/test_tuning.py runs it with two runs of six steps"),
+    ("docs/reference/sensor.md", "consistency reproduce", STUDY),
     ("docs/tuning.md", "consistency tune --log OUT", REAL),
     ("docs/tuning.md", "python experiments/e15", REAL),
 ]  # fmt: skip
@@ -254,27 +258,31 @@ def repository(folder: Path) -> None:
     shutil.copytree(ROOT / "docs/examples/repository", folder, dirs_exist_ok=True)
 
 
+def in_checkout(folder: Path) -> None:
+    shutil.copytree(ROOT / "docs/examples/repository", folder / "docs/examples/repository")
+
+
 def case_studies(folder: Path) -> None:
     shutil.copytree(ROOT / "docs/case-studies", folder / "docs/case-studies")
 
 
 PREPARE: dict[str, list[Callable[[Path], None]]] = {
-    "README.md": [case_studies],
+    "README.md": [in_checkout],
     "docs/case-studies.md": [case_studies],
     "docs/characterise.md": [log("drive"), images, boards],
     "docs/examples/repository/README.md": [repository],
     "docs/files.md": [inline],
-    "docs/files.md TUM trajectories": [trajectories],
+    "docs/files.md The shortest way": [planar],
+    "docs/reference/file-kinds.md TUM trajectories": [trajectories],
     "docs/files.md Another world frame: `--align`": [trajectories],
-    "docs/files.md Tables: .csv, .parquet and .jsonl": [planar],
+    "docs/reference/file-kinds.md Tables: .csv, .parquet and .jsonl": [planar],
     "docs/files.md Without the first steps: `--skip`": [started],
-    "docs/files.md OpenVINS": [openvins],
-    "docs/files.md Poses with velocity and biases": [moving],
-    "docs/files.md KITTI": [kitti],
-    "docs/files.md Logs": [log("LOG")],
+    "docs/reference/file-kinds.md OpenVINS": [openvins],
+    "docs/reference/file-kinds.md Poses with velocity and biases": [moving],
+    "docs/reference/file-kinds.md KITTI": [kitti],
+    "docs/reference/file-kinds.md Logs": [log("LOG")],
     "docs/files.md Relative poses": [motions],
     "docs/front-end.md": [images],
-    "docs/index.md": [case_studies],
     "docs/monitor.md": [innovations],
     "docs/referee.md": [results("results", "DIR", "NEW")],
     "docs/regime.md": [log("log")],

@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ("docs", "docs/examples", "docs/examples/repository", "experiments", "benchmarks", "scenarios")
+FOLDERS = (
+    "docs",
+    "docs/reference",
+    "docs/examples",
+    "docs/examples/repository",
+    "experiments",
+    "benchmarks",
+    "scenarios",
+)
 PATHS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for p in sorted((ROOT / f).glob("*.md")))]
 PAGES = [str(path.relative_to(ROOT)) for path in PATHS]
 

@@ -183,7 +183,7 @@ KINDS: dict[str, tuple[Callable[..., Any], str]] = {
     "a thread ends the process": (kills_its_thread, "its process ended with exit status 4"),
     "kills itself": (
         lambda *_: os.kill(os.getpid(), signal.SIGKILL),
-        "its process was killed by SIGKILL, from outside or for want of memory",
+        "its process was killed by SIGKILL, from outside or because memory ran out",
     ),
     "closes all files": (closes_all_files, TIME_OUT),
     "forks and dies": (forks_and_dies, "its process ended with exit status 5"),

@@ -138,7 +138,7 @@ def json_tree(path: Path, rng: Rng) -> None:
 
 
 def json_twice(path: Path, rng: Rng) -> None:
-    """A key that is there twice."""
+    """A key that is duplicated."""
     data = json.loads(path.read_text(encoding="utf-8"))
     table = data if isinstance(data, dict) else data[0]
     key = pick(rng, list(table))
@@ -190,7 +190,7 @@ def lines_swapped(path: Path, rng: Rng) -> None:
 
 
 def field(path: Path, rng: Rng) -> None:
-    """One field changed, left out or there twice."""
+    """One field changed, left out or duplicated."""
     lines = _lines(path)
     at = int(rng.integers(len(lines)))
     separator = "," if "," in lines[at] else " "
@@ -332,7 +332,7 @@ def cell(path: Path, rng: Rng) -> None:
 
 
 def column(path: Path, rng: Rng) -> None:
-    """A column of another type, left out, renamed or there twice."""
+    """A column of another type, left out, renamed or duplicated."""
     table = pq.read_table(path)
     k = int(rng.integers(table.num_columns))
     name, values = table.column_names[k], table.column(k)

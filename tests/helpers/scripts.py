@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import ModuleType
 
-from consistency.bench.runs.findings import sibling
+from consistency.bench.runs.findings import figure_scripts, sibling
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 
@@ -13,3 +13,8 @@ FOLDER = Path(__file__).parents[2] / "experiments"
 def experiment(name: str) -> ModuleType:
     """A fresh module of a script, by its name without the suffix."""
     return sibling(str(FOLDER / "README.md"), name)
+
+
+def figures(name: str) -> ModuleType:
+    """The module of a script in ``experiments/figures``."""
+    return figure_scripts()[name]

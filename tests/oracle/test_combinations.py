@@ -29,14 +29,12 @@ from consistency.bench.filters.kernel.part_functions import (
     retract,
     stands_apart,
 )
-from consistency.bench.filters.kernel.update_steps import linearise_seen
-from consistency.bench.filters.kernel.work_arrays import make_work
-from consistency.bench.filters.motion.unicycle import Unicycle, move
-from consistency.bench.filters.point.at_known import AtTruth
+from consistency.bench.filters.kernel.update_steps import linearise_seen, make_work
+from consistency.bench.filters.methods.ideal import AtTruth
+from consistency.bench.filters.parts.unicycle import Unicycle, move
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.basics import SlamState
-from consistency.bench.filters.textbook.sensors import view
+from consistency.bench.filters.textbook.basics import SlamState, view
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Info, Observation, Trial
 from consistency.referee.types import Array

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from consistency.bench.filters.error.polar import sight, to_polar
 from consistency.bench.filters.kernel.part_functions import measure, measure_jacobian
 from consistency.bench.filters.methods import equivariant
-from consistency.bench.filters.sensor.models import Uvd
+from consistency.bench.filters.methods.equivariant import sight, to_polar
+from consistency.bench.filters.parts.sensors import Uvd
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array
 

@@ -17,7 +17,7 @@ import consistency as cs
 from consistency.bench.filters import EXTRAS, SMOOTHERS, filter_names, usable_names
 from consistency.bench.filters.stepping import run_filter, step_through
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.sensors import PointSensor, heading_matrix
+from consistency.bench.filters.textbook.basics import PointSensor, heading_matrix
 from consistency.bench.models import motion, point, stereo
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Estimates, Gaussian, Observation, Trial

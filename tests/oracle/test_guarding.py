@@ -16,8 +16,8 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.filters.compiled import Compiled, problem_of
 from consistency.bench.filters.compiler.jit import Kernel
-from consistency.bench.filters.guard import kernel_rules, plain_rules
-from consistency.bench.filters.guard.guard_part import guard_part, keep_agreeing
+from consistency.bench.filters.guard import kernel_guard, plain_rules
+from consistency.bench.filters.guard.kernel_guard import guard_part, keep_agreeing
 from consistency.bench.filters.guard.plain_rules import KINDS, kept_observations, limits_of
 from consistency.bench.filters.kernel import loop
 from consistency.bench.filters.kernel.part_functions import make_watch
@@ -114,7 +114,7 @@ def test_decisions_are_those_of_the_definitions(kind: str, rng: np.random.Genera
 def test_a_search_that_is_cut_short_is_so_at_the_same_node(
     nodes: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (plain_rules, kernel_rules):
+    for module in (plain_rules, kernel_guard):
         monkeypatch.setattr(module, "MOST_NODES", nodes)
     for _ in range(40):
         step = Step(rng, 6, 3)

@@ -25,35 +25,25 @@ WORLDS = {"xyz": "herath2007-xyz", "uvd": "herath2007-wide-baseline"}
 ZERO, CLEAR = 1e-13, 1e-6  # singular values, relative to the largest
 
 
-def slam_of(state: Any) -> SlamState:
-    slam: SlamState = state if isinstance(state, SlamState) else state.slam
-    return slam
-
-
-def with_covariance(state: Any, P: Array) -> Any:
-    slam = replace(slam_of(state), P=P)
-    return slam if isinstance(state, SlamState) else replace(state, slam=slam)
-
-
-def of_the_robot(state: Any, block: Array) -> Any:
+def of_the_robot(state: SlamState, block: Array) -> SlamState:
     """The state with a covariance of the robot and none of the map."""
-    P = np.zeros_like(slam_of(state).P)
+    P = np.zeros_like(state.P)
     P[:3, :3] = block
-    return with_covariance(state, P)
+    return replace(state, P=P)
 
 
-def motion_jacobian(twin: Any, state: Any, control: Control) -> Array:
+def motion_jacobian(twin: Any, state: SlamState, control: Control) -> Array:
     """F (3, 3), from what it makes of two covariances."""
-    noise, all_ = (slam_of(twin.predict(of_the_robot(state, P), control)).P for P in (np.zeros((3, 3)), np.eye(3)))
+    noise, all_ = (twin.predict(of_the_robot(state, P), control).P for P in (np.zeros((3, 3)), np.eye(3)))
     square, F = (all_ - noise)[:3, :3], np.eye(3)
     F[:2, 2] = square[:2, 2]
     assert np.allclose(F @ F.T, square, rtol=0, atol=1e-12)
     return F
 
 
-def split(state: Any, observation: Observation) -> tuple[Observation, Observation]:
+def split(state: SlamState, observation: Observation) -> tuple[Observation, Observation]:
     """What is seen of landmarks in the state, and of new ones."""
-    known = np.isin(observation.landmarks, slam_of(state).landmarks)
+    known = np.isin(observation.landmarks, state.landmarks)
     old, new = (Observation(observation.landmarks[rows], observation.z[rows]) for rows in (known, ~known))
     return old, new
 
@@ -65,15 +55,15 @@ def observability_matrix(twin: Any, trial: Trial, belief: Any) -> Array:
         Phi = motion_jacobian(twin, state, trial.control(k)) @ Phi
         state = twin.predict(state, trial.control(k))
         old, new = split(state, trial.observation(k))
-        _, info = twin.update(with_covariance(state, np.eye(len(slam_of(state).x))), old)
+        _, info = twin.update(replace(state, P=np.eye(len(state.x))), old)
         H = (info.gain @ info.S).T  # P H' with P = I
-        state, n = twin.update(state, old)[0], len(slam_of(state).x)
+        state, n = twin.update(state, old)[0], len(state.x)
         blocks.append(np.hstack([H[:, :3] @ Phi, H[:, 3:]]))
         if len(new.landmarks):
-            Jp = slam_of(twin.update(of_the_robot(state, np.eye(3)), new)[0]).P[n:, :3]
+            Jp = twin.update(of_the_robot(state, np.eye(3)), new)[0].P[n:, :3]
             blocks.append(np.hstack([-Jp @ Phi, np.zeros((len(Jp), n - 3)), np.eye(len(Jp))]))
             state = twin.update(state, new)[0]
-    width = len(slam_of(state).x)
+    width = len(state.x)
     return np.vstack([np.pad(block, ((0, 0), (0, width - block.shape[1]))) for block in blocks])
 
 

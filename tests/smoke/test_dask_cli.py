@@ -39,7 +39,7 @@ def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(fresh, to_all):
     assert status == 130, error
     assert "Traceback" not in error
     assert not remaining(process.pid)
-    assert "finished runs are kept where there are any: the same command goes on, 'run' with --resume" in error
+    assert "finished runs are kept where there are any: the same command continues, 'run' with --resume" in error
     resume(fresh)
 
 
@@ -62,7 +62,7 @@ def test_a_scheduler_that_ends(fresh, cluster, monkeypatch):
     assert status == 2, error
     assert "Traceback" not in error
     assert "the executor has ended" in error
-    assert f"; {kept(fresh)} finished runs are kept, and the same command with --resume goes on" in error
+    assert f"; {kept(fresh)} finished runs are kept, and the same command with --resume continues" in error
     resume(fresh)
 
 

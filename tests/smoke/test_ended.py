@@ -117,7 +117,7 @@ def test_a_signal_keeps_what_is_finished(at, which, name, status):
     _, error = process.communicate()
     assert process.returncode == status, error
     assert "Traceback" not in error
-    assert error.rstrip().endswith("the same command goes on, 'run' with --resume") == (name == "SIGINT")
+    assert error.rstrip().endswith("the same command continues, 'run' with --resume") == (name == "SIGINT")
     assert which == "sweep" or not out.exists()
     consistency(*command, "--out", str(out), *["--resume"] * (which != "sweep"), cwd=at)
     require_same(at, out, which)

@@ -152,7 +152,9 @@ def test_twenty_kills_at_random_moments(fresh):
     resume(fresh)
 
 
-GONE = "consistency: stopped; finished runs are kept where there are any: the same command goes on, 'run' with --resume"
+GONE = (
+    "consistency: stopped; finished runs are kept where there are any: the same command continues, 'run' with --resume"
+)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ RUN = ("run", "linear-gaussian", "--filter", "kf", "--runs", "1")
 
 @pytest.mark.slow
 def test_a_folder_for_an_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The commands of docs/compiling.md: what the first run compiles, the second finds."""
+    """The commands of docs/long-runs.md: what the first run compiles, the second finds."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
     monkeypatch.setenv("NUMBA_CPU_NAME", "x86-64-v2")
     monkeypatch.setenv("NUMBA_CPU_FEATURES", "")

@@ -19,6 +19,7 @@ import pytest
 import typer
 from documents import ROOT
 
+import consistency as cs
 from consistency.bench.runs.findings import sibling
 from consistency.commands.app import app
 
@@ -195,6 +196,18 @@ def test_a_gate_that_fails_is_in_the_summary(workspace):
     done = run_action(workspace("0.15"), install="false", tests="tests -k consistent")
     assert (done.status, done.outputs["verdict"]) == (1, "fail")
     assert "test_the_ekf_is_consistent | overconfident | x" in done.summary
+
+
+def test_runs_of_a_program_get_a_report(tmp_path: Path) -> None:
+    """Three runs decide nothing, so the job fails."""
+    at = tmp_path / "workspace"
+    at.mkdir()
+    row = "printf 'step,a,P_a_a,true_a\\n1,0.{seed},1,0\\n2,0.{run},1,0\\n' > estimates.csv"
+    cs.monte_carlo(["sh", "-c", row], 3, out=at / "gate", state=["a"])
+    done = run_action(at, bash=False, install="false", estimates="gate")
+    assert (done.status, done.outputs["verdict"]) == (1, "fail")
+    assert "| gate: estimates | undecided |" in done.summary
+    assert (at / "consistency-report/gate/report.html").exists()
 
 
 WRONG = {

@@ -31,7 +31,7 @@ from consistency.bench.sweeps.plan import load_sweep, sweep_names
 
 PYTHON = ("python", "python notebook")
 SITE = re.compile(r"\{[\w-]+\}.*")  # directives of the site
-OTHERS = {"c++", "cmake", "ctest", "dask", "done", "export", "for", "my-filter", "openssl"}  # the syntax is checked
+OTHERS = {"apt", "c++", "cd", "cmake", "ctest", "dask", "done", "export", "for", "my-filter", "openssl", "python3", "."}
 PLACEHOLDER = re.compile(r"[A-Z][A-Z_.:|]*")
 ALL = [command for page in PAGES for command in commands(page)]
 OURS = [command for command in ALL if command.words[0] == "consistency"]

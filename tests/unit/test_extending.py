@@ -12,7 +12,7 @@ from pathlib import Path
 
 import forks
 import pytest
-from documents import blocks
+from documents import ROOT, blocks, read
 
 import consistency
 import consistency.bench.filters
@@ -25,6 +25,12 @@ EFFECTS = Path("consistency/bench/scenario/effects")
 def code(heading: str) -> list[str]:
     """Code blocks of one part of the document."""
     return [block.text for block in blocks(PAGE, "python", "toml", part=heading)]
+
+
+def example(name: str) -> str:
+    """A file to copy, to which the document links."""
+    assert f"(examples/extending/{name})" in read(PAGE)
+    return (ROOT / "docs/examples/extending" / name).read_text(encoding="utf-8")
 
 
 @pytest.fixture
@@ -46,7 +52,7 @@ def python(folder: Path, code: str, imports: str = "import scipy.stats, typer") 
 
 def test_the_command_of_the_document_works(copy: Path) -> None:
     """One new file and one row; it is in the help, reads files, and loads nothing heavy before it is called."""
-    module, row = code("Add a command")
+    module, (row,) = example("worst.py"), code("Add a command")
     assert row.count("\n") == 1
     (copy / "consistency/commands/worst.py").write_text(module, encoding="utf-8")
     first = "    # the laboratory\n"
@@ -75,7 +81,7 @@ def changed(path: Path, old: str, new: str) -> None:
 
 def test_the_question_of_the_document_is_asked(copy: Path) -> None:
     """Two files; runs whose errors grow are found at fault, the same runs in random order are not."""
-    statistic, table, line = code("Add a question of the verdict")
+    statistic, (table, line) = example("trend.py"), code("Add a question of the verdict")
     folder = copy / "consistency/referee/diagnostics"
     (folder / "questions/trend.py").write_text(statistic, encoding="utf-8")
     tests = folder / "judging/hypothesis_tests.py"
@@ -114,8 +120,7 @@ for order in (np.arange(n), np.arange(n) * 37 % n):
 
 def test_the_renderer_of_the_document_works(copy: Path) -> None:
     """One file; the command line and the gates have the format at once."""
-    (module,) = code("Add a renderer")
-    (copy / "consistency/referee/show/as_csv.py").write_text(module, encoding="utf-8")
+    (copy / "consistency/referee/show/as_csv.py").write_text(example("as_csv.py"), encoding="utf-8")
     words = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a", "--report", "out.csv"]
     done = python(copy, f"from consistency.commands import main\nmain({words})")
     assert done.stdout.endswith("out.csv\n"), done.stderr
@@ -129,8 +134,9 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
 
 def test_the_kind_of_files_of_the_document_is_read(copy: Path) -> None:
     """One file and a row; what is refused of it is refused, and what is broken is said."""
-    module, load, row = code("Add a kind of files")
-    (copy / "consistency/referee/readers/formats/run_lines.py").write_text(module, encoding="utf-8")
+    load, row = code("Add a kind of files")
+    module = copy / "consistency/referee/readers/formats/run_lines.py"
+    module.write_text(example("run_lines.py"), encoding="utf-8")
     kinds = copy / "consistency/referee/readers/pipeline/kinds.py"
     changed(kinds, "KINDS = (", f"{load}\n\nKINDS = (")
     last = ")\n\n\ndef kind_of"
@@ -157,7 +163,7 @@ def test_a_default_stands_once(copy: Path) -> None:
 
 def test_the_bias_of_the_document_works(copy: Path) -> None:
     """One new file, one line elsewhere, a key in a scenario; and the document's own test passes."""
-    effect, line, key, test = code("Add a sensor effect")
+    effect, test, (line, key) = example("bias.py"), example("check_bias.py"), code("Add a sensor effect")
     assert line.count("\n") == 1
     (copy / EFFECTS / "bias.py").write_text(effect, encoding="utf-8")
     names, first = copy / EFFECTS / "__init__.py", "from consistency.bench.scenario.effects.effect"
@@ -185,7 +191,7 @@ def test_excerpts_of_filters_are_the_code_that_runs() -> None:
     registry = (PACKAGE / "bench" / "filters" / "__init__.py").read_text(encoding="utf-8")
     sources = [registry, *(path.read_text(encoding="utf-8") for path in METHODS.glob("*.py"))]
     excerpts = code("Add a filter")
-    assert len(excerpts) == 7
+    assert len(excerpts) == 2
     for excerpt in excerpts:
         pieces = re.split(r"\n{3,}", excerpt.strip("\n"))
         assert all(any(piece in source for source in sources) for piece in pieces), excerpt
@@ -196,7 +202,7 @@ def test_excerpts_of_filters_are_the_code_that_runs() -> None:
 )
 def test_a_filter_is_one_file_and_a_line_for_each_name(method: str, names: set[str]) -> None:
     """Nothing else in the package but its textbook knows the file or what it defines."""
-    registered = {name: module for name, (module, _, _) in consistency.bench.filters.MODULES.items()}
+    registered = {name: module for name, (module, _) in consistency.bench.filters.MODULES.items()}
     mine = {name for name, module in registered.items() if module == f"methods.{method}"}
     assert {name.rpartition("-")[0] for name in mine} == names
     source = (METHODS / f"{method}.py").read_text(encoding="utf-8")
@@ -216,8 +222,7 @@ def words_of_code(source: str) -> set[str]:
 
 
 def test_the_experiment_of_the_document_runs(tmp_path: Path) -> None:
-    (script,) = code("Add an experiment")
-    (tmp_path / "e13_iterated.py").write_text(script, encoding="utf-8")
+    (tmp_path / "e13_iterated.py").write_text(example("e13_iterated.py"), encoding="utf-8")
     program = "import sys, runpy; sys.argv = ['e13', '2', '0']; runpy.run_path('e13_iterated.py', run_name='__main__')"
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
     done = subprocess.run(

@@ -6,7 +6,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = (".", "docs", "experiments", "benchmarks", "scenarios", "reports")
+FOLDERS = (
+    ".",
+    "docs",
+    "docs/reference",
+    "docs/examples",
+    "docs/api",
+    "experiments",
+    "benchmarks",
+    "scenarios",
+    "reports",
+)
 PAGES = [page for folder in FOLDERS for page in sorted((ROOT / folder).glob("*.md"))]
 
 

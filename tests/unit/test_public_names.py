@@ -93,7 +93,8 @@ def is_inside(name):
     return name.split(".")[1] in {"bench", "commands", "referee", "stereo"}
 
 
-PAGES = [path for pattern in ("README.md", "docs/*.md", "docs/api/*.md", "docs/gallery/*.py", "docs/examples/*.py")
+PLACES = ("README.md", "docs/*.md", "docs/reference/*.md", "docs/api/*.md", "docs/gallery/*.py", "docs/examples/*.py")
+PAGES = [path for pattern in PLACES
          for path in sorted(ROOT.glob(pattern))]  # fmt: skip
 
 

@@ -90,15 +90,25 @@ def test_an_empty_folder_is_no_site(tmp_path):
 @pytest.mark.parametrize(
     "source, page, link, expected",
     [
-        ("docs/method.md", "docs/method.md", "[a](../scenarios/README.md#keys)", "[a](generated/scenarios.md#keys)"),
-        ("docs/method.md", "docs/method.md", "[a](files.md#b)", "[a](files.md#b)"),
-        ("docs/method.md", "docs/method.md", "[`x`](../consistency/bench/types.py)", "`x`"),
-        ("docs/method.md", "docs/method.md", "[a](https://example.org/b.md)", "[a](https://example.org/b.md)"),
-        ("scenarios/README.md", "docs/generated/scenarios", "[a](../docs/sensor.md#b)", "[a](../sensor.md#b)"),
+        (
+            "docs/laboratory.md",
+            "docs/laboratory.md",
+            "[a](../scenarios/README.md#keys)",
+            "[a](generated/scenarios.md#keys)",
+        ),
+        ("docs/laboratory.md", "docs/laboratory.md", "[a](files.md#b)", "[a](files.md#b)"),
+        ("docs/laboratory.md", "docs/laboratory.md", "[`x`](../consistency/bench/types.py)", "`x`"),
+        ("docs/laboratory.md", "docs/laboratory.md", "[a](https://example.org/b.md)", "[a](https://example.org/b.md)"),
+        (
+            "scenarios/README.md",
+            "docs/generated/scenarios",
+            "[a](../docs/reference/sensor.md#b)",
+            "[a](../reference/sensor.md#b)",
+        ),
         ("scenarios/README.md", "docs/generated/scenarios", "[a](../experiments/README.md)", "[a](experiments.md)"),
         ("CONTRIBUTING.md", "docs/generated/contributing", "[a](LICENSE)", "a"),
         ("README.md", "docs/generated/readme", "![a](docs/images/regime.png)", "![a](../images/regime.png)"),
-        ("docs/method.md", "docs/method.md", "[a](../README.md#b)", "[a](generated/readme.md#b)"),
+        ("docs/laboratory.md", "docs/laboratory.md", "[a](../README.md#b)", "[a](generated/readme.md#b)"),
     ],
 )
 def test_links_lead_to_pages_of_the_site(source, page, link, expected):
@@ -119,8 +129,8 @@ def test_every_command_has_a_page_with_its_examples(tmp_path, monkeypatch):
         assert "\x08" not in text
         for line in COMMANDS[name].examples:
             assert f"$ consistency {line}\n" in text
-    assert "dask or slurm ([docs/cluster.md](../../cluster.md))" in pages["run"]
-    assert "As many runs as the verdict takes, instead of `--runs`." in pages["run"]
+    assert "dask or slurm ([docs/long-runs.md](../../long-runs.md))" in pages["run"]
+    assert "Run until the verdict is clear, instead of `--runs`." in pages["run"]
 
 
 # --- reference ---------------------------------------------------------------------------------------

@@ -144,7 +144,7 @@ def judge(given: Inputs, estimates: str) -> tuple[bool, list[Row]]:
     """Whether they are consistent, and a row for each filter in them."""
     page = given.report / "-".join(part for part in Path(estimates).with_suffix("").parts if part not in ("/", ".."))
     words = ["consistency", "analyse", *given.options, "--json", "--fail-on", "inconsistent"]
-    if not (Path(estimates) / "manifest.json").exists():  # of `consistency run`, which has a report of its own
+    if not (Path(estimates) / "estimates.parquet").exists():  # of `consistency run`, which has a report of its own
         words += ["--report", str(page), "--overwrite"]
     status, said = run(*words, "--", estimates)
     if status not in (0, 1):

@@ -2,5 +2,5 @@
 
 ``worlds`` has the dimensions of worlds and turns a point into a scenario, ``world_scores`` scores a filter in worlds.
 ``search`` looks for the worst world, and knows nothing of filters.
-``challenge`` puts them together and confirms, ``challenge_text`` has the words and files.
+``challenge`` puts them together, confirms, and has the words and files.
 """

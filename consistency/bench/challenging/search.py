@@ -90,7 +90,7 @@ def search(
     Parameters
     ----------
     evaluate : gives candidates trials
-    left : whether to go on with another batch, and another rung
+    left : whether to continue with another batch, and another rung
     """
     even = qmc.Halton(len(space.dimensions), rng=rng)
     while left():

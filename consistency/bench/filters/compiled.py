@@ -15,14 +15,14 @@ from threadpoolctl import ThreadpoolController
 from consistency.bench.filters.believed_noise import bias_at, sensor_noise
 from consistency.bench.filters.compiler.dispatch import fits, require_fitting
 from consistency.bench.filters.compiler.jit import Outlook
-from consistency.bench.filters.covariance_update.local import LOCAL_FROM, Local
-from consistency.bench.filters.covariance_update.parking import Parking
-from consistency.bench.filters.guard.guard_part import guard_part
 from consistency.bench.filters.guard.guarded import Guarded
+from consistency.bench.filters.guard.kernel_guard import guard_part
 from consistency.bench.filters.guard.plain_rules import KINDS
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
 from consistency.bench.filters.kernel.update_steps import REASONS
+from consistency.bench.filters.parts.local import LOCAL_FROM, Local
+from consistency.bench.filters.parts.parking import Parking
 from consistency.bench.protocols import Filter, Problem, TrialTruth
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import Estimates, Map, Trial
@@ -185,13 +185,14 @@ def guarded(filter_: Filter, kind: str) -> Any:
 
 def variants(
     textbook: Callable[..., Any], method: str, parts: Parts, suffixes: str = "xyz uvd xy rb", **changes: Any
-) -> tuple[Compiled, ...]:
+) -> dict[str, Compiled]:
     """A method on points (``METHOD-xyz``), pixels (``-uvd``), relative positions (``-xy``), and by bearings (``-rb``).
 
-    ``textbook`` makes the plain filter of a name and ``uvd``; ``changes`` are as for :class:`Compiled`.
+    Returns them by name. ``textbook`` makes the plain filter of a name and ``uvd``; ``changes`` are as for
+    :class:`Compiled`.
     """
-    plain = [(textbook(f"{method}-{s}", uvd=s == "uvd"), SENSORS[s]) for s in suffixes.split()]
-    return tuple(Compiled(each, parts, sensors, **changes) for each, sensors in plain)
+    plain = {s: textbook(f"{method}-{s}", uvd=s == "uvd") for s in suffixes.split()}
+    return {each.name: Compiled(each, parts, SENSORS[s], **changes) for s, each in plain.items()}
 
 
 def problem_of(trial: Trial, belief: Belief) -> Problem:
@@ -210,7 +211,7 @@ def problem_for(filter_: Any, trial: Trial, belief: Belief) -> Problem:
     Raises
     ------
     InputError
-        It needs the truth, and the trial has none, or has observations of what is no landmark.
+        It needs the truth, and the trial has none, or has observations of what is not a landmark.
     """
     problem = problem_of(trial, belief)
     if is_realisable(filter_):
@@ -222,6 +223,6 @@ def problem_for(filter_: Any, trial: Trial, belief: Belief) -> Problem:
         raise InputError(f"{needs}: run {trial.run} has none; a log needs {missing}, or leave the filter out")
     if len(trial.landmark) and trial.landmark.max() >= len(trial.landmarks):
         raise InputError(
-            f"{needs}: run {trial.run} has observations of things that are no landmark; leave the filter out"
+            f"{needs}: run {trial.run} has observations of things that are not landmarks; leave the filter out"
         )
     return replace(problem, truth=TrialTruth(trial.truth, trial.landmarks))

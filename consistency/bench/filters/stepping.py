@@ -2,25 +2,79 @@
 
 from __future__ import annotations
 
+import sysconfig
+import traceback
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from consistency.bench.filters.compiled import problem_for
 from consistency.bench.filters.kernel.linalg import definiteness
-from consistency.bench.filters.recorder import RunRecord
 from consistency.bench.protocols import Filter, WholeTrial
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Gaussian, Info, Map, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.parsing import one_line
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Failure, Indices
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a filter has said so far in a run, written as it goes; the arrays may lie where another process reads them.
+
+    Rows are of steps 1..T. Those of the step in which the filter is may be half written.
+    """
+
+    at: Indices  # (1,), the step in which it is, 0 before the start
+    pose: Array  # (T, 3)
+    covariance: Array  # (T, 3, 3)
+    own: Array  # (T, 3, 3), of its own error; of no meaning where that is the additive one
+    nis: Array  # (T,)
+    dof: Array  # (T,)
+    log_det: Array  # (T,)
+    rejected: Array  # (M,), bool
+
+    @classmethod
+    def empty(cls, steps: int, observations: int) -> RunRecord:
+        """Room for one run."""
+        at, rejected = np.zeros(1, np.int64), np.zeros(observations, bool)
+        pose, covariance, own = (np.empty((steps, *shape)) for shape in ((3,), (3, 3), (3, 3)))
+        nis, dof, log_det = (np.empty(steps) for _ in range(3))
+        return cls(at, pose, covariance, own, nis, dof, log_det, rejected).begun()
+
+    def begun(self) -> RunRecord:
+        """The same arrays, as they are before the first step."""
+        self.at[:], self.dof[:], self.rejected[:] = 0, 0, False
+        for array in (self.pose, self.covariance, self.own, self.nis, self.log_det):
+            array[:] = np.nan
+        return self
+
+    def estimates(
+        self, name: str, run: int, error: str = ADDITIVE, *, reason: str = "", map_: Map | None = None,
+        guarded: bool = False,
+    ) -> Estimates:  # fmt: skip
+        """Copies of what was said; with a ``reason`` the run has failed in the step in which it is."""
+        step = max(int(self.at[0]), 1)
+        failure = Failure(name, run, step, reason) if reason else None
+        said = (self.pose, self.covariance, self.own, self.nis, self.dof, self.log_det)
+        pose, covariance, own, nis, dof, log_det = (array.copy() for array in said)
+        if failure is not None:
+            for array in (pose, covariance, own, nis, log_det):
+                array[step - 1 :] = np.nan
+            dof[step - 1 :] = 0
+        return Estimates(
+            name, run, pose, covariance, nis, dof.astype(np.int64), failure, error, None if error == ADDITIVE else own,
+            map_ if failure is None else None, self.rejected.copy() if guarded else None, log_det,
+        )  # fmt: skip
+
 
 SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands
 LONGEST = 1000  # characters of an exception's message that are kept
+NOT_THE_USERS = [str(Path(__file__).parents[2]), *map(sysconfig.get_path, ("stdlib", "purelib", "platlib"))]
 
 
 def optimal_gain(filter_: Filter) -> bool:
@@ -64,7 +118,7 @@ def run_filter(filter_: Filter, trial: Trial, belief: Belief, record: RunRecord 
     Raises
     ------
     InputError
-        The filter's error is no convention, nothing gives its covariance, or estimates of a whole trial have another.
+        The filter's error is not a convention, nothing gives its covariance, or a whole trial's estimates have another.
     """
     if isinstance(filter_, WholeTrial):
         estimates, error = filter_.run(trial, belief), error_of(filter_)
@@ -88,7 +142,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, record: RunRecor
     Raises
     ------
     InputError
-        The filter's error is no convention, or nothing gives its covariance; it needs the truth and there is none.
+        The filter's error is not a convention, or nothing gives its covariance; it needs the truth and there is none.
     """
     T, name, error = trial.steps, name_of(filter_), error_of(filter_)
     record = record or RunRecord.empty(T, len(trial.landmark))
@@ -140,7 +194,14 @@ def reason_of(exception: BaseException) -> str:
         text = f"its message cannot be read ({type(error).__name__})"
     what = "out of memory" if isinstance(exception, MemoryError) else type(exception).__name__
     text = text if len(text) <= LONGEST else f"{text[:LONGEST]} ..."
-    return f"{what}: {one_line(text.encode(errors='backslashreplace').decode(), 8 * LONGEST)}"
+    return f"{what}: {one_line(text.encode(errors='backslashreplace').decode(), 8 * LONGEST)}{_line_of(exception)}"
+
+
+def _line_of(exception: BaseException) -> str:
+    """File and line where the user's code raised, in brackets; nothing where it did not."""
+    frames = traceback.extract_tb(exception.__traceback__)
+    own = [frame for frame in frames if not frame.filename.startswith(tuple(NOT_THE_USERS))]
+    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
 
 
 def _nis(info: Info) -> float:
@@ -157,6 +218,8 @@ def _nis(info: Info) -> float:
 def _pose_and_covariances(filter_: Filter, state: Any, error: str) -> tuple[Array, list[Array]]:
     """Mean (3,) of the pose and its covariance (3, 3), with that of the filter's own error where it has one."""
     estimate = filter_.pose(state)
+    if not (hasattr(estimate, "mean") and hasattr(estimate, "covariance")):
+        raise TypeError(f"pose must return cs.Gaussian(mean, covariance), not {type(estimate).__name__}")
     mean, P = _array(estimate.mean, (3,)), _array(estimate.covariance, (3, 3))
     if error == ADDITIVE:
         return mean, [P]

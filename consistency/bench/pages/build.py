@@ -10,15 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.pages.sections import exhibits, images, overview, sensor_issues
+from consistency.bench.pages.sections import exhibits, overview
 from consistency.bench.pages.sections.calibration_rates import calibration_rates
 from consistency.bench.pages.sections.filters_table import filters_table
-from consistency.bench.pages.sections.front_end import front_end
+from consistency.bench.pages.sections.overview import provenance
 from consistency.bench.pages.sections.report_input import Report, Study, Track
-from consistency.bench.pages.sections.stereo_noise import stereo_noise
-from consistency.bench.pages.sections.study_origin import provenance
 from consistency.bench.pages.sections.study_sections import SECTIONS
-from consistency.bench.runs.findings import read_findings
+from consistency.bench.runs.findings import figure_scripts, read_findings
 from consistency.bench.runs.results_to_records import design_of, longest_run, record_of
 from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
@@ -108,8 +106,6 @@ def compose(report: Report) -> Document:
     Of several studies the PDF has the findings and a part of each study; the page has all.
     """
     brief = len(report.studies) > 1
-    noise, sensor = "What eq. 21 does to Gaussian pixels (fig. 12)", "The stereo sensor: biases and practical issues"
-    sensor_blocks, image_blocks = (exhibits.shown(report, part.EXHIBITS) for part in (sensor_issues, images))
     only_page = () if brief else None
     chapters = (
         Chapter("findings", "Findings: published beside measured", "Findings", exhibits.all_findings(report),
@@ -117,15 +113,22 @@ def compose(report: Report) -> Document:
         Chapter("filters", "Filters side by side", "Filters", filters_table(report)),
         Chapter("verdicts", "Verdicts", "Verdicts", overview.verdicts(report), on_paper=only_page),
         *(_study_chapter(index, study, brief) for index, study in enumerate(report.studies)),
-        Chapter("distributions", noise, "Stereo noise", stereo_noise(report)),
-        Chapter("front-end", "Stereo front-end", "Stereo front-end", front_end(report)),
-        Chapter("sensor-issues", sensor, "Sensor issues", sensor_blocks, on_paper=only_page),
-        Chapter("images", "The stereo sensor in rendered images", "Rendered images", image_blocks, on_paper=only_page),
+        *_of_experiments(report, brief),
         Chapter("calibration", "How far the referee can be trusted", "The referee", calibration_rates(), on_paper=()),
         Chapter("provenance", "Provenance", "Provenance", provenance(report), on_paper=only_page),
     )  # fmt: skip
     shown = tuple(chapter for chapter in chapters if chapter.blocks)
     return Document(report.title, answer(report.studies, report.findings), shown, overview.opening(report))
+
+
+def _of_experiments(report: Report, brief: bool) -> list[Chapter]:
+    """Chapters that the scripts in ``experiments/figures`` make of the tables in the folder."""
+    chapters = []
+    for script in figure_scripts().values():
+        anchor, title, link = script.CHAPTER
+        on_paper = () if brief and not script.ON_PAPER else None
+        chapters.append(Chapter(anchor, title, link, script.blocks(report), on_paper=on_paper))
+    return chapters
 
 
 def _study_chapter(index: int, study: Study, brief: bool) -> Chapter:

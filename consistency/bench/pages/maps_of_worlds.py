@@ -1,4 +1,7 @@
-"""The report of a sweep: where each filter is consistent, with its RMSE beside it, and which to trust for which rig."""
+"""The report of a sweep: what each filter is in each cell, and which to trust for which rig.
+
+A heat map shows the ratio of true to stated covariance of a filter in each cell, as number and colour.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.pages.heat import View, cells_of, heat_figure, results_at, title_of, views, words_of
-from consistency.bench.sweeps import axes as grid
+from consistency.bench.sweeps.axes import Axis as GridAxis
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell as GridCell
 from consistency.bench.sweeps.plan import values_of
 from consistency.bench.sweeps.printing import by_verdict
 from consistency.bench.sweeps.regime import Regime
-from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.document.blocks import (
     Block,
     Cell,
@@ -33,7 +34,7 @@ from consistency.referee.document.blocks import (
     table,
 )
 from consistency.referee.document.colours import COLOURS, EXPECTED, Look, solid, style
-from consistency.referee.document.wording import listed, number
+from consistency.referee.document.wording import brief, listed, number
 from consistency.referee.pages.origin import facts
 from consistency.referee.show.painting import TITLE, add_legend, canvas, dots, log_axis, say, stroke, wrapped
 
@@ -57,28 +58,43 @@ HYPHENATED = {
     "consistent": "Con-\nsistent", "overconfident": "Over-\nconfident", "conservative": "Conser-\nvative",
     "heavy-tailed": "Heavy-\ntailed", "inconsistent": "Incon-\nsistent", "undecided": "Un-\ndecided",
 }  # fmt: skip
-PAIRS = 4  # of panels in one drawing
-ROOM = 1.25  # of a log axis is left beyond the first and the last value, as a factor
+SMALL, LARGE = COLOURS[0], COLOURS[1]  # of a ratio below and above 1: blue and vermilion, told apart by everybody
+NOTHING, PAPER = "#e3e3e3", "#ffffff"
+FULL = 4.0  # ratio from which on the colour is full, and 1 over it
+DARK = 0.45  # luminance below which text is white
+LONGEST = 30  # characters of a value beside an axis
+# what fits into a tile
+WORDS = {
+    "consistent": "consistent", "overconfident": "overconf.", "conservative": "conserv.", "biased": "biased",
+    "heavy-tailed": "heavy tails", "inconsistent": "inconsist.", "undecided": "undecided", "failed": "failed",
+}  # fmt: skip
+ROW, MARGIN = 0.34, 0.75  # inches: height of a row of tiles, and of title and axis
+ROOM = 15  # rows of tiles in one drawing, about, titles and axes counted as two
+BEYOND = 1.25  # of a log axis is left beyond the first and the last value, as a factor
+WIDEST = 6  # tiles beside each other where two panels stand side by side
+View = tuple[list[GridAxis], list[tuple[GridAxis, int]]]  # axes for the sides of a panel, and a place on each other one
 
 
 def compose_regime(regime: Regime) -> Document:
     sweep = regime.sweep
-    sides = _sides(regime)
-    if len(sweep.axes) == len(sides) == 1:
-        regions: tuple[Figure, ...] = (_along(regime, sides[0]),)
-    else:
-        regions = tuple(figure for name in sweep.filters for figure in _figures(regime, name))
     about = Text(method(regime), style="note")
-    chapters = [Chapter("filters", "Filters", "Filters", (_summary(regime), about), sweep.summary)]
-    if regions:
-        chapters.append(Chapter("regions", "Where each filter is consistent", "Regions", regions))
     heat = tuple(heat_figure(regime, name) for name in sweep.filters)
-    chapters += [
+    chapters = [
+        Chapter("filters", "Filters", "Filters", (_summary(regime), about), sweep.summary),
+        *_regions(regime),
         Chapter("ratios", "How wrong the covariance is", "Covariance ratios", heat),
         Chapter("rigs", "Rig, and the filters to trust", "Rigs", (_rigs(regime),)),
         Chapter("provenance", "Provenance", "Provenance", _provenance(regime)),
     ]
     return Document(f"Regime map: {sweep.name}", answer(regime), tuple(chapters))
+
+
+def _regions(regime: Regime) -> list[Chapter]:
+    """The chapter of a sweep along one axis of numbers; none for others, whose heat maps show as much."""
+    sides = _sides(regime)
+    if not len(regime.sweep.axes) == len(sides) == 1:
+        return []
+    return [Chapter("regions", "Where each filter is consistent", "Regions", (_along(regime, sides[0]),))]
 
 
 def answer(regime: Regime) -> str:
@@ -141,8 +157,9 @@ def _rigs(regime: Regime) -> Table:
     return Table(columns, tuple(groups), "Filters to trust for each rig", caption=caption, style="grouped")
 
 
-def _sides(regime: Regime) -> list[grid.Axis]:
-    return next((sides for sides, _ in views(regime, numbers=True)), [])
+def _sides(regime: Regime) -> list[GridAxis]:
+    """The first two axes of numbers in the grid, which have columns of their own."""
+    return [axis for axis in regime.sweep.grid if axis.numeric and len(axis.values) > 1][:2]
 
 
 def _trusted(regime: Regime, cell: GridCell) -> Cell:
@@ -172,27 +189,14 @@ def _provenance(regime: Regime) -> tuple[Block, ...]:
     return (Facts((*rows, *facts(dict(regime.manifest)))),)
 
 
-# --- figures ----------------------------------------------------------------------------------------
-
-
 def _short(key: str) -> str:
     return key.rpartition(".")[2]
 
 
-def _figures(regime: Regime, name: str) -> tuple[Figure, ...]:
-    """Verdicts of one filter over two axes, with the RMSE beside them; none without an axis of numbers."""
-    found = views(regime, numbers=True)
-    if not found:
-        return ()
-    drawings = tuple(partial(_draw, regime, name, found[i : i + PAIRS]) for i in range(0, len(found), PAIRS))
-    caption = (
-        f"{name}: verdict in each cell, by shape and colour; beside it the RMSE of the position, with filled markers "
-        "where the filter is consistent."
-    )
-    return (Figure(name, caption, drawings),)
+# --- along one axis ---------------------------------------------------------------------------------
 
 
-def _along(regime: Regime, side: grid.Axis) -> Figure:
+def _along(regime: Regime, side: GridAxis) -> Figure:
     """Covariance ratio and RMSE of all filters along the one axis of a sweep."""
 
     def draw() -> Drawing:
@@ -205,11 +209,10 @@ def _along(regime: Regime, side: grid.Axis) -> Figure:
             for axes, values in quantities:
                 axes.plot(x, values, label=name, **stroke(look))
                 for place, value, (_, result) in zip(x, values, found, strict=True):
-                    marker = replace(LOOKS[result.status], colour=look.colour, size=4.5)
-                    axes.plot(place, value, gid=TITLE + words_of(result), **dots(marker))
+                    axes.plot(place, value, gid=TITLE + words_of(result), **dots(_marker(result.status, look.colour)))
         statuses = dict.fromkeys(result.status for result in regime.results.values())
         for status in statuses:
-            ratios.plot([], [], label=status, **dots(replace(LOOKS[status], colour="#555555", size=4.5)))
+            ratios.plot([], [], label=status, **dots(_marker(status, "#555555")))
         ratios.axhline(1.0, **stroke(EXPECTED))
         ratios.set_ylabel("true / stated covariance")
         errors.set_ylabel("RMSE (m)")
@@ -225,78 +228,149 @@ def _along(regime: Regime, side: grid.Axis) -> Figure:
     return Figure(f"Along {_short(side.key)}", caption, (draw,))
 
 
-def _draw(regime: Regime, name: str, shown: Sequence[View]) -> Drawing:
-    """A row for each view: verdicts, and the RMSE."""
-    figure, panels = canvas(1.7 * len(shown), 2, 2 * len(shown))
-    for verdicts, rmse, (sides, at) in zip(panels[::2], panels[1::2], shown, strict=True):
-        found, title = results_at(regime, name, at), title_of(at)
-        verdicts.set_title(wrapped(title or "verdict", 46))
-        rmse.set_title("RMSE")
-        if not found:
-            say(verdicts, "no cell is there yet")
-            say(rmse, "no cell is there yet")
-            continue
-        places = [regime.sweep.axes.index(axis) for axis in sides]
-        _draw_verdicts(verdicts, sides, places, found)
-        _draw_rmse(rmse, sides, places, found)
-    return add_legend(figure)
+def _marker(status: str, colour: str) -> Look:
+    """The shape of a verdict in the colour of a filter; hollow where its own is."""
+    look = LOOKS[status]
+    if look.edge:
+        return replace(look, edge=colour, size=4.5)
+    return replace(look, colour=colour, size=4.5)
 
 
-def _draw_verdicts(
-    axes: Axes, sides: Sequence[grid.Axis], places: Sequence[int], found: Sequence[tuple[GridCell, CellResult]]
-) -> None:
-    """A marker for each cell, with what was found in words to hover."""
-    seen = set[str]()
-    for cell, result in sorted(found, key=lambda pair: list(STATUSES).index(pair[1].status)):
-        x, y = (float(axis.values[cell.indices[place]]) for axis, place in _both(sides, places))
-        label = "" if result.status in seen else result.status
-        seen.add(result.status)
-        words = f"{words_of(result)}, ANEES {result.anees:.2f}, RMSE {result.rmse_position:.3f} m"
-        axes.plot(x, y, label=label, gid=TITLE + words, **dots(LOOKS[result.status]))
-    _draw_side(axes, "x", sides[0])
-    if len(sides) > 1:
-        _draw_side(axes, "y", sides[1])
-    else:
-        axes.set_yticks([])
-
-
-def _draw_rmse(
-    axes: Axes, sides: Sequence[grid.Axis], places: Sequence[int], found: Sequence[tuple[GridCell, CellResult]]
-) -> None:
-    """A line for each value of the second axis."""
-    rows: dict[int, list[tuple[float, CellResult]]] = {}
-    for cell, result in found:
-        row = cell.indices[places[1]] if len(places) > 1 else 0
-        rows.setdefault(row, []).append((float(sides[0].values[cell.indices[places[0]]]), result))
-    for row, line in sorted(rows.items()):
-        look = replace(style(row), size=3.6)
-        label = f"RMSE, {_short(sides[1].key)} {sides[1].say(row)}" if len(sides) > 1 else ""
-        axes.plot([x for x, _ in line], [r.rmse_position for _, r in line], label=label, **stroke(look))
-        for x, result in line:
-            hollow = result.status != "consistent"
-            axes.plot(
-                x, result.rmse_position, **dots(replace(look, colour="#ffffff", edge=look.colour) if hollow else look)
-            )
-    axes.set_ylabel("RMSE (m)")
-    _draw_side(axes, "x", sides[0])
-    if any(result.rmse_position > 0.0 for _, result in found):
-        log_axis(axes, "y")
-
-
-def _both(sides: Sequence[grid.Axis], places: Sequence[int]) -> list[tuple[grid.Axis, int]]:
-    """The two axes of a panel with their places among those of the sweep; the first one twice where there is one."""
-    pairs = list(zip(sides, places, strict=True))
-    return pairs if len(pairs) > 1 else [*pairs, *pairs]
-
-
-def _draw_side(axes: Axes, side: str, axis: grid.Axis) -> None:
+def _draw_side(axes: Axes, side: str, axis: GridAxis) -> None:
     """Ticks and range of one axis of numbers."""
     first, last = float(axis.values[0]), float(axis.values[-1])
     unit = f" ({axis.unit})" if axis.unit else ""
     axes.set(**{f"{side}label": _short(axis.key) + unit})
     if axis.log:
-        axes.set(**{f"{side}lim": (first / ROOM, last * ROOM)})
+        axes.set(**{f"{side}lim": (first / BEYOND, last * BEYOND)})
         log_axis(axes, side)
     else:
         room = 0.08 * (last - first)
         axes.set(**{f"{side}lim": (first - room, last + room), f"{side}ticks": [float(value) for value in axis.values]})
+
+
+# --- heat maps ------------------------------------------------------------------------------------
+
+
+def views(regime: Regime) -> list[View]:
+    """Panels that show all cells; two axes of the grid are their sides, or one and an axis that varies alone."""
+    sweep = regime.sweep
+    grid = sorted((a for a in sweep.grid if len(a.values) > 1), key=lambda axis: not axis.numeric)
+    found: list[View] = []
+    for sides in [[axis, *grid[:1]] for axis in sweep.alone] or [grid[:2] or list(sweep.axes)[:2]]:
+        others = [axis for axis in sweep.axes if axis not in sides]
+        places = itertools.product(*(range(len(a.values)) if a.home is None else (a.home,) for a in others))
+        found += [(sides, list(zip(others, at, strict=True))) for at in places]
+    return found
+
+
+def cells_of(regime: Regime, fixed: Sequence[tuple[GridAxis, int]]) -> list[GridCell]:
+    """Cells at one place on each of some axes."""
+    places = [(regime.sweep.axes.index(axis), i) for axis, i in fixed]
+    return [cell for cell in regime.sweep.cells if all(cell.indices[k] == i for k, i in places)]
+
+
+def title_of(fixed: Sequence[tuple[GridAxis, int]]) -> str:
+    """Values on the axes of a grid that a panel does not show."""
+    shown = ((axis, i) for axis, i in fixed if axis.home is None and len(axis.values) > 1)
+    return ", ".join(f"{axis.key.rpartition('.')[2]} {axis.say(i)}" for axis, i in shown)
+
+
+def heat_figure(regime: Regime, name: str) -> Figure:
+    """Heat maps of one filter, as many drawings as it takes."""
+    found = views(regime)
+    rows = max(len(sides[1].values) if len(sides) > 1 else 1 for sides, _ in found)
+    widest = max(len(sides[0].values) for sides, _ in found)
+    columns = 1 if len(found) == 1 or widest > WIDEST else 2
+    most = columns * max(1, ROOM // (rows + 2))
+    drawings = tuple(
+        partial(_draw_maps, regime, name, found[i : i + most], columns, rows) for i in range(0, len(found), most)
+    )
+    caption = (
+        f"{name}: ratio of true to stated covariance in each cell, and the verdict; 1 is right, more is overconfident. "
+        "A dash: no run gave a ratio."
+    )
+    return Figure(name, caption, drawings)
+
+
+def _draw_maps(regime: Regime, name: str, shown: Sequence[View], columns: int, rows: int) -> Drawing:
+    from matplotlib.patches import Rectangle
+
+    height = (ROW * rows + MARGIN) * -(-len(shown) // columns)
+    figure, panels = canvas(height, columns, len(shown))
+    for axes, (sides, fixed) in zip(panels, shown, strict=True):
+        _draw_tiles(axes, regime, name, sides, fixed)
+    ends = ((f"{FULL:g} and more: overconfident", LARGE), (f"1/{FULL:g} and less: conservative", SMALL))
+    for label, colour in (*ends, ("no ratio", NOTHING)):
+        panels[0].add_patch(Rectangle((0, 0), 0, 0, facecolor=colour, label=label, visible=False))
+    return add_legend(figure)
+
+
+def _draw_tiles(
+    axes: Axes, regime: Regime, name: str, sides: Sequence[GridAxis], at: Sequence[tuple[GridAxis, int]]
+) -> None:
+    """The heat map at one place on each other axis: values from the left, and from below."""
+    across, places = sides[0], [regime.sweep.axes.index(axis) for axis in sides]
+    count = len(across.values)
+    axes.grid(visible=False)
+    axes.set(title=wrapped(title_of(at), 46), xlabel=_short(across.key), xlim=(-0.5, count - 0.5), xticks=range(count))
+    axes.set_xticklabels([wrapped(said(across, i), 12) for i in range(count)])
+    axes.set(ylim=(-0.5, 0.5), yticks=[])
+    if len(sides) > 1:
+        rows = len(sides[1].values)
+        axes.set(ylabel=_short(sides[1].key), ylim=(-0.5, rows - 0.5), yticks=range(rows))
+        axes.set_yticklabels([wrapped(said(sides[1], i), 16) for i in range(rows)])
+    found = results_at(regime, name, at)
+    if not found:
+        say(axes, "no cell is there yet")
+    for cell, result in found:
+        row = cell.indices[places[1]] if len(places) > 1 else 0
+        _draw_tile(axes, cell.indices[places[0]], row, result)
+
+
+def results_at(regime: Regime, name: str, at: Sequence[tuple[GridAxis, int]]) -> list[tuple[GridCell, CellResult]]:
+    """Cells at one place on each of some axes that have a verdict on the filter."""
+    cells = cells_of(regime, at)
+    return [(cell, regime.results[cell.number, name]) for cell in cells if (cell.number, name) in regime.results]
+
+
+def _draw_tile(axes: Axes, x: int, y: int, result: CellResult) -> None:
+    from matplotlib.patches import Rectangle
+
+    face = colour_of(result.ratio)
+    axes.add_patch(Rectangle(
+        (x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", gid=TITLE + words_of(result)
+    ))  # fmt: skip
+    axes.text(x, y, brief(result.ratio), color=ink_on(face), weight="bold", ha="center", va="bottom")
+    axes.text(x, y - 0.08, WORDS[result.status], color=ink_on(face), fontsize=5.0, ha="center", va="top")
+
+
+def words_of(result: CellResult) -> str:
+    """What a reader sees who points at a cell."""
+    ends = f"[{brief(result.ratio_low)}, {brief(result.ratio_high)}]"
+    return f"{result.status}, covariance ratio {brief(result.ratio)} {ends}, {result.runs} runs"
+
+
+def said(axis: GridAxis, index: int) -> str:
+    """A value in few characters; by its number where it is long."""
+    text = axis.say(index)
+    return text if len(text) <= LONGEST else f"({index + 1}) {text[: LONGEST - 5]}…"
+
+
+def colour_of(ratio: float) -> str:
+    """White at 1, vermilion above and blue below, by the logarithm; grey where there is no ratio."""
+    if np.isnan(ratio):
+        return NOTHING
+    share = np.clip(np.log(ratio) / np.log(FULL), -1.0, 1.0) if ratio > 0 else -1.0
+    end, white = _channels(LARGE if share > 0 else SMALL), _channels(PAPER)
+    mixed = np.rint(255.0 * (white + abs(share) * (end - white))).astype(int)
+    return "#{:02x}{:02x}{:02x}".format(*mixed)
+
+
+def ink_on(colour: str) -> str:
+    """Black or white, whichever reads better."""
+    return "#ffffff" if _channels(colour) @ (0.299, 0.587, 0.114) < DARK else "#000000"
+
+
+def _channels(colour: str) -> np.ndarray:
+    return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0

@@ -31,7 +31,7 @@ def analyse(
     Parameters
     ----------
     results : of ``consistency.run_trials``, a folder of them, or a sequence of records
-    confidence : 1 less the false-alarm rate of a verdict, in place of ``settings``
+    confidence : 1 - the false-alarm rate of a verdict, in place of ``settings``
     settings : what to ask; the defaults of :class:`Settings` where None. Results of a run until decided are then
         judged as that run was.
     skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data

@@ -13,8 +13,7 @@ from typing import NoReturn
 
 from joblib.externals.loky.backend.reduction import dumps
 
-from consistency.bench.filters.recorder import RunRecord
-from consistency.bench.filters.stepping import error_of, name_of, reason_of, rejects
+from consistency.bench.filters.stepping import RunRecord, error_of, name_of, reason_of, rejects
 from consistency.bench.runs.remote_batch import BatchResult, do_batch, require_same_versions
 from consistency.bench.runs.trial_work import Outcomes, TrialWork
 from consistency.bench.store.trial_rows import RunOutcome, outcome_of
@@ -172,7 +171,7 @@ def _result_of(future: Future[BatchResult]) -> BatchResult | str:
 
 
 def _refuse(error: Exception) -> NoReturn:
-    """Say that the executor has ended; like a full disk it is no fault of the runs, which a resume does."""
+    """Say that the executor has ended; like a full disk it is not a fault of the runs, which a resume does."""
     raise InputError(f"the executor has ended ({reason_of(error)})") from ConnectionError(str(error))
 
 

@@ -181,7 +181,7 @@ def place_for(
                 if new.is_placed or not finished or not isinstance(error.__cause__, OSError):
                     raise
                 raise InputError(
-                    f"{error}; {finished} finished runs are kept, and the same command with --resume goes on"
+                    f"{error}; {finished} finished runs are kept, and the same command with --resume continues"
                 ) from error.__cause__
             finally:
                 unfinished.is_over = new.is_placed
@@ -207,7 +207,7 @@ def _place(
 
 
 def _require_same(study: Mapping[str, Any], before: Mapping[str, Any]) -> None:
-    """Refuse to go on from runs of something else; a study of a fixed number of runs has no plan that could differ."""
+    """Refuse to continue from runs of something else; a study with a fixed number of runs has no plan to differ."""
     for key, text in KEYS.items() if before else ():
         now, then = study.get(key), before.get(key, {} if key == "error" else None)
         if now != then and not (key == PLAN and None in (now, then)):

@@ -1,4 +1,4 @@
-"""Kernels compiled before they are needed: which are missing, how long that will take, several side by side."""
+"""Kernels compiled before they are needed: which are missing, and several side by side."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from consistency.referee.system import progress
 from consistency.referee.system.stopping import away_from_signals, end_with_parent, link_to_parent
 
 NAMED = 3  # filters that are named where several are compiled
+EACH = "10 to 60 s for each"
 Wanted = tuple[Filter, Trial, Belief]  # a filter, and a trial that it is to run on
 
 
@@ -41,7 +42,7 @@ class Need(NamedTuple):
 
 
 def compile_all(wanted: Iterable[Wanted], jobs: int = 1) -> list[Need]:
-    """Compile each kernel that is not yet compiled, once, and say how long it will take.
+    """Compile each kernel that is not yet compiled, once, and say so before.
 
     Parameters
     ----------
@@ -82,10 +83,10 @@ def _compile(missing: Sequence[Need], jobs: int) -> None:
     workers = min(jobs, len(shared))
     if disk_cache.folder_fault():
         workers = 1
-    with progress.foreseen(_label(missing), _wall([need.outlook.seconds for need in missing], max(workers, 1))):
-        if workers > 1:
-            _compile_side_by_side(shared, workers)
-        away_from_signals(_compile_here, missing)
+    progress.announce(f"{_label(missing)}, once: {EACH}")
+    if workers > 1:
+        _compile_side_by_side(shared, workers)
+    away_from_signals(_compile_here, missing)
 
 
 def _compile_here(needs: Sequence[Need]) -> None:
@@ -102,25 +103,18 @@ def _label(missing: Sequence[Need]) -> str:
     return f"compiling {len(missing)} kernels of {', '.join(names[:NAMED])}{more}"
 
 
-def _wall(seconds: Sequence[float], workers: int) -> float:
-    """Seconds for all of them: the first of each process in full, as later ones share functions with it."""
-    longest = sorted(seconds, reverse=True)
-    total = sum(longest[:workers]) + disk_cache.AGAIN * sum(longest[workers:])
-    return max(longest[0], total / workers)
-
-
 # --- side by side ---------------------------------------------------------------------------------
 
 
 def _compile_side_by_side(needs: Sequence[Need], workers: int) -> None:
     """Compile in processes, which keep kernels on disk; what they fail at is said where it is compiled again."""
     context = get_context("loky")
-    longest_first = sorted(needs, key=lambda need: need.outlook.seconds, reverse=True)
+    largest_first = sorted(needs, key=lambda need: need.outlook.size, reverse=True)
     initargs = link_to_parent(context)
     pool = ProcessPoolExecutor(workers, context=context, initializer=_begin_compiler, initargs=initargs)
     try:
         with contextlib.suppress(Exception):  # no more processes, or a filter that cannot be sent
-            wait([pool.submit(_compile_one, _pickled(need)) for need in longest_first])
+            wait([pool.submit(_compile_one, _pickled(need)) for need in largest_first])
     finally:
         pool.shutdown(kill_workers=True)
 

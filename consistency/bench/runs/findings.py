@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -133,6 +134,22 @@ def experiments() -> dict[str, ModuleType]:
     if not folder.is_dir():
         raise InputError(f"{folder}: the experiments are missing; install the package again")
     return {path.stem: _load(path) for path in sorted(folder.glob("e[0-9][0-9]_*.py"))}
+
+
+@cache
+def figure_scripts() -> dict[str, ModuleType]:
+    """Scripts of ``experiments/figures/`` by name, each a chapter of a report on the tables that experiments leave.
+
+    A script has CHAPTER (anchor, title, entry in the contents), ``blocks(report)``, empty without its tables, and
+    ON_PAPER: whether the PDF of several studies has it, too.
+
+    Raises
+    ------
+    InputError
+        A script cannot be imported.
+    """
+    folder = data_folder("experiments") / "figures"
+    return {path.stem: _load(path) for path in sorted(folder.glob("*.py"))}
 
 
 def _load(path: Path) -> ModuleType:

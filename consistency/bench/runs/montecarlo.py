@@ -1,4 +1,4 @@
-"""Monte Carlo studies: trials through filters, in parallel, with the same bits for any number of workers."""
+"""Monte Carlo studies: filters on trials, in parallel, with the same bits for any number of workers."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.local_threads import LocalThreads
 from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork, Workers
 from consistency.bench.scenario import Belief, Scenario
-from consistency.bench.scenario.tables.toml_tables import UNITS
+from consistency.bench.scenario.toml_tables import UNITS
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.bench.store.journal import Journal
-from consistency.bench.store.log import Log, write_log
-from consistency.bench.store.log_tables import require_format
+from consistency.bench.store.log import Log, require_format, write_log
 from consistency.bench.store.results import Results, StoredResults, Tables
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
@@ -70,7 +69,7 @@ def run_trials(
     jobs : workers; -1 for one per core. Compiled filters share threads, each other filter has processes of its own.
         An ``executor`` has workers of its own
     timeout : seconds per trial, after which the process of a filter that is not compiled is killed
-    previous : results of the same scenario, filters and seed to go on from; its runs are not done again
+    previous : results of the same scenario, filters and seed to continue from; its runs are not done again
     out : folder for the results, which appears as a whole at the end. Finished runs are kept in a journal beside it
         as they come, so that memory does not grow with the runs, and none is lost, whatever ends the process
     overwrite : replace ``out``, where it is an output folder of this bench, and drop unfinished work on it; that of
@@ -203,7 +202,7 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief, log: str | 
             hint = (
                 "give an object of it, with ()" if isinstance(filter_, type) else "it needs init, predict, update, pose"
             )
-            raise InputError(f"{filter_!r} is no filter: {hint}")
+            raise InputError(f"{filter_!r} is not a filter: {hint}")
     names = [name_of(f) for f in instances]
     if len(set(names)) < len(names):
         raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")

@@ -221,7 +221,7 @@ def map_of(
         judged = np.isfinite(rows["nees"])
         if not judged.any():
             return None
-        some: Any = slice(None) if judged.all() else judged  # a slice is no copy
+        some: Any = slice(None) if judged.all() else judged  # a slice is not a copy
         runs, row = np.unique(rows["run"][some], return_inverse=True)
         labels, column = np.unique(rows["landmark"][some], return_inverse=True)
         nees = np.full((len(runs), len(labels)), np.nan)

@@ -15,7 +15,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from consistency.bench.scenario.effects import LocalBias
 from consistency.bench.scenario.sensor import BelievedSensor
-from consistency.bench.scenario.tables.toml_tables import UNITS, Count, Finite, NonNegative, Positive, Table, read_table
+from consistency.bench.scenario.toml_tables import UNITS, Count, Finite, NonNegative, Positive, Table, read_table
 from consistency.bench.scenario.truth import Truth
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_folder, one_line
@@ -162,7 +162,7 @@ def load_scenario(name: str | Path) -> Scenario:
 
 
 def misbelief(scenario: Scenario) -> str:
-    """What the belief has otherwise than the truth, and the remedy, in one clause; empty where the belief is right.
+    """In what the belief differs from the truth, and the remedy, in one clause; empty where the belief is right.
 
     A bias map must be believed if it is the case. Other effects that make observations err are in no belief.
     """

@@ -181,7 +181,7 @@ class Unfinished:
 
     Parameters
     ----------
-    resume : go on with what is there
+    resume : continue with what is there
     overwrite : drop what is there
     kind : of the output folder
 
@@ -223,7 +223,7 @@ class Unfinished:
             self._leave()
             raise InputError(
                 f"--out {out}: unfinished work is there, with {len(self.journal.runs)} finished runs; add --resume to "
-                "the same command to go on, or --overwrite to drop it"
+                "the same command to continue, or --overwrite to drop it"
             )
 
     def __enter__(self) -> Unfinished:

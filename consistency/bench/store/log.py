@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -11,11 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-import tomli_w
+import pyarrow as pa
+import pyarrow.csv as pa_csv
 
 from consistency.bench.scenario import (
     Belief,
     BelievedMotion,
+    BelievedSensor,
     Finite,
     GuardSettings,
     PicturedSensor,
@@ -24,15 +26,76 @@ from consistency.bench.scenario import (
     read_table,
     toml_text,
 )
-from consistency.bench.scenario.tables.toml_tables import SIGMA_UNITS
+from consistency.bench.scenario.toml_tables import SIGMA_UNITS
 from consistency.bench.store.folder_tables import write_tables
-from consistency.bench.store.log_tables import read_table_file, require_format, table_file
+from consistency.bench.store.parquet import OPTIONAL, check_column, read_parquet, require_table
 from consistency.bench.store.trial_rows import controls_table, observations_table, stacked_table, truth_columns
 from consistency.bench.types import Trial
 from consistency.referee.column_names import COLUMNS, POSE
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import reading
+from consistency.referee.parsing import is_file, reading, require_room
 from consistency.referee.types import Array, Indices
+
+FORMATS = ("parquet", "csv")
+DAMAGED = "cannot be read as CSV; needs a header, and in each row as many numbers, with commas between them"
+
+
+def require_format(form: str) -> None:
+    """Refuse a form of tables that is none of ``FORMATS``."""
+    if form not in FORMATS:
+        raise InputError(f"--format {form}: must be {' or '.join(FORMATS)}")
+
+
+def table_file(folder: Path, name: str) -> Path:
+    """Where a table of a log is, or would be: NAME.parquet, or NAME.csv where that is there.
+
+    Raises
+    ------
+    InputError
+        Both are there.
+    """
+    paths = [folder / f"{name}.{form}" for form in FORMATS]
+    there = [path for path in paths if path.exists()]
+    if len(there) > 1:
+        raise InputError(f"{folder}: holds {there[0].name} and {there[1].name}; take one of them away")
+    return there[0] if there else paths[0]
+
+
+def read_table_file(folder: Path, name: str, also: Sequence[str] = ()) -> pd.DataFrame:
+    """One table of numbers, checked: its columns and those in ``also``, types, no NaN where none is allowed.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged, lacks a column or holds what the column may not.
+    """
+    path = table_file(folder, name)
+    if path.suffix == ".parquet":
+        require_table(folder, name, also)
+        return read_parquet(folder, name)
+    if not is_file(path):
+        raise InputError(f"{path}: is not a file")
+    names = _header(path)
+    needed = dict.fromkeys((*COLUMNS[name], *also))
+    if missing := [column for column in needed if column not in names]:
+        raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(needed)}")
+    if twice := [column for column in names if names.count(column) > 1]:
+        raise InputError(f"{path}: column '{twice[0]}' is duplicated")
+    kinds = COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in names}
+    with reading(path, DAMAGED):
+        convert = pa_csv.ConvertOptions(include_columns=list(kinds), column_types=dict.fromkeys(kinds, pa.float64()))
+        read = pa_csv.read_csv(path, convert_options=convert)
+        require_room(path, read.nbytes)
+        table: pd.DataFrame = read.to_pandas()
+    for column, kind in kinds.items():
+        check_column(path, table[column], kind)
+    return table.astype(kinds)
+
+
+def _header(path: Path) -> list[str]:
+    with reading(path, DAMAGED), path.open(encoding="utf-8-sig") as file:
+        return [name.strip('"') for name in file.readline(2**16).strip().split(",")]
+
 
 STRAY = 0.05  # share of pixels that gross errors may put outside the image; other units put more there
 View = tuple[tuple[int, int], tuple[float, float]]  # image (width, height) and principal point (column, row), px
@@ -64,7 +127,7 @@ class Log:
     belief: Belief
     landmarks: pd.DataFrame | None
     sha256: dict[str, str] = field(default_factory=dict)  # of the files, for the manifest of what is made of them
-    screening: dict[str, Any] | None = None  # gate and counts, where landmarks begin anew off the common motion
+    screening: dict[str, Any] | None = None  # gate and counts, where landmarks restart off the common motion
 
 
 def read_log(folder: str | Path) -> Log:
@@ -140,7 +203,7 @@ def write_log(
         tables["truth"] = stacked_table("truth", parts)
     if landmarks is not None:
         tables["landmarks"] = landmarks
-    texts = {"sensor.toml": tomli_w.dumps(_sensor_file(belief, trials[0].start, view)), **files}
+    texts = {"sensor.toml": _sensor_file(belief, trials[0].start, view), **files}
 
     def contents(at: Path) -> None:
         for name, text in texts.items():
@@ -165,22 +228,21 @@ def sensor_text(folder: Path, belief: Belief) -> str:
     return toml_text(changed.model_dump(mode="json", exclude_none=True))
 
 
-def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, object]:
-    sensor = belief.sensor.model_dump(exclude_none=True)
-    unit = f"sigma{SIGMA_UNITS[belief.sensor.model]}"
-    return {
-        "model": sensor["model"],
-        unit: list(sensor["sigma"]),
-        **{key: sensor[key] for key in ("f", "B") if key in sensor},
-        **({"disparity": list(sensor["disparity"])} if "disparity" in sensor else {}),
-        **{key: sensor[key] for key in ("disparity_growth", "bias") if key in sensor},
-        **({"image": list(view[0]), "principal_point": list(view[1])} if view else {}),
-        "mount": {key: list(value) for key, value in sensor["mount"].items()},
-        "motion": belief.motion.model_dump(),
-        "start": dict(zip(POSE, map(float, start), strict=True)),
-        "sigma_points": belief.sigma_points.model_dump(),
-        **({} if belief.guard is None else {"guard": belief.guard.model_dump(exclude_none=True)}),
-    }
+def sensor_keys(sensor: BelievedSensor) -> dict[str, Any]:
+    """Keys of ``sensor.toml`` that say what a sensor is believed to be."""
+    keys = sensor.model_dump(mode="json", exclude_none=True)
+    return {"model": keys.pop("model"), f"sigma{SIGMA_UNITS[sensor.model]}": keys.pop("sigma"), **keys}
+
+
+def _sensor_file(belief: Belief, start: Array, view: View | None) -> str:
+    keys = sensor_keys(belief.sensor)
+    if view is not None:
+        keys |= {"image": view[0], "principal_point": view[1]}
+    keys |= {"motion": belief.motion.model_dump(), "start": dict(zip(POSE, map(float, start), strict=True))}
+    keys["sigma_points"] = belief.sigma_points.model_dump()
+    if belief.guard is not None:
+        keys["guard"] = belief.guard.model_dump(exclude_none=True)
+    return toml_text(keys)
 
 
 def _observations(folder: Path, sensor: SensorFile) -> pd.DataFrame:
@@ -202,7 +264,7 @@ def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, bel
     if observations.empty:
         raise InputError(f"{path}: holds no observation; no landmark was ever in view")
     twice = observations.duplicated(["run", "step", "landmark"])
-    _refuse(path, twice, "row {}: this landmark is there twice in one step")
+    _refuse(path, twice, "row {}: this landmark is duplicated in one step")
     known = pd.MultiIndex.from_frame(controls[["run", "step"]])
     stray = ~pd.MultiIndex.from_frame(observations[["run", "step"]]).isin(known)
     _refuse(path, stray, f"row {{}}: {table_file(folder, 'controls').name} has no such run and step")
@@ -233,7 +295,7 @@ def _check_pixels(folder: Path, observations: pd.DataFrame, sensor: SensorFile) 
 
 
 class _Names(NamedTuple):
-    """Numbers in the files: those of landmarks, sorted, and those of things that are no landmark, sorted."""
+    """Numbers in the files: those of landmarks, sorted, and those of things that are not landmarks, sorted."""
 
     landmarks: Indices
     things: Indices
@@ -262,8 +324,8 @@ def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | N
 def _positions(folder: Path, landmarks: pd.DataFrame | None, names: _Names, belief: Belief) -> Array | None:
     if belief.sensor.model == "linear" and len(names.things):
         raise InputError(
-            f"{table_file(folder, 'observations')}: column 'landmark': {names.things[0]} is no landmark, and a linear "
-            "world needs one that it is linearised about"
+            f"{table_file(folder, 'observations')}: column 'landmark': {names.things[0]} is not a landmark, and a "
+            "linear world needs one that it is linearised about"
         )
     path, labels = table_file(folder, "landmarks"), names.landmarks
     if landmarks is None:
@@ -272,7 +334,7 @@ def _positions(folder: Path, landmarks: pd.DataFrame | None, names: _Names, beli
         return None
     table = landmarks.set_index("landmark")[["x", "y", "z"]]
     if table.index.has_duplicates:
-        raise InputError(f"{path}: column 'landmark': every landmark may stand there once")
+        raise InputError(f"{path}: column 'landmark': every landmark may be listed once")
     if missing := sorted(set(labels) - set(table.index)):
         raise InputError(f"{path}: landmark {missing[0]} of observations.parquet is not there")
     return table.loc[list(labels)].to_numpy(float)

@@ -179,13 +179,13 @@ def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
     """The opened file of a table, refused where it is missing, damaged or lacks a column, those in ``also`` too."""
     path = folder / f"{name}.parquet"
     if not is_file(path):
-        raise InputError(f"{path}: {'is no file' if path.exists() else 'missing'}; write the folder again")
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'missing'}; write the folder again")
     file = open_parquet(path)
     needed, names = dict.fromkeys((*COLUMNS[name], *also)), file.schema_arrow.names
     if missing := [column for column in needed if column not in names]:
         raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(needed)}")
     if twice := [column for column in needed if names.count(column) > 1]:
-        raise InputError(f"{path}: column '{twice[0]}' is there twice")
+        raise InputError(f"{path}: column '{twice[0]}' is duplicated")
     return file
 
 
@@ -242,7 +242,7 @@ def are_no_numbers(cells: pd.Series[Any]) -> Array:
 
 
 def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
-    """Refuse what is no number; ``first`` is the row of the file that the column begins with."""
+    """Refuse what is not a number; ``first`` is the row of the file that the column begins with."""
     import pandas as pd
 
     with reading(path, f"column '{column.name}' cannot be read as numbers"):

@@ -49,7 +49,7 @@ class _Manifest(BaseModel):
     @classmethod
     def _each_once(cls, names: list[str]) -> list[str]:
         if len(set(names)) < len(names):
-            raise ValueError("a name is there twice")
+            raise ValueError("a name is duplicated")
         for name in names:
             require_name(name, "its names")
         return names
@@ -74,7 +74,9 @@ def require_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     if tables != set(keys.tables):
         raise InputError(f"{path}: key 'tables' lacks '{min(tables - set(keys.tables))}'; {AGAIN}")
     if unknown := sorted(set(keys.optimal_gain) - set(keys.filters)):
-        raise InputError(f"{path}: key 'optimal_gain': '{one_line(unknown[0])}' is no filter of these results; {AGAIN}")
+        raise InputError(
+            f"{path}: key 'optimal_gain': '{one_line(unknown[0])}' is not a filter of these results; {AGAIN}"
+        )
     if not keys.complete and keys.finished_runs is None:
         raise InputError(f"{path}: key 'finished_runs': missing, but 'complete' is false; {AGAIN}")
 
@@ -115,7 +117,7 @@ def require_rows(
     if rejections is not None:
         _require_rejections(folder / "rejections.parquet", rejections, there, failed)
     if landmarks is not None and landmarks["landmark"].duplicated().any():
-        raise InputError(f"{folder / 'landmarks.parquet'}: column 'landmark': a landmark is there twice; {AGAIN}")
+        raise InputError(f"{folder / 'landmarks.parquet'}: column 'landmark': a landmark is duplicated; {AGAIN}")
 
 
 def _failed(path: Path, filters: Sequence[str], failures: pd.DataFrame, count: int) -> dict[str, Steps]:
@@ -125,7 +127,7 @@ def _failed(path: Path, filters: Sequence[str], failures: pd.DataFrame, count: i
     failed: dict[str, Steps] = {name: {} for name in filters}
     for name, run, step in zip(failures["filter"], failures["run"], failures["step"], strict=True):
         if name not in failed:
-            raise InputError(f"{path}: '{one_line(name)}' is no filter of these results; {AGAIN}")
+            raise InputError(f"{path}: '{one_line(name)}' is not a filter of these results; {AGAIN}")
         if run in failed[name] or run < 0 or step < 1:
             raise InputError(
                 f"{path}: run {run} of '{name}', step {step}: a run fails once, in step 1 or later; {AGAIN}"
@@ -204,7 +206,7 @@ def _require_maps(folder: Path, there: dict[str, Steps], failed: dict[str, Steps
         rows += len(table)
         if table.duplicated().any():
             run, landmark = table[table.duplicated()].iloc[0]
-            raise InputError(f"{path}: landmark {landmark:.0f} of run {run:.0f} of '{name}' is there twice; {AGAIN}")
+            raise InputError(f"{path}: landmark {landmark:.0f} of run {run:.0f} of '{name}' is duplicated; {AGAIN}")
         if strange := sorted(set(table["run"]) - (set(there[name]) - set(failed[name]))):
             raise InputError(f"{path}: '{name}' has no finished run {strange[0]:.0f}; {AGAIN}")
     _require_all_rows(folder, "map", rows)

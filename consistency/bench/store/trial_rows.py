@@ -152,12 +152,12 @@ def _nees(error: Array | None, P: Array, first: int) -> Array:
 
 
 def is_flat(covariance: Array) -> bool:
-    """Whether landmarks (K, 3, 3) are in a plane: their heights are no variables."""
+    """Whether landmarks (K, 3, 3) are in a plane: their heights are not variables."""
     return not covariance[:, 2].any()
 
 
 def _map_columns(trial: Trial, estimates: Estimates, map_: Map) -> Columns:
-    """Rows of ``map.parquet``; without NEES where the id is no landmark of the world, or its place is not known."""
+    """Rows of ``map.parquet``; without NEES where the id is not a landmark of the world, or its place is not known."""
     ids, count = map_.landmarks, len(map_.landmarks)
     nees, joint = np.full(count, np.nan), np.full(count, np.nan)
     if trial.landmarks is not None:

@@ -210,5 +210,5 @@ def result_from(numbers: Mapping[str, Any]) -> CellResult:
         elif isinstance(value, (int, float, str)):
             given[name] = float(value)
         else:
-            raise ValueError(f"'{name}' is no number")
+            raise ValueError(f"'{name}' is not a number")
     return CellResult(**given)

@@ -84,7 +84,7 @@ def _system_refusals(folder: SweepFolder) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(
-            f"--out {folder.path}: {error.strerror or error}; what is finished is there, and the same command goes on"
+            f"--out {folder.path}: {error.strerror or error}; what is finished is there, and the same command continues"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""The folder of a sweep: an atomic folder for each filter in each cell, so that it goes on where it was stopped."""
+"""The folder of a sweep: an atomic folder for each filter in each cell, so that it continues where it was stopped."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class SweepFolder:
             return result_from(read_manifest(path)["result"])
 
     def changed_input(self, work: CellWork) -> str:
-        """What the result that is there was made with otherwise than now, in words; empty where all is the same."""
+        """What the result that is there was made with and what differs now, in words; empty where all is the same."""
         path = self.place(work)
         before = read_manifest(path).get("inputs")
         if not isinstance(before, dict):

@@ -48,9 +48,9 @@ def judge(
     are white. Without truth they are judged alone.
 
     If a fit to the truth absorbed an unknown part of the errors (``Record.reduced``), a covariance that is too large
-    is no fault, as with ``allow="conservative"``. *Consistent* is still shown on both sides, after adding the largest
-    share of the NEES that the fit may have absorbed (``Record.unseen``). Questions that cannot be answered after the
-    fit (``Record.unavailable``) are not asked.
+    is not a fault, as with ``allow="conservative"``. *Consistent* is still shown on both sides, after adding the
+    largest share of the NEES that the fit may have absorbed (``Record.unseen``). Questions that cannot be answered
+    after the fit (``Record.unavailable``) are not asked.
 
     A map is judged likewise, with its landmarks in the place of steps (``Record.landmarks``) and with the NEES of
     pose and map together, where it is given.
@@ -234,7 +234,7 @@ def _judge_conventions(record: Record, settings: Settings, keep_record: bool) ->
 
 
 def look(design: Design, evidence: Record, spent: float | None) -> Verdict:
-    """The verdict at one inspection: `undecided` means that the runs go on.
+    """The verdict at one inspection: `undecided` means that the runs continue.
 
     A filter without truth is judged by its innovations, at looks only.
     """

@@ -104,7 +104,7 @@ def folds_of(
     Raises
     ------
     InputError
-        A name is no drive, or nothing is left to fit or to judge.
+        A name is not a drive, or nothing is left to fit or to judge.
     """
     every = np.arange(len(windows.drives))
     begin = np.zeros(len(every), np.int64)

@@ -162,7 +162,7 @@ def _why_open(fit: MeanFit) -> str:
     if fit.strength < STRONG:
         return f"neighbouring windows are weak instruments (F {short(fit.strength)}, below {STRONG:g})"
     if fit.lasts:
-        return "errors outlast a window, so that neighbouring windows are no instruments"
+        return "errors outlast a window, so that neighbouring windows are not instruments"
     return "neighbouring windows tell less than these"
 
 
@@ -190,7 +190,7 @@ def noise_lines(model: NoiseModel) -> Iterator[str]:
     """Limits of the model, what was left out, and what the referee says of the judged motions."""
     yield "; ".join(_limits_of_use(model))
     if model.noise.factor != 1.0:
-        yield f"cautious: all covariances are raised x{model.noise.factor:.3g}, so that a new drive seldom has more"
+        yield f"cautious: all covariances are raised x{model.noise.factor:.3g}, so that a new drive rarely has more"
     if shift := model.drives[0].shift:
         yield (f"clocks: {shift:.3g} s are added to the timestamps of the estimates, for which the motions agree best")
     if model.second is not None:

@@ -35,7 +35,7 @@ CONSTANT = 1e-6  # of a rotation matrix, by which placeholders differ at most
 FOLLOWS = 0.1  # of the way: steps agree by as much more in the body than in the world where the path turns with it
 FEW = 8  # windows that a mean square needs
 FAR, NEAR = 20, 1  # spans between two passes of a place, along the way at least and in space at most
-RARE = 0.002  # chance that white noise shows as much of a turned body, or as little between passes
+RARE = 0.002  # probability that white noise shows as much of a turned body, or as little between passes
 LIVE = "record the live odometry, before loops are closed or a map corrects it"
 
 
@@ -79,7 +79,7 @@ class BodyTurn(NamedTuple):
 
 
 def require_poses(drives: Sequence[Drive]) -> None:
-    """Refuse estimates or a truth that are no poses, but increments, or positions with placeholders of orientations."""
+    """Refuse estimates or a truth that are increments, or positions with placeholders of orientations."""
     for drive in drives:
         _require_poses(drive.name, "estimates", drive.estimate, drive.truth, "give --motions")
         _require_poses(drive.name, "truth", drive.truth, drive.estimate, "compound them to poses")
@@ -166,7 +166,7 @@ def require_sound(windows: DriveWindows, correct: bool) -> None:
     scale = fit_mean(windows).way
     if correct and not 1.0 / SCALE <= scale <= SCALE:
         raise InputError(
-            f"the true way is {scale:.3g} times the estimated one: the scale is not metric, as of a single camera; "
+            f"the true way is {scale:.3g} times the estimated one: the scale is not metric, as with a single camera; "
             "fit after the scale is known (stereo, inertial, wheels), or state it by a scale state"
         )
     closed = f": loops are closed, or a map is used, so that there are no increments; {LIVE}"

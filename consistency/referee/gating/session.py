@@ -81,7 +81,7 @@ class Ledger:
         return late
 
     def bound(self) -> float:
-        """Chance that any gate fails its test by a false alarm, at most; those that a test wants to fail cannot."""
+        """Largest probability that any gate fails its test by a false alarm; those that a test wants to fail cannot."""
         own = [e.false_alarm for e in self.entries() if not e.in_budget and not wanted(e)]
         return min(1.0, sum(own) + (self.budget or 0.0) * (self.rate is not None))
 
@@ -116,12 +116,12 @@ def needed_at(entry: Entry, rate: float) -> int:
 
 
 def ending(ledger: Ledger) -> str:
-    """How many gates, and the chance that any of them fails a test without a fault."""
+    """How many gates, and the probability that any of them fails a test without a fault."""
     entries = ledger.entries()
     bad, good = (sum(e.outcome != "passed" and wanted(e) == w for e in entries) for w in (False, True))
     text = f"{len(entries)} gate{'s' * (len(entries) != 1)}, {bad} failed"
     text += f", {good} failed as expected" if good else ""
-    text += f"; chance that any fails without a fault at most {ledger.bound():.3g}"
+    text += f"; probability that any fails without a fault at most {ledger.bound():.3g}"
     if ledger.rate is not None:
         text += f" (budget {ledger.budget:g}: {ledger.rate:.3g} for a gate)"
     return text

@@ -77,7 +77,7 @@ def read(
     windows : "independent" declares errors of different windows independent, so that each is a run
     align : none, origin, posyaw, posyaw-all, se3 or se3-all: how estimates are moved into the world of the truth
     lever_arm : of a truth of positions alone: its point in the axes of the estimated body, x, y, z, m
-    split : cut one long log into so many pieces, which stand as runs; "auto" takes the advised number
+    split : split one long log into so many pieces treated as independent runs; "auto" takes the advised number
     truth_covariance : of the truth itself, in the convention of the error: "columns" of its file, or a file of t and 36
         or 21 numbers
     truth_errors : how errors of the truth depend on each other: "independent", "per-run", or "common" to all runs; with

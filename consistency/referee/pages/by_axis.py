@@ -154,5 +154,5 @@ def axis_caption(study: Judged, found: tuple[Forest, ...]) -> str:
         text += " Coverage: share of runs within 2 sigma, in one step of each; 95.4 % is right."
     return (
         f"{text} Bars: 95 % intervals, of ratio and bias for all axes at once, of coverage exact for each axis; an "
-        "arrow goes on beyond the drawn range. The questions decide, not the bars."
+        "arrow continues beyond the drawn range. The questions decide, not the bars."
     )

@@ -40,7 +40,7 @@ def monitor_drawing(shown: Watched | Sequence[GateRatios]) -> Drawing:
 
 
 def _draw_ratios(axes: Axes, each: GateRatios) -> None:
-    """Test ratios of a sensor over time, the gate, and what a right filter seldom exceeds."""
+    """Test ratios of a sensor over time, the gate, and what a right filter rarely exceeds."""
     points(axes, each.t, each.ratio, EACH, limit=LONG)
     for at, look in ((1.0, LIMIT), (each.unusual, EXPECTED)):
         if np.isfinite(at):
@@ -61,7 +61,7 @@ def _draw_sizes(axes: Axes, watched: Watched) -> None:
 def _draw_evidence(axes: Axes, watched: Watched) -> None:
     """E-value after each step with the value at which an alarm is raised; since the fault it is shaded.
 
-    What goes on beyond the square of that value is cut off.
+    What continues beyond the square of that value is cut off.
     """
     threshold, alarm = watched.monitor.threshold, watched.alarm
     clock, label = _clock(watched)

@@ -26,7 +26,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.gating.checked_arrays import planned_dof, rate_shares
 from consistency.referee.programs.process import Processes, Stopped, run_program
 from consistency.referee.programs.study_folder import new_folder, opened, require_usable, write_manifest
-from consistency.referee.programs.words import Program, seed_of
+from consistency.referee.programs.words import OF_A_RUN, Program, seed_of
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.kinds import found_in
 from consistency.referee.readers.pipeline.program_runs import (
@@ -34,6 +34,8 @@ from consistency.referee.readers.pipeline.program_runs import (
     ProgramRun,
     ProgramStudy,
     Runs,
+    filled,
+    is_recorded,
     kind_of_failure,
     log_lines,
     runs_in,
@@ -102,6 +104,9 @@ def run_study(
     """
     r = _required(plan, reading or Reading())
     require_usable(out, resume, overwrite)
+    _require_paths(program, plan, estimates, r)
+    if resume and not out.exists():
+        say(f"consistency: --resume: {out} is not there yet; all runs are done")
     out = Path(os.path.abspath(out))
     program.warn_of_relative_paths()
     if not program.uses_run:
@@ -121,6 +126,8 @@ def _required(plan: Plan, r: Reading) -> Reading:
     """The options, checked before any work."""
     if plan.runs is not None and plan.runs < 1:
         raise InputError(f"--runs must be at least 1, got {plan.runs}")
+    if plan.seed < 0:
+        raise InputError(f"--seed must be 0 or more, got {plan.seed}")
     if plan.jobs == 0 or plan.jobs < -1:
         raise InputError(f"--jobs must be at least 1, or -1 for one a core, got {plan.jobs}")
     if plan.timeout is not None and not 0.0 < plan.timeout < 1e9:
@@ -138,6 +145,27 @@ def _required(plan: Plan, r: Reading) -> Reading:
     if os.name == "nt":
         raise InputError("monte-carlo needs process groups of POSIX; on Windows run it in WSL")
     return checked_options(r)
+
+
+def _require_paths(program: Program, plan: Plan, estimates: str, r: Reading) -> None:
+    """Refuse one file for all runs, a placeholder without its option, and a truth that is not where it should be."""
+    if not plan.inputs and any("{input}" in word for word in program.words):
+        raise InputError("{input} in the command needs --each 'FILES'")
+    here = {"here": str(program.here)}
+    if Path(filled(estimates, here)).is_absolute() and not any(part in estimates for part in OF_A_RUN):
+        raise InputError(f"--estimates {estimates}: is one file for all runs; let the program write into {{out}}")
+    for name in PATHS:
+        path = getattr(r, name)
+        if path is None:
+            continue
+        inputs = [here | {"input": str(each), "name": each.stem} for each in plan.inputs]
+        if not is_recorded(str(path)):
+            inputs = [here] if Path(filled(str(path), here)).is_absolute() else []
+        found = [program.here / filled(str(path), values) for values in inputs]
+        missing = [each for each in found if "{" not in str(each) and not each.exists()]
+        if missing:
+            more = f" (nor are {len(missing) - 1} others)" if len(missing) > 1 else ""
+            raise InputError(f"--{name}: {missing[0]} is not there{more}")
 
 
 def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[str, Any]:
@@ -282,8 +310,8 @@ class _Loop:
             self.next_look = next(self.counts)
             self.total = self.plan.max_runs
             self.fields |= {"until_decided": looked}
-        elif self.total is None:
-            self.total = planned
+        else:
+            self.total = max(self.total or planned, len(runs_in(self.study.folder)))
         self.fields |= {"runs": self.total}
         write_manifest(self.study.folder, self.fields)
         self.advance = stack.enter_context(progress("runs", self.total or planned))

@@ -21,11 +21,11 @@ from consistency.referee.system.provenance import manifest_of
 
 LOCK = ".lock"
 SAME = {  # keys of the manifest that a resumed study must have, and what they are called
-    "words": "the words of the command",
-    "files": "a file that they name",
-    "seed": "--seed",
-    "inputs": "the files of --each",
-    "cwd": "--cwd",
+    "words": "the words of the command have",
+    "files": "{} has",
+    "seed": "--seed has",
+    "inputs": "the files of --each have",
+    "cwd": "--cwd has",
 }
 
 
@@ -35,10 +35,10 @@ def require_usable(folder: Path, resume: bool, overwrite: bool) -> None:
     Raises
     ------
     InputError
-        It exists without ``resume`` or ``overwrite``, is no folder of this command, or cannot be written.
+        It exists without ``resume`` or ``overwrite``, is not a folder of this command, or cannot be written.
     """
     if resume and overwrite:
-        raise InputError("--resume goes on with what --overwrite would replace; give one of them")
+        raise InputError("--resume continues with what --overwrite would replace; give one of them")
     try:
         there = folder.exists() or folder.is_symlink()
     except (OSError, ValueError) as error:
@@ -52,9 +52,9 @@ def require_usable(folder: Path, resume: bool, overwrite: bool) -> None:
 
 
 def _is_begun(folder: Path) -> bool:
-    """Whether a folder is that of a command that was killed before it wrote a manifest."""
+    """Whether a folder is empty, or that of a command that was killed before it wrote a manifest."""
     names = [path.name for path in folder.iterdir()]
-    return LOCK in names and all(name == LOCK or name.endswith(PARTIAL) for name in names)
+    return all(name == LOCK or name.endswith(PARTIAL) for name in names)
 
 
 @contextmanager
@@ -119,12 +119,12 @@ def _require_same(before: ProgramStudy, manifest: Mapping[str, Any]) -> None:
     """Refuse to resume another study."""
     for key, what in SAME.items():
         if before.manifest.get(key) != manifest.get(key):
-            changed = _changed(before.manifest.get(key), manifest.get(key))
-            raise InputError(f"--resume: {what} changed since the runs in {before.folder}{changed}; use --overwrite")
+            what = what.format(_changed(before.manifest.get(key), manifest.get(key)))
+            raise InputError(f"--resume: {what} changed since the runs in {before.folder}; use --overwrite")
 
 
 def _changed(old: Any, new: Any) -> str:
-    """Which file changed, where there are several."""
+    """Which file changed."""
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return ""
-    return f" ({next(name for name in {**old, **new} if old.get(name) != new.get(name))})"
+    return str(next(name for name in {**old, **new} if old.get(name) != new.get(name)))

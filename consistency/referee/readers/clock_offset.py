@@ -21,7 +21,7 @@ PARTS = 12  # that a single run is cut into
 CAP = 100.0  # NEES over its degrees of freedom, beyond which an estimate counts no more: a broken one decides nothing
 GROSS = 4.0  # mean NEES over its degrees of freedom that a right single run hardly has
 ROUNDS, SETTLED = 5, 1e-4  # of clocks and frames in turn, and the change of the offset, s, that ends them
-RATE = 1e-4  # chance that an offset is named where there is none
+RATE = 1e-4  # probability that an offset is named where there is none
 LEAST = 0.01  # share of the NEES that it makes, at least
 
 

@@ -65,48 +65,49 @@ def _option(
 class Reading:
     """Options of files; None leaves one to the kind of file. :func:`consistency.read` describes them."""
 
-    truth: Path | None = _option("Truth of the estimates, in the same form, or a KITTI drive's folder.")
+    truth: Path | None = _option("Truth of the estimates, in the same form, or the folder of a KITTI drive.")
     covariance: Path | None = _option("Covariances of a TUM trajectory: t and 36 or 21 numbers.")
     error: str | None = _option(
-        "Error that the covariance is of: so2, vector, left, right, so3, so3-body, additive, or guess."
+        "Error definition the covariance refers to: so2, vector, left, right, so3, so3-body, additive, or guess."
     )
-    state: Sequence[str] | None = _option("Columns that make up the state [x,y,heading].", "A,B,C", _names)
+    state: Sequence[str] | None = _option("Columns of the state [x,y,heading].", "A,B,C", _names)
     covariance_order: str | None = _option(
-        "translation-rotation [default], rotation-translation, or blocks of p, R, v, bg, ba, as p,v,R."
+        "Order of the covariance: translation-rotation [default], rotation-translation, or blocks of p, R, v, bg, ba "
+        "such as p,v,R."
     )
-    max_dt: float | None = _option(f"Seconds between an estimate and its truth at most [{MAX_DT:g}].")
-    time_offset: float | str | None = _option("Seconds to add to the estimates' timestamps.", "S|estimate", _seconds)
+    max_dt: float | None = _option(f"Maximum time between an estimate and its truth, s [{MAX_DT:g}].")
+    time_offset: float | str | None = _option(
+        "Seconds to add to the timestamps of the estimates.", "S|estimate", _seconds
+    )
     axes: Sequence[str] | None = _option(
-        "Components of a trajectory to judge, as x,y,yaw; names here, a number in fit-covariance.", "A,B,C", _names
+        "Components of a trajectory to judge, such as x,y,yaw; in fit-covariance a number.", "A,B,C", _names
     )
-    topic: str | None = _option("Of a ROS bag: Odometry or PoseWithCovarianceStamped.")
-    truth_topic: str | None = _option("Of a ROS bag: poses, or PARENT:CHILD, frames of /tf.")
-    body: str | None = _option("Of a KITTI drive as truth: imu [default], velodyne or camera.")
+    topic: str | None = _option("Topic of the estimates in a ROS bag: Odometry or PoseWithCovarianceStamped.")
+    truth_topic: str | None = _option("Topic of the truth in a ROS bag: poses, or PARENT:CHILD, two frames of /tf.")
+    body: str | None = _option("Body that a KITTI drive as truth refers to: imu [default], velodyne or camera.")
     relative: str | float | None = _option(
         "Judge motions over windows: N steps, seconds (10s), metres (50m).", "N|Ns|Nm", str
     )
     motions: bool | None = _option(
-        "With --relative: each row is a motion with a covariance of its own.", flag="--motions/"
+        "Read each row as a motion with its own covariance (with --relative).", flag="--motions/"
     )
-    windows: str | None = _option("'independent': errors of windows are, so that each is a run.")
+    windows: str | None = _option("'independent': treat each window as an independent run.")
     align: str | None = _option(
         "Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
         "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
         "MODE",
     )
     lever_arm: Sequence[float] | None = _option(
-        "Of a truth of positions alone: its point in the axes of the body, m.", "X,Y,Z", _lengths
+        "Point that a truth of positions measures, in the axes of the body, m.", "X,Y,Z", _lengths
     )
     split: str | int | None = _option(
-        "Cut one long log into pieces that stand as runs: their number, or 'auto'.", "auto|N", str
+        "Split one long log into N pieces treated as independent runs, or 'auto'.", "auto|N", str
     )
     truth_covariance: str | None = _option(
-        "Covariance of the truth: 'columns' of its file, or a file of t and 36 or 21.", "columns|FILE"
+        "Covariance of the truth: 'columns' of its file, or a file of t and 36 or 21 numbers.", "columns|FILE"
     )
-    truth_errors: str | None = _option(
-        "How errors of the truth depend on each other: independent, per-run or common to all runs."
-    )
-    truth_shared: bool | None = _option("The estimator has fused the truth.", flag="--truth-shared/")
+    truth_errors: str | None = _option("Dependence of the truth's errors: independent, per-run, or common to all runs.")
+    truth_shared: bool | None = _option("Declare that the estimator has fused the truth.", flag="--truth-shared/")
     by: str | None = _option("Judge groups by this column, too: bins of numbers, or words.", "COLUMN")
     by_file: Path | None = _option("Table with that column and t, run or both.")
     bins: int | Sequence[float] | None = _option(

@@ -68,7 +68,7 @@ def assemble(
     t : (steps,), s, NaN where a step has no time
     axes : names of the components of the error
     file : where the estimates are from, for messages
-    may_end : a run that ends before the others is no sign of a broken filter
+    may_end : a run that ends before the others is not a sign of a broken filter
 
     Raises
     ------
@@ -131,7 +131,7 @@ def with_failed_runs(record: Record, failed: Mapping[int, str]) -> Record:
 
 
 def _require_different(file: str, tracks: Sequence[Track]) -> None:
-    """Refuse a run that is there twice: the verdict counts runs that share no noise."""
+    """Refuse a run that is duplicated: the verdict counts runs that share no noise."""
     seen: dict[bytes, Track] = {}
     for track in tracks:
         if track.error is None or len(track.error) < 2 or not np.nan_to_num(track.error).any():
@@ -139,8 +139,8 @@ def _require_different(file: str, tracks: Sequence[Track]) -> None:
         other = seen.setdefault(hashlib.sha256(np.ascontiguousarray(track.error).tobytes()).digest(), track)
         if other is not track:
             raise InputError(
-                f"{file}: the errors from {track.place[0]} on are those from {other.place[0]} on to the last digit: a "
-                "run that is there twice; leave one of them out"
+                f"{file}: the runs that start at {other.place[0]} and {track.place[0]} are identical; "
+                "remove the duplicate"
             )
 
 

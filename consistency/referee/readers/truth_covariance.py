@@ -24,7 +24,7 @@ REFUSED = {
 
 
 def require_truth_options(r: Reading) -> None:
-    """Refuse declarations that are unknown, or an uncertain truth where its errors enter otherwise than once a step.
+    """Refuse declarations that are unknown, or an uncertain truth where its errors do not enter once in each step.
 
     Raises
     ------
@@ -64,8 +64,8 @@ def declared(records: Sequence[Record], r: Reading) -> list[Record]:
         if len(wrong):
             run, step = wrong[0]
             raise InputError(
-                f"{record.name}: the covariance of the truth in run {record.run_numbers[run]}, step {step + 1} is no "
-                "covariance: it is not symmetric, or negative in some direction"
+                f"{record.name}: the covariance of the truth in run {record.run_numbers[run]}, step {step + 1} is not "
+                "a covariance: it is not symmetric, or negative in some direction"
             )
         missing = int((np.isnan(P).any(axis=(2, 3)) & np.isfinite(record.nees)).sum()) if record.nees is not None else 0
         if missing and not np.isfinite(P).any():

@@ -184,8 +184,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / "manifest.json"
     if not folder.exists() and unfinished_of(folder).is_dir():
         raise InputError(
-            f"{folder}: not written yet, its runs are in a journal; the same 'consistency run' with --resume goes on, "
-            "and with --resume --runs 1 writes what is finished"
+            f"{folder}: not written yet, its runs are in a journal; the same 'consistency run' with --resume "
+            "continues, and with --resume --runs 1 writes what is finished"
         )
     if not folder.is_dir():
         raise InputError(f"{folder}: {'a file, not a folder' if folder.exists() else 'no such folder'}")

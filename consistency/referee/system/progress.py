@@ -40,7 +40,7 @@ _quiet = ContextVar("quiet", default=False)
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Inside, only what is foreseen to take long is said: many short works report for themselves."""
+    """Inside, only what is announced is said: many short works report for themselves."""
     token = _quiet.set(True)
     try:
         yield
@@ -52,6 +52,11 @@ def say(text: str) -> None:
     """One line on standard error, unless it is to be quiet, or nobody can read it."""
     if not _quiet.get():
         print(text, file=_Forgiving(), flush=True)
+
+
+def announce(text: str) -> None:
+    """One line on standard error before what takes long, said even where it is to be quiet."""
+    print(text, file=_Forgiving(), flush=True)
 
 
 def each(items: Iterable[T], total: int, label: str, unit: str) -> Iterator[T]:
@@ -101,34 +106,6 @@ def _bar(label: str, total: int, unit: str) -> Iterator[Advance]:
             bar.update(task, rate=_speed(speed, unit) if speed else "")
 
         yield advance
-
-
-@contextmanager
-def foreseen(label: str, seconds: float) -> Iterator[None]:
-    """Work that will take about so many seconds and cannot say how far it is; said even where all else is quiet.
-
-    On a terminal a bar goes by the clock, elsewhere there is one line.
-    """
-    about = f"{seconds / 60.0:.0f} min" if seconds >= 90.0 else f"{max(seconds, 1.0):.0f} s"
-    said = f"{label}: about {about}, once"
-    if sys.stderr is None or not sys.stderr.isatty():
-        print(said, file=_Forgiving(), flush=True)
-        yield
-        return
-    from rich.console import Console
-    from rich.progress import Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
-    from rich.progress_bar import ProgressBar
-
-    class Clock(ProgressColumn):
-        def render(self, task: Task) -> ProgressBar:
-            passed = seconds if task.finished else min(task.elapsed or 0.0, 0.99 * seconds)
-            return ProgressBar(total=seconds, completed=passed, width=40)
-
-    stream: Any = _Forgiving()
-    with Progress(TextColumn("{task.description}"), Clock(), TimeElapsedColumn(), console=Console(file=stream)) as bar:
-        task = bar.add_task(said, total=1)
-        yield
-        bar.update(task, completed=1)
 
 
 def _speed(rate: float, unit: str) -> str:

@@ -152,11 +152,11 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
     Raises
     ------
     InputError
-        It is no baseline, is damaged, or was written with other first steps.
+        It is not a baseline, is damaged, or was written with other first steps.
     """
     data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")
+        raise InputError(f"{path}: is not a baseline; write one with 'consistency baseline DIR --out {path}'")
     with reading(path, "damaged; write it again"):
         for key in ("scenario", "origin", "filters"):
             if key not in data:
@@ -202,7 +202,7 @@ def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]
     _known(table, place, FILTER_KEYS, optional=("axes",))  # files written before lack it
     runs = [_whole(run, f"{place}.runs.{k}", 0, 2**63) for k, run in enumerate(_list(table["runs"], f"{place}.runs"))]
     if len(set(runs)) < len(runs):
-        raise ValueError(f"key '{place}.runs': a run is there twice")
+        raise ValueError(f"key '{place}.runs': a run is duplicated")
     nees = _numbers(table["nees"], f"{place}.nees")
     squared, covered = (
         [_numbers(row, f"{place}.{key}.{k}", HIGHEST_DOF) for k, row in enumerate(_list(table[key], f"{place}.{key}"))]
@@ -229,7 +229,7 @@ def _trials_of(table: Any) -> dict[int, str]:
 
 
 def _known(table: Any, place: str, keys: Sequence[str], optional: Sequence[str] = ()) -> None:
-    """Refuse what is no table of these keys and no others."""
+    """Refuse what is not a table of these keys and no others."""
     if not isinstance(table, dict):
         raise ValueError(f"key '{place}': not a table")
     if missing := [key for key in keys if key not in table]:

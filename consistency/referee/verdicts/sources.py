@@ -48,7 +48,7 @@ def source_of(of: Source | Sequence[Record]) -> Source:
 
 
 def files_source(path: Path, records: Sequence[Record]) -> Source:
-    """Return records of files as a source, with the looks of a program's runs that went on until decided."""
+    """Return records of files as a source, with the looks of a program's runs that were made until decided."""
     source = source_of(records)
     if not is_program_runs(path):
         return source

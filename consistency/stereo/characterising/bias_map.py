@@ -67,8 +67,8 @@ def estimate_bias(fits: Sequence[LikelihoodFit], grid: Grid, level: float, rate:
 
     Parameters
     ----------
-    level : chance that the interval of one node misses
-    rate : chance to find a bias in a coordinate that has none
+    level : probability that the interval of one node misses
+    rate : probability of finding a bias in a coordinate that has none
     """
     known = grid.known
     value, half, believed = (np.full((3, len(known)), fill) for fill in (np.nan, np.nan, 0.0))

@@ -17,7 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
 from consistency.stereo.characterising.log_residuals import MAD, Residuals
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.sequence import SUFFIXES, read_image
 
 MODELS = ("full", "poor", "none")  # five coefficients, k1 alone, no distortion

@@ -20,7 +20,7 @@ from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fi
 from consistency.stereo.characterising.log_residuals import Residuals, RowSelection, octaves, select
 
 NAMES = ("u", "v", "d")
-RATE = 0.01  # chance that any interval misses
+RATE = 0.01  # probability that any interval misses
 LEAST = 100  # rows from which a noise can be told
 LEAST_TRACKS = 5
 
@@ -30,7 +30,7 @@ class Coordinate:
     """Estimates for one coordinate, u, v or d."""
 
     name: str
-    sigma: Interval  # px, of what is drawn anew
+    sigma: Interval  # px, of what is drawn again
     pooled: float  # px, about the mean of all rows: noise, offsets and bias together; NaN where that is not known
     about_tracks: float  # px, about the means of tracks; NaN likewise
     correlation: Interval | None  # with the step before
@@ -101,7 +101,7 @@ def characterise(
     strange : rows that were of no landmark
     grid : nodes of the bias map across and down
     alone : whether the rows of a track are not in order of time and have no offset in common
-    miss : chance that any interval misses
+    miss : probability that any interval misses
 
     Raises
     ------
@@ -156,7 +156,7 @@ def _nodes(data: Residuals, sensor: PicturedSensor, grid: tuple[int, int]) -> tu
 def _fitted(
     data: Residuals, k: int, X: Array, ridge: Array, G: Array, chosen: RowSelection, source: str, alone: bool
 ) -> LikelihoodFit:
-    """The fit of coordinate ``k``; nodes without any data are no parameters."""
+    """The fit of coordinate ``k``; nodes without any data are not parameters."""
     rows = Rows(data.r[:, k], X, G, data.first, data.gap, ridge)
     try:
         return fit(rows, float(chosen.rough[k]), memory=rows.length >= 1.5 and not alone)

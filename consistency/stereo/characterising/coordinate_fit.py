@@ -39,7 +39,7 @@ class Levels:
     tails: int = 4
 
     def of(self, group: str) -> float:
-        """Chance that one member of a group is missed."""
+        """Probability that one member of a group is missed."""
         return self.rate / (6 * max(int(getattr(self, group)), 1))
 
 
@@ -51,7 +51,7 @@ def half_width(gradient: Array, fit: LikelihoodFit, level: float) -> float:
 
 
 def noise_interval(fit: LikelihoodFit, level: float) -> Interval:
-    """Standard deviation of what is drawn anew, in the root mean square over the rows, px."""
+    """Standard deviation of what is drawn again, in the root mean square over the rows, px."""
     log_sigma, gradient = log_level(fit)
     return _exponential(log_sigma, half_width(gradient, fit, level))
 
@@ -163,7 +163,7 @@ class Mixture:
 def tails(w: Array, level: float) -> ResidualTails:
     """Student's degrees of freedom by the likelihood of residuals (N,), its interval by the ratio of likelihoods.
 
-    ``level`` is the chance that the interval misses.
+    ``level`` is the probability that the interval misses.
     """
     w = (w - w.mean()) / w.std(ddof=1)
 
@@ -234,7 +234,7 @@ def moving_over_rest(w: Array, weight: Array, moving: Array, track: Array, level
     weight : (N, 3), degrees of freedom of each
     moving : (N,) of bool
     track : (N,)
-    level : chance that one interval misses
+    level : probability that one interval misses
     """
     if min(moving.sum(), (~moving).sum()) < FEWEST:
         return ()

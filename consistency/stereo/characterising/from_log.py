@@ -11,8 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.scenario import Mount, PicturedSensor, read_table
-from consistency.bench.store.log import Log, SensorFile, read_log
-from consistency.bench.store.log_tables import table_file
+from consistency.bench.store.log import Log, SensorFile, read_log, table_file
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
@@ -26,7 +25,7 @@ from consistency.stereo.frontend.planar_log import CAMERA
 
 OTHERS = ("motion", "start", "sigma_points")  # tables that a measured sensor keeps from the log
 EXACT = "Poses are taken as exact: their errors are in sigma."
-FREE = "The pose of each step is fitted, six values each: what moves all points together is no noise."
+FREE = "The pose of each step is fitted, six values each: what moves all points together is not noise."
 PLANE = "The truth is on a plane: what the sensor rolls, pitches and heaves is in sigma."
 SPACE = "truth.tum"  # of a log from images: true poses of the left camera in space
 REST = "Only the parts at rest are used: noise while moving may be larger."

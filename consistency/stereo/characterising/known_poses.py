@@ -35,7 +35,7 @@ def characterise_posed(
 ) -> Characterisation:
     """Noise, growth, correlation and tails from tracks of unknown points.
 
-    With ``free_poses`` the pose of each step is fitted too, so that its error is no noise.
+    With ``free_poses`` the pose of each step is fitted too, so that its error is not noise.
 
     Raises
     ------

@@ -68,7 +68,7 @@ class Residuals:
 
 
 def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Residuals, int]:
-    """Residuals of trials with true poses and landmarks, and how many rows are of things that are no landmark.
+    """Residuals of trials with true poses and landmarks, and how many rows are of things that are not landmarks.
 
     What is ideal is Herath et al. (2007) eq. 22 at the true poses.
     """

@@ -10,10 +10,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import tomli_w
 
-from consistency.bench.scenario import PicturedSensor
+from consistency.bench.scenario import PicturedSensor, toml_text
 from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth
+from consistency.bench.store.log import sensor_keys
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import p_text
@@ -105,7 +105,7 @@ def _bias(of: Characterisation) -> list[str]:
 def _gross(of: Characterisation) -> str:
     share = interval(of.gross, 2, 100.0)
     what = "are more than" if of.bias is not None else "are of tracks that are somewhere more than"
-    return f"{share} % of the observations {what} 6 robust sd off, and are no part of sigma."
+    return f"{share} % of the observations {what} 6 robust sd off, and are not part of sigma."
 
 
 def _ratio(of: Characterisation) -> list[str]:
@@ -138,7 +138,7 @@ def _or_dash(estimate: Interval | None) -> Cell:
 
 
 def believed_sensor(of: Characterisation) -> PicturedSensor:
-    """The sensor as a filter should believe it: noise drawn anew, and growth and bias map where they are shown."""
+    """The sensor as a filter should believe it: noise drawn again, and growth and bias map where they are shown."""
     changes: dict[str, Any] = {"sigma": tuple(_rounded(c.sigma.value, 5) for c in of.coordinates)}
     changes["disparity_growth"] = changes["bias"] = None
     if of.growth is not None and of.growth.shown:
@@ -154,51 +154,21 @@ def believed_sensor(of: Characterisation) -> PicturedSensor:
 
 def measured_sensor_toml(of: Characterisation, others: Mapping[str, Any] = MappingProxyType({})) -> str:
     """The text of ``sensor.toml``; ``others`` are tables of the log that stay as they are (motion, start, ...)."""
-    sensor = believed_sensor(of)
-    lines = [f"# {line}" for line in ("Measured by 'consistency characterise'.", counted(of) + ".", *sentences(of))]
-    lines += [f'model = "{sensor.model}"', _pair("sigma_px", sensor.sigma)]
-    lines += [
-        f"# sigma_{c.name} {interval(c.sigma)}; with offsets and bias in it {c.pooled:.4g}" for c in of.coordinates
-    ]
-    lines += [f"f_px = {sensor.f!r}", f"B_m = {sensor.B!r}"]
-    for key in ("disparity", "image", "principal_point"):
-        if (value := getattr(sensor, key)) is not None:
-            lines.append(_pair(f"{key}_px", value))
-    lines += _growth_lines(of, sensor) + _bias_lines(of, sensor)
-    tables = {"mount": {key: list(value) for key, value in sensor.mount.model_dump().items()}, **others}
-    return "\n".join(lines) + "\n\n" + tomli_w.dumps({key: value for key, value in tables.items() if value is not None})
+    sentence = "Measured by 'consistency characterise'."
+    comments = [sentence, counted(of) + ".", *sentences(of), *_half_widths(of)]
+    tables = {key: table for key, table in others.items() if table is not None}
+    return "".join(f"# {line}\n" for line in comments) + toml_text(sensor_keys(believed_sensor(of)) | tables)
 
 
-def _growth_lines(of: Characterisation, sensor: PicturedSensor) -> list[str]:
-    if sensor.disparity_growth is None or of.growth is None:
+def _half_widths(of: Characterisation) -> list[str]:
+    """Half widths of the intervals at the nodes of the bias map, a line for each row of the image."""
+    if of.bias is None:
         return []
-    lines = ["", "[disparity_growth]", "# sigma of d is sigma[2] times the ratio, linear between the nodes; px:"]
-    lines += [f"# {interval(s)} at {d:.4g}" for d, s in zip(of.growth.nodes, of.growth.sigma, strict=True)]
-    growth = sensor.disparity_growth
-    return [*lines, _pair("disparity_px", growth.disparity), _pair("ratio", growth.ratio)]
-
-
-def _bias_lines(of: Characterisation, sensor: PicturedSensor) -> list[str]:
-    if sensor.bias is None or of.bias is None:
-        return []
-    bias, lines = of.bias, ["", "[bias]", "# measured is ideal + bias + noise; rows are v, columns are u"]
-    unknown = np.flatnonzero(~bias.grid.known)
-    if len(unknown):
-        columns = len(bias.grid.u)
-        places = ", ".join(f"({bias.grid.u[i % columns]:.4g}, {bias.grid.v[i // columns]:.4g})" for i in unknown)
-        lines.append(f"# zero because nothing is known there, at (u, v): {places}")
-    lines += [_pair("u_px", sensor.bias.u), _pair("v_px", sensor.bias.v)]
-    for k, name in enumerate(NAMES):
-        matrix = getattr(sensor.bias, f"bias_{name}")
-        if not matrix:  # left out
-            lines.append(f"# none is shown in {name} (p {bias.p_value[k]:.2g})")
-            continue
-        half = bias.half[k].reshape(len(bias.grid.v), -1)
-        lines.append(f"bias_{name}_px = [")
-        for row, widths in zip(matrix, half, strict=True):
-            halves = ", ".join("unknown" if np.isnan(w) else f"±{w:.2g}" for w in widths)
-            lines.append(f"  [{', '.join(map(repr, row))}],  # {halves}")
-        lines.append("]")
+    lines = []
+    for k in np.flatnonzero(of.bias.shown):
+        lines.append(f"Half widths of bias_{NAMES[k]}, px; rows are v, columns are u; nan: not known, taken as zero:")
+        rows = of.bias.half[k].reshape(len(of.bias.grid.v), -1)
+        lines += ["  " + " ".join(f"±{width:.2g}" for width in row) for row in rows]
     return lines
 
 
@@ -250,10 +220,6 @@ def require_free_file(path: Path, overwrite: bool) -> None:
 def write_sensor(path: Path, text: str) -> None:
     with writing(path):
         write_whole(path, text.encode("utf-8"))
-
-
-def _pair(key: str, values: Any) -> str:
-    return f"{key} = [{', '.join(repr(value) for value in values)}]"
 
 
 def _rounded(value: float, digits: int) -> float:

@@ -22,14 +22,14 @@ from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.cameras.rig import is_rectified
 from consistency.stereo.visual_odometry.odometry import motion_covariances, trajectory, visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
 
 LANDMARKS = 200  # in a log; the filters' covariance is then 603 x 603
-FEWEST = MIN_LIFE + 1  # stereo pairs of a log: the first is no observation
+FEWEST = MIN_LIFE + 1  # stereo pairs of a log: the first is not an observation
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -101,7 +101,7 @@ class Summary:
 
     def _truth_lines(self, out: Path) -> list[str]:
         if self.truth is None:
-            lacking = missing_of_drive(self.sequence)  # files without which oxts of a drive is no truth
+            lacking = missing_of_drive(self.sequence)  # files without which oxts of a drive is not a truth
             oxts = f": that of oxts takes {' and '.join(lacking)} too" if lacking else ""
             return [f"no truth found{oxts}; --truth FILE takes one"]
         judge = f"consistency analyse {out}/trajectory.tum --truth {out}/truth.tum --covariance {out}/covariance.txt"

@@ -23,7 +23,11 @@ from consistency.stereo.visual_odometry.relative_pose import RelativePose, angul
 from consistency.stereo.visual_odometry.sequence import Sequence
 from consistency.stereo.visual_odometry.tracks import PIXELS, TrackSelection, linked, thinned
 
-MAX_AGE, MIN_LIFE, BANDS = 12, 2, 3  # observations of a landmark at most and at least, columns: as docs/kitti07.md
+MAX_AGE, MIN_LIFE, BANDS = (
+    12,
+    2,
+    3,
+)  # observations of a landmark at most and at least, columns: as docs/reference/recorded.md
 NEAR = 10.0  # standard deviations of its disparity that a landmark has at least: its range is nearly Gaussian
 MOST_SLOTS = 64  # landmarks at once
 # rad: as many such tilts, at random, come to 1 / NEAR within a landmark's life

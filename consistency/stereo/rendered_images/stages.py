@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 BLOCK = 7  # px, window of the structure tensor
 MARGIN = 12.0  # px from the border, so that the windows of later stages are whole
@@ -170,7 +170,7 @@ def _searched(image: Array, search: tuple[int, int], block: int) -> int:
 def _at(places: Array, disparities: Array, search: tuple[int, int]) -> Array:
     """Values (N,) of a disparity image (h, w) in sixteenths at the nearest pixels, px.
 
-    NaN outside the search and at its ends, where the best match is no minimum.
+    NaN outside the search and at its ends, where the best match is not a minimum.
     """
     height, width = disparities.shape
     column, row = np.rint(places).astype(int).T

@@ -32,7 +32,7 @@ MAD = 1.4826  # standard deviation over median deviation, of a Gaussian
 
 @dataclass(frozen=True)
 class Screened:
-    """Trials in which landmarks begin anew where they leave the common motion, and how often they do."""
+    """Trials in which landmarks restart where they leave the common motion, and how often they do."""
 
     trials: list[Trial]
     scale: Array  # (s,), in units of z, standard deviation of the misfits by their median: a gate is some times it
@@ -42,7 +42,7 @@ class Screened:
 
 
 def screened(trials: Sequence[Trial], belief: Belief, gate: Array) -> Screened:
-    """Recorded trials in which a landmark begins anew, under another number, where it leaves the common motion.
+    """Recorded trials in which a landmark restarts, under another number, where it leaves the common motion.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def _expected(points: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
 def _begun_anew(trials: Sequence[Trial], broken: Sequence[Indices]) -> list[Trial]:
     """Trials in which a landmark has another id from each row in ``broken`` on: its n-th new one is one in all trials.
 
-    The ids of landmarks stay what they are, new ones follow; then those of things that are no landmark, likewise.
+    The ids of landmarks stay what they are, new ones follow; then those of things that are not landmarks, likewise.
     """
     ids = max(trial.n_landmarks for trial in trials)
     known = ids if trials[0].landmarks is None else len(trials[0].landmarks)
@@ -183,7 +183,7 @@ def _begun_anew(trials: Sequence[Trial], broken: Sequence[Indices]) -> list[Tria
 
 
 def _piece(trial: Trial, broken: Indices) -> Indices:
-    """How often the landmark of each row (M,) has begun anew up to it; rows are in order of the steps."""
+    """How often the landmark of each row (M,) has restarted up to it; rows are in order of the steps."""
     order = np.argsort(trial.landmark, kind="stable")
     breaks = np.isin(order, broken).astype(np.int64)
     before = np.cumsum(breaks) - breaks
@@ -206,7 +206,7 @@ def _renumbered(trial: Trial, landmark: Indices, parent: Indices, new: Array) ->
 
 
 def screened_log(log: Log, gate: str | Array) -> Log:
-    """A log in which landmarks begin anew where they leave the common motion; ``screening`` says how often.
+    """A log in which landmarks restart where they leave the common motion; ``screening`` says how often.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def screening_line(log: Log) -> str:
     gate, scale = (", ".join(f"{value:.2g}" for value in found[name]) for name in ("gate", "scale"))
     return (
         f"screen: {found['broken']} of {found['judged']} observations that follow another of their landmark leave the "
-        f"common motion by more than {gate}; a landmark begins anew there (standard deviation of the rest: {scale})"
+        f"common motion by more than {gate}; a landmark restarts there (standard deviation of the rest: {scale})"
     )
 
 

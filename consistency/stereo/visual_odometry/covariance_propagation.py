@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras import array_checks, batch_inverses
+from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import ConvergenceError, DegenerateError
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, solved
 from consistency.stereo.visual_odometry.registration import checked_clouds
@@ -36,7 +36,7 @@ def implicit_covariance(C_yy: Array, C_yx: Array, S_x: Array) -> Array:
     DegenerateError
         C_yy is not positive definite: x does not fix y.
     """
-    inverse, definite = batch_inverses.symmetric_inverses(C_yy)
+    inverse, definite = arrays.symmetric_inverses(C_yy)
     if not definite.all():
         raise DegenerateError("the cost has no minimum here: its second derivative is not positive definite")
     S = inverse @ (_wide(C_yx @ S_x) @ np.swapaxes(_wide(C_yx), -1, -2)) @ inverse
@@ -68,8 +68,8 @@ def triangulation_covariance(rig: StereoRig, uv: Array, S_uv: Array) -> Array:
     InputError
         A shape, a value that is not finite, S_uv not symmetric positive semidefinite.
     """
-    uv = array_checks.checked_rows("uv", uv, 4)
-    S_uv = array_checks.covariances("S_uv", S_uv, len(uv), 4)
+    uv = arrays.checked_rows("uv", uv, 4)
+    S_uv = arrays.covariances("S_uv", S_uv, len(uv), 4)
     C_pp, C_pu = triangulation_derivatives(rig, *solved(rig, uv))
     return implicit_covariance(C_pp, C_pu[:, None], S_uv[:, None])
 
@@ -112,7 +112,7 @@ def registration_covariance(p1: Array, p2: Array, S1: Array, S2: Array, pose: Re
         ``pose`` is not the minimum for these points.
     """
     p1, p2 = checked_clouds(p1, p2)
-    S1, S2 = array_checks.covariances("S1", S1, len(p1), 3), array_checks.covariances("S2", S2, len(p1), 3)
+    S1, S2 = arrays.covariances("S1", S1, len(p1), 3), arrays.covariances("S2", S2, len(p1), 3)
     C_d, C_dd, C_dp = registration_derivatives(p1, p2, pose)
     S = implicit_covariance(C_dd, C_dp, np.concatenate([S1, S2]))
     step = np.linalg.solve(C_dd, C_d)

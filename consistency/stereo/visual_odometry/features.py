@@ -11,7 +11,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
 from consistency.stereo.visual_odometry.relative_pose import cross_matrix
 
@@ -47,7 +47,7 @@ def grey(image: Array, name: str = "image") -> Array:
     """
     image = np.asarray(image)
     if image.dtype.kind not in "uif" or image.size == 0:
-        raise InputError(f"{name}: is no image, but an array of {image.dtype} with shape {image.shape}")
+        raise InputError(f"{name}: is not an image, but an array of {image.dtype} with shape {image.shape}")
     if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))):
         raise InputError(f"{name}: shape {image.shape}; an image is (h, w) or (h, w, 3)")
     if image.dtype == np.uint8 and image.ndim == 2:
@@ -99,7 +99,7 @@ def mutual_matches(first: Array, second: Array, allowed: Array | None = None, ra
     Parameters
     ----------
     first, second : descriptors of unit length
-    allowed : (N, K), whether two may match at all, or None for all; what is not allowed is no second best either
+    allowed : (N, K), whether two may match at all, or None for all; what is not allowed is not a second best either
     ratio : the nearest must be closer than ``ratio`` times the second nearest, in the direction first to second
     """
     if not len(first) or not len(second):

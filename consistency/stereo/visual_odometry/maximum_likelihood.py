@@ -16,7 +16,7 @@ from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras import array_checks, batch_inverses
+from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import ConvergenceError, DegenerateError
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
 from consistency.stereo.visual_odometry.covariance_propagation import implicit_covariance
@@ -112,7 +112,7 @@ def register_weighted(
         No minimum was reached.
     """
     p1, p2 = checked_clouds(p1, p2)
-    S1, S2 = array_checks.covariances("S1", S1, len(p1), 3), array_checks.covariances("S2", S2, len(p1), 3)
+    S1, S2 = arrays.covariances("S1", S1, len(p1), 3), arrays.covariances("S2", S2, len(p1), 3)
     frames = TwoFrames(PointMatches(), p1, p2, _weights("S1", S1), _weights("S2", S2))
     return _refined(frames, S1, S2, pose or register_svd(p1, p2), p2, robust)
 
@@ -147,10 +147,10 @@ def refine_reprojection(
     InputError, DegenerateError, GimbalLockError, ConvergenceError
         As :func:`register_weighted`.
     """
-    uv1, uv2 = array_checks.checked_rows("uv1", uv1, 4), array_checks.checked_rows("uv2", uv2, 4)
-    array_checks.same_length("uv1, uv2", uv1, uv2)
-    S1 = array_checks.covariances("S_uv", S_uv, len(uv1), 4)
-    S2 = S1 if S_uv2 is None else array_checks.covariances("S_uv2", S_uv2, len(uv1), 4)
+    uv1, uv2 = arrays.checked_rows("uv1", uv1, 4), arrays.checked_rows("uv2", uv2, 4)
+    arrays.same_length("uv1, uv2", uv1, uv2)
+    S1 = arrays.covariances("S_uv", S_uv, len(uv1), 4)
+    S2 = S1 if S_uv2 is None else arrays.covariances("S_uv2", S_uv2, len(uv1), 4)
     _, q = checked_clouds(triangulate(rig, uv1), triangulate(rig, uv2))
     rig.project(pose.apply(q))
     frames = TwoFrames(PixelMatches(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))
@@ -180,7 +180,7 @@ def _refined(frames: TwoFrames, S1: Array, S2: Array, pose: RelativePose, q: Arr
 
 def _profile(f: Derivatives, weight: Array, bend: Array) -> tuple[Array, Array]:
     """C_dd (6, 6) and C_dz (2N, 6, k) of the cost of the pose alone, each point at its best position."""
-    inverse, definite = batch_inverses.symmetric_inverses(f.qq)
+    inverse, definite = arrays.symmetric_inverses(f.qq)
     if not definite.all():
         k = int(np.argmin(definite))
         raise DegenerateError(f"match {k}: its point is not fixed by the images; leave it out", k)
@@ -232,7 +232,7 @@ def _step(f: Derivatives, weight: Array, bend: Array, damping: float) -> tuple[A
     dd, qq = f.dd, f.qq
     if damping:
         dd, qq = dd * (1.0 + damping * np.eye(6)), qq * (1.0 + damping * np.eye(3))
-    inverse, definite = batch_inverses.symmetric_inverses(qq)
+    inverse, definite = arrays.symmetric_inverses(qq)
     gain = f.dq @ inverse
     g = f.d - (gain @ f.q[:, :, None])[:, :, 0]
     H = np.dot(weight[None], (dd - gain @ np.swapaxes(f.dq, 1, 2)).reshape(-1, 36)).reshape(6, 6)

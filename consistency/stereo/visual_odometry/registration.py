@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras import array_checks
+from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, DegenerateError
 from consistency.stereo.visual_odometry.relative_pose import RelativePose
 
@@ -95,8 +95,8 @@ def register_horn(p1: Array, p2: Array, *, directions: bool = False) -> Relative
 
 def checked_clouds(p1: Array, p2: Array) -> tuple[Array, Array]:
     """Both clouds as floats, (N, 3) and (N, 3), checked: errors as :func:`register_svd`."""
-    p1, p2 = array_checks.checked_rows("p1", p1, 3), array_checks.checked_rows("p2", p2, 3)
-    array_checks.same_length("p1, p2", p1, p2)
+    p1, p2 = arrays.checked_rows("p1", p1, 3), arrays.checked_rows("p2", p2, 3)
+    arrays.same_length("p1, p2", p1, p2)
     if len(p1) < 3:
         raise DegenerateError(f"p1, p2: {len(p1)} points, a rigid motion needs at least 3")
     for name, p in (("p1", p1), ("p2", p2)):
@@ -174,7 +174,7 @@ def register_ransac(
     if (S1 is None) != (S2 is None):
         raise InputError("S1, S2: give both covariances or none")
     if S1 is not None and S2 is not None:
-        S1, S2 = array_checks.covariances("S1", S1, len(p1), 3), array_checks.covariances("S2", S2, len(p1), 3)
+        S1, S2 = arrays.covariances("S1", S1, len(p1), 3), arrays.covariances("S2", S2, len(p1), 3)
     least = fewest(len(p1)) if minimum is None else minimum
 
     def inliers_of(R: Array, t: Array) -> Array:

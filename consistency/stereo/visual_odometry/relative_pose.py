@@ -14,7 +14,7 @@ from consistency.referee import geometry
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import propagated
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras import array_checks
+from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import GimbalLockError
 
 LOCKED = 1e-6  # cosine of the pitch below which six digits of roll and yaw are left
@@ -38,12 +38,12 @@ class RelativePose:
     t: Array  # (3,), m
 
     def __post_init__(self) -> None:
-        array_checks.freeze(self, R=(3, 3), t=(3,))
+        arrays.freeze(self, R=(3, 3), t=(3,))
 
     @classmethod
     def from_vector(cls, vector: Array) -> RelativePose:
         """Of x, y, z (m), roll, pitch, yaw (rad); shape (6,)."""
-        values = array_checks.floats("vector", vector)
+        values = arrays.floats("vector", vector)
         if values.shape != (6,):
             raise InputError(f"vector: shape {values.shape}, allowed is (6,)")
         return cls(geometry.rotation(*values[3:]), values[:3])
@@ -120,7 +120,7 @@ def compose(a: RelativePose, S_a: Array, b: RelativePose, S_b: Array) -> tuple[R
     GimbalLockError
         One of the three poses has a pitch of +-90 degrees.
     """
-    S_a, S_b = (array_checks.covariances(name, S, 1, 6)[0] for name, S in (("S_a", S_a), ("S_b", S_b)))
+    S_a, S_b = (arrays.covariances(name, S, 1, 6)[0] for name, S in (("S_a", S_a), ("S_b", S_b)))
     both = a.compose(b)
     E_a, E_b, E_inverse = angular(a), angular(b), np.linalg.inv(angular(both))
     J_a, J_b = np.eye(6), np.zeros((6, 6))
@@ -134,7 +134,7 @@ def compose(a: RelativePose, S_a: Array, b: RelativePose, S_b: Array) -> tuple[R
 
 def invert(pose: RelativePose, S: Array) -> tuple[RelativePose, Array]:
     """The inverse motion with its covariance (6, 6) to first order; errors as in :func:`compose`."""
-    S = array_checks.covariances("S", S, 1, 6)[0]
+    S = arrays.covariances("S", S, 1, 6)[0]
     inverse = pose.inverse()
     J = np.zeros((6, 6))
     J[:3, :3] = -pose.R.T

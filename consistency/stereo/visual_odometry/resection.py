@@ -10,8 +10,7 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, opencv
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
 from consistency.stereo.visual_odometry.covariance_propagation import triangulation_covariance
 from consistency.stereo.visual_odometry.registration import draws_for, fewest

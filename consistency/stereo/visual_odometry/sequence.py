@@ -16,7 +16,7 @@ from consistency.referee.readers.formats.kitti_files import NANO, place_of, read
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
 from consistency.stereo.visual_odometry.cameras.camera_pair import PairCalibration, Rectification, rectify
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")
 KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"))
@@ -126,7 +126,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> Array:
     Raises
     ------
     InputError
-        There is no such file, it is no image, or it has another size.
+        There is no such file, it is not an image, or it has another size.
     """
     cv2, path = opencv(), Path(path)
     if not path.is_file():
@@ -268,7 +268,7 @@ def _camera(folder: Path) -> dict[int, Path]:
             pairs = [(int(path.stem), path) for path in _images(images)]
         by_time = dict(pairs)
         if len(by_time) < len(pairs) or not all(0 <= time < 2**63 for time in by_time):
-            raise ValueError("a time is there twice, or is none")
+            raise ValueError("a time is duplicated, or is none")
     for path in by_time.values():
         if not is_file(path):
             raise InputError(f"{table}: names {path.name}, which is not in {images}")

@@ -23,7 +23,7 @@ def linked(links: Sequence[Indices]) -> list[Indices]:
 
     Returns
     -------
-    for each pair (M_k,), the track of each match; a track goes on where the row in frame k + 1 is one of the next
+    for each pair (M_k,), the track of each match; a track continues where the row in frame k + 1 is one of the next
     pair, and tracks are numbered in the order in which they begin
     """
     tracks: list[Indices] = []

@@ -16,8 +16,17 @@ import pytest
 
 import consistency as cs
 from consistency.bench.challenging import world_scores as scoring
-from consistency.bench.challenging.challenge import BASES, ChallengePhases, Plan, base_of, challenge, is_overconfident
-from consistency.bench.challenging.challenge_text import challenge_data, challenge_lines, write_scenario
+from consistency.bench.challenging.challenge import (
+    BASES,
+    ChallengePhases,
+    Plan,
+    base_of,
+    challenge,
+    challenge_data,
+    challenge_lines,
+    is_overconfident,
+    write_scenario,
+)
 from consistency.bench.challenging.search import (
     BATCH,
     RUNGS,

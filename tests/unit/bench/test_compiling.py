@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,6 @@ import pytest
 
 from consistency.bench.filters.compiler import disk_cache
 from consistency.bench.filters.compiler.content_key import Content
-from consistency.bench.filters.compiler.disk_cache import FIRST
 from consistency.bench.filters.compiler.jit import Kernel, Outlook
 from consistency.bench.runs import compiling
 from consistency.bench.runs.findings import experiments
@@ -119,7 +119,7 @@ def test_kernels_are_compiled_side_by_side_and_once(done: Done, folder: Path) ->
     """Two of the three filters have one kernel."""
     out, err = done()
     assert out == "3.0 6.0 9.0 1 1 1"
-    assert err == "compiling 2 kernels of two, three: about 1 s, once\n"
+    assert err == "compiling 2 kernels of two, three, once: 10 to 60 s for each\n"
     assert 1 <= len(processes(folder)) <= 2  # the first may be done with both before the second has started
     assert not living(folder)
     count = len(processes(folder))
@@ -186,12 +186,12 @@ def test_kernels_of_root_serve_other_users(done: Done, folder: Path, monkeypatch
 
 def test_what_others_cannot_read_is_compiled_here(capsys: pytest.CaptureFixture[str]) -> None:
     made: list[int] = []
-    outlook = Outlook("", is_ready=False, is_shared=False, seconds=4.0)
+    outlook = Outlook("", is_ready=False, is_shared=False, size=4)
     mine: Any = SimpleNamespace(name="mine", compile=lambda *_: made.append(1))
     need = compiling.Need(mine, None, None, outlook)  # type: ignore[arg-type]
     compiling._compile([need, need], 2)
     assert made == [1, 1]
-    assert capsys.readouterr().err == "compiling 2 kernels of mine: about 6 s, once\n"
+    assert capsys.readouterr().err == "compiling 2 kernels of mine, once: 10 to 60 s for each\n"
 
 
 def test_a_few_filters_are_named() -> None:
@@ -200,7 +200,7 @@ def test_a_few_filters_are_named() -> None:
     assert compiling._label(needs[:1]) == "compiling the kernel of a"
 
 
-# --- what is foreseen -------------------------------------------------------------------------------
+# --- the size ---------------------------------------------------------------------------------------
 
 
 def inner(x: float) -> float:
@@ -211,59 +211,44 @@ def outer(x: float) -> float:
     return inner(x) * 2.0
 
 
-@pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    disk_cache.folder().mkdir(mode=0o700)
-    return disk_cache.folder() / disk_cache.FILE
-
-
-def test_seconds_are_those_of_this_machine(cache: Path) -> None:
-    assert disk_cache.seconds_for(10_000) == pytest.approx(10_000 * FIRST)
-    cache.write_text("1000 2\nnonsense\n1000 4\n0 7\n1000 -1\n1000 nan\n2000 200\n")
-    assert disk_cache.seconds_for(10_000) == pytest.approx(40.0)
-    cache.write_text("1 100\n" * 50 + "1000 2\n" * disk_cache.RECENT)
-    assert disk_cache.seconds_for(10_000) == pytest.approx(20.0)
-
-
-def test_what_compiling_took_is_kept(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(disk_cache.time, "monotonic", iter([0.0, 3.0, 5.0, 6.0, 7.0, 9.0]).__next__)
-    for size in (1000.0, 500.0):
-        with disk_cache.measured(size):
-            pass
-    assert cache.read_text() == "1000 3.000\n500 1.000\n"
-    monkeypatch.setattr(disk_cache, "LONGEST", 5)
-    with disk_cache.measured(10.0):
-        pass
-    assert cache.read_text() == "10 2.000\n"
-
-
 def test_the_size_is_that_of_all_functions() -> None:
-    sizes = Content(outer, ()).functions
-    assert sizes == {f"{__name__}.{f.__name__}": len(f.__code__.co_code) for f in (inner, outer)}
+    assert Content(outer, ()).size == sum(len(f.__code__.co_code) for f in (inner, outer))
 
 
-def test_functions_that_were_compiled_before_count_less(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(disk_cache, "seconds_for", lambda size: size)
+def test_a_kernel_is_ready_once_it_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     kernel = Kernel(total)
     first = kernel.outlook(1)
-    assert (first.is_ready, first.is_shared, first.seconds) == (False, True, len(total.__code__.co_code))
+    assert (first.is_ready, first.is_shared, first.size) == (False, True, len(total.__code__.co_code))
     assert kernel(1.0) == 2.0
     assert kernel.outlook(1.0).is_ready
-    assert kernel.outlook(1) == first._replace(seconds=disk_cache.AGAIN * first.seconds)
-    assert float(cache.read_text().split()[0]) == first.seconds
+    assert kernel.outlook(1) == first
 
 
 def total(x: float) -> float:
     return x + x
 
 
-def test_seconds_of_several() -> None:
-    """The second kernel of a process shares functions with the first."""
-    assert compiling._wall([10.0], 1) == 10.0
-    assert compiling._wall([10.0, 20.0], 1) == 25.0
-    assert compiling._wall([10.0, 20.0], 2) == 20.0
-    assert compiling._wall([10.0, 10.0, 10.0, 10.0], 2) == 15.0
+def test_the_largest_kernel_is_compiled_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may take as long as two others."""
+    begun: list[int] = []
+
+    class Pool:
+        def __init__(self, *_: Any, **__: Any) -> None: ...
+
+        def submit(self, _: Any, size: int) -> Future[None]:
+            begun.append(size)
+            done: Future[None] = Future()
+            done.set_result(None)
+            return done
+
+        def shutdown(self, **_: Any) -> None: ...
+
+    monkeypatch.setattr(compiling, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(compiling, "_pickled", lambda need: need.outlook.size)
+    needs: Any = [SimpleNamespace(outlook=Outlook("", False, True, size)) for size in (2, 3, 1)]
+    compiling._compile_side_by_side(needs, 2)
+    assert begun == [3, 2, 1]
 
 
 # --- before what takes long -------------------------------------------------------------------------

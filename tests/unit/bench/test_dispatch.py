@@ -10,10 +10,10 @@ import pytest
 import consistency as cs
 from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.compiler.dispatch import fits, generic, implement, part, require_fitting
-from consistency.bench.filters.covariance_update.local import Local
 from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.methods.riekf import RightInvariant
-from consistency.bench.filters.update.unscented import Unscented
+from consistency.bench.filters.methods.ukf import Unscented
+from consistency.bench.filters.parts.local import Local
 
 
 @part()
@@ -109,7 +109,7 @@ REFUSED = [
     ("ekf-uvd", "herath2007-stereo", {"point": parts("kf", "linear-gaussian").point}, "sensor 'Uvd'"),
     ("ri-ekf-uvd", "herath2007-stereo", {"covariance": Local(100)}, "covariance 'Local'"),
     ("ekf-uvd", "herath2007-stereo", {"error": RightInvariant(), "covariance": Local(100)}, "'RightInvariant'"),
-    ("ekf-uvd", "herath2007-stereo", {"motion": Stranger()}, "motion: 'Stranger' is no registered part"),
+    ("ekf-uvd", "herath2007-stereo", {"motion": Stranger()}, "motion: 'Stranger' is not a registered part"),
 ]
 
 

@@ -16,9 +16,9 @@ from consistency.bench.filters.stepping import step_through
 from consistency.bench.models import point, stereo
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.scenario.effects import EFFECTS, Context, FieldOfView, ListedEffect, Observations
-from consistency.bench.scenario.tables.toml_tables import Count, Positive, Triple
+from consistency.bench.scenario.toml_tables import Count, Positive, Triple
 from consistency.bench.simulation import World, draw_landmarks, planned_controls
-from consistency.bench.simulation.sensing import purpose_of
+from consistency.bench.simulation.world import purpose_of
 from consistency.bench.store.log import read_log
 from consistency.bench.store.trial_rows import observations_table
 from consistency.referee.types import Array
@@ -275,7 +275,7 @@ def test_an_effect_that_says_it_draws_nothing_gets_nothing(small: Small) -> None
         cs.simulate(with_effects(small, {"kind": "silent"}))
 
 
-# --- things that are no landmark ------------------------------------------------------------------------
+# --- things that are not landmarks ------------------------------------------------------------------------
 
 GHOSTS = {"kind": "ghosts", "count": 4, "length": 12}
 
@@ -428,7 +428,7 @@ def test_a_linear_log_holds_landmarks_only(linear: cs.Scenario, tmp_path: Path) 
         source=lambda t: t["landmark"].where(t.index > 0, -1),
         landmark=lambda t: t["landmark"].where(t.index > 0, 500),
     )
-    with pytest.raises(cs.InputError, match=r"observations\.parquet: column 'landmark': 500 is no landmark"):
+    with pytest.raises(cs.InputError, match=r"observations\.parquet: column 'landmark': 500 is not a landmark"):
         read_log(tmp_path / "log")
 
 

@@ -7,7 +7,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from documents import blocks
+from documents import ROOT, blocks
 from painted import by_title, lines, panels
 
 import consistency as cs
@@ -19,8 +19,7 @@ from consistency.bench.pages.sections import study_sections
 @pytest.fixture
 def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The module of sections with the example and its place, as the guide says."""
-    place = "consistency/bench/pages/sections/study_sections.py"
-    (code,) = (block.text for block in blocks("docs/extending.md", "python") if place in block.before)
+    code = (ROOT / "docs/examples/extending/position_errors.py").read_text(encoding="utf-8")
     (order,) = (block.text for block in blocks("docs/extending.md", "python") if "`pose_errors`" in block.before)
     module = ModuleType("with_example")
     module.__dict__.update(vars(study_sections))

@@ -427,7 +427,7 @@ def test_a_full_disk_keeps_what_was_there(run, written, tmp_path, monkeypatch, w
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(getattr(gather, where.split(".")[0]), where.split(".")[1], full)
-    kept = "; 3 finished runs are kept, and the same command with --resume goes on" if where == "Writer.add" else ""
+    kept = "; 3 finished runs are kept, and the same command with --resume continues" if where == "Writer.add" else ""
     said = rf"--out .*out: cannot be written \(No space left on device\){kept}$"
     with pytest.raises(cs.InputError, match=said):
         run(runs=3, seed=4, jobs=2, out=tmp_path / "out", overwrite=True)

@@ -7,8 +7,9 @@ import pytest
 from painted import panels, titles
 
 import consistency as cs
-from consistency.bench.pages import heat, write_regime_reports
-from consistency.bench.pages.heat import colour_of, heat_figure, ink_on
+from consistency.bench.pages import maps_of_worlds as heat
+from consistency.bench.pages import write_regime_reports
+from consistency.bench.pages.maps_of_worlds import colour_of, heat_figure, ink_on
 from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.plan import load_sweep

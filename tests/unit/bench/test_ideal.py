@@ -50,5 +50,5 @@ def test_things_that_are_no_landmark_are_refused(uvd):
     trial, filter_ = cs.simulate(uvd), cs.get_filter("ideal-ekf-uvd")
     landmark = np.array(trial.landmark)
     landmark[-1] = trial.n_landmarks
-    with pytest.raises(cs.InputError, match="things that are no landmark"):
+    with pytest.raises(cs.InputError, match="things that are not landmarks"):
         run_filter(filter_, replace(trial, landmark=landmark, n_landmarks=trial.n_landmarks + 1), uvd.belief)

@@ -161,7 +161,7 @@ DAMAGE = {
     "time runs back": ("controls", put("dt", 5, -0.1), r"column 'dt', row 5: must be positive"),
     "no controls": ("controls", lambda t: t[:0], r"holds no control"),
     "no observations": ("observations", lambda t: t[:0], r"holds no observation"),
-    "landmark twice": ("observations", lambda t: pd.concat([t, t[:1]]), r"row \d+: this landmark is there twice"),
+    "landmark twice": ("observations", lambda t: pd.concat([t, t[:1]]), r"row \d+: this landmark is duplicated"),
     "stray step": ("observations", put("step", 4, 61), r"row 4: controls\.parquet has no such run and step"),
     "observation of step 0": ("observations", put("step", 4, 0), r"row 4: controls\.parquet has no such run and step"),
     "stray run": ("observations", put("run", 4, 9), r"row 4: controls\.parquet has no such run and step"),
@@ -173,7 +173,7 @@ DAMAGE = {
     "position twice": (
         "landmarks",
         lambda t: pd.concat([t, t[:1]]),
-        r"column 'landmark': every landmark may stand there once",
+        r"column 'landmark': every landmark may be listed once",
     ),
 }
 

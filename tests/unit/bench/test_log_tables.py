@@ -103,7 +103,7 @@ REFUSED = {
     "missing column": (edit(lambda lines: [line.rsplit(",", 1)[0] for line in lines]), "column 'omega' is missing"),
     "column twice": (
         edit(lambda lines: [f"{lines[0]},dt", *(f"{line},1" for line in lines[1:])]),
-        "'dt' is there twice",
+        "'dt' is duplicated",
     ),
     "semicolons": (edit(lambda lines: [line.replace(",", ";") for line in lines]), "column 'run' is missing"),
     "short row": (edit(lambda lines: [*lines[:4], lines[4].rsplit(",", 1)[0], *lines[5:]]), "cannot be read as CSV"),
@@ -116,7 +116,7 @@ REFUSED = {
     "empty": (lambda folder: (folder / "controls.csv").write_text("") and None, "column 'run' is missing"),
     "no text": (lambda folder: (folder / "controls.csv").write_bytes(b"\x80\x81") and None, "cannot be read as CSV"),
     "both forms": (both, r"holds controls\.parquet and controls\.csv; take one of them away"),
-    "a folder": (folder_in_its_place, r"controls\.csv: is no file"),
+    "a folder": (folder_in_its_place, r"controls\.csv: is not a file"),
     "neither": (lambda folder: (folder / "controls.csv").unlink(), r"controls\.parquet: missing"),
 }
 

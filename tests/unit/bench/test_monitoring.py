@@ -125,7 +125,7 @@ def test_refused_archives(arrays, said, tmp_path):
         ({"nis_dof": [2, 2.5, 0, 1, 3]}, "line 3: nis 2.5 with nis_dof 2.5"),
         ({"nis_dof": [2, 2, -1, 1, 3]}, "line 4: nis nan with nis_dof -1"),
         ({"nis_dof": [2, None, 0, 1, 3]}, "line 3: nis 2.5 with nis_dof nan"),
-        ({"step": [1, 2, 2, 3, 4]}, "line 4: step 2 is there twice"),
+        ({"step": [1, 2, 2, 3, 4]}, "line 4: step 2 is duplicated"),
         ({"t": [1, 2, 1.5, 3, 4]}, "t 1.5 is less than the one before"),
     ],
 )

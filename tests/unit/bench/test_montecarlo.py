@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -121,7 +122,8 @@ def test_a_filter_that_breaks_at_once(xyz: cs.Scenario) -> None:
     results = cs.run_trials(xyz, [Stillborn()], runs=3, jobs=1)
     assert len(results.estimates) == 0
     assert list(results.failures["step"]) == [1, 1, 1]
-    assert set(results.failures["reason"]) == {"KeyError: 'no such map'"}
+    (reason,) = set(results.failures["reason"])
+    assert re.fullmatch(r"KeyError: 'no such map' \(test_montecarlo\.py:\d+\)", reason)  # the line that raised
     verdict = cs.analyse(results)["stillborn"]
     assert verdict.status == "failed"
     assert verdict.statistics["runs"] == 3

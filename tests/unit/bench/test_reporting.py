@@ -17,6 +17,7 @@ import pytest
 from edited import change_manifest
 from painted import by_title, lines, panels, places, shaded, titles
 from scipy import stats
+from scripts import figures
 
 import consistency as cs
 from consistency.bench.pages import write_reports
@@ -24,12 +25,9 @@ from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.sections import (
     anees,
     calibration_rates,
-    front_end,
     nees_distribution,
     nis,
-    paths_and_landmarks,
-    pose_errors,
-    stereo_noise,
+    one_run,
 )
 from consistency.bench.pages.sections.report_input import Report, Study, Track
 from consistency.bench.pages.sections.study_sections import without_truth
@@ -48,6 +46,7 @@ from consistency.referee.pages.judged import clock_of
 from consistency.referee.show import as_html, pdf
 from consistency.referee.types import Failure
 
+front_end, stereo_noise = figures("front_end"), figures("stereo_noise")
 ODD = {
     "ekf-xyz": "<script>alert(1)</script><img src=x onerror=alert(2)>",
     "ekf-uvd": "#set *b* $x^2$ $$y$$ \\frac `c` @ref {{ 7*7 }} </script>",
@@ -186,8 +185,8 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(pose_errors.pose_error_series, study.tracks),
-        paths_and_landmarks.read(study).paths, strict=True,
+        anees.read(study).curves, map(one_run.pose_error_series, study.tracks),
+        one_run.read(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
         verdict = by_filter[track.name]
@@ -207,9 +206,9 @@ def test_the_model_is_what_analyse_says(folder):
 def test_the_odometry_is_that_of_the_trial(report, uvd):
     (study,) = report.studies
     trial = cs.simulate(uvd, run=0, seed=1)
-    np.testing.assert_array_equal(paths_and_landmarks.read(study).truth, trial.truth[:, :2])
+    np.testing.assert_array_equal(one_run.read(study).truth, trial.truth[:, :2])
     step = trial.controls[0, 0] * trial.controls[0, 1]
-    odometry = paths_and_landmarks.read(study).odometry
+    odometry = one_run.read(study).odometry
     np.testing.assert_allclose(np.linalg.norm(odometry[1] - odometry[0]), abs(step))
 
 
@@ -734,7 +733,7 @@ def test_odd_names_are_shown_literally_and_failed_runs_are_listed(results, tmp_p
     (study,) = report.studies
     assert len(study.failures) == 6
     assert study.tracks[1].verdict.status == "failed"
-    assert not np.isfinite(paths_and_landmarks.read(study).paths[1][1]).any()
+    assert not np.isfinite(one_run.read(study).paths[1][1]).any()
     assert "6 of 8 runs" in compose(report).answer
 
 
@@ -818,7 +817,7 @@ def test_findings_and_distributions(reproduced):
     # first order: sigma_x = x^2 sigma_d / (f B)
     np.testing.assert_allclose(np.sqrt(narrow.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.09))
     np.testing.assert_allclose(np.sqrt(wide.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.5))
-    cloud, histogram = panels(stereo_noise.stereo_noise(report)[0])
+    cloud, histogram = panels(stereo_noise.blocks(report)[0])
     linear, fitted = lines(cloud)
     np.testing.assert_array_equal(linear.get_xydata(), stereo_noise.ellipse(narrow.linear))
     np.testing.assert_array_equal(fitted.get_xydata(), stereo_noise.ellipse(narrow.fitted))
@@ -886,7 +885,7 @@ def test_the_front_end_is_what_its_tables_hold(reproduced):
     assert "probability 0.1 % at most" in text
     assert "$x$ <b>: 0 of 1 accepted" in text
     assert printed(report).startswith(b"%PDF")
-    by_depth, by_scene, first_order = (panels(figure) for figure in front_end.front_end(report))
+    by_depth, by_scene, first_order = (panels(figure) for figure in front_end.blocks(report))
     (curve,) = lines(by_depth[0], "measured")
     np.testing.assert_allclose(curve.get_ydata(), [95.0, 80.0])
     (accepted,) = by_depth[0].patches
@@ -936,7 +935,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
     for number, track in enumerate(study.tracks):
         drawn_panels = panels(figure, number)
         assert titles(drawn_panels)[0] == track.name
-        of = pose_errors.pose_error_series(track)
+        of = one_run.pose_error_series(track)
         for axes, error, sigma in zip(drawn_panels, of.error.T, of.sigma.T, strict=True):
             _, low, high, curve = axes.lines
             np.testing.assert_array_equal(curve.get_ydata(), error)
@@ -945,7 +944,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
 
 def test_the_map_shows_truth_and_estimates(report):
     (study,) = report.studies
-    found = paths_and_landmarks.read(study)
+    found = one_run.read(study)
     (axes,) = panels(by_title(compose(report))["Scenario and estimates, run 0"])
     (truth,), (odometry,) = lines(axes, "true path"), lines(axes, "odometry alone")
     np.testing.assert_array_equal(truth.get_xydata(), found.truth)
@@ -1022,7 +1021,7 @@ def test_a_log_without_truth_says_so(uvd, tmp_path):
     report = build_report(tmp_path / "run")
     (study,) = report.studies
     assert not study.has_truth
-    assert paths_and_landmarks.read(study).odometry is None
+    assert one_run.read(study).odometry is None
     assert str(tmp_path) not in study.name
     source = shown(report)
     assert "The truth of log is not known" in source

@@ -174,8 +174,8 @@ BAD = {
     "negative disparity": ((put("truth.sensor.disparity_px", [-1.0, 32.0]),), r"'truth\.sensor\.disparity\.0'"),
     "half a linear world": ((put("truth.motion.model", "linear"),), r"'truth'.*'linear' together"),
     "disparity reversed": ((put("truth.sensor.disparity_px", [32.0, 1.0]),), r"disparity"),
-    "true is no number": ((put("truth.motion.sigma_v", True),), r"truth\.motion\.sigma_v"),
-    "text is no number": ((put("truth.motion.sigma_v", "0.1"),), r"truth\.motion\.sigma_v"),
+    "true is not a number": ((put("truth.motion.sigma_v", True),), r"truth\.motion\.sigma_v"),
+    "text is not a number": ((put("truth.motion.sigma_v", "0.1"),), r"truth\.motion\.sigma_v"),
     "two mistakes": (
         (put("truth.steps", -1), put("belief.motion.sigma_v", -1.0)),
         r"'truth\.steps'.*; key 'belief\.motion\.sigma_v'",

@@ -68,11 +68,11 @@ TABLES = [
     ("truth", twice, r"truth\.parquet: step 0 of run 0 is not what comes next"),
     ("truth", lambda t: t.iloc[::-1], r"truth\.parquet: step 12 of run 8 is not what comes next"),
     ("failures", only("run < 0"), r"failures\.parquet: has 0 rows, manifest\.json counts 1 failures"),
-    ("failures", value("run == 3", "filter", "three"), r"failures\.parquet: 'three' is no filter"),
+    ("failures", value("run == 3", "filter", "three"), r"failures\.parquet: 'three' is not a filter"),
     ("failures", value("run == 3", "step", 0), r"step 0: a run fails once"),
     ("failures", value("run == 3", "step", 13), r"has steps that truth\.parquet lacks"),
     ("failures", value("run == 3", "step", 9), r"run 3 of 'two' has 7 steps, not 8"),
-    ("map", twice, r"map\.parquet: landmark 0 of run 0 of 'one' is there twice"),
+    ("map", twice, r"map\.parquet: landmark 0 of run 0 of 'one' is duplicated"),
     ("map", value("filter == 'two' and run == 4", "run", 3), r"map\.parquet: 'two' has no finished run 3"),
     ("map", value("filter == 'two' and run == 4", "filter", "three"), r"map\.parquet: 5 of \d+ rows are of no filter"),
     ("rejections", only("run != 2"), r"rejections\.parquet: must have each run of 'two' once"),
@@ -80,7 +80,7 @@ TABLES = [
     ("rejections", twice, r"must have each run of 'two' once"),
     ("rejections", value("run == 2", "rejected", 50), r"counts of rejected observations"),
     ("rejections", value("run == 2", "rejected_spurious", 4), r"counts of rejected observations"),
-    ("landmarks", twice, r"landmarks\.parquet: column 'landmark': a landmark is there twice"),
+    ("landmarks", twice, r"landmarks\.parquet: column 'landmark': a landmark is duplicated"),
 ]  # fmt: skip
 
 
@@ -132,9 +132,9 @@ def test_a_run_that_is_never_uncertain_has_no_nees(folder):
 MANIFESTS = [
     ({"filters": "one"}, r"key 'filters': Input should be a valid list"),
     ({"filters": []}, r"key 'filters': "),
-    ({"filters": ["one", "one"]}, r"key 'filters': .*a name is there twice"),
+    ({"filters": ["one", "one"]}, r"key 'filters': .*a name is duplicated"),
     ({"filters": ["one", "two\u2028"]}, r"key 'filters': .*the name 'two\\u2028' has a control character"),
-    ({"filters": ["one"]}, r"failures\.parquet: 'two' is no filter"),
+    ({"filters": ["one"]}, r"failures\.parquet: 'two' is not a filter"),
     ({"filters": ["one", "two", "three"]}, r"run 0 of 'three' is missing"),
     ({"complete": "yes"}, r"key 'complete'"),
     ({"complete": None}, r"key 'complete'"),
@@ -147,7 +147,7 @@ MANIFESTS = [
     ({"tables": "estimates"}, r"key 'tables'"),
     ({"seed": "a"}, r"key 'seed'"),
     ({"failures": 2}, r"failures\.parquet: has 1 rows, manifest\.json counts 2"),
-    ({"optimal_gain": ["three"]}, r"key 'optimal_gain': 'three' is no filter"),
+    ({"optimal_gain": ["three"]}, r"key 'optimal_gain': 'three' is not a filter"),
     ({"scenario_hash": "0" * 16}, r"key 'scenario_hash' is not that of key 'scenario'"),
     ({"kind": "log"}, r"key 'kind'"),
     ({"contents": []}, r"manifest\.json: key 'contents' must have tables as keys"),

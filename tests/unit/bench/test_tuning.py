@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from documents import blocks
+from documents import ROOT
 from scipy import stats
 
 import consistency as cs
@@ -398,9 +398,9 @@ def test_a_log_is_tuned_to_a_sensor_file(capsys: pytest.CaptureFixture[str], tmp
 
 
 def test_the_filterpy_filter_of_the_manual(tmp_path: Path) -> None:
-    [block] = blocks("docs/tuning.md", "python")
-    short = block.text.replace("runs=20", "runs=2").replace("truth__steps=50", "truth__steps=6")
-    assert short != block.text
+    script = (ROOT / "docs/examples/tune_my_ekf.py").read_text(encoding="utf-8")
+    short = script.replace("runs=20", "runs=2").replace("truth__steps=50", "truth__steps=6")
+    assert short != script
     (tmp_path / "mine.py").write_text(short)
     done = subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from consistency.bench.tuning.fit import LIMIT, FactorFit, KnownScores, derivatives, maximise
-from consistency.bench.tuning.profile_intervals import UNITS, depth_of, independent_sums, profile_intervals
+from consistency.bench.tuning.fit import (
+    LIMIT,
+    UNITS,
+    FactorFit,
+    KnownScores,
+    depth_of,
+    derivatives,
+    independent_sums,
+    maximise,
+    profile_intervals,
+)
 from consistency.referee.types import Array
 
 SIGMAS = 4.8  # bound on a normal number, so that each assertion fails by chance in less than 1e-5 of all runs

@@ -13,8 +13,7 @@ import pytest
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.filters.textbook.basics import motion_jacobians
-from consistency.bench.filters.textbook.sensors import PointSensor
+from consistency.bench.filters.textbook.basics import PointSensor, motion_jacobians
 from consistency.bench.simulation import draw_landmarks, planned_controls, planned_path, require_landmarks_in_view
 from consistency.bench.types import Control, Trial
 from consistency.referee.geometry import rotation

@@ -105,7 +105,7 @@ def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path):
             {"truth_topic": "/gps"},
             r"--truth-topic /gps: is not there with poses; there are: /odom, PARENT:CHILD of /tf",
         ),
-        ({"truth_topic": "odom:body"}, r"--truth-topic odom:body: is no transform of /tf; there are: map:body"),
+        ({"truth_topic": "odom:body"}, r"--truth-topic odom:body: is not a transform of /tf; there are: map:body"),
         (
             {"truth_topic": "map:body", "topic": "/tf"},
             r"--topic /tf: is not there with poses and cov.*there are: /odom",

@@ -162,7 +162,7 @@ def test_a_singular_matrix_of_a_camera_is_named(files):
         ("%YAML:1.0\n---\nK1: " + "[" * 1_000_000, "nested too deep"),
         ("K1: " + "- " * 20_000, "nested too deep"),
         ("a: &a [1, 1]\nK1: [*a, *a]\n", "aliases"),
-        ("K1: 1\nK1: 2\n", "key 'K1' is there twice"),
+        ("K1: 1\nK1: 2\n", "key 'K1' is duplicated"),
         ("K1: 2020-99-99\n", "cannot be read as YAML"),
         ("K1: [1" + "0" * 400 + "]\n", "key 'K1': must be numbers"),
         ("x" * (2**20 + 1), "at most 1 MiB are read"),
@@ -187,7 +187,7 @@ def test_yaml_that_is_hostile(tmp_path, text, said):
     "key, value, said",
     [
         ("runs", [2**63, 1], "filters.one.runs.0"),
-        ("runs", [0] * 9, "a run is there twice"),
+        ("runs", [0] * 9, "a run is duplicated"),
         ("dof", 10**400, "filters.one.dof"),
         ("dof", True, "filters.one.dof"),
         ("nees", [1.0], "not equally long"),

@@ -56,7 +56,7 @@ def test_what_was_measured_keeps_the_promise(row: Row) -> None:
 
 
 def test_the_documentation_shows_it() -> None:
-    assert calibration_rows.markdown(TABLE) in (ROOT / "docs/referee.md").read_text(encoding="utf-8")
+    assert calibration_rows.markdown(TABLE) in (ROOT / "docs/reference/rates.md").read_text(encoding="utf-8")
 
 
 def test_rows_of_one_module_take_the_place_of_their_questions_in_their_worlds() -> None:

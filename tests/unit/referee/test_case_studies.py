@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import consistency
 
 import consistency as cs
 from consistency.diagnostics import gate_runs
@@ -244,17 +243,6 @@ def test_the_factor_of_the_older_version_alone_is_overconfident() -> None:
     assert verdict("4.2.1", "-tenth").inflation < 1.2
 
 
-@pytest.mark.parametrize(("document", "kinds"), [
-    ("README.md", {("4.2.1", ""), ("4.2.1", "-tenth"), ("4.3.0", "-raw")}),
-    ("docs/index.md", {("4.2.1", "")}),
-])  # fmt: skip
-def test_figures_of_the_opening_are_those_of_the_archives(document: str, kinds: set[tuple[str, str]]) -> None:
-    text = " ".join((DOCS.parent / document).read_text("utf-8").split())
-    opening = text.partition("## Quick start")[0]
-    assert set(RATIO.findall(opening)) == {ratio(*kind) for kind in kinds}
-
-
-def test_the_printed_verdict_of_the_readme_is_what_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    (shown,) = re.findall(r"^(gtsam-4\.2\.1 is .*) \.\.\.$", (DOCS.parent / "README.md").read_text("utf-8"), re.M)
-    out, _ = consistency(capsys, "analyse", FOLDER / "gtsam-4.2.1.npz", "--fail-on", "inconsistent", status=1)
-    assert shown in " ".join(out.split())
+def test_the_figure_of_the_readme_is_that_of_the_archive() -> None:
+    factor = f"by a factor of {verdict('4.2.1').inflation:.1f}"
+    assert factor in " ".join((DOCS.parent / "README.md").read_text("utf-8").split())

@@ -411,8 +411,8 @@ def test_bad_baselines_are_refused(results, tmp_path):
     data = json.loads(path.read_text())
     for broken, message in (
         ("{", "not valid JSON"),
-        ("[]", "is no baseline"),
-        (json.dumps(data | {"kind": "log"}), "is no baseline"),
+        ("[]", "is not a baseline"),
+        (json.dumps(data | {"kind": "log"}), "is not a baseline"),
         (json.dumps(data | {"filters": {"f": {}}}), "damaged"),
     ):
         path.write_text(broken)

@@ -1,4 +1,4 @@
-"""docs/conventions.md: the example of each library, with right options and wrong ones; sources to verdict and page."""
+"""The page of conventions: the example of each library, with right options and wrong ones; sources to verdict."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from test_drives import estimates
 
 from consistency.referee.types import Array
 
-PAGE = read("docs/conventions.md")
+PAGE = read("docs/reference/conventions.md")
 SECTIONS = dict(part.split("\n", 1) for part in PAGE.split("\n## ")[1:])
 NEEDED = {"GTSAM Pose2": "gtsam", "GTSAM Pose3": "gtsam", "Stone Soup": "stonesoup"}
 FAULTS = {"overconfident", "conservative", "biased", "heavy-tailed", "inconsistent"}
@@ -35,7 +35,7 @@ def run_example(name: str, at: Path, monkeypatch: pytest.MonkeyPatch, *changes: 
     """The code of a section, with random numbers of its own."""
     if name in NEEDED:
         pytest.importorskip(NEEDED[name], reason=f"{NEEDED[name]} is not installed")
-    (code,) = blocks("docs/conventions.md", "python", part=name)
+    (code,) = blocks("docs/reference/conventions.md", "python", part=name)
     text = code.text
     for old, new in (("default_rng(6021)", f"default_rng({secrets.randbits(60)})"), *changes):
         assert old in text
@@ -83,7 +83,7 @@ def test_the_notebook_says_what_the_command_says(
     run_example("GTSAM Pose3", tmp_path, monkeypatch)
     out, _ = consistency(capsys, *commands(SECTIONS["GTSAM Pose3"])[0], "--json")
     said = {verdict["status"] for verdict in json.loads(out).values()}
-    (code,) = blocks("docs/conventions.md", "python notebook", part="GTSAM Pose3")
+    (code,) = blocks("docs/reference/conventions.md", "python notebook", part="GTSAM Pose3")
     (tmp_path / "look.py").write_text(code.text)
     runpy.run_path("look.py")
     assert {capsys.readouterr().out.strip()} == said

@@ -132,7 +132,7 @@ def test_what_cannot_be_used_is_one_line(tmp_path, capsys):
     assert "a.bin: no such file" in refused(capsys, "monitor", path)
     for content in (b"", b"not a log", bytes(1000)):
         path.write_bytes(content)
-        assert "a.bin: is no flight log of ArduPilot" in refused(capsys, "monitor", path)
+        assert "a.bin: is not a flight log of ArduPilot" in refused(capsys, "monitor", path)
     Flight().write(path)
     assert "holds no message XKF4 or NKF4" in refused(capsys, "monitor", path)
     flight(path, {"SH": [0.0, 0.0]})

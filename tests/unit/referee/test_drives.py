@@ -146,7 +146,7 @@ def test_what_is_wrong_with_a_drive_is_said(drive: Path) -> None:
     stamps.write_text("\n".join(lines))
     calibration = drive.parent / "calib_imu_to_velo.txt"
     calibration.write_text("R: 1 0 0 0 2 0 0 0 1\nT: 0 0 0\n")
-    refused(r"calib_imu_to_velo\.txt: key 'R': is no rotation", body="velodyne")
+    refused(r"calib_imu_to_velo\.txt: key 'R': is not a rotation", body="velodyne")
     calibration.write_text("R: 1 0 0\nT: 0 0 0\n")
     refused(r"calib_imu_to_velo\.txt: key '", body="velodyne")
     calibration.unlink()

@@ -141,7 +141,7 @@ def broken(arrays, key, value):
         ("true_v", None, "key 'true_v' is missing, of the true states"),
         ("ba", None, "key 'ba' is missing; there are two biases or none"),
         ("order", ["R", "v", "p"], "key 'order' is R, v, p; must name R, p, v, bg, ba, each once"),
-        ("R", np.tile(2.0 * np.eye(3), (RUNS, STEPS, 1, 1)), "key 'R' holds a matrix that is no rotation"),
+        ("R", np.tile(2.0 * np.eye(3), (RUNS, STEPS, 1, 1)), "key 'R' holds a matrix that is not a rotation"),
         ("true_R", np.tile(np.diag([1.0, 1.0, -1.0]), (RUNS, STEPS, 1, 1)), "key 'true_R' holds a matrix that is no"),
         ("p", np.zeros((RUNS, STEPS, 2)), r"key 'p' has shape \(3, 7, 2\), needs \(runs, steps, 3\)"),
         ("p", np.zeros((STEPS, RUNS, 3)), r"keys 'p' and 'true_p' have shapes \(7, 3, 3\) and \(3, 7, 3\)"),

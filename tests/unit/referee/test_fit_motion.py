@@ -1,4 +1,4 @@
-"""Means that depend on the motion, clocks that differ, and inputs that are no poses, on drives with known errors."""
+"""Means that depend on the motion, clocks that differ, and inputs that are not poses, on drives with known errors."""
 
 from __future__ import annotations
 
@@ -426,5 +426,5 @@ def test_rotations_equal_to_rounding_are_no_closed_loops(size: float, rng: np.ra
 def test_timestamps_in_messages_are_not_rounded(tmp_path: Path) -> None:
     path = tmp_path / "a.tum"
     path.write_text("".join(f"1326030980.{k} {k} 0 0 0 0 0 1\n" for k in (51, 53, 53, 55)))
-    with pytest.raises(InputError, match=r"line 3: timestamp 1326030980\.53 is there twice"):
+    with pytest.raises(InputError, match=r"line 3: timestamp 1326030980\.53 is duplicated"):
         cs.read_drives(path, path)

@@ -225,7 +225,7 @@ def test_an_angle_that_is_none(tmp_path):
     fields = lines_of[5].split()
     fields[3] = "61"
     path.write_text("\n".join([*lines_of[:5], " ".join(fields), *lines_of[6:]]), encoding="utf-8")
-    with pytest.raises(cs.InputError, match=r"rover\.pos, line 6: '47 61 .*' is no angle of degrees, minutes and"):
+    with pytest.raises(cs.InputError, match=r"rover\.pos, line 6: '47 61 .*' is not an angle of degrees, minutes and"):
         read_solution(path)
 
 
@@ -235,8 +235,8 @@ def test_an_angle_that_is_none(tmp_path):
         ("latitude(deg)", "latitude(gon)", r"rover\.pos: holds none of latitude\(deg\).*out-solformat =llh, =xyz or"),
         ("sdeu(m)", "other(m)", r"rover\.pos: column 'sdeu\(m\)' is missing"),
         ("GPST", "LOCAL", r"rover\.pos, line 6: stands under no header"),
-        ("2024/03/05 10:00:00.250", "2024/13/05 10:00:00.250", r"rover\.pos, line 7: .* is no date and time"),
-        ("2024/03/05 10:00:00.250", "2024/03/05 10:00:00.000", r"rover\.pos, line 7: timestamp .* is there twice"),
+        ("2024/03/05 10:00:00.250", "2024/13/05 10:00:00.250", r"rover\.pos, line 7: .* is not a date and time"),
+        ("2024/03/05 10:00:00.250", "2024/03/05 10:00:00.000", r"rover\.pos, line 7: timestamp .* is duplicated"),
         (" 12.3\n", " 12.3 1\n", r"rover\.pos, line 6: has 16 fields; its header names a time of two and 13 more"),
         ("   1  9 ", "   x  9 ", r"rover\.pos, line 6: a field is not a number"),
     ],

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from consistency.bench.filters.error.invariant_pose import exponential, left_jacobian, move_pose, shifted_covariance
-from consistency.bench.filters.error.polar import SensorPoint
 from consistency.bench.filters.kernel.part_functions import Frame, world_point
+from consistency.bench.filters.methods.equivariant import SensorPoint
+from consistency.bench.filters.parts.invariant_pose import exponential, left_jacobian, move_pose, shifted_covariance
 from consistency.bench.models.point import Mounting
 from consistency.referee.geometry import pose_error, rotation, wrap
 from consistency.referee.types import Array

@@ -266,6 +266,9 @@ def test_standard_deviations_are_judged_by_group_one_by_one() -> None:
     assert f"{GROUP} of x" in verdict.faults
     assert any(line.startswith("x: mode <= 0: covariance ratio") for line in verdict.reasons)
     assert verdict.statistics["by_part"]["y"]["groups"][0]["status"] == "overconfident"
+    error[column == 0] /= 2.0
+    right = cs.judge(error, deviations=sigma, axes=("x", "y"), by={"mode": column})
+    assert "; x: consistent in each of 4 groups by mode; y: consistent in each of 4 groups by mode" in right.reasons[0]
 
 
 def test_groups_go_with_runs_windows_and_pieces() -> None:
@@ -330,9 +333,14 @@ def test_honest_columns_are_not_refused() -> None:
     assert selects_on_outcome(Column("n_matches", number), ("x", "y"), flat, flat, covariance) == ""
 
 
-@pytest.mark.parametrize("name", ["x", "true_x", "x_gt", "est_y", "sigma", "P_xx", "std_heading"])
+@pytest.mark.parametrize("name", ["x", "true_x", "x_gt", "est_y", "sigma", "P_xx", "std_y"])
 def test_names_that_select_on_the_outcome(name: str) -> None:
     assert selects_on_outcome(Column(name, np.arange(40.0)), ("x", "y")) != ""
+
+
+@pytest.mark.parametrize("name", ["p_hpa", "gnss_std", "speed", "true_speed", "t", "var_of_matches"])
+def test_names_that_do_not(name: str) -> None:
+    assert selects_on_outcome(Column(name, np.arange(40.0)), ("x", "y")) == ""
 
 
 def test_groups_of_the_outcome_show_and_do_not_convict() -> None:

@@ -450,9 +450,9 @@ REFUSED = {
         lambda d: lines("t.csv", "t,x,y,z,qw,qx,qy,qz", [d.t, *with_w_first(1.01 * d.true)]),
         r"t\.csv, line 2: the quaternion has length 1\.01, not 1; read as .* quaternion w first",
     ),
-    "a time that is there twice": (
+    "a time that is duplicated": (
         lambda d: lines("t.csv", NAMES, [np.full(STEPS, 1.0), *d.true.T]),
-        r"t\.csv, line 3: timestamp 1 is there twice",
+        r"t\.csv, line 3: timestamp 1 is duplicated",
     ),
     "two poses in a row": (
         lambda d: lines("t.csv", TWO, [d.t, *d.true.T[:3], *d.true.T]),
@@ -464,11 +464,11 @@ REFUSED = {
     ),
     "matrices that stretch": (
         lambda d: lines("t.txt", "", [d.t, *matrices(d.true * [1, 1, 1, 1.1, 1.1, 1.1, 1.1])], " "),
-        r"t\.txt, line 1: the 12 numbers are no rotation",
+        r"t\.txt, line 1: the 12 numbers are not a rotation",
     ),
     "matrices with another last row": (
         lambda d: lines("t.txt", "", [*matrices(d.true, 4)[:15], np.full(STEPS, 2.0)], " "),
-        r"t\.txt, line 1: the 16 numbers are no rotation",
+        r"t\.txt, line 1: the 16 numbers are not a rotation",
     ),
     "another time base": (
         lambda d: lines("t.csv", "#sec,nsec,x,y,z,qx,qy,qz,qw", [*whole(d.t - 1e9), *d.true.T]),

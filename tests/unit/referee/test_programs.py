@@ -131,6 +131,10 @@ def test_a_program_that_is_none_is_refused_before_any_folder(words, message, pla
         (["--keep", "none"], "--keep must be"),
         (["--resume", "--overwrite"], "give one of them"),
         (["--cwd", "nowhere"], "no such folder"),
+        (["--seed", "-1"], "--seed must be 0 or more"),
+        (["--estimates", "{here}/one.csv"], "is one file for all runs; let the program write into {out}"),
+        (["--truth", "{here}/none.csv"], "none.csv is not there"),
+        (["--each", "tables/1?.csv", "--truth", "t/{name}.csv"], "t/10.csv is not there (nor are 9 others)"),
         (["--junit", "a.txt"], "must end in .xml"),
         (["--report", "tables/0.csv"], "exists already"),
     ],
@@ -140,6 +144,15 @@ def test_options_that_do_not_go_together(options, message, place, capsys):
     assert status == 2
     assert message in err
     assert not (place / "out").exists()
+
+
+def test_a_recorded_file_needs_its_option(place, capsys):
+    status, _, err = monte_carlo("--out", "out", "--", "./filter", "{input}", capsys=capsys)
+    assert (status, "{input} in the command needs --each" in err) == (2, True)
+    (place / "out").mkdir()  # an empty folder is taken
+    with pytest.raises(SystemExit):
+        main(["monte-carlo", "--out", "out", "--", "./filter", "{run}"])
+    assert "named by --state A,B" in capsys.readouterr().err
 
 
 def test_a_relative_path_is_pointed_out(place, capsys):
@@ -337,6 +350,17 @@ def test_estimates_that_end_before_their_truth_have_failed(place, capsys):
     assert failures(place / "out", capsys) == {}
 
 
+def test_a_table_that_ends_before_those_of_most_runs_has_failed(place, capsys):
+    script(place, COPY + "\n[ $1 = 4 ] && sed -i '$d' estimates.csv; exit 0")
+    words = ("--runs", "8", "--out", "out", "--overwrite", "--", "./filter", "{run}")
+    monte_carlo("--keep", "failed", *words, capsys=capsys)
+    assert failures(place / "out", capsys) == {4: "its estimates end at 3, those of most runs at 4"}
+    assert run_files(place / "out", "estimates.csv") == ["0004"]
+    script(place, COPY + "\n[ $1 -gt 2 ] && sed -i '$d' estimates.csv; exit 0")  # runs of any length
+    monte_carlo(*words, capsys=capsys)
+    assert failures(place / "out", capsys) == {}
+
+
 def test_first_runs_that_fail_alike_end_the_study(place, capsys):
     script(place, "echo libfoo.so not found; exit 127")
     status, out, err = monte_carlo("--out", "out", "--", "./filter", "{run}", capsys=capsys)
@@ -400,17 +424,17 @@ def test_an_unfinished_folder_says_so(place, capsys):
     status, out, err = consistency("analyse", "out", capsys=capsys)
     assert status == 0
     assert "0 of 13" in out
-    assert "only 13 of 14 runs are there; the same 'consistency monte-carlo' with --resume goes on" in err
+    assert "only 13 of 14 runs are there; the same 'consistency monte-carlo' with --resume continues" in err
     assert consistency("analyse", "out", "--fail-on", "inconsistent", capsys=capsys)[0] == 2
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda place: script(place, COPY + "\n# changed"), "a file that they name changed"),
-        (lambda place: (place / "gains.txt").write_text("2"), "gains.txt"),
-        (lambda place: ["--seed", "4"], "--seed changed"),
-        (lambda place: ["--", "./filter", "{run}", "x"], "the words of the command changed"),
+        (lambda place: script(place, COPY + "\n# changed"), "filter has changed since the runs"),
+        (lambda place: (place / "gains.txt").write_text("2"), "gains.txt has changed since"),
+        (lambda place: ["--seed", "4"], "--seed has changed"),
+        (lambda place: ["--", "./filter", "{run}", "x"], "the words of the command have changed"),
     ],
 )
 def test_another_study_is_not_resumed(change, message, place, capsys):
@@ -468,7 +492,7 @@ def test_a_stopped_study_loses_no_finished_run(number, place, capsys):
     said = command.communicate()[1].decode()
     if number == signal.SIGTERM:
         assert command.returncode == 128 + number
-        assert "the same command with --resume goes on" in said
+        assert "the same command with --resume continues" in said
         with pytest.raises(ProcessLookupError):
             _wait_for_the_end(program)
     else:

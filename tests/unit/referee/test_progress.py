@@ -3,42 +3,18 @@
 from __future__ import annotations
 
 import io
-import sys
-import time
 
 import pytest
 
 from consistency.referee.system import progress as module
-from consistency.referee.system.progress import each, foreseen, progress, quiet, say
+from consistency.referee.system.progress import announce, each, progress, quiet, say
 
 
-def test_what_is_foreseen_to_take_long_is_said_at_once_and_once(capsys: pytest.CaptureFixture[str]) -> None:
-    with quiet(), foreseen("compiling the kernel of ekf-uvd", 14.6):
-        assert capsys.readouterr().err == "compiling the kernel of ekf-uvd: about 15 s, once\n"
-    assert capsys.readouterr().err == ""
-    with foreseen("compiling 40 kernels", 300.0):
-        assert capsys.readouterr().err == "compiling 40 kernels: about 5 min, once\n"
-
-
-def test_a_terminal_has_a_bar_by_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is full when the work is done, not when the seconds are over."""
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "120")
-    nearly, until = "━" * 39 + "\x1b[0m\x1b[91m╸", time.monotonic() + 20.0
-    with foreseen("compiling", 0.01):
-        while nearly not in bar(terminal) and time.monotonic() < until:
-            time.sleep(0.01)
-        time.sleep(0.1)
-        assert nearly in bar(terminal)
-    assert "━" * 40 in bar(terminal)
-    assert "╸" not in bar(terminal)
-
-
-def bar(terminal: Terminal) -> str:
-    """What it shows now."""
-    return terminal.getvalue().rpartition("compiling: about 1 s, once")[2]
+def test_what_is_announced_is_said_where_all_else_is_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    with quiet():
+        say("one of many")
+        announce("compiling the kernel of ekf-uvd")
+    assert capsys.readouterr().err == "compiling the kernel of ekf-uvd\n"
 
 
 class Terminal(io.StringIO):

@@ -148,7 +148,7 @@ def test_what_is_wrong_is_named_by_table_and_row(tmp_path):
         cs.read(own.astype({"a": object}).replace({"a": {own["a"][2]: "east"}}), truth=truth, state=["a", "b"])
     with pytest.raises(cs.InputError, match=r"^estimates: holds no row"):
         cs.read(own[:0], truth=truth, state=["a", "b"])
-    with pytest.raises(cs.InputError, match=r"^estimates: column 'a' is there twice"):
+    with pytest.raises(cs.InputError, match=r"^estimates: column 'a' is duplicated"):
         cs.read(own.rename(columns={"b": "a"}), truth=truth, state=["a", "b"])
     with pytest.raises(cs.InputError, match=r"^estimates: needs --truth FILE"):
         cs.read(own, state=["a", "b"])

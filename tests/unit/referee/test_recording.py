@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from command import consistency
+from document_inputs import planar
 from documents import blocks
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -573,10 +574,7 @@ def test_poses_in_an_archive_take_a_convention(tmp_path: Path) -> None:
 # --- the commands of the manual ----------------------------------------------------------------------
 
 
-def example(word: str) -> str:
-    """The block of the manual that holds a word."""
-    (found,) = (block.text for block in blocks("docs/files.md", "python") if word in block.text)
-    return found
+FILTERPY = (ROOT / "docs/examples/filterpy_csv.py").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -593,7 +591,7 @@ def test_the_filterpy_filter_of_the_manual(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     """The manual's seed, so no false alarm of its own; the three wrong filters are the negative control."""
-    text = example("KalmanFilter(")
+    text = FILTERPY
     if change:
         assert change[0] in text
         text = text.replace(*change)
@@ -609,8 +607,8 @@ def test_the_filterpy_filter_of_the_manual(
 
 
 def test_the_notebook_of_the_manual(inside: Path) -> None:
-    (inside / "make.py").write_text(example("KalmanFilter("))
-    (inside / "notebook.py").write_text(example("record.plot("))
-    runpy.run_path("make.py")
+    (block,) = (block.text for block in blocks("docs/files.md", "python") if "record.plot(" in block.text)
+    (inside / "notebook.py").write_text(block)
+    planar(inside)
     assert runpy.run_path("notebook.py")["verdict"].status == "consistent"
     assert (inside / "mine.png").read_bytes().startswith(b"\x89PNG")

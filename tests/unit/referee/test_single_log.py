@@ -291,7 +291,7 @@ def test_options(tmp_path, options, message):
         read_recordings(*files, **options)
     (r,) = read_recordings(*files, split="25")
     assert r.error.shape == (25, 24, 3)
-    assert any("the log is cut into 25 pieces of 24 steps, which stand as runs" in note for note in r.notes)
+    assert any("the log is cut into 25 pieces of 24 steps, treated as runs" in note for note in r.notes)
     auto = cs.judge(cs.read(*files, split="auto"))
     assert auto.status in ("consistent", "undecided")
 

@@ -329,7 +329,7 @@ def test_misuse_is_no_failed_run(rng):
         arrays[key == "covariances"][:, 2] = np.nan
         with pytest.raises(ValueError, match=f"{key}, step 3: not finite in any run"):
             assert_consistent(*arrays)
-    with pytest.raises(ValueError, match="a run that is there twice"):
+    with pytest.raises(ValueError, match="are identical; remove the duplicate"):
         assert_consistent(errors[[0, 1, 1]], covariances[:3])
     with pytest.raises(ValueError, match="not positive definite"):
         cs.nees(errors[0, 0], -covariances[0, 0])

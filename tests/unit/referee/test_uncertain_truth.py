@@ -315,7 +315,7 @@ def test_what_is_refused(tmp_path, capsys, options, message):
 def test_a_covariance_of_the_truth_that_is_none_is_refused():
     e, S = np.zeros((2, 3, 2)), np.broadcast_to(np.eye(2), (2, 3, 2, 2))
     bad = np.broadcast_to(np.diag([1.0, -1.0]), (2, 3, 2, 2))
-    with pytest.raises(cs.InputError, match="covariance of the truth in run 0, step 1 is no covariance"):
+    with pytest.raises(cs.InputError, match="covariance of the truth in run 0, step 1 is not a covariance"):
         cs.judge(e, S, truth_covariances=bad)
     with pytest.raises(cs.InputError, match="'truth_covariances' has shape"):
         cs.judge(e, S, truth_covariances=np.ones((2, 3, 1, 1)))
@@ -348,7 +348,7 @@ def test_a_table_and_an_archive_state_it(tmp_path):
     assert_array_equal(archive.truth_covariance, one.truth_covariance)
     assert archive.truth_errors == "common"
     np.savez(tmp_path / "bad.npz", errors=v, covariances=P2, truth_covariances=-one.truth_covariance)
-    with pytest.raises(cs.InputError, match=r"bad: the covariance of the truth in run 0, step 1 is no covariance"):
+    with pytest.raises(cs.InputError, match=r"bad: the covariance of the truth in run 0, step 1 is not a covariance"):
         read_recordings(tmp_path / "bad.npz")
     in_memory = cs.judge(v, P2, truth_covariances=one.truth_covariance, truth_errors="common")
     assert in_memory.truth.errors == "common"

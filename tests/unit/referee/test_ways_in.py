@@ -442,11 +442,11 @@ def test_nees_with_degrees_of_freedom_by_step(inside):
 def test_times_in_messages_have_all_their_digits(inside):
     pose = "0 0 0 0 0 0 1"
     Path("est.tum").write_text(f"1326030980.51 {pose}\n1326030980.53 {pose}\n1326030980.53 {pose}\n")
-    with pytest.raises(cs.InputError, match=r"timestamp 1326030980\.53 is there twice"):
+    with pytest.raises(cs.InputError, match=r"timestamp 1326030980\.53 is duplicated"):
         cs.read("est.tum", truth="est.tum")
     table = pd.DataFrame({"t": ["1326030980.5312", "1326030980.5312"], "a": 1.0, "P_a_a": 1.0})
     truth = write("truth.csv", pd.DataFrame({"t": [1.0, 2.0], "a": 1.0}))
-    with pytest.raises(cs.InputError, match=r"t 1326030980\.5312 is there twice"):
+    with pytest.raises(cs.InputError, match=r"t 1326030980\.5312 is duplicated"):
         cs.read(write("est.csv", table), truth=truth, state=["a"])
     table["t"] = ["1326030980.53", "1326030981.5312"]
     with pytest.raises(cs.InputError, match=r"t is 1326030980\.53 to 1326030981\.5312, but 1 to 2 in truth\.csv"):
@@ -502,7 +502,7 @@ def test_a_chain_of_frames_is_composed(tmp_path):
     [back] = read_recordings(bag, truth_topic="mast:map")
     assert_allclose(back.error[0, :, :3], -total.inv().apply(expected), atol=1e-6)
     with pytest.raises(
-        cs.InputError, match=r"map:arm: is no transform of /tf; .*base:mast, map:odom, odom:base, world"
+        cs.InputError, match=r"map:arm: is not a transform of /tf; .*base:mast, map:odom, odom:base, world"
     ):
         read_recordings(bag, truth_topic="map:arm")
 

@@ -108,7 +108,7 @@ WRONG = {
         "est.csv, line 3: has 3 columns, the header has 10",
     ),
     "binary": (lambda at: (at / "est.csv").write_bytes(b"\xff\xfe\x00PAR1"), ("est.csv",), "est.csv: not a text file"),
-    "column twice": (raw("x,x\n1,2\n"), EST, "column 'x' is there twice"),
+    "column twice": (raw("x,x\n1,2\n"), EST, "column 'x' is duplicated"),
     "no truth": (csv(), ("est.csv",), "needs --truth FILE, or columns nis and nis_dof"),
     "missing state of the truth": (csv(None, columns("y")), EST, "truth.csv: column 'y' is missing"),
     "other state": (csv(), (*EST, "--state", "x,vx"), "est.csv: column 'vx' is missing"),
@@ -132,8 +132,8 @@ WRONG = {
         EST,
         "est.csv, line 2: the covariance is not symmetric",
     ),
-    "row twice": (csv(twice), EST, "est.csv, line 17: step 4 of run 0 is there twice"),
-    "runs without run": (csv(columns("run")), EST, "is there twice; several runs need a column 'run'"),
+    "row twice": (csv(twice), EST, "est.csv, line 17: step 4 of run 0 is duplicated"),
+    "runs without run": (csv(columns("run")), EST, "is duplicated; several runs need a column 'run'"),
     "time runs back": (
         csv(lambda e: e.drop(columns=["run", "step"]), columns("step")),
         EST,
@@ -188,7 +188,7 @@ WRONG = {
         LINE,
         "t.txt, line 5: the quaternion has length 1.118",
     ),
-    "TUM timestamp twice": (text(t=TUM + "0.2 0 0 0 0 0 0 1\n"), LINE, "t.txt, line 4: timestamp 0.2 is there twice"),
+    "TUM timestamp twice": (text(t=TUM + "0.2 0 0 0 0 0 0 1\n"), LINE, "t.txt, line 4: timestamp 0.2 is duplicated"),
     "TUM back in time": (
         text(truth=TUM + "0.1 0 0 0 0 0 0 1\n"),
         LINE,
@@ -330,7 +330,7 @@ WRONG = {
         ("t.txt", "--truth", "gt", "--covariance", "P.txt"),
         "gt: is a folder, but t.txt",
     ),
-    "a run twice": (doubled, RUNS, "a run that is there twice; leave one of them out"),
+    "a run twice": (doubled, RUNS, "are identical; remove the duplicate"),
     "a run in two files": (both_suffixes, RUNS, "est: holds the run '0' twice, as .txt and .tum"),
     "dof of a half": (csv(lambda e: e.assign(nis=1.0, nis_dof=1.5)), EST, "est.csv, line 2: nis 1 with nis_dof 1.5"),
     # archives

@@ -5,14 +5,14 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 from painted import by_title, legend_of, lines, panels, titles
-from scripts import experiment
+from scripts import experiment, figures
 
 import consistency as cs
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.sections import images, sensor_issues
 from consistency.bench.pages.sections.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, shown
 from consistency.referee.document.blocks import Column, Heading, Stack, Status, Table
 
+images, sensor_issues = figures("images"), figures("sensor_issues")
 SECTIONS = (sensor_issues, images)
 SCRIPTS = ("e20_bias_or_noise", "e21_sensor_issues", "e24_image_noise", "e25_image_tracks", "e26_lens_models")
 TEXT = dict.fromkeys(("source", "claim", "statistic", "published", "measured"), "")

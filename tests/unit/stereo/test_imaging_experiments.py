@@ -5,11 +5,10 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 from painted import by_title, lines, panels
-from scripts import experiment
+from scripts import experiment, figures
 
 import consistency as cs
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.sections import images
 from consistency.bench.pages.sections.exhibits import shown
 from consistency.referee.document.blocks import Heading, Table
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Tracks
@@ -17,6 +16,7 @@ from consistency.stereo.rendered_images.scene import Layer, Scene
 from consistency.stereo.rendered_images.stops import Stops, wall_texture
 
 pytest.importorskip("cv2")
+images = figures("images")
 
 
 @pytest.fixture

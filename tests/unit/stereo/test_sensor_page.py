@@ -1,4 +1,4 @@
-"""Every example of docs/sensor.md works in herath2007-stereo, and the page has every effect and scenario."""
+"""Every example of the page of sensor effects works in herath2007-stereo, and it has every effect and scenario."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import consistency as cs
 from consistency.bench.scenario import data_folder
 from consistency.bench.scenario.effects import EFFECTS
 
-PAGE = read("docs/sensor.md")
-TABLES = [block.text for block in blocks("docs/sensor.md", "toml")]
+PAGE = read("docs/reference/sensor-effects.md")
+TABLES = [block.text for block in blocks("docs/reference/sensor-effects.md", "toml")]
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: re.findall(r'kind = "(.*)"|sensor\.(\w+)', table)[0])
@@ -27,7 +27,7 @@ def test_a_table_switches_something_on(tmp_path: Path, table: str) -> None:
 
 
 def test_code_runs() -> None:
-    pieces = blocks("docs/sensor.md", "python")
+    pieces = blocks("docs/reference/sensor-effects.md", "python")
     assert len(pieces) == 2
     for piece in pieces:
         exec(piece.text, {})

@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
+import scripts
 from scipy import stats
 from scripts import experiment
 
 import consistency as cs
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.sections import front_end
 from consistency.vision import RelativePose
 
-rigs = experiment("published_rig")
+rigs, front_end = experiment("published_rig"), scripts.figures("front_end")
 
 
 @pytest.fixture

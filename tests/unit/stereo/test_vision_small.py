@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from consistency.stereo.visual_odometry.cameras import batch_inverses
+from consistency.stereo.visual_odometry.cameras import arrays
 
 
 @pytest.mark.parametrize("m", [2, 3, 6])
 def test_inverses_are_lapacks(m, rng):
     root = rng.normal(size=(40, m, m))
     C = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(m)
-    inverse, definite = batch_inverses.symmetric_inverses(C)
+    inverse, definite = arrays.symmetric_inverses(C)
     assert definite.all()
     assert inverse == pytest.approx(np.linalg.inv(C), rel=1e-8)
 
@@ -22,8 +22,8 @@ def test_what_is_not_positive_definite_is_told(m, rng):
         values = np.ones(m)
         values[k] = -0.1
         C = np.stack([np.eye(m), turn * values @ turn.T])
-        inverse, definite = batch_inverses.symmetric_inverses(C)
+        inverse, definite = arrays.symmetric_inverses(C)
         assert definite.tolist() == [True, False]
         assert np.isfinite(inverse).all()
-    assert batch_inverses.symmetric_inverses(-np.eye(m)[None])[1].tolist() == [False]
-    assert batch_inverses.symmetric_inverses(np.full((1, m, m), np.nan))[1].tolist() == [False]
+    assert arrays.symmetric_inverses(-np.eye(m)[None])[1].tolist() == [False]
+    assert arrays.symmetric_inverses(np.full((1, m, m), np.nan))[1].tolist() == [False]

@@ -64,11 +64,11 @@ class Content:
         return self._digest.hexdigest()[:32]
 
     @property
-    def functions(self) -> dict[str, int]:
-        """Bytes of bytecode of each function that is compiled, by its name; those of libraries are left out."""
+    def size(self) -> int:
+        """Bytes of bytecode of all functions that are compiled; those of libraries are left out."""
         seen = [each for each in self._seen.values() if isinstance(each, FunctionType)]
         own = [each for each in seen if not _is_foreign(each.__module__) and each not in BODIES]
-        return {f"{each.__module__}.{each.__qualname__}": len(each.__code__.co_code) for each in own}
+        return sum(len(each.__code__.co_code) for each in own)
 
     def _add(self, value: Any, names: tuple[str, ...] = ()) -> None:
         """A value and what it reads; of a module, its attributes of these names."""

@@ -11,12 +11,9 @@ import os
 import stat
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from filelock import FileLock
@@ -24,11 +21,6 @@ from filelock import FileLock
 MOST = 1 << 30  # bytes of a folder, some 500 kernels; those not used for longest go first
 SUFFIX = ".kernel"
 _DIGEST = hashlib.sha256().digest_size
-FILE = "seconds.txt"  # beside the compiled code: a line for each kernel, its size and seconds
-RECENT = 15  # kernels whose median counts, so that neither a busy hour nor an old processor does for long
-LONGEST = 1 << 16  # bytes of the file, after which it begins anew
-FIRST = 4e-4  # s a byte where nothing was compiled yet: two idle cores take 3.5e-4
-AGAIN = 0.5  # share of a function's time where the process has compiled it before, for types that may differ
 _STALE = 86_400.0  # s, after which a file that a killed process was writing is removed
 
 
@@ -58,7 +50,7 @@ def read_code(path: Path, tell: bool = False) -> bytes | None:
         if not content:
             refusal = "somebody else may write there; code is compiled for this process"
         elif hashlib.sha256(payload).digest() != content[:_DIGEST]:
-            refusal = "compiled code is damaged there; it is compiled anew"
+            refusal = "compiled code is damaged there; it is compiled again"
     if refusal:
         if tell:
             _say(f"{path}: {refusal}")
@@ -146,47 +138,3 @@ def is_ours(*paths: Path) -> bool:
 def _say(sentence: str) -> None:
     """Once in a process."""
     print(f"consistency: {sentence}", file=sys.stderr)
-
-
-# --- how long it took ------------------------------------------------------------------------------
-
-
-def seconds_for(size: float) -> float:
-    """Seconds for a kernel of this size, in bytes of bytecode."""
-    return size * _per_byte()
-
-
-@contextmanager
-def measured(size: float) -> Iterator[None]:
-    """Keep how long the compiling inside took; where the folder does not take it, nothing is kept."""
-    started = time.monotonic()
-    yield
-    line = f"{size:.0f} {time.monotonic() - started:.3f}\n".encode()
-    path = folder() / FILE
-    with suppress(OSError):
-        if is_ours(path.parent):
-            is_long = path.exists() and path.stat().st_size > LONGEST
-            flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if is_long else os.O_APPEND)
-            file = os.open(path, flags, 0o600)
-            try:
-                os.write(file, line)  # at once, so that lines of several processes do not mix
-            finally:
-                os.close(file)
-
-
-def _per_byte() -> float:
-    try:
-        lines = (folder() / FILE).read_text(encoding="ascii", errors="replace").splitlines()[-RECENT:]
-    except OSError:
-        lines = []
-    rates = [rate for rate in map(_rate, lines) if rate is not None]
-    return median(rates) if rates else FIRST
-
-
-def _rate(line: str) -> float | None:
-    """Seconds a byte; None for a line that nobody wrote so."""
-    try:
-        size, seconds = map(float, line.split())
-    except ValueError:
-        return None
-    return seconds / size if 0.0 < size < 1e9 and 0.0 < seconds < 1e5 else None

@@ -138,7 +138,7 @@ def require_fitting(parts: Any) -> None:
     for role, value in zip(parts._fields, parts, strict=True):
         cls = type(value)
         if PARTS.get(cls.__name__) is not cls:
-            raise TypeError(f"{role}: '{cls.__name__}' is no registered part")
+            raise TypeError(f"{role}: '{cls.__name__}' is not a registered part")
         for other, names in _needs[cls].items():
             chosen = type(getattr(parts, other)).__name__
             if chosen not in names:

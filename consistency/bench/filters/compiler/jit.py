@@ -45,7 +45,7 @@ class Outlook(NamedTuple):
     key: str  # of what the kernel is made of
     is_ready: bool  # compiled in this process, or on disk
     is_shared: bool  # whether other processes can read what one has compiled
-    seconds: float  # that compiling takes, or would take
+    size: int  # bytes of bytecode that it is compiled from
 
 
 class Kernel:
@@ -60,7 +60,6 @@ class Kernel:
         self.loaded = 0  # signatures that this process has read from disk
         self._entries: dict[Any, Any] = {}
         self._contents: dict[Any, Content] = {}  # by signature, as far as somebody has asked
-        self._functions: set[str] = set()  # that this process has compiled
 
     def __call__(self, *args: Any) -> Any:
         return away_from_signals(self._run, *args)
@@ -93,17 +92,11 @@ class Kernel:
         is_ready = signature in self._entries or (
             is_shared and disk_cache.read_code(disk_cache.code_path(content.key)) is not None
         )
-        return Outlook(content.key, is_ready, is_shared, disk_cache.seconds_for(self._size(content)))
+        return Outlook(content.key, is_ready, is_shared, content.size)
 
     def _content(self, signature: tuple[Any, ...]) -> Content:
         jitable.register_jitables()
         return Content(self.function, signature)
-
-    def _size(self, content: Content) -> float:
-        """Bytes of bytecode to be compiled; functions that this process has compiled before count less."""
-        return sum(
-            size * (disk_cache.AGAIN if name in self._functions else 1.0) for name, size in content.functions.items()
-        )
 
     def _made(self, signature: tuple[Any, ...]) -> Any:
         content = self._contents.get(signature) or self._content(signature)
@@ -122,9 +115,8 @@ class Kernel:
 
     def _compiled(self, entry: Any, signature: tuple[Any, ...], content: Content) -> Any:
         names = {self.function.__qualname__, *content.dispatchers}
-        with disk_cache.measured(self._size(content)), one_program(names):
+        with one_program(names):
             entry.compile(signature)
-        self._functions |= content.functions.keys()
         return entry
 
     def _load(self, entry: Any, payload: bytes | None) -> bool:

@@ -1,6 +1,6 @@
 """A kernel compiled as one program: what it calls is linked into it, then optimised and turned into machine code once.
 
-Numba optimises each function together with all that it calls, makes machine code of it, and does so anew for each of
+Numba optimises each function together with all that it calls, makes machine code of it, and does so again for each of
 its callers. Nothing but the kernel calls the functions of a kernel, so that inside :func:`one_program` they are lowered
 only, and linked where the kernel is finished. This touches the inside of Numba: other versions than ``TESTED`` compile
 as Numba does, with the same numbers.
@@ -116,7 +116,7 @@ def remembered_types() -> Iterator[None]:
     for what is called: for ``a * b`` some thirty templates, of strings, lists and dates, before that of numbers.
 
     A function has one type for arguments of the same types under the same rules for floating-point numbers. A call
-    that has none is asked anew, so that its error says what Numba says.
+    that has none is asked again, so that its error says what Numba says.
     """
     infer = _Function.get_call_type
 

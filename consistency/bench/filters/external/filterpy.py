@@ -17,9 +17,8 @@ from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, Unscen
 from scipy.linalg import block_diag
 
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.basics import PointSensor, SlamState
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
-from consistency.bench.filters.textbook.sensors import PointSensor
 from consistency.bench.filters.textbook.ukf import ordered_root
 from consistency.bench.types import Control, Info
 from consistency.referee.types import Array
@@ -95,7 +94,8 @@ def _ukf(
     return ukf
 
 
-EKF_XYZ = FilterpyEkf("filterpy-ekf-xyz", uvd=False)
-EKF_UVD = FilterpyEkf("filterpy-ekf-uvd", uvd=True)
-UKF_XYZ = FilterpyUkf("filterpy-ukf-xyz", uvd=False)
-UKF_UVD = FilterpyUkf("filterpy-ukf-uvd", uvd=True)
+FILTERS = {
+    f"filterpy-{method}-{data}": kind(f"filterpy-{method}-{data}", uvd=data == "uvd")
+    for method, kind in (("ekf", FilterpyEkf), ("ukf", FilterpyUkf))
+    for data in ("xyz", "uvd")
+}

@@ -241,6 +241,5 @@ def _map(landmarks: dict[int, Gaussian]) -> Map:
     return Map(np.array(labels, np.int64), mean, covariance)
 
 
-BATCH_UVD = Incremental("gtsam-batch-uvd")
-LAG_UVD = FixedLag("gtsam-lag-uvd", LAG)
-MAP_UVD = WholeTrialSmoother("gtsam-map-uvd")
+SMOOTHERS = (Incremental("gtsam-batch-uvd"), FixedLag("gtsam-lag-uvd", LAG), WholeTrialSmoother("gtsam-map-uvd"))
+FILTERS = {smoother.name: smoother for smoother in SMOOTHERS}

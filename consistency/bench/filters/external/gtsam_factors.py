@@ -8,11 +8,12 @@ depend on it, but in these variables the likelihood of stereo is nearly Gaussian
 The motion of a step has noise in v and omega alone, two numbers for three: across the heading a step is certain. The
 factor gives it ``ACROSS`` of the noise along, little enough that a covariance of rank two is taken for one.
 
-A disparity is reported only inside the search range [l, h], so its density is a normal one over Z, the chance to be
-reported. With ``lam`` and ``kappa`` mean and variance of the normal cut to [l, h], in units of sigma, the derivative of
--log density by the expected disparity e is -(d - e - sigma lam) / sigma^2 and its Fisher information kappa / sigma^2:
-those of a normal observation d* = e + (d - e - sigma lam) / kappa with variance sigma^2 / kappa. Gauss-Newton on d*,
-taken anew in each iteration, is scoring, and ends where the likelihood with its Z is greatest. What is not modelled:
+A disparity is reported only inside the search range [l, h], so its density is a normal one over Z, the probability
+that it is reported. With ``lam`` and ``kappa`` mean and variance of the normal cut to [l, h], in units of sigma, the
+derivative of -log density by the expected disparity e is -(d - e - sigma lam) / sigma^2 and its Fisher information
+kappa / sigma^2: those of a normal observation d* = e + (d - e - sigma lam) / kappa with variance sigma^2 / kappa.
+Gauss-Newton on d*,
+taken again in each iteration, is scoring, and ends where the likelihood with its Z is greatest. What is not modelled:
 that a landmark out of view was not seen.
 
 Where expected and measured pixels are more than ``FAR`` standard deviations apart, as on the way back to the start, the
@@ -31,8 +32,8 @@ import numpy as np
 
 from consistency.bench.filters.believed_noise import bias_at, disparity_sigma
 from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.basics import heading_matrix, mounted
 from consistency.bench.filters.textbook.inverse_range import rays, untruncated
-from consistency.bench.filters.textbook.sensors import heading_matrix, mounted
 from consistency.bench.models import stereo
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Observation
@@ -44,7 +45,7 @@ Error = Callable[[list[Array]], tuple[Array, list[Array]]]  # values to the erro
 
 
 def pose_key(step: int) -> int:
-    """Key of the pose of a step, from 1 on; the start is no variable."""
+    """Key of the pose of a step, from 1 on; the start is not a variable."""
     return int(gtsam.symbol("x", step))
 
 

@@ -69,15 +69,15 @@ class Guarded:
         misses = state.misses | {labels[i]: 0 if keep[i] else state.misses.get(labels[i], 0) + 1 for i in known}
         agreed = {labels[i] for i in known if keep[i]}
         begun = {label: at for label, at in state.begun.items() if label not in agreed}
-        anew = [int(i) for i in known if not keep[i] and labels[i] in begun and hasattr(self.filter, "forget")]
-        keep[anew] = True
+        again = [int(i) for i in known if not keep[i] and labels[i] in begun and hasattr(self.filter, "forget")]
+        keep[again] = True
         rejected = np.append(state.rejected, ~keep)
-        rejected[[begun[labels[i]] for i in anew]] = True
-        begins = [int(i) for i in np.flatnonzero(keep) if i in anew or labels[i] not in state.known]
+        rejected[[begun[labels[i]] for i in again]] = True
+        begins = [int(i) for i in np.flatnonzero(keep) if i in again or labels[i] not in state.known]
         begun |= {labels[i]: first + i for i in begins}
         known_now = state.known.union(observation.landmarks[keep].tolist())
         inner, forgetful = state.inner, cast(Any, self.filter)
-        for i in anew:
+        for i in again:
             inner = forgetful.forget(inner, labels[i])
         inner, info = self.filter.update(inner, Observation(observation.landmarks[keep], observation.z[keep]))
         return replace(state, inner=inner, known=known_now, misses=misses, begun=begun, rejected=rejected), info

@@ -1,6 +1,6 @@
 """Arrays of kernels, and what is done with them in loops, which compile in a fraction of the time of NumPy's functions.
 
-NumPy's constructors are compiled anew for each kind of shape, so that kernels call those of this module. Where no
+NumPy's constructors are compiled again for each kind of shape, so that kernels call those of this module. Where no
 value is given, an array has any. ``copy`` and ``fill`` write to the whole of their target.
 """
 

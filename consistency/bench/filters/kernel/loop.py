@@ -46,9 +46,8 @@ from consistency.bench.filters.kernel.part_functions import (
     to_error,
     world_point,
 )
-from consistency.bench.filters.kernel.update_steps import NOT_FINITE, POSE
-from consistency.bench.filters.kernel.work_arrays import Work, make_work
-from consistency.bench.filters.motion.unicycle import robot_frame
+from consistency.bench.filters.kernel.update_steps import NOT_FINITE, POSE, Work, make_work
+from consistency.bench.filters.parts.unicycle import robot_frame
 from consistency.referee.types import Array, Indices
 
 
@@ -85,7 +84,7 @@ def _find_known(data: Data, k: int, offset: Indices, work: Work[NamedTuple]) -> 
 def _insert_new(
     slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple], watch: NamedTuple
 ) -> State:
-    """The state with the landmarks that begin in step k + 1: at its end, or anew at their place."""
+    """The state with the landmarks that begin in step k + 1: at its end, or again at their place."""
     w = landmark_width(slam.landmark)
     x, P, n, base, offset = state.x, state.P, state.n, state.base, state.offset
     for i in range(data.first[k], data.first[k + 1]):

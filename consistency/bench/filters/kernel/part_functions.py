@@ -16,7 +16,7 @@ from consistency.bench.filters.compiler.dispatch import generic, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import copy_matrix, fill_matrix, filled, integers, matrix, vector
 from consistency.bench.filters.kernel.blas import add_transposed_times
-from consistency.bench.filters.motion.unicycle import Frame, add_motion_noise, move, move_about, propagate_covariance
+from consistency.bench.filters.parts.unicycle import Frame, add_motion_noise, move, move_about, propagate_covariance
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array, Indices
 
@@ -391,7 +391,7 @@ def screen(
 
 @generic(default=True)
 def may_enter(guard: NamedTuple, row: int, is_known: bool, watch: Any) -> bool:
-    """Whether a landmark begins with the observation in this row of the data; anew, if it is in the state."""
+    """Whether a landmark begins with the observation in this row of the data; again, if it is in the state."""
     return not is_known
 
 
@@ -445,9 +445,9 @@ def held_at(covariance: NamedTuple, label: int, local: Any) -> int:
 
 @generic(default=True)
 def withhold(
-    covariance: NamedTuple, state: State, data: Data, k: int, rejected: Array, anew: Array, local: Any
+    covariance: NamedTuple, state: State, data: Data, k: int, rejected: Array, again: Array, local: Any
 ) -> None:
     """``local`` <- as if the rows of step k + 1 that are ``rejected`` (M,) had not been seen.
 
-    The landmarks of the rows ``anew`` (M,), which are among these, are forgotten: they are about to begin anew.
+    The landmarks of the rows ``again`` (M,), which are among these, are forgotten: they are about to restart.
     """

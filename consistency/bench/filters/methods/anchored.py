@@ -21,7 +21,7 @@ from consistency.bench.filters.kernel.part_functions import (
     world_point,
 )
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.motion.unicycle import Frame
+from consistency.bench.filters.parts.unicycle import Frame
 from consistency.bench.filters.textbook.anchored import AnchoredKalman
 from consistency.bench.models.point import Mounting, turned_to_robot
 from consistency.referee.types import Array
@@ -117,4 +117,4 @@ def anchored_world_point(
         _by_values(values, 1.0 if a == 0 else 0.0, 1.0 if a == 1 else 0.0, 1.0 if a == 2 else 0.0, Dl[a])
 
 
-XYZ, UVD = variants(AnchoredKalman, "anchored-ekf", ekf.parts, "xyz uvd", landmark=AnchoredInverseDepth())
+FILTERS = variants(AnchoredKalman, "anchored-ekf", ekf.parts, "xyz uvd", landmark=AnchoredInverseDepth())

@@ -21,6 +21,7 @@ from consistency.bench.filters.kernel.part_functions import (
     stands_apart,
 )
 from consistency.bench.filters.kernel.update_steps import (
+    Work,
     add_noise,
     combine_seen,
     correct_at_once,
@@ -29,10 +30,9 @@ from consistency.bench.filters.kernel.update_steps import (
     linearise_seen,
     place_observed,
 )
-from consistency.bench.filters.kernel.work_arrays import Work
-from consistency.bench.filters.landmark.world_point import PlanarPoint, WorldPoint
-from consistency.bench.filters.motion.unicycle import Unicycle
-from consistency.bench.filters.sensor.models import RangeBearing, RelativeXy, Uvd, Xyz
+from consistency.bench.filters.parts.sensors import RangeBearing, RelativeXy, Uvd, Xyz
+from consistency.bench.filters.parts.unicycle import Unicycle
+from consistency.bench.filters.parts.world_point import PlanarPoint, WorldPoint
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import PLANAR_SENSORS, Belief
@@ -103,4 +103,4 @@ def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
     return Slam(motion, sensor, landmark, Additive(), AtEstimate(), Joint(), Dense())
 
 
-XYZ, UVD, XY, RB = variants(ExtendedKalman, "ekf", parts)
+FILTERS = variants(ExtendedKalman, "ekf", parts)

@@ -27,10 +27,9 @@ from consistency.bench.filters.kernel.part_functions import (
     place,
     propagate_covariance_at,
 )
-from consistency.bench.filters.kernel.update_steps import place_observed
-from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.kernel.update_steps import Work, place_observed
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.motion.unicycle import move, propagate_covariance_by
+from consistency.bench.filters.parts.unicycle import move, propagate_covariance_by
 from consistency.bench.filters.textbook.fej import FirstEstimateKalman
 from consistency.referee.types import Array
 
@@ -83,4 +82,4 @@ def place_first_estimate(
     work.Jp[1, 2] += pose[0] - predicted[0]
 
 
-XYZ, UVD, XY, RB = variants(FirstEstimateKalman, "fej-ekf", ekf.parts, point=FirstEstimate())
+FILTERS = variants(FirstEstimateKalman, "fej-ekf", ekf.parts, point=FirstEstimate())

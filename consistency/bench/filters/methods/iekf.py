@@ -17,12 +17,12 @@ from consistency.bench.filters.kernel.part_functions import (
     predict_innovation,
 )
 from consistency.bench.filters.kernel.update_steps import (
+    Work,
     combine_seen,
     correct_iterated,
     innovate,
     linearise_seen,
 )
-from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.ekf import predict_innovation_linearised
 from consistency.bench.filters.textbook.iekf import PASSES, IteratedKalman
@@ -58,4 +58,4 @@ def innovate_about_estimate(
     return True
 
 
-XYZ, UVD, XY, RB = variants(IteratedKalman, "iekf", ekf.parts, update=Iterated(PASSES))
+FILTERS = variants(IteratedKalman, "iekf", ekf.parts, update=Iterated(PASSES))

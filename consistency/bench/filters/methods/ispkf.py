@@ -19,11 +19,10 @@ from consistency.bench.filters.kernel.part_functions import (
     predict,
     predict_innovation,
 )
-from consistency.bench.filters.kernel.update_steps import correct_iterated, innovate
-from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.kernel.update_steps import Work, correct_iterated, innovate
 from consistency.bench.filters.methods import ukf
+from consistency.bench.filters.methods.ukf import SigmaRoom, Unscented, innovate_by_points
 from consistency.bench.filters.textbook.ispkf import PASSES, IteratedPointsKalman
-from consistency.bench.filters.update.unscented import SigmaRoom, Unscented, innovate_by_points
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
@@ -81,4 +80,4 @@ def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:
     return slam._replace(update=IteratedPoints(slam.update, PASSES))
 
 
-XYZ, UVD = variants(IteratedPointsKalman, "ispkf", parts, "xyz uvd")
+FILTERS = variants(IteratedPointsKalman, "ispkf", parts, "xyz uvd")

@@ -44,10 +44,9 @@ from consistency.bench.filters.kernel.part_functions import (
     place,
     propagate_covariance_at,
 )
-from consistency.bench.filters.kernel.update_steps import place_observed
-from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.kernel.update_steps import Work, place_observed
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.motion.unicycle import move, propagate_covariance_by
+from consistency.bench.filters.parts.unicycle import move, propagate_covariance_by
 from consistency.bench.filters.textbook.oc import ConstrainedKalman
 from consistency.referee.types import Array, Indices
 
@@ -117,4 +116,4 @@ def place_constrained(
         notes.landmarks[label, a] = notes.path[k + 1, a] + x[n + a] - x[a]
 
 
-XYZ, UVD, XY, RB = variants(ConstrainedKalman, "oc-ekf", ekf.parts, point=ObservabilityConstrained())
+FILTERS = variants(ConstrainedKalman, "oc-ekf", ekf.parts, point=ObservabilityConstrained())

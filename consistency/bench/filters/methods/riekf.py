@@ -7,7 +7,6 @@ from typing import NamedTuple
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.error.invariant_pose import exponential, shifted_covariance
 from consistency.bench.filters.kernel.arrays import fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
 from consistency.bench.filters.kernel.covariance import add_gram_to_state
@@ -21,9 +20,10 @@ from consistency.bench.filters.kernel.part_functions import (
     retract,
     to_error,
 )
-from consistency.bench.filters.kernel.work_arrays import Work
+from consistency.bench.filters.kernel.update_steps import Work
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.motion.unicycle import move, noise_columns
+from consistency.bench.filters.parts.invariant_pose import exponential, shifted_covariance
+from consistency.bench.filters.parts.unicycle import move, noise_columns
 from consistency.bench.filters.textbook.riekf import RightInvariantKalman
 from consistency.referee.types import Array
 
@@ -94,4 +94,4 @@ def right_pose_covariance(error: RightInvariant, x: Array, P: Array, out: Array)
     shifted_covariance(x, P, out)
 
 
-XYZ, UVD, XY, RB = variants(RightInvariantKalman, "ri-ekf", ekf.parts, error=RightInvariant())
+FILTERS = variants(RightInvariantKalman, "ri-ekf", ekf.parts, error=RightInvariant())

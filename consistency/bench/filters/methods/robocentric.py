@@ -8,12 +8,14 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.covariance_update.parking import Parking
-from consistency.bench.filters.error.invariant_pose import InvariantPose
 from consistency.bench.filters.kernel.part_functions import Slam
-from consistency.bench.filters.landmark.inverse_range import InverseRange, Pixels
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.sensor.models import growth_of
+from consistency.bench.filters.parts import reactivation  # noqa: F401, registers the update
+from consistency.bench.filters.parts.converting import Converted, Converting
+from consistency.bench.filters.parts.invariant_pose import InvariantPose
+from consistency.bench.filters.parts.inverse_range import InverseRange, Pixels
+from consistency.bench.filters.parts.parking import Parking
+from consistency.bench.filters.parts.sensors import growth_of
 from consistency.bench.filters.textbook.inverse_range import Corrections, searched
 from consistency.bench.filters.textbook.robocentric import (
     ADRIFT,
@@ -28,8 +30,6 @@ from consistency.bench.filters.textbook.robocentric import (
     RobotCentredKalman,
     rounds,
 )
-from consistency.bench.filters.update import reactivation  # noqa: F401, registers the update
-from consistency.bench.filters.update.converting import Converted, Converting
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
@@ -63,7 +63,8 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
     return Compiled(textbook, parts, textbook.sensors)
 
 
-PARKED = compiled(RobotCentredKalman("parked-ekf-uvd", Corrections()))
-ROBOCENTRIC = compiled(
-    RobotCentredKalman("robocentric-ekf-uvd", Corrections(parking=False, turning=False, iteration=False))
-)
+PLAIN = Corrections(parking=False, turning=False, iteration=False)
+FILTERS = {
+    "parked-ekf-uvd": compiled(RobotCentredKalman("parked-ekf-uvd", Corrections())),
+    "robocentric-ekf-uvd": compiled(RobotCentredKalman("robocentric-ekf-uvd", PLAIN)),
+}

@@ -27,15 +27,15 @@ from consistency.bench.filters.kernel.part_functions import (
     predict_innovation,
 )
 from consistency.bench.filters.kernel.update_steps import (
+    Work,
     combine_seen,
     correct_at_once,
     gather,
     innovate,
     linearise_seen,
 )
-from consistency.bench.filters.kernel.work_arrays import Work
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.sensor.models import (
+from consistency.bench.filters.parts.sensors import (
     Growth,
     growth_of,
     locate_xyz_jacobian,
@@ -150,7 +150,7 @@ def parts(problem: Problem, controls: Array, uvd: bool, debiasing: bool) -> Slam
     return slam._replace(sensor=DebiasedXyz(rho, growth, f * B, slam.sensor.mount)) if debiasing else slam
 
 
-PREDICTED, DEBIASED = (
-    Compiled(TriangulatedKalman(f"{method}-ekf-xyz", debiasing), partial(parts, debiasing=debiasing), ("uvd",))
-    for method, debiasing in (("predicted", False), ("debiased", True))
-)
+FILTERS = {
+    name: Compiled(TriangulatedKalman(name, debiasing), partial(parts, debiasing=debiasing), ("uvd",))
+    for name, debiasing in (("predicted-ekf-xyz", False), ("debiased-ekf-xyz", True))
+}

@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.basics import PointSensor, SlamState, heading_matrix
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.filters.textbook.inverse_range import rays
-from consistency.bench.filters.textbook.sensors import PointSensor, heading_matrix
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Gaussian, Info
 from consistency.referee.types import Array

@@ -30,10 +30,9 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.basics import PointSensor, SlamState, heading_matrix, mounted
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.filters.textbook.riekf import additive_from_right
-from consistency.bench.filters.textbook.sensors import PointSensor, heading_matrix, mounted
 from consistency.bench.models.point import Mounting
 from consistency.bench.types import Control, Gaussian, Info
 from consistency.referee.types import Array

@@ -8,48 +8,40 @@ at estimates that are not the best ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Info, Observation
 from consistency.referee.types import Array
 
 
-@dataclass(frozen=True)
-class FirstState:
-    """The state of the EKF and the first estimates of its variables."""
+class FirstEstimateKalman(ExtendedKalman):
+    """``points`` of the state are the first estimates of its variables (n,); of the pose that is its prediction."""
 
-    slam: SlamState
-    first: Array  # (n,), of the pose the prediction in this step
+    def init(self, problem: Problem) -> SlamState:
+        return replace(basics.start(problem), points=problem.start.copy())
 
+    def predict(self, state: SlamState, control: Control) -> SlamState:
+        predicted = basics.move(state.x[:3], control)
+        after = basics.predict_by(state, control, predicted[:2] - state.points[:2], state.x[:3])
+        return replace(after, points=np.concatenate([predicted, state.points[3:]]))
 
-class FirstEstimateKalman(basics.WrappedFilter):
-    def init(self, problem: Problem) -> FirstState:
-        return FirstState(basics.start(problem), problem.start.copy())
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        after, info = super().update(state, observation)
+        return replace(after, points=np.concatenate([state.points, after.x[len(state.x) :]])), info
 
-    def predict(self, state: FirstState, control: Control) -> FirstState:
-        pose = state.slam.x[:3]
-        predicted = basics.move(pose, control)
-        slam = basics.predict_by(state.slam, control, predicted[:2] - state.first[:2], pose)
-        return FirstState(slam, np.concatenate([predicted, state.first[3:]]))
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        return basics.correct_about(state, state.points, seen, z, R, self.uvd)
 
-    def update(self, state: FirstState, observation: Observation) -> tuple[FirstState, Info]:
-        first, known = state.first, len(state.slam.x)
+    def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+        landmark, Jp, Jz = basics.locate_point(state, z, self.uvd)
+        Jp[:2, 2] = basics.quarter_turn(landmark[:2] - state.points[:2])
+        return landmark, Jp, Jz
 
-        def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-            return basics.correct_about(slam, first, seen, z, R, self.uvd)
-
-        def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
-            landmark, Jp, Jz = basics.locate_point(slam, z, self.uvd)
-            Jp[:2, 2] = basics.quarter_turn(landmark[:2] - first[:2])
-            return landmark, Jp, Jz
-
-        slam, info = basics.update_jointly(state.slam, observation, self.uvd, correct, locate)
-        return FirstState(slam, np.concatenate([first, slam.x[known:]])), info
-
-    def forget(self, state: FirstState, landmark: int) -> FirstState:
-        return FirstState(basics.without(state.slam, landmark), state.first[state.slam.beside(landmark)])
+    def forget(self, state: SlamState, landmark: int) -> SlamState:
+        return replace(basics.without(state, landmark), points=state.points[state.beside(landmark)])

@@ -7,55 +7,53 @@ mend. It needs a trial whose truth is known, simulated or recorded.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.basics import SlamState
-from consistency.bench.filters.textbook.sensors import view
+from consistency.bench.filters.textbook.basics import SlamState, view
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.protocols import Problem, TrialTruth
-from consistency.bench.types import Control, Info, Observation
+from consistency.bench.types import Control, Info
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
 
-@dataclass(frozen=True)
-class IdealState:
-    """The state of the EKF, and the step that the truth is taken of."""
+class IdealKalman(ExtendedKalman):
+    """``points`` of the state is the step of which the truth is taken."""
 
-    slam: SlamState
-    truth: TrialTruth
-    step: int
-
-
-class IdealKalman(basics.WrappedFilter):
     realisable = False
 
-    def init(self, problem: Problem) -> IdealState:
-        return IdealState(basics.start(problem), truth_of(problem), 0)
+    def init(self, problem: Problem) -> SlamState:
+        truth_of(problem)
+        return replace(basics.start(problem), points=0)
 
-    def predict(self, state: IdealState, control: Control) -> IdealState:
-        before, after = state.truth.path[state.step : state.step + 2]
-        slam = basics.predict_by(state.slam, control, after[:2] - before[:2], before)
-        return replace(state, slam=slam, step=state.step + 1)
+    def predict(self, state: SlamState, control: Control) -> SlamState:
+        before, after = truth_of(state.problem).path[state.points : state.points + 2]
+        moved = basics.predict_by(state, control, after[:2] - before[:2], before)
+        return replace(moved, points=state.points + 1)
 
-    def update(self, state: IdealState, observation: Observation) -> tuple[IdealState, Info]:
-        pose, landmarks = state.truth.path[state.step], state.truth.landmarks[:, : state.slam.width]
-        sensor = view(state.slam.problem.belief.sensor, self.uvd)
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        true = np.concatenate([_pose(state), *(_landmark(state, label) for label in state.landmarks)])
+        return basics.correct_about(state, true, seen, z, R, self.uvd)
 
-        def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-            true = np.concatenate([pose, *(landmarks[label] for label in slam.landmarks)])
-            return basics.correct_about(slam, true, seen, z, R, self.uvd)
+    def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+        landmark, _, _ = basics.locate_point(state, z, self.uvd)
+        sensor = view(state.problem.belief.sensor, self.uvd)
+        Hp, Hl = sensor.jacobians(_pose(state), _landmark(state, label))
+        Jz = np.linalg.inv(Hl)
+        return landmark, -Jz @ Hp, Jz
 
-        def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
-            landmark, _, _ = basics.locate_point(slam, z, self.uvd)
-            Hp, Hl = sensor.jacobians(pose, landmarks[label])
-            Jz = np.linalg.inv(Hl)
-            return landmark, -Jz @ Hp, Jz
 
-        slam, info = basics.update_jointly(state.slam, observation, self.uvd, correct, locate)
-        return replace(state, slam=slam), info
+def _pose(state: SlamState) -> Array:
+    """The true pose (3,)."""
+    return np.asarray(truth_of(state.problem).path[state.points])
+
+
+def _landmark(state: SlamState, label: int) -> Array:
+    """A landmark (w,) where it truly is."""
+    return truth_of(state.problem).landmarks[label, : state.width]
 
 
 def truth_of(problem: Problem) -> TrialTruth:

@@ -13,7 +13,7 @@ from scipy.special import log_ndtr
 from scipy.stats import norm
 
 from consistency.bench.filters.believed_noise import disparity_sigma
-from consistency.bench.filters.textbook.sensors import heading_matrix, mounted
+from consistency.bench.filters.textbook.basics import heading_matrix, mounted
 from consistency.bench.scenario.sensor import BelievedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array

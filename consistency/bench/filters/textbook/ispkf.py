@@ -19,8 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from consistency.bench.filters.textbook import ukf
-from consistency.bench.filters.textbook.basics import SlamState
-from consistency.bench.filters.textbook.sensors import view
+from consistency.bench.filters.textbook.basics import SlamState, view
 from consistency.bench.types import Info
 from consistency.referee.types import Array
 

@@ -7,53 +7,45 @@ the best estimates; these points follow them where robot and map move together.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Info, Observation
 from consistency.referee.types import Array
 
 
-@dataclass(frozen=True)
-class ConstrainedState:
-    """The state of the EKF, and the direction (J a, 1, J l_1, ...) in which it must not be observed."""
+class ConstrainedKalman(ExtendedKalman):
+    """``points`` of the state, (1 + m, 2), are a, l_1, ..., l_m of the direction in which it must not be observed.
 
-    slam: SlamState
-    turned: Array  # (1 + m, 2): a, l_1, ..., l_m
+    That is (J a, 1, J l_1, ...).
+    """
 
+    def init(self, problem: Problem) -> SlamState:
+        return replace(basics.start(problem), points=problem.start[None, :2])
 
-class ConstrainedKalman(basics.WrappedFilter):
-    def init(self, problem: Problem) -> ConstrainedState:
-        return ConstrainedState(basics.start(problem), problem.start[None, :2])
-
-    def predict(self, state: ConstrainedState, control: Control) -> ConstrainedState:
-        x, turned = state.slam.x, state.turned.copy()
-        shift = np.mean(x[state.slam.positions] - turned, axis=0)
+    def predict(self, state: SlamState, control: Control) -> SlamState:
+        x, turned = state.x, state.points.copy()
+        shift = np.mean(x[state.positions] - turned, axis=0)
         predicted = basics.move(x[:3], control)
-        slam = basics.predict_by(state.slam, control, predicted[:2] - (turned[0] + shift), x[:3])  # predicted less p*
+        after = basics.predict_by(state, control, predicted[:2] - (turned[0] + shift), x[:3])  # predicted less p*
         turned[0] = predicted[:2] - shift
-        return ConstrainedState(slam, turned)
+        return replace(after, points=turned)
 
-    def update(self, state: ConstrainedState, observation: Observation) -> tuple[ConstrainedState, Info]:
-        turned, predicted = list(state.turned), state.slam.x[:2]
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        after, info = super().update(state, observation)
+        new = after.positions[len(state.points) :]
+        return replace(after, points=np.vstack([state.points, state.points[0] + after.x[new] - after.x[:2]])), info
 
-        def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-            at = slam.x.copy()
-            at[slam.positions] = state.turned + (predicted - state.turned[0])
-            return basics.correct_about(slam, at, seen, z, R, self.uvd)
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        at = state.x.copy()
+        at[state.positions] = state.points + (state.x[:2] - state.points[0])
+        return basics.correct_about(state, at, seen, z, R, self.uvd)
 
-        def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
-            placed = basics.locate_point(slam, z, self.uvd)
-            turned.append(turned[0] + placed[0][:2] - slam.x[:2])
-            return placed
-
-        slam, info = basics.update_jointly(state.slam, observation, self.uvd, correct, locate)
-        return ConstrainedState(slam, np.array(turned)), info
-
-    def forget(self, state: ConstrainedState, landmark: int) -> ConstrainedState:
-        turned = np.delete(state.turned, 1 + state.slam.landmarks.index(landmark), axis=0)
-        return ConstrainedState(basics.without(state.slam, landmark), turned)
+    def forget(self, state: SlamState, landmark: int) -> SlamState:
+        turned = np.delete(state.points, 1 + state.landmarks.index(landmark), axis=0)
+        return replace(basics.without(state, landmark), points=turned)

@@ -46,6 +46,7 @@ from scipy.linalg import block_diag
 
 from consistency.bench.filters.believed_noise import bias_at, variance_at
 from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.basics import heading_matrix
 from consistency.bench.filters.textbook.inverse_range import (
     Corrections,
     carried,
@@ -74,7 +75,6 @@ from consistency.bench.filters.textbook.robocentric_state import (
     without_block,
     without_idle_clones,
 )
-from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Info, Observation
 from consistency.referee.errors import InputError
@@ -83,7 +83,9 @@ from consistency.referee.types import Array
 
 EVERY, UNSEEN = 10, 4  # steps between two rounds of parking, and without a sight before a landmark is parked
 EVERY_LATE, UNSEEN_LATE = 50, 20  # without promptness
-DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
+DOUBT = (
+    0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is not a linear update
+)
 ADRIFT = 0.2  # rad, standard deviation of the heading from which any return is in doubt
 KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it

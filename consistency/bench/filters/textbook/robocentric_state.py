@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from consistency.bench.filters.textbook.basics import heading_matrix, mounted
 from consistency.bench.filters.textbook.inverse_range import (
     carried,
     left_jacobian,
@@ -18,7 +19,6 @@ from consistency.bench.filters.textbook.inverse_range import (
     rays,
     shift_matrix,
 )
-from consistency.bench.filters.textbook.sensors import heading_matrix, mounted
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 

@@ -27,9 +27,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.basics import SlamState, heading_matrix
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
-from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Info, Observation
 
@@ -80,7 +79,7 @@ class SubmapKalman:
 
 
 def in_world(state: Maps) -> SlamState:
-    """Robot, landmarks of the large map and those of the small one, all in the world; a landmark may be there twice."""
+    """Robot, landmarks of the large map and those of the small one, all in the world; a landmark may be duplicated."""
     large, small = state.large, state.small
     origin, n, turn = large.x[:3], len(large.x), heading_matrix(large.x[2])
     x, J = [large.x[3:]], np.eye(n + len(small.x))
@@ -116,5 +115,4 @@ def joined_map(state: Maps) -> SlamState:
     return replace(both, x=x[keep], P=(P + P.T) / 2.0, landmarks=state.large.landmarks + new)
 
 
-XYZ = SubmapKalman("submap-ekf-xyz", uvd=False)
-UVD = SubmapKalman("submap-ekf-uvd", uvd=True)
+FILTERS = {name: SubmapKalman(name, uvd=name.endswith("uvd")) for name in ("submap-ekf-xyz", "submap-ekf-uvd")}

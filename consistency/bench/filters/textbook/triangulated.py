@@ -6,7 +6,7 @@ p (1 + rho^2): u and v enter linearly, and the second derivative of p by d is 2 
 series in rho.
 
 - ``ekf-xyz`` takes R at the measured point. A point that came out too near claims to be certain, one too far to be
-  uncertain, and the estimate is drawn towards the robot: see docs/static-limit.md.
+  uncertain, and the estimate is drawn towards the robot: see docs/consistent.md.
 - ``predicted-ekf-xyz`` takes R at the point that is expected, in which the noise of this observation has no part.
 - ``debiased-ekf-xyz`` also subtracts the bias, p rho^2 at the point that is expected, after Sibley, Matthies & Sukhatme
   (2005), "Bias reduction and filter convergence for long range stereo". Nothing is expected of a new landmark: its R is

@@ -15,9 +15,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from consistency.bench.filters.textbook import basics
-from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.basics import SlamState, view
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
-from consistency.bench.filters.textbook.sensors import view
 from consistency.bench.scenario import SigmaPoints
 from consistency.bench.types import Control, Info
 from consistency.referee.types import Array

@@ -197,7 +197,7 @@ def extra_table(
     if absent := [column for column in wanted if column not in table.columns]:
         raise InputError(f"{path}: column '{absent[0]}' is missing; needed: {', '.join(wanted)}")
     if not table.columns.is_unique:
-        raise InputError(f"{path}: a column is there twice; write the folder again")
+        raise InputError(f"{path}: a column is duplicated; write the folder again")
     if table.empty:
         raise InputError(f"{path}: has no rows; write the folder again")
     for column in numbers:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,10 +16,13 @@ from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.document.blocks import (
     Block,
     Column,
+    Details,
+    Facts,
     Figure,
     Heading,
     Name,
     Reasons,
+    Settings,
     Table,
     Text,
     table,
@@ -143,7 +147,7 @@ def places(report: Report) -> list[Place]:
 
 
 def window_of(found: list[Place], factor: float) -> tuple[float, float]:
-    """Drawn range of the ratios; ends of intervals are no reason for a wider one."""
+    """Drawn range of the ratios; ends of intervals are not reason for a wider one."""
     values = [1.0 / factor, factor, *(place.ratio.value for place in found)]
     return min(values) / ROOM, max(values) * ROOM
 
@@ -170,7 +174,7 @@ def _picture(report: Report) -> Figure:
     caption = (
         "By how much the covariance of the pose must grow to match the errors, with 95 % intervals; log axis. A filter "
         "is shown to be honest where its whole interval lies in the shade and no other question found a fault; to the "
-        "right of it is overconfident. An arrow goes on beyond the drawn range."
+        "right of it is overconfident. An arrow continues beyond the drawn range."
     )
     return Figure(TITLE, caption, (draw,), level=2)
 
@@ -187,3 +191,38 @@ def verdicts(report: Report) -> tuple[Block, ...]:
         return (Text("No study was run for these findings."),)
     blocks = [block for study in report.studies for block in judgement(study)]
     return (*blocks, Text(method(report.studies), "How a verdict comes about.", "note"))
+
+
+SHORT = 4000  # characters of settings that surely fit on one page
+
+
+def provenance(report: Report) -> tuple[Block, ...]:
+    """What the manifest says, and of each study what it adds."""
+    rows = facts(report.manifest)
+    return Facts(rows), *(_study(study, rows, len(report.studies) > 1) for study in report.studies)
+
+
+def _study(study: Study, stated: tuple[tuple[str, str], ...], several: bool) -> Details:
+    """Facts of one study that the report does not state already, and its settings."""
+    rows = tuple(row for row in facts(study.results.manifest) if row not in stated)
+    settings = resolved(study)
+    what = "resolved belief" if study.is_log else "resolved scenario"
+    if several:
+        what = f"provenance and {what}"
+    blocks = (Facts(rows), Settings(settings)) if rows else (Settings(settings),)
+    return Details(f"{study.name}: {what}", blocks, whole=len(settings) < SHORT)
+
+
+def resolved(study: Study) -> str:
+    """The scenario, or the log's belief, as JSON."""
+    manifest = study.results.manifest
+    return json.dumps(_rounded(manifest.get("scenario") or manifest.get("belief") or {}), indent=2, ensure_ascii=False)
+
+
+def _rounded(value: Any) -> Any:
+    """Six digits of every number, to read; the manifest has them all."""
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value

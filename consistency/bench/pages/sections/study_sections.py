@@ -11,8 +11,7 @@ from collections.abc import Callable
 from consistency.bench.pages.sections.anees import anees_curves
 from consistency.bench.pages.sections.nees_distribution import nees_distribution
 from consistency.bench.pages.sections.nis import innovations
-from consistency.bench.pages.sections.paths_and_landmarks import world_map
-from consistency.bench.pages.sections.pose_errors import pose_errors
+from consistency.bench.pages.sections.one_run import pose_errors, world_map
 from consistency.bench.pages.sections.report_input import Study
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Text, table
 from consistency.referee.document.guard import COLUMNS as GUARD_COLUMNS
@@ -35,7 +34,7 @@ OF_MAPS = (
     "pose, so each run counts once. Together: by the joint covariance of pose and landmarks, whose NEES is chi-square "
     "with 3 degrees of freedom for the pose and 3 for each landmark; a dash where it was not kept. The verdict on the "
     "map asks what that on the pose asks, with landmarks in the place of steps, and of pose and map together; no "
-    "verdict on a pose depends on it. Left out: what is no landmark of the world, or has no covariance that is "
+    "verdict on a pose depends on it. Left out: what is not a landmark of the world, or has no covariance that is "
     "positive definite."
 )
 OF_REJECTIONS = (

@@ -255,7 +255,7 @@ def _reason(code: int | None) -> str:
     """How a process ended."""
     if code is None or code >= 0:
         return f"its process ended with exit status {code}"
-    outside = ", from outside or for want of memory" if code in KILLED else ""
+    outside = ", from outside or because memory ran out" if code in KILLED else ""
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
     return f"its process was killed by {name}{outside}"
 

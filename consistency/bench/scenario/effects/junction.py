@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from consistency.bench.models import point, stereo
 from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.tables.toml_tables import Count, Positive, Rate
+from consistency.bench.scenario.toml_tables import Count, Positive, Rate
 from consistency.referee.types import Array
 
 
@@ -29,9 +29,9 @@ class Crossings:
 class Junction(UvdEffect):
     """``count`` apparent crossings of a near vertical and a far horizontal edge, each of which is tracked as a corner.
 
-    The crossing is on the ray that meets both edges. While the robot moves, it slides up and down the near edge and to
-    and fro on the far one, as no rigid point does: for a level camera u is that of the near edge and v that of the far
-    one. d is that of the far edge with probability ``far_share``, chosen once for each crossing, and else of the near.
+    The crossing is on the ray that meets both edges. While the robot moves, it slides along both, as no rigid point
+    does: for a level camera u is that of the near edge and v that of the far one. d is that of the far
+    edge with probability ``far_share``, chosen once for each crossing, or else of the near one.
 
     The edges have the length ``edge``; each crossing can be seen from a step of the planned path that is drawn from
     ``seed``, at any distance in the sensor's range, with the far edge ``behind`` the near one by a length from that

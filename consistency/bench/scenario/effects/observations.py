@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.bench.models import planar, point, stereo
-from consistency.bench.scenario.tables.sensor_view import SeeingSensor
+from consistency.bench.scenario.sensor_view import SeeingSensor
 from consistency.referee.types import Array, Indices
 
 NO_LANDMARK = -1  # source of an observation that is of no landmark
@@ -23,7 +23,7 @@ class Observations:
         Steps 1..T.
     landmark : (M,)
         Ids as a filter is told them: 0..N-1 are the landmarks of the world, those from N on are things that are
-        no landmark.
+        not landmarks.
     z : (M, s), or what gives it for (step, landmark)
         (x, y, z) in m, (u, v, d) in px, (dx, dy) in m, or range in m and bearing in rad.
     ids : int
@@ -84,7 +84,7 @@ class Observations:
         return Observations(self.step, self.landmark, z, self.ids, self.source if source is None else source)
 
     def add(self, step: Indices, thing: Indices, z: Array) -> Observations:
-        """With K rows more, of things that are no landmark.
+        """With K rows more, of things that are not landmarks.
 
         Parameters
         ----------

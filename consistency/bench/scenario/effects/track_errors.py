@@ -9,7 +9,7 @@ from pydantic import Field
 
 from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import NO_LANDMARK, Context, Observations
-from consistency.bench.scenario.tables.toml_tables import NonNegative, Positive, Rate
+from consistency.bench.scenario.toml_tables import NonNegative, Positive, Rate
 from consistency.referee.types import Array, Indices
 
 
@@ -19,7 +19,7 @@ class TrackError(UvdEffect):
 
     Herath et al. (2007) sec. 3.5 and 4.4.
     e_k = c e_k-1 + sqrt(1 - c^2) w_k with w ~ N(0, sigma^2) and c the ``correlation`` from step to step. After a gap
-    in a track it starts anew.
+    in a track it restarts.
     """
 
     units: ClassVar[dict[str, str]] = {"sigma": "_px"}

@@ -15,7 +15,7 @@ ENOUGH = 20  # runs that show how their errors depend on each other
 REACH = 10  # longest time constant that is looked for in a run with a fit of its own: this part of its steps
 SHORTEST = 0.5  # steps; errors of a shorter time constant are white
 MARGIN = 2.0  # standard errors by which more is taken to be left than seems: by simulation, benchmarks/alignment.py
-DOUBT = 0.01  # chance that correlations are called oscillating though they are sums of exponentials
+DOUBT = 0.01  # probability that correlations are called oscillating though they are sums of exponentials
 LONGEST, WIDER = (
     2,
     1.4,

@@ -283,7 +283,7 @@ class UncertainTruth:
         return "conservative"
 
     def _accepted(self, answers: Sequence[Answer], settings: Settings) -> tuple[float, float]:
-        """Interval of the mean NEES by both covariances that is no fault of the scale; too large a one shows by P."""
+        """Interval of the mean NEES by both covariances that is not a fault of scale; too large a one shows by P."""
         rate = at_share(answers, settings).false_alarm * SHARES[MAIN]
         if not settings.one_sided:
             rate /= 2.0

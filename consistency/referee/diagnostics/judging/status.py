@@ -178,7 +178,7 @@ def _without_bias(given: Sequence[Answer], settings: Settings, sample: Sample) -
 
 
 def _status_of_sample(settings: Settings, faults: set[str], sample: Sample, tests: Tests) -> str:
-    """The status by the errors of a sample: of the scale only where it is no matter of a few large errors."""
+    """The status by the errors of a sample: of the scale only where it does not depend on a few large errors."""
     of_groups = _sides(settings, tests.groups) if GROUP in faults else set()
     if MAIN in faults:
         if not _robust(sample.means(), sample.dof, sample.longest, settings, 1):

@@ -1,1 +1,1 @@
-"""The monitor of a filter in service, and innovations behind a validation gate."""
+"""The monitor of a deployed filter, and innovations behind a validation gate."""

@@ -1,4 +1,4 @@
-"""Sequential test of the NIS, for a filter in service."""
+"""Sequential test of the NIS, for a deployed filter."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.monitoring.truncated_chi2 import gate_limit
 RATIOS = (1.1, 1.25, 1.5, 2.0, 4.0)  # of an alternative to the edge of the tolerance
 SERIES = 2.10975  # rounded up from 2.109743, the sum of 1 / (n ln^2 n) over n >= 2: the shares add up to less than 1
 RESTS = ((0.99, 2), (0.95, 5))  # share that the gate accepts, at least; innovations not judged after a rejection
-FAR = 1e-9  # chance that an innovation of a right filter is as large as an outlier
+FAR = 1e-9  # probability that an innovation of a right filter is as large as an outlier
 LARGEST = 1e300  # evidence is cut off here, which is on the safe side
 EXPONENT = 690.0  # exp() of it is just below LARGEST
 CAVEAT = (
@@ -67,7 +67,7 @@ class Alarm:
 
 
 def accepted_scales(tolerance: float) -> str:
-    """The scales that are no fault, in words."""
+    """The scales that are not fault, in words."""
     if tolerance == 1.0:
         return "x1 is right"
     return f"x{1 / tolerance:.3g} to x{tolerance:.3g} is accepted"
@@ -128,7 +128,7 @@ def rest_after_rejection(gate: float | None) -> int:
 
 
 class Monitor:
-    """Watch the NIS of a filter in service; an alarm is false with probability at most ``false_alarm``, ever.
+    """Watch the NIS of a deployed filter; an alarm is false with probability at most ``false_alarm``, ever.
 
     The filter must have the optimal (Kalman) gain for its model: only then are the innovations of a right filter
     white. What is tested is that the covariance of the innovations is between 1 / ``tolerance`` and ``tolerance``
@@ -140,7 +140,7 @@ class Monitor:
     false_alarm : probability that a right filter ever raises an alarm, however long the mission
     tolerance : 1 or more; 1 is the exact test, which in time alarms on every filter that is not exactly right
     gate : probability at which the filter's chi-square gate accepts the innovation of a right filter, such as 0.99;
-        None without a gate. A NIS above its limit counts as rejected. Rejections are no evidence, and after one the
+        None without a gate. A NIS above its limit counts as rejected. Rejections are not evidence, and after one the
         next 2 innovations (5 with a gate below 0.99) are not judged; so a fault so large that the gate rejects nearly
         everything goes unseen here: look at ``rejections`` as well
     mission : number of innovations after which no fault begins, if known: an early fault is then found a little

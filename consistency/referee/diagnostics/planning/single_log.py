@@ -93,7 +93,7 @@ CAPTION = "what is constant over the log is not judged, and every piece has it"
 
 @dataclass(frozen=True)
 class ErrorMemory:
-    """Over how many steps the errors of a log go on."""
+    """Over how many steps the errors of a log last."""
 
     steps: int  # of the log
     time: float  # integrated correlation time, steps: the larger of both
@@ -182,7 +182,7 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
     if len(clock):
         times = clock[log.start : end].reshape(pieces, length)
     note = (
-        f"{record.name}: the log is cut into {pieces} pieces of {length} steps, which stand as runs; its errors go on "
+        f"{record.name}: the log is cut into {pieces} pieces of {length} steps, treated as runs; its errors last "
         f"over {memory.time:.3g} steps"
     )
     return replace(
@@ -220,7 +220,7 @@ def _unshown(memory: ErrorMemory, pieces: int, length: int, parts: Array) -> str
         if memory.piece > memory.steps:
             whole = "as long as the log"
         return (
-            f"{pieces} pieces of {length} steps are not shown to be independent: errors go on over {memory.time:.3g} "
+            f"{pieces} pieces of {length} steps are not shown to be independent: errors last over {memory.time:.3g} "
             f"steps (up to {memory.upper:.3g}), about zero or in size, and pieces should be {whole}"
         )
     from consistency.referee.diagnostics.questions.independence import independence

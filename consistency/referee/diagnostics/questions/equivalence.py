@@ -159,7 +159,7 @@ def deciding_runs(test: MeanTest, factor: float, settings: Settings, low_is_faul
     if not test.runs or not test.ratio > 0:
         return None
     off = float(np.log(test.ratio)) if test.runs >= FEW else 0.0
-    gap = off if settings.one_sided else abs(off)  # one-sided, a ratio below 1 is no fault and farther from the end
+    gap = off if settings.one_sided else abs(off)  # one-sided, a ratio below 1 is not a fault and farther from the end
     tail = SHARES[MAIN] * settings.false_alarm / (1 if settings.one_sided else 2)
     power, room = float(special.ndtri(settings.power)), float(np.log(factor)) - gap
     fault = gap if low_is_fault or off > 0 else 0.0

@@ -10,7 +10,9 @@ from scipy import special
 from consistency.referee.types import Array
 
 FEWEST = 20  # pieces that are asked
-ENOUGH = 150  # pieces that show it: of sizes that go on as AR(.3) to AR(.99), fewer than 5 % of logs are then found at
+ENOUGH = (
+    150  # pieces that show it: of sizes that continue as AR(.3) to AR(.99), fewer than 5 % of logs are then found at
+)
 # fault and not doubted (benchmarks/calibration_windows.py)
 RATE = 0.004  # chance to doubt independent pieces; by simulation at most 0.5 %, with 20 pieces and with 1,000
 SIZES = 0.75  # share of the rate that sizes have: signs have as many numbers as the error, and need less
@@ -52,7 +54,7 @@ def independence(whitened: Array, nees: Array | None = None) -> Independence:
 
     - the errors, with the mean 0 that they should have: a bias counts as a correlation that never decays;
     - the cube roots of their NEES, which are nearly Gaussian (Wilson & Hilferty 1931), about their mean over the
-      pieces, so that the size of the covariance is no matter.
+      pieces, so that the size of the covariance does not matter.
 
     Each p value is multiplied by the number of bands and divided by its share of the rate (Bonferroni). What all pieces
     have in common cannot be seen, and what changes slowly only if it is strong.

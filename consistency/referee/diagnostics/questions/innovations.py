@@ -16,7 +16,7 @@ from consistency.referee.diagnostics.verdict.parts import NisTest, Outliers
 from consistency.referee.types import Array
 
 LAGS = 10
-IMPOSSIBLE, UNLIKELY = 1e-9, 1e-3  # chance that any innovation of a right filter is as large
+IMPOSSIBLE, UNLIKELY = 1e-9, 1e-3  # probability that any innovation of a right filter is as large
 FEW = 0.05  # share of innovations that may be called outliers
 FEWEST = 400  # innovations; below, the chi-square of the portmanteau is not to be trusted
 FEWEST_EACH = 40  # innovations for each component, measured with up to 40 components
@@ -161,7 +161,7 @@ def _portmanteau(u: Array, lags: int) -> Whiteness:
 
 
 LEAST_GAIN = float(np.log(1e4))  # log likelihood that another number of components gains over a wrong scale
-ODD = 1e-3  # chance that a NIS with this number of components is not taken for such
+ODD = 1e-3  # probability that a NIS with this number of components is not taken for such
 SMALL = 0.7  # NIS over its degrees of freedom: gates and cautious noises leave more
 NEES_RIGHT = (0.8, 1.25)  # mean NEES over its degrees of freedom
 AFTER_UPDATE = (

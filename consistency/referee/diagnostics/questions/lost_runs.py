@@ -15,7 +15,7 @@ from consistency.referee.types import Array
 
 PARTS = np.array([0.0, 0.125, 0.25, 0.5])  # of the share in question: what the bet takes the true share to be
 HALVINGS = 40  # of the interval in which a limit is sought
-FURTHEST = 100_000  # runs; more are no advice
+FURTHEST = 100_000  # runs; more are not advice
 
 
 def lost_bound(dof: int, rate: float | Array) -> Array:
@@ -100,7 +100,7 @@ def _next(is_lost: Array, share: float, level: float) -> int | None:
 
 
 def early_ends(nees: Array) -> EarlyEnds:
-    """Test whether runs that end early have a larger NEES in their last step than the runs that go on.
+    """Test whether runs that end early have a larger NEES in their last step than the runs that continue.
 
     In each step in which runs end, the NEES of all runs that have reached it are ranked. Given these values, each run
     is equally likely to end if ends do not depend on errors, however the steps depend on each other. So the sum of

@@ -15,7 +15,8 @@ from consistency.referee.diagnostics.records.groups import Column
 from consistency.referee.types import Array
 
 OF_ERRORS = {"nees", "anees", "error", "errors", "err", "ate", "ape", "rpe"}
-OF_SIGMAS = {"sigma", "std", "stddev", "stdev", "cov", "covariance", "variance", "var", "p"}
+OF_SIGMAS = {"sigma", "std", "stddev", "stdev", "cov", "covariance", "variance", "var"}
+OF_POSES = {"position", "pos", "rotation", "attitude", "pose", "stated", "own"}
 OF_TRUTH, OF_ESTIMATE = {"true", "truth", "gt", "groundtruth"}, {"est", "estimate", "estimated", "state"}
 OF_TIME = {"t", "time", "timestamp", "step", "run"}
 UNITS = (1.0, 2.0, 3.0, 100.0, 1000.0, 180.0 / np.pi)  # in which a sigma may stand: multiples, cm, mm, degrees
@@ -62,10 +63,12 @@ def selects_on_outcome(
     name, values, words = column.name, column.values.ravel(), _words_of(column.name)
     if words <= OF_TIME:
         return ""
-    if words & OF_SIGMAS:
+    components = {axis.lower() for axis in axes}
+    is_stated = words & OF_SIGMAS and words <= OF_SIGMAS | OF_POSES | components
+    if is_stated or re.match(r"(own_)?P_", name):
         return "is a stated sigma"
     for of, what in ((OF_TRUTH, "truth"), (OF_ESTIMATE, "estimate")):
-        if words & of and words - of and words - of <= {axis.lower() for axis in axes}:
+        if words & of and words - of and words - of <= components:
             return f"is a component of the {what}"
     if name in axes:
         return "is a component of the estimate"

@@ -71,7 +71,7 @@ def asymmetric(covariance: Array, tolerance: Tolerance = EXACT) -> Array:
 
 
 def negative(covariance: Array) -> Array:
-    """Which finite matrices (N, n, n) have a negative variance in some direction that is no rounding in any unit.
+    """Which finite matrices (N, n, n) have a negative variance in some direction that is not rounding in any unit.
 
     More lenient than :attr:`Validity.INDEFINITE`, so that a covariance that lost its rank is not called impossible.
     """

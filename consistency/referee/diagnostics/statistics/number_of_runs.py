@@ -27,7 +27,7 @@ def required_runs(
     dof : dimension of the error, or the effective degrees of freedom of a run
     ratio : true over stated covariance; above 1 overconfident, below 1 conservative
     false_alarm : of the test on a consistent filter
-    power : chance that the fault is found
+    power : probability that the fault is found
     two_sided : False spends all of ``false_alarm`` on the side of ``ratio``
 
     Raises
@@ -111,7 +111,7 @@ def lost_runs(share: float, power: float = POWER, lost: int = 0) -> int:
 
 
 def power_of(dof: float, runs: int, ratio: float, false_alarm: float = FALSE_ALARM, two_sided: bool = True) -> float:
-    """Chance that ``runs`` runs find a covariance wrong by ``ratio``; the complement of :func:`required_runs`."""
+    """Probability that ``runs`` runs find a covariance wrong by ``ratio``; the complement of :func:`required_runs`."""
     tail, k = _one_tail(false_alarm, two_sided), dof * runs
     if ratio > 1.0:
         return float(distributions.chi2.sf(distributions.chi2.isf(tail, k) / ratio, k))

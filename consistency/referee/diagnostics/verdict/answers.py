@@ -76,8 +76,8 @@ class Settings:
     false_alarm: float = FALSE_ALARM  # chance to find a fault in a right filter, all questions together
     detect: float = DETECT  # consistent: the ratio of true to stated covariance is shown to be in [1 / detect, detect]
     power: float = POWER  # a filter at either end is not called consistent, with this probability or more
-    tolerance: float | None = None  # a ratio shown to lie in [1 / tolerance, tolerance] is no fault
-    allow: str | None = None  # "conservative": a covariance that is too large is no fault
+    tolerance: float | None = None  # a ratio shown to lie in [1 / tolerance, tolerance] is not a fault
+    allow: str | None = None  # "conservative": a covariance that is too large is not a fault
     method: str = "max"  # of the band over all steps: "max" or "bonferroni"
     subsets: Mapping[str, Sequence[int]] | None = None  # further groups of components to look at, name -> indices
     lost: float | None = None  # consistent: the share of lost runs is shown to be this at most
@@ -118,7 +118,7 @@ class Settings:
 def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answer]:
     """Answers corrected for the number of questions: weighted Holm (1979), valid under any dependence.
 
-    The chance that a right filter is found at fault in any question is at most ``false_alarm``. The main question
+    The probability that a right filter is found at fault in any question is at most ``false_alarm``. The main question
     keeps its share; the shares of questions that cannot be asked (p is NaN) go to the other ones. The
     adjusted p value of a question is the false-alarm rate at which it would just be found.
     """

@@ -22,7 +22,7 @@ STATUSES = {
     "conservative": "the errors are smaller than the covariance says",
     "biased": "the errors have a mean; about it they are as large as the covariance says",
     "heavy-tailed": "a few errors are far larger than a Gaussian of the stated covariance has them",
-    "inconsistent": "the errors are otherwise than the covariance says, in more than their size",
+    "inconsistent": "the errors disagree with the covariance in more than scale",
     "undecided": "no fault is found, and it is not shown that there is none",
     "failed": "a run broke down, or there was nothing to judge",
 }
@@ -163,12 +163,14 @@ class EarlyEnds:
     """Runs that end before the last step of the others, and their errors there."""
 
     runs: int  # that end while others go on
-    above: float  # share of the runs that go on whose NEES is smaller in that step; 1/2 if ends do not depend on errors
+    above: (
+        float  # share of the runs that continue whose NEES is smaller in that step; 1/2 if ends do not depend on errors
+    )
     p_value: float  # that they do not, or on small errors only; NaN where no run ends early
 
     @property
     def lost(self) -> bool:
-        """Whether runs that end early have clearly larger errors than those that go on."""
+        """Whether runs that end early have clearly larger errors than those that continue."""
         return self.p_value <= EARLY
 
 

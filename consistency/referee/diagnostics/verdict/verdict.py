@@ -140,7 +140,7 @@ class Findings:
 
     @property
     def threshold(self) -> tuple[float, float]:
-        """Interval in which ``statistic`` is no fault."""
+        """Interval in which ``statistic`` is not a fault."""
         if self.scale is not None:
             return self.scale.accepted
         if self.innovations is not None:

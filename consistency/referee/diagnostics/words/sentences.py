@@ -37,8 +37,8 @@ from consistency.referee.diagnostics.words.numbers import (
 )
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
-MUCH = 100_000  # runs; more are no advice
-MOST_STEPS = 10_000_000  # of a log; more are no advice
+MUCH = 100_000  # runs; more are not advice
+MOST_STEPS = 10_000_000  # of a log; more are not advice
 LATER = "no fault found in the scale; the other questions are asked at the next look"
 
 
@@ -201,6 +201,16 @@ def _groups(by: ByGroup, faults: Faults) -> str:
     return groups_without_fault(by)
 
 
+def _groups_of_all(v: Findings) -> str:
+    """What is shown of the groups of the whole, or of each part, where none is at fault."""
+    if v.by_group is not None:
+        return f"; {groups_without_fault(v.by_group)}"
+    texts = [f"; {name}: {groups_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
+    if len(texts) > MOST:
+        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
+    return "".join(texts)
+
+
 def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
     return any(question in asked for question in questions)
 
@@ -227,8 +237,7 @@ def _no_fault(v: Findings, s: Scale) -> str:
     worst = clear(v.worst_axis)
     if worst is not None:
         axis = f" (worst axis: {worst[0]}, {ratio_text(worst[1])})"
-    if v.by_group is not None:
-        axis += f"; {groups_without_fault(v.by_group)}"
+    axis += _groups_of_all(v)
     if shown.shown:
         return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
     do = "do"
@@ -378,7 +387,7 @@ def _early_ends(v: Findings) -> list[str]:
         return []
     return [
         f"{plural(v.ends.runs, v.unit)} that end early have a larger NEES in their last step than "
-        f"{100 * v.ends.above:.0f} % of the {v.unit}s that go on (p {p_text(v.ends.p_value)}): if they end because "
+        f"{100 * v.ends.above:.0f} % of the {v.unit}s that continue (p {p_text(v.ends.p_value)}): if they end because "
         "they are lost, no rate holds; write a row of NaN where a filter breaks down, so that it counts as failed"
     ]
 

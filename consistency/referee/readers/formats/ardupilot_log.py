@@ -129,7 +129,7 @@ def _loaded(path: Path, wanted: dict[str, list[str]]) -> tuple[dict[str, list[di
         raise InputError(f"{path}: no such file")
     with reading(path), path.open("rb") as file:
         if file.read(len(BEGIN)) != BEGIN:
-            raise InputError(f"{path}: is no flight log of ArduPilot; one begins with the format of its messages")
+            raise InputError(f"{path}: is not a flight log of ArduPilot; one begins with the format of its messages")
     rows: dict[str, list[dict[str, float]]] = {name: [] for name in wanted}
     gates: dict[str, float] = {}
     said = io.StringIO()  # it prints what it skips

@@ -49,7 +49,7 @@ def head_of(path: Path, columns: Columns | None = None) -> Head | None:
 
 
 def begins_with_numbers(path: Path) -> bool:
-    """Whether the first line that is no comment is of numbers alone."""
+    """Whether the first line that is not a comment is of numbers alone."""
     lines, row = _beginning(path)
     return (
         row is not None and all(map(_is_number, fields_of(row))) and all(text.lstrip()[0] == "#" for _, text in lines)
@@ -57,7 +57,7 @@ def begins_with_numbers(path: Path) -> bool:
 
 
 def beginning(path: Path) -> bytes:
-    """The first bytes of a file; none of what is no file or cannot be read."""
+    """The first bytes of a file; none of what is not a file or cannot be read."""
     if not is_file(path):  # a pipe would be waited for
         return b""
     try:

@@ -204,7 +204,7 @@ def _in_degrees(
         bad = np.flatnonzero((minutes < 0) | (minutes >= 60) | (seconds < 0) | (seconds > 60) | (whole % 1 != 0))
         if len(bad):
             row = rows[bad[0]]
-            what = f"'{' '.join(row[2 + at : 5 + at])}' is no angle of degrees, minutes and seconds"
+            what = f"'{' '.join(row[2 + at : 5 + at])}' is not an angle of degrees, minutes and seconds"
             raise InputError(f"{path}, line {numbers[bad[0]]}: {what}")
         columns.append(np.copysign(np.abs(whole) + minutes / 60.0 + seconds / 3600.0, whole))
         at += 3
@@ -221,7 +221,9 @@ def _time(path: Path, number: int, row: Sequence[str], clock: str) -> float:
         else:
             at, second = GPS + dt.timedelta(weeks=int(row[0])), float(row[1])
     except (ValueError, IndexError, TypeError, OverflowError):
-        raise InputError(f"{path}, line {number}: '{' '.join(row[:2])}' is no date and time, and no GPS week") from None
+        raise InputError(
+            f"{path}, line {number}: '{' '.join(row[:2])}' is not a date and time, and no GPS week"
+        ) from None
     whole = (at - UNIX).total_seconds() - AHEAD[clock]
     return whole + second - (leap_seconds(whole + second) if clock == "GPST" else 0)
 

@@ -98,7 +98,7 @@ def _quaternions(path: Path, key: str, R: Array) -> Array:
     finite = np.isfinite(R).all(axis=(-2, -1))
     off = np.abs(R[finite] @ np.swapaxes(R[finite], -1, -2) - np.eye(3)).max(axis=(-2, -1))
     if (off > ROTATION).any() or (np.linalg.det(R[finite]) < 0).any():
-        raise InputError(f"{path}: key '{key}' holds a matrix that is no rotation")
+        raise InputError(f"{path}: key '{key}' holds a matrix that is not a rotation")
     out = np.full((*R.shape[:2], 4), np.nan)
     if finite.any():
         out[finite] = Rotation.from_matrix(R[finite]).as_quat()

@@ -34,7 +34,7 @@ def read_times(path: Path) -> Array:
     Raises
     ------
     InputError
-        The file is missing or empty, or a line is no time or not later than the one before.
+        The file is missing or empty, or a line is not a time or not later than the one before.
     """
     stamps = []
     for number, line in enumerate(read_text(path, "cannot be read").rstrip().splitlines(), 1):
@@ -58,7 +58,7 @@ def read_keys(path: Path, unnamed: str = "") -> dict[str, Array]:
     Raises
     ------
     InputError
-        The file is missing, a key is there twice, or a line is something else.
+        The file is missing, a key is duplicated, or a line is something else.
     """
     rows: dict[str, Array] = {}
     for number, line in enumerate(line for line in read_text(path, "cannot be read").splitlines() if line.strip()):
@@ -67,7 +67,7 @@ def read_keys(path: Path, unnamed: str = "") -> dict[str, Array]:
         if key.startswith("calib_time"):
             continue
         if name in rows:
-            raise InputError(f"{path}: key '{one_line(name)}' is there twice")
+            raise InputError(f"{path}: key '{one_line(name)}' is duplicated")
         try:
             rows[name] = np.array(values.split(), float)
         except ValueError:
@@ -90,7 +90,7 @@ def turn(path: Path, rows: dict[str, Array], name: str) -> Array:
     """A rotation (3, 3) by its key."""
     R = numbers(path, rows, name, (3, 3))
     if not np.abs(R @ R.T - np.eye(3)).max() < ROTATION or np.linalg.det(R) < 0:
-        raise InputError(f"{path}: key '{name}': is no rotation")
+        raise InputError(f"{path}: key '{name}': is not a rotation")
     return R
 
 

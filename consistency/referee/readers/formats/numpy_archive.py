@@ -230,7 +230,7 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
         The file is missing, or not an archive of arrays.
     """
     if not is_file(path):
-        raise InputError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
     if path.suffix.lower() == ".mat":
         from consistency.referee.readers.formats.matlab_file import load_matlab
 
@@ -242,7 +242,7 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
         if not hasattr(archive, "files"):
             raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {keys}")
         if len(set(archive.files)) < len(archive.files):
-            raise ValueError("a key is there twice")
+            raise ValueError("a key is duplicated")
         require_room(path, sum(member.file_size for member in archive.zip.infolist()))
         return {key: _numbers(path, archive, key) for key in archive.files}
 

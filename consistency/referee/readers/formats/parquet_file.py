@@ -41,7 +41,7 @@ def read_columns(path: Path, refusal: str) -> tuple[dict[str, Array], int]:
         table = file.read()
     names = table.column_names
     if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"{path}: column '{one_line(twice[0])}' is there twice")
+        raise InputError(f"{path}: column '{one_line(twice[0])}' is duplicated")
     with reading(path, refusal):
         return {name: _cells(name, column) for name, column in zip(names, table.columns, strict=True)}, table.num_rows
 

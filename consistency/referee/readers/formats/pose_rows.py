@@ -233,7 +233,9 @@ def _is_rigid(numbers: Array) -> Indices:
 def _matrices(lines: Lines) -> Lines:
     """Matrices that turn body into world coordinates, row by row, behind a time or a number or neither."""
     numbers, before, covariance = _matrix(lines)
-    what = f"the {numbers.shape[1]} numbers are no rotation and translation, row by row; should be these, or {LAYOUT}"
+    what = (
+        f"the {numbers.shape[1]} numbers are not a rotation and translation, row by row; should be these, or {LAYOUT}"
+    )
     refuse(~_is_rigid(numbers), lines.place, what)
     t, clock = _clock(lines, before)
     M = numbers.reshape(len(numbers), -1, 4)

@@ -21,7 +21,7 @@ from consistency.referee.types import Array
 
 SAME = 1e-9  # of quaternions
 FEWEST = 3  # estimates of a run
-TURNED, BEYOND = 0.5, 10.0  # rad and sigma: a turn that is no error of a constant orientation
+TURNED, BEYOND = 0.5, 10.0  # rad and sigma: a turn that is not an error of a constant orientation
 WINDING, ALIGNED = 0.01, 0.25  # 1 less the mean direction of a path, and the part of it that is left in the body's axes
 
 

@@ -213,7 +213,7 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Lines:
     chain = _chain(list(links), parent, child)
     if not chain:
         has = ", ".join(sorted(map(":".join, links))) or "none"
-        raise InputError(f"{bag}: --truth-topic {frames}: is no transform of /tf; there are: {has}")
+        raise InputError(f"{bag}: --truth-topic {frames}: is not a transform of /tf; there are: {has}")
     tracks = {pair: _track(bag, ":".join(pair), iter(links[pair])) for pair, _ in chain}
     longest = max(tracks.values(), key=lambda lines: len(lines.t))
     if chain == [((parent, child), True)]:

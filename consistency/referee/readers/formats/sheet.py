@@ -201,11 +201,11 @@ def frame_rows(frame: Any, name: str) -> TableRows:
     Raises
     ------
     InputError
-        It holds no row, or a column is there twice.
+        It holds no row, or a column is duplicated.
     """
     names = [str(column) for column in frame.columns]
     if twice := {column for column in names if names.count(column) > 1}:
-        raise InputError(f"{name}: column '{sorted(twice)[0]}' is there twice")
+        raise InputError(f"{name}: column '{sorted(twice)[0]}' is duplicated")
     data = {str(column): _cells(np.asarray(frame[column])) for column in frame.columns}
     rows = len(next(iter(data.values()), ()))
     if not rows:
@@ -268,7 +268,7 @@ def _header(path: Path, line: str) -> tuple[list[str], str]:
     names = [name.strip().strip('"') for name in line.split(separator)]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
-        raise InputError(f"{path}: column '{sorted(twice)[0]}' is there twice")
+        raise InputError(f"{path}: column '{sorted(twice)[0]}' is duplicated")
     return names, separator
 
 
@@ -386,7 +386,7 @@ def increasing(lines: Lines) -> Lines:
     refuse(~np.isfinite(t), lines.place, "the timestamp is not finite")
 
     def what(row: int) -> str:
-        of = "is there twice" if t[row] == t[row - 1] else "is less than the one before"
+        of = "is duplicated" if t[row] == t[row - 1] else "is less than the one before"
         return f"timestamp {exact(t[row])} {of}; they must increase, so leave the row out"
 
     refuse(np.append(False, np.diff(t) <= 0), lines.place, what)

@@ -147,7 +147,10 @@ def _require_truth(
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
     if truth is None and not {"nis", "nis_dof"} <= set(sheet.data):
         others = f"columns nis and nis_dof to be judged by the NIS alone, or columns true_{axes[0]}, … beside the state"
-        raise InputError(f"{sheet.path}: needs --truth FILE, or {others}")
+        state = ""
+        if not any(axis in sheet for axis in axes):
+            state = f"; the columns of another state than {','.join(axes)} are named by --state A,B"
+        raise InputError(f"{sheet.path}: needs --truth FILE, or {others}{state}")
     if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: for tables it is '{COLUMNS}', those of the truth")
 

@@ -28,7 +28,7 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
     Raises
     ------
     InputError
-        A step or a timestamp is there twice, or a timestamp is less than the one before.
+        A step or a timestamp is duplicated, or a timestamp is less than the one before.
     """
     values = sheet.numbers(key, finite=True, whole=key == "step")
     order = np.argsort(runs, kind="stable") if key == "t" else np.lexsort((values, runs))
@@ -37,7 +37,7 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
     if len(stuck):
         row = int(order[stuck[0] + 1])
         of = f" of run {runs[row]}" if "run" in sheet else ""
-        what = "is there twice" if values[order[stuck[0]]] == values[row] else "is less than the one before"
+        what = "is duplicated" if values[order[stuck[0]]] == values[row] else "is less than the one before"
         hint = ""
         if "run" not in sheet:
             hint = "; several runs need a column 'run'"
@@ -65,7 +65,9 @@ def cross_covariances(sheet: TableRows) -> Array | None:
         else:
             missing.append(names[0])
     if missing and len(missing) < len(POSE) ** 2:
-        raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; a cross-covariance is no symmetric matrix")
+        raise InputError(
+            f"{sheet.path}: column '{missing[0]}' is missing; a cross-covariance is not a symmetric matrix"
+        )
     return None if missing else out
 
 

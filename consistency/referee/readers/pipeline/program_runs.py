@@ -11,7 +11,7 @@ import itertools
 import json
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -46,6 +46,11 @@ def filled(text: str, values: Mapping[str, str]) -> str:
     if not values:
         return text
     return re.sub(r"\{(" + "|".join(values) + r")\}", lambda match: values[match[1]], text)
+
+
+def is_recorded(path: str) -> bool:
+    """Whether a path follows from a recorded file, and so is where the user stands."""
+    return "{name}" in path or "{input}" in path
 
 
 @dataclass(frozen=True)
@@ -120,7 +125,7 @@ class ProgramStudy:
 
     @property
     def design(self) -> Design | None:
-        """Looks at growing numbers of runs, if the runs went on until decided."""
+        """Looks at growing numbers of runs, if the runs were made until decided."""
         plan = self.manifest["until_decided"]
         return sequential_design(**plan) if plan else None
 
@@ -143,7 +148,7 @@ class ProgramStudy:
         for name in PATHS:
             path = getattr(r, name)
             if path is not None:
-                recorded = "input" in run.values and ("{name}" in str(path) or "{input}" in str(path))
+                recorded = "input" in run.values and is_recorded(str(path))
                 base = Path(run.values["here"]) if recorded else run.folder
                 own[name] = base / filled(str(path), run.known)
         return run.folder / filled(self.estimates, run.known), replace(r, **own)
@@ -188,7 +193,7 @@ def read_program_runs(folder: Path, r: Reading, found_in: Reader) -> list[Estima
     for run in runs_in(folder).values():
         runs.take(run)
     if not runs.found:
-        why = next(iter(runs.failed.values()), "none is finished; the same command with --resume goes on")
+        why = next(iter(runs.failed.values()), "none is finished; the same command with --resume continues")
         raise InputError(f"{folder}: no run can be judged: {why}")
     return runs.estimators(runs.first if study.design else None)
 
@@ -206,6 +211,7 @@ class Runs:
         self.found: dict[int, Sequence[Estimator]] = {}
         self.failed: dict[int, str] = {}
         self.trials: dict[int, str] = {}
+        self._ends: dict[int, tuple[float, str]] = {}  # last time of the estimates, and why that may be too early
 
     def take(self, run: ProgramRun) -> list[Record]:
         """Read a run, and return its records; none if it has failed."""
@@ -220,12 +226,13 @@ class Runs:
             self.failed[run.run] = with_log(str(error).replace(f"{run.folder}/", ""), run)
             return []
         self.found[run.run] = [_without_folder(one, run.folder) for one in found]
+        self._ends[run.run] = _end_of(found[0].runs[0])
         self.trials[run.run] = f"{run.source} {_digest(found)}"
         return records
 
     def delete_files(self, run: ProgramRun) -> None:
-        """Keep the numbers that were read of a run in place of its files, unless these end before their truth."""
-        if _ends_early(self.found[run.run][0].runs[0]):
+        """Keep the numbers that were read of a run in place of its files, unless these are not whole."""
+        if run.run in self._early(self.found):
             return
         estimates, r = self.study.files_of(run, self.options)
         if not (run.folder / NUMBERS).exists():
@@ -237,6 +244,25 @@ class Runs:
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
+
+    def _early(self, runs: Iterable[int]) -> dict[int, str]:
+        """Runs that left a part of a table, and why they count as failed.
+
+        These end before their truth, unless all do, or before most of the runs, which have the same end. Recorded
+        files are of any length.
+        """
+        if self.study.manifest.get("inputs"):
+            return {}
+        ends = {run: self._ends[run] for run in runs}
+        early = {run: late for run, (_, late) in ends.items() if late}
+        if len(early) == len(ends):
+            early = {}
+        longest = max((end for end, _ in ends.values()), default=0.0)
+        short = [run for run, (end, _) in ends.items() if end < longest]
+        if 2 * len(short) < len(ends):
+            for run in short:
+                early.setdefault(run, f"its estimates end at {ends[run][0]:.6g}, those of most runs at {longest:.6g}")
+        return early
 
     def _found(self, run: ProgramRun) -> list[Estimator]:
         if (run.folder / NUMBERS).exists():
@@ -256,10 +282,9 @@ class Runs:
         """The estimators of the first ``count`` runs by number, or of all that are there."""
         found = {run: one for run, one in sorted(self.found.items()) if count is None or run < count}
         failed = {run: why for run, why in self.failed.items() if count is None or run < count}
-        if not self.study.manifest.get("inputs"):
-            early = _early(found)
-            failed |= early
-            found = {run: one for run, one in found.items() if run not in early}
+        early = self._early(found)
+        found = {run: one for run, one in found.items() if run not in early}
+        failed |= early
         return [replace(one, trials=self.trials) for one in merged(found, self.study.name, failed)]
 
 
@@ -332,19 +357,15 @@ def _require_whole(records: Sequence[Record]) -> None:
                 raise InputError(f"{note.rpartition(': ')[0]}: its last line is cut short")
 
 
-def _early(found: Mapping[int, Sequence[Estimator]]) -> dict[int, str]:
-    """Runs whose estimates end before their truth, unless those of all runs do, and why they count as failed."""
-    early = {run: why for run, of_run in found.items() if (why := _ends_early(of_run[0].runs[0]))}
-    return {} if len(early) == len(found) else early
-
-
-def _ends_early(p: Poses) -> str:
+def _end_of(p: Poses) -> tuple[float, str]:
+    """Time or step of the last estimate, and what to say where the truth continues."""
     if len(p.t) < 2 or not len(p.true_t):
-        return ""
+        return float(p.t[-1]), ""
     period = float(np.median(np.diff(p.t)))
-    if p.true_t[-1] - p.t[-1] <= LATE * period:
-        return ""
-    return f"its estimates end at {p.t[-1]:.6g}, its truth at {p.true_t[-1]:.6g}"
+    late = ""
+    if p.true_t[-1] - p.t[-1] > LATE * period:
+        late = f"its estimates end at {p.t[-1]:.6g}, its truth at {p.true_t[-1]:.6g}"
+    return float(p.t[-1]), late
 
 
 def _digest(found: Sequence[Estimator]) -> str:

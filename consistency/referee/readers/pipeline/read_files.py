@@ -189,7 +189,7 @@ def pieces_asked(r: Reading) -> int | None:
     Raises
     ------
     InputError
-        It is no number of pieces, or another option makes runs of the log.
+        It is not a number of pieces, or another option makes runs of the log.
     """
     if r.split is None:
         return None

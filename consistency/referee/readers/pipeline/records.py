@@ -41,8 +41,8 @@ OF_WINDOWS = ("relative", "motions", "windows")  # options
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
 FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
 STILL = (
-    "not estimated and left out: their errors are 0 in every row, and their variances one constant each, as of a robot "
-    "in the plane"
+    "not estimated and left out: their errors are 0 in every row, and their variances one constant each, as for a "
+    "robot in the plane"
 )
 
 

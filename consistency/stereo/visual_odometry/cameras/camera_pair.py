@@ -13,7 +13,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
 from consistency.stereo.visual_odometry.cameras.yaml_file import read_matrix
 

@@ -1,6 +1,12 @@
-"""What can be wrong with matches, points and poses; all are :class:`consistency.referee.errors.InputError`."""
+"""Errors of input that cannot be used, and OpenCV, or the error that says what to install."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
 
 from consistency.referee.errors import InputError
+from consistency.referee.extras import MissingPackageError, remedy
 
 
 class MatchError(InputError):
@@ -29,3 +35,17 @@ class GimbalLockError(InputError):
 
 class ConvergenceError(InputError):
     """A minimisation that did not reach a minimum."""
+
+
+def opencv() -> Any:
+    """The module ``cv2``.
+
+    Raises
+    ------
+    InputError
+        OpenCV is not installed.
+    """
+    try:
+        return importlib.import_module("cv2")
+    except ImportError:
+        raise MissingPackageError(f"an image needs {remedy('vision')}") from None

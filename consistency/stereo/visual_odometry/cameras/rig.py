@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras import array_checks, batch_inverses
+from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import PointError
 
 NEAREST = 1e-3  # depth in baselines up to which a point is at the camera: a disparity of a thousand focal lengths
@@ -48,7 +48,7 @@ class StereoRig:
     image_size: tuple[int, int]  # width, height, px
 
     def __post_init__(self) -> None:
-        array_checks.freeze(self, K_left=(3, 3), K_right=(3, 3), R=(3, 3), t=(3,))
+        arrays.freeze(self, K_left=(3, 3), K_right=(3, 3), R=(3, 3), t=(3,))
         for name, K in (("K_left", self.K_left), ("K_right", self.K_right)):
             if np.tril(K, -1).any() or K[2, 2] != 1.0 or min(K[0, 0], K[1, 1]) <= 0.0:
                 raise InputError(f"{name}: give [[fu, skew, u0], [0, fv, v0], [0, 0, 1]] with positive fu and fv")
@@ -85,7 +85,7 @@ class StereoRig:
         PointError
             A point at or behind a camera.
         """
-        p = array_checks.checked_rows("points", points, 3)
+        p = arrays.checked_rows("points", points, 3)
         h = p @ np.swapaxes(self.cameras[:, :, :3], 1, 2) + self.cameras[:, None, :, 3]  # (2, N, 3)
         depth = h[:, :, 2]
         if (bad := (depth <= NEAREST * self.baseline).any(axis=0)).any():
@@ -114,7 +114,7 @@ def triangulate(rig: StereoRig, uv: Array) -> Array:
     PointError
         Rays that meet at infinity, at a camera or behind one: zero or negative disparity. See :func:`triangulable`.
     """
-    points, good = _points(rig, array_checks.checked_rows("uv", uv, 4))
+    points, good = _points(rig, arrays.checked_rows("uv", uv, 4))
     if not good.all():
         k = int(np.argmin(good))
         raise PointError(
@@ -127,7 +127,7 @@ def triangulate(rig: StereoRig, uv: Array) -> Array:
 
 def triangulable(rig: StereoRig, uv: Array) -> Array:
     """(N, 4) px to (N,) bool: the matches that :func:`triangulate` gives a point in front of both cameras."""
-    return _points(rig, array_checks.checked_rows("uv", uv, 4))[1]
+    return _points(rig, arrays.checked_rows("uv", uv, 4))[1]
 
 
 def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
@@ -155,7 +155,7 @@ def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
 
 def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
     AtA = np.einsum("kin,kjn->ijn", A, A)
-    inverse, definite = batch_inverses.symmetric_inverses(np.moveaxis(AtA, -1, 0))
+    inverse, definite = arrays.symmetric_inverses(np.moveaxis(AtA, -1, 0))
     inverse = np.moveaxis(inverse, 0, -1)
     alone = np.einsum("iin,iin->in", inverse, AtA)
     definite &= (alone < 1.0 / FIXED).all(axis=0)

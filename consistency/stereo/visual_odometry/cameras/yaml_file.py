@@ -13,7 +13,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import HUGE, read_text, reading
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.opencv import opencv
+from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 UNREADABLE = "cannot be read as YAML"
 LARGEST = 2**20  # bytes of a calibration
@@ -61,13 +61,13 @@ def _plain(path: Path, text: str) -> Any:
 
 
 def _once(yaml: Any) -> Any:
-    """PyYAML's safe loader, which refuses a key that is there twice."""
+    """PyYAML's safe loader, which refuses a key that is duplicated."""
 
     class Once(yaml.SafeLoader):  # type: ignore[misc]
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             keys = [self.construct_object(key, deep=True) for key, _ in node.value]
             if twice := [key for key in keys if keys.count(key) > 1]:
-                raise ValueError(f"key '{twice[0]}' is there twice")
+                raise ValueError(f"key '{twice[0]}' is duplicated")
             return super().construct_mapping(node, deep)
 
     return Once

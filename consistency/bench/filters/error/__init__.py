@@ -1,1 +1,0 @@
-"""In which error the covariance is meant: retraction, and the noise of motion in that error."""

@@ -1,0 +1,348 @@
+"""The decisions of ``plain_rules`` in kernels, and the part that makes them: one for all kinds of guards.
+
+A filter behind any of them has one kernel.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters.compiler.dispatch import implement, part
+from consistency.bench.filters.compiler.jit import inner
+from consistency.bench.filters.guard.plain_rules import KINDS, MOST_NODES, limits_of
+from consistency.bench.filters.kernel.part_functions import (
+    Data,
+    Slam,
+    State,
+    make_watch,
+    may_enter,
+    observed_width,
+    predict_innovation,
+    rejected_rows,
+    screen,
+    withhold,
+)
+from consistency.bench.filters.kernel.update_steps import INNOVATION, Work
+from consistency.bench.scenario import GuardSettings
+from consistency.referee.types import Array, Indices
+
+
+class Watch(NamedTuple):
+    """For M rows of data, up to m landmarks in a step, and s values of each."""
+
+    rejected: Array  # (M,) which rows the filter is not given, or has forgotten
+    sightings: Indices  # (n_landmarks,)
+    misses: Indices  # (n_landmarks,) rejected one after the other, up to the last
+    begun: Indices  # (n_landmarks,) row with which each landmark began, until another agrees with it; then -1
+    again: Array  # (M,) rows with which a landmark restarts
+    kept: Array  # (m,) of the known landmarks in a step
+    own: Array  # (m,) squared distance of each alone
+    order: Indices  # (m,) those that pass the gate
+    root: Array  # (s m, s m) lower root of S of the chosen ones
+    white: Array  # (s m,) their innovation divided by it
+    chosen: Indices  # (m,)
+    best: Indices  # (m,)
+    size: Indices  # (m + 1,) of a search: how many are chosen at each level
+    total: Array  # (m + 1,) their squared distance
+    branch: Indices  # (m + 1,) how many branches have been followed
+
+
+@inner
+def added_distance(i: int, count: int, s: int, y: Array, S: Array, watch: Watch) -> float:
+    """By how much observation i adds to the squared distance of the ``count`` chosen ones; NaN if S is not definite.
+
+    That is its own squared distance after an update with those. ``root`` and ``white`` get its rows behind theirs.
+    """
+    root, white, added = watch.root, watch.white, 0.0
+    for a in range(s):
+        row, p = s * count + a, s * i + a
+        for g in range(count + 1):
+            first = s * (watch.chosen[g] if g < count else i)
+            for e in range(s if g < count else a + 1):
+                c, q = s * g + e, first + e
+                rest = S[p, q] if p < q else S[q, p]
+                for b in range(c):
+                    rest -= root[row, b] * root[c, b]
+                if c < row:
+                    root[row, c] = rest / root[c, c]
+                elif rest > 0.0:
+                    root[row, row] = np.sqrt(rest)
+                else:
+                    return np.nan
+        rest = y[p]
+        for b in range(row):
+            rest -= root[row, b] * white[b]
+        white[row] = rest / root[row, row]
+        added += white[row] * white[row]
+    return added
+
+
+@inner
+def pass_gate(limit: float, s: int, m: int, y: Array, S: Array, watch: Watch) -> int:
+    """``own`` (m,) <- squared distances, ``kept`` (m,) <- whether each is within ``limit``; returns how many are.
+
+    -1 where S is not positive definite.
+    """
+    count = 0
+    for i in range(m):
+        watch.own[i] = added_distance(i, 0, s, y, S, watch)
+        if not watch.own[i] >= 0.0:
+            return -1
+        watch.kept[i] = watch.own[i] <= limit
+        if watch.kept[i]:
+            watch.order[count] = i
+            count += 1
+    return count
+
+
+@inner
+def keep_compatible(joint: Array, count: int, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
+    """``kept`` (m,) <- the largest jointly compatible set of the ``count`` that passed the gate."""
+    _sort_by_distance(count, watch)
+    best = _search(joint, count, s, y, S, watch)
+    for i in range(m):
+        watch.kept[i] = False
+    for i in range(best):
+        watch.kept[watch.best[i]] = True
+    return best >= 0
+
+
+@inner
+def _sort_by_distance(count: int, watch: Watch) -> None:
+    """``order`` (count,) <- nearest first; a stable insertion sort, for there are few."""
+    order, own = watch.order, watch.own
+    for last in range(1, count):
+        i, place = order[last], last
+        while place > 0 and own[order[place - 1]] > own[i]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = i
+
+
+@inner
+def _search(joint: Array, count: int, s: int, y: Array, S: Array, watch: Watch) -> int:
+    """``best`` <- the largest jointly compatible set of ``order`` (count,), by branch and bound; returns its size.
+
+    At each level an observation is first taken, then left out. -1 where S is not positive definite.
+    """
+    size, total, branch, chosen = watch.size, watch.total, watch.branch, watch.chosen
+    best, nearest, nodes, level = 0, 0.0, 0, 0
+    size[0], total[0], branch[0] = 0, 0.0, 0
+    while level >= 0:
+        n, far = size[level], total[level]
+        if level == count:
+            if far <= joint[n] and (n > best or (n == best and far < nearest)):
+                best, nearest = n, far
+                for i in range(n):
+                    watch.best[i] = chosen[i]
+            level -= 1
+            continue
+        if branch[level] == 2:
+            level -= 1
+            continue
+        nodes += 1
+        if nodes > MOST_NODES:
+            break
+        branch[level] += 1
+        if branch[level] == 1:
+            far += added_distance(watch.order[level], n, s, y, S, watch)
+            if np.isnan(far):
+                return -1
+            chosen[n] = watch.order[level]
+            n += 1
+        most = n + count - level - 1
+        if (most > best or (most == best and far < nearest)) and far <= joint[most]:
+            level += 1
+            size[level], total[level], branch[level] = n, far, 0
+    return best
+
+
+@inner
+def keep_supported(own: float, support: float, count: int, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
+    """``kept`` (m,) <- what supports the best hypothesis and what is rescued, of the ``count`` that passed the gate.
+
+    ``own`` and ``support`` are the squared distances up to which an observation passes the gate and supports.
+    """
+    best = _best_hypothesis(support, count, s, y, S, watch)
+    for i in range(m):
+        watch.kept[i] = False
+    if best < 0:
+        return True
+    low = _list_support(best, support, count, s, y, S, watch)
+    for i in range(low):
+        watch.chosen[i] = watch.best[i]
+        watch.kept[watch.best[i]] = True
+        if not added_distance(watch.best[i], i, s, y, S, watch) >= 0.0:
+            return False
+    for c in range(count):
+        i = watch.order[c]
+        watch.kept[i] = watch.kept[i] or added_distance(i, low, s, y, S, watch) <= own  # rescued
+    return True
+
+
+@inner
+def _best_hypothesis(support: float, count: int, s: int, y: Array, S: Array, watch: Watch) -> int:
+    """The observation with most support, the nearest of several; -1 if there is none."""
+    best, most = -1, 0
+    for c in range(count):
+        i = watch.order[c]
+        supporters = _list_support(i, support, count, s, y, S, watch)
+        if supporters > most or (supporters == most and watch.own[i] < watch.own[best]):
+            best, most = i, supporters
+    return best
+
+
+@inner
+def _list_support(hypothesis: int, support: float, count: int, s: int, y: Array, S: Array, watch: Watch) -> int:
+    """``best`` <- the hypothesis and what it leaves within ``support``, in order; returns how many."""
+    found = 0
+    added_distance(hypothesis, 0, s, y, S, watch)
+    watch.chosen[0] = hypothesis
+    for c in range(count):
+        i = watch.order[c]
+        if i == hypothesis or added_distance(i, 1, s, y, S, watch) <= support:
+            watch.best[found] = i
+            found += 1
+    return found
+
+
+JOINT, RANSAC = list(KINDS).index("joint"), list(KINDS).index("ransac")
+
+
+@part()
+class Guard(NamedTuple):
+    """Squared distances up to which 0, 1, ... observations are accepted together, and one supports a hypothesis.
+
+    A track is used from ``min_age`` sightings on, and ended by ``forget_after`` rejections in a row, none if it is 0.
+    """
+
+    kind: int  # JOINT, RANSAC, or a gate of each observation alone (Cox 1993)
+    min_age: int
+    forget_after: int
+    joint: Array  # (m + 1,)
+    support: float
+
+
+def guard_part(kind: str, settings: GuardSettings, s: int, m: int) -> Guard:
+    """A guard of up to ``m`` landmarks in a step, each with ``s`` values."""
+    limits = limits_of(settings, s, m)
+    return Guard(list(KINDS).index(kind), settings.min_age, settings.forget_after or 0, limits.joint, limits.support)
+
+
+@implement(make_watch, Guard)
+def watch_tracks(guard: Guard, s: int, m: int, rows: int, n_landmarks: int) -> Watch:
+    return Watch(
+        np.zeros(rows, np.bool_),
+        np.zeros(n_landmarks, np.int64),
+        np.zeros(n_landmarks, np.int64),
+        np.full(n_landmarks, -1),
+        np.zeros(rows, np.bool_),
+        np.zeros(m, np.bool_),
+        np.zeros(m),
+        np.zeros(m, np.int64),
+        np.zeros((s * m, s * m)),
+        np.zeros(s * m),
+        np.zeros(m, np.int64),
+        np.zeros(m, np.int64),
+        np.zeros(m + 1, np.int64),
+        np.zeros(m + 1),
+        np.zeros(m + 1, np.int64),
+    )
+
+
+@implement(screen, Guard)
+def screen_known(
+    guard: Guard,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    local: NamedTuple,
+    work: Work[NamedTuple],
+    watch: Watch,
+) -> tuple[int, int, bool]:
+    """First by the track, then by what the filter expects of the landmarks that it knows."""
+    m = _screen_tracks(guard, state.offset, data, k, m, work, watch)
+    withhold(slam.covariance, state, data, k, watch.rejected, watch.anew, local)
+    if m == 0:
+        return 0, 0, False
+    code, _ = predict_innovation(slam.update, slam, state, data, k, m, local, work)
+    if code > 0:
+        return code, m, False
+    s = observed_width(slam.sensor)
+    if not keep_agreeing(guard, s, m, work.A[: s * m, state.n + state.base], work.S, watch):
+        return INNOVATION, m, False
+    for i in range(m):
+        row, label, kept = work.known[i], work.label[i], watch.kept[i]
+        watch.rejected[row] = not kept
+        watch.misses[label] = 0 if kept else watch.misses[label] + 1
+        watch.anew[row] = not kept and watch.begun[label] >= 0
+        if kept:
+            watch.begun[label] = -1
+    left = _without_rejected(m, work, watch)
+    if left < m:
+        withhold(slam.covariance, state, data, k, watch.rejected, watch.anew, local)
+        _begin_anew(data, k, watch)
+    return 0, left, left == m
+
+
+@inner
+def keep_agreeing(guard: Guard, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
+    """``watch.kept`` (m,) <- which of ``m`` observations to keep, by innovation (s m,) and the upper half of S.
+
+    False where S is not positive definite.
+    """
+    count = pass_gate(guard.joint[1], s, m, y, S, watch)
+    if count >= 0 and guard.kind == JOINT:
+        return keep_compatible(guard.joint, count, s, m, y, S, watch)
+    if count >= 0 and guard.kind == RANSAC:
+        return keep_supported(guard.joint[1], guard.support, count, s, m, y, S, watch)
+    return count >= 0
+
+
+@inner
+def _screen_tracks(
+    guard: Guard, offset: Indices, data: Data, k: int, m: int, work: Work[NamedTuple], watch: Watch
+) -> int:
+    """Rejects observations of tracks that are too young or given up; returns how many known landmarks are left."""
+    for i in range(data.first[k], data.first[k + 1]):
+        label = data.landmark[i]
+        watch.sightings[label] += 1
+        is_given_up = 0 < guard.forget_after <= watch.misses[label]
+        watch.rejected[i] = is_given_up or watch.sightings[label] < guard.min_age
+        if offset[label] < 0 and not watch.rejected[i]:
+            watch.begun[label] = i
+    return _without_rejected(m, work, watch)
+
+
+@inner
+def _begin_anew(data: Data, k: int, watch: Watch) -> None:
+    """What a landmark began with is rejected, where it restarts with the first that disagrees."""
+    for i in range(data.first[k], data.first[k + 1]):
+        if watch.anew[i]:
+            label = data.landmark[i]
+            watch.rejected[watch.begun[label]], watch.rejected[i] = True, False
+            watch.begun[label] = i
+
+
+@inner
+def _without_rejected(m: int, work: Work[NamedTuple], watch: Watch) -> int:
+    left = 0
+    for i in range(m):
+        if not watch.rejected[work.known[i]]:
+            work.known[left], work.label[left], work.at[left] = work.known[i], work.label[i], work.at[i]
+            left += 1
+    return left
+
+
+@implement(may_enter, Guard)
+def enters_unless_rejected(guard: Guard, row: int, is_known: bool, watch: Watch) -> bool:
+    return watch.anew[row] if is_known else not watch.rejected[row]
+
+
+@implement(rejected_rows, Guard)
+def rejected_of(guard: Guard, watch: Watch) -> Array:
+    return watch.rejected.copy()

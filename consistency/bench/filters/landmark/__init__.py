@@ -1,1 +1,0 @@
-"""How a landmark is kept in the state, one file for each parametrisation."""

@@ -1,1 +1,0 @@
-"""Where f and h are linearised."""

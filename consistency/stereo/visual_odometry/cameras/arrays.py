@@ -1,0 +1,115 @@
+"""Arrays that callers hand in: shape, finite values, covariances that are covariances; and inverses of many of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+
+ROUNDING = 1e-9  # of a covariance's largest entry: asymmetry and negative eigenvalues below are rounding
+ORTHONORMAL = 1e-6  # largest entry of R'R - I: a calibration file has about that many digits
+LARGEST = 1e75  # of a number: fourth powers of coordinates are still finite
+
+
+def checked_rows(name: str, value: Any, width: int) -> Array:
+    """``value`` as floats of shape (N, width).
+
+    Raises
+    ------
+    InputError
+        Another shape, or a value that is not finite.
+    """
+    array = floats(name, value)
+    if array.ndim != 2 or array.shape[1] != width:
+        raise InputError(f"{name}: shape {array.shape}, allowed is (N, {width})")
+    return array
+
+
+def freeze(record: Any, **shapes: tuple[int, ...]) -> None:
+    """Fields of a frozen record become read-only copies, as floats of these shapes; a field ``R`` is a rotation.
+
+    Raises
+    ------
+    InputError
+        Another shape, a value that is not finite, or R no rotation.
+    """
+    for name, shape in shapes.items():
+        value = floats(name, getattr(record, name)).copy()
+        if value.shape != shape:
+            raise InputError(f"{name}: shape {value.shape}, allowed is {shape}")
+        value.flags.writeable = False
+        object.__setattr__(record, name, value)
+    R = record.R
+    if np.abs(R.T @ R - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(R) < 0.0:
+        raise InputError("R: not a rotation; its columns must be orthonormal and its determinant +1")
+
+
+def same_length(names: str, *arrays: Array) -> None:
+    """All arrays have the same number of rows, else InputError."""
+    if len({len(array) for array in arrays}) > 1:
+        counts = ", ".join(str(len(array)) for array in arrays)
+        raise InputError(f"{names}: {counts} rows, they must be matched row by row")
+
+
+def covariances(name: str, value: Any, count: int, size: int) -> Array:
+    """``value`` of shape (size, size), for all rows, or (count, size, size), as the latter.
+
+    Raises
+    ------
+    InputError
+        Another shape, a value that is not finite, or a matrix that is not symmetric positive semidefinite.
+    """
+    matrices = floats(name, value)
+    if matrices.shape not in {(size, size), (count, size, size)}:
+        raise InputError(f"{name}: shape {matrices.shape}, allowed are ({size}, {size}) and ({count}, {size}, {size})")
+    if matrices.size == 0:
+        return matrices
+    slack = ROUNDING * np.abs(matrices).max(axis=(-2, -1), keepdims=True)
+    if (np.abs(matrices - np.swapaxes(matrices, -1, -2)) > slack).any():
+        raise InputError(f"{name}: not symmetric; give covariances, for pixels in px^2")
+    try:
+        np.linalg.cholesky(matrices + (slack + np.finfo(float).tiny) * np.eye(size))
+    except np.linalg.LinAlgError:
+        raise InputError(f"{name}: not positive semidefinite; give covariances, for pixels in px^2") from None
+    return np.broadcast_to(matrices, (count, size, size))
+
+
+def floats(name: str, value: Any) -> Array:
+    """``value`` as an array of finite floats, else InputError."""
+    try:
+        array: Array = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: not an array of numbers") from None
+    if (bad := ~(np.abs(array) <= LARGEST)).any():
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        why = "too large" if np.isfinite(array[index]) else "not finite"
+        raise InputError(f"{name}: {why} at index {index}; leave such rows out")
+    return array
+
+
+def symmetric_inverses(C: Array) -> tuple[Array, Array]:
+    """Inverses (..., m, m) of symmetric matrices, and which of them are positive definite (...).
+
+    What stands for the inverse of one that is not means nothing. Three rows go by cofactors, which takes a third of
+    the time of LAPACK's calls for each matrix.
+    """
+    if C.shape[-1] != 3:
+        one = np.eye(C.shape[-1])
+        finite = np.asarray(np.isfinite(C).all(axis=(-2, -1)))
+        definite = finite & (np.linalg.eigvalsh(np.where(finite[..., None, None], C, one))[..., 0] > 0.0)
+        return np.linalg.inv(np.where(definite[..., None, None], C, one)), definite
+    a, b, c, d, e, f = (C[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    out = np.empty_like(C)
+    out[..., 0, 0] = d * f - e * e
+    out[..., 0, 1] = out[..., 1, 0] = c * e - b * f
+    out[..., 0, 2] = out[..., 2, 0] = b * e - c * d
+    out[..., 1, 1] = a * f - c * c
+    out[..., 1, 2] = out[..., 2, 1] = b * c - a * e
+    out[..., 2, 2] = minor = a * d - b * b
+    det = a * out[..., 0, 0] + b * out[..., 0, 1] + c * out[..., 0, 2]
+    definite = (a > 0.0) & (minor > 0.0) & (det > 0.0)
+    out /= np.where(definite, det, 1.0)[..., None, None]
+    return out, definite

@@ -47,18 +47,17 @@ def cut_note(path: Path, line: int) -> CutNote:
 
 
 def one_of_each_kind(notes: Iterable[str]) -> tuple[str, ...]:
-    """Notes of files, ``est/0.csv: read as poses``, of which those that say the same are one."""
+    """Notes of files, ``est/0.csv: read as poses``, of which three or more that say the same are one."""
     files: dict[str, list[str]] = {}
     for note in dict.fromkeys(filter(None, notes)):
         file, _, text = note.partition(": ")
         files.setdefault(text, []).append(file)
-    return tuple(f"{_first_of(names)}: {text}" if text else names[0] for text, names in files.items())
-
-
-def _first_of(names: Sequence[str]) -> str:
-    if len(names) == 1:
-        return names[0]
-    return f"{names[0]} and {len(names) - 1} other{'s' * (len(names) > 2)}"
+    out: list[str] = []
+    for text, names in files.items():
+        if len(names) > 2:
+            names = [f"{names[0]} and {len(names) - 1} others"]
+        out += [f"{name}: {text}" if text else name for name in names]
+    return tuple(out)
 
 
 def listed(items: Sequence[object], most: int = 5) -> str:

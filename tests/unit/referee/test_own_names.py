@@ -297,4 +297,4 @@ def test_refusals_name_the_option(tmp_path: Path) -> None:
 def test_notes_of_like_files_are_one() -> None:
     notes = ["a/0.csv: read so", "b/0.csv: read otherwise", "a/1.csv: read so", "a/2.csv: read so", "", "whole"]
     assert one_of_each_kind(notes) == ("a/0.csv and 2 others: read so", "b/0.csv: read otherwise", "whole")
-    assert one_of_each_kind(["a: so", "b: so"]) == ("a and 1 other: so",)
+    assert one_of_each_kind(["a: so", "b: so", "c"]) == ("a: so", "b: so", "c")

@@ -11,7 +11,7 @@ from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, GROUP, JOINT, SCALE, SHAPE, Settings
-from consistency.referee.diagnostics.verdict.parts import ByGroup, Equivalence, Innovations, Location, Scale, Within
+from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Location, Scale, Within
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.words.faults import (
     MOST,
@@ -25,7 +25,7 @@ from consistency.referee.diagnostics.words.faults import (
     shape_text,
     tails_text,
 )
-from consistency.referee.diagnostics.words.groups import faults_of_groups, groups_without_fault, lines_of_groups
+from consistency.referee.diagnostics.words.groups import groups_text, lines_of_groups, right_groups
 from consistency.referee.diagnostics.words.numbers import (
     SMALLEST_P,
     is_or_are,
@@ -174,7 +174,7 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
     if v.status == "heavy-tailed":
         parts.append(f"in the mean the covariance ratio is {ratio_text(s.inflation)}")
     if v.by_group is not None:
-        parts.append(_groups(v.by_group, faults))
+        parts.append(groups_text(v.by_group, GROUP in faults))
     if len(faults) == 1:
         parts += [ALONE[question] for question in faults if question in ALONE]
     if "innovation scale" in faults and v.innovations is not None:
@@ -192,23 +192,6 @@ def _rank(v: Findings, faults: Faults, questions: Collection[str]) -> tuple[bool
     p = min((faults[question].adjusted for question in questions if question in faults), default=1.0)
     order = (SCALE, BIAS, SHAPE)
     return questions is not named and questions != named, max(p, SMALLEST_P), [*order, questions].index(questions)
-
-
-def _groups(by: ByGroup, faults: Faults) -> str:
-    """The worst group where one is at fault, otherwise what is shown of the groups."""
-    if GROUP in faults:
-        return faults_of_groups(by)
-    return groups_without_fault(by)
-
-
-def _groups_of_all(v: Findings) -> str:
-    """What is shown of the groups of the whole, or of each part, where none is at fault."""
-    if v.by_group is not None:
-        return f"; {groups_without_fault(v.by_group)}"
-    texts = [f"; {name}: {groups_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
-    if len(texts) > MOST:
-        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
-    return "".join(texts)
 
 
 def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
@@ -237,7 +220,7 @@ def _no_fault(v: Findings, s: Scale) -> str:
     worst = clear(v.worst_axis)
     if worst is not None:
         axis = f" (worst axis: {worst[0]}, {ratio_text(worst[1])})"
-    axis += _groups_of_all(v)
+    axis += right_groups(v)
     if shown.shown:
         return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
     do = "do"

@@ -23,7 +23,10 @@ from consistency.commands.shared_options import (
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
 
-KEPT = ("truth", "max_dt", "time_offset", "topic", "truth_topic", "body")
+KEPT = (
+    "truth", "max_dt", "time_offset", "topic", "truth_topic", "body", "columns", "truth_columns", "world", "body_axes",
+    "truth_world", "truth_body_axes",
+)  # fmt: skip
 
 
 @reads_files(only=KEPT)

@@ -16,7 +16,8 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.referee.readers.clock_units import unit_apart
-from consistency.referee.readers.formats.named_columns import fields_of, require_units
+from consistency.referee.readers.formats.file_head import fields_of
+from consistency.referee.readers.formats.named_columns import require_units
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.types import Array
 
@@ -681,6 +682,12 @@ def test_a_lower_triangle_is_a_covariance(heading, inside):
         ),
         ("o.txt.gz", "", "", r"o\.txt\.gz: unknown kind of file; .*; unpack it$"),
         ("f.ulg", "", "", r"f\.ulg: unknown kind of file; .*; flight logs are for 'consistency monitor'$"),
+        (
+            "d/0.csv",
+            "t,x,y,heading",
+            "0,1,2,3\n",
+            r"0\.csv: column 'P_xx' is missing; .*; --columns P_xx=NAME says what it is called",
+        ),
     ],
 )
 def test_a_refusal_names_the_remedy(name, header, rows, said, inside):

@@ -59,7 +59,11 @@ def test_the_worst_axis_stands_beside_the_whole(rng, capsys):
     assert f"ratio of the {beside.replace(':', ': f')}" in capsys.readouterr().out
     few = judged(error[:5])
     assert few.status == "undecided"
-    assert "(worst axis: " in few.reasons[0]
+    assert few.worst_axis is not None
+    assert few.worst_axis[1].holds(1.0)
+    assert "worst axis" not in few.reasons[0]
+    show(*document({"f": few}, reasons=False).opening)
+    assert "worst axis" not in capsys.readouterr().out + str(few)
 
 
 def test_the_worst_axis_of_a_fault_is_to_its_side(rng):

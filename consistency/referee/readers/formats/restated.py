@@ -114,10 +114,10 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
     elif is_plane(estimates):
         return []
     elif r.covariance is not None:
-        runs = files_of_runs(estimates, r.truth, r.covariance)
+        runs = files_of_runs(estimates, r, r.covariance)
         found = [_covariances(path, run, r) for run, (_, _, path) in enumerate(runs) if path is not None]
     else:
-        found = [_trajectory(own, run, r) for run, (own, _, _) in enumerate(files_of_runs(estimates, r.truth, None))]
+        found = [_trajectory(own, run, r) for run, (own, _, _) in enumerate(files_of_runs(estimates, r, None))]
     known = [each for each in found if each is not None]
     return known if len(known) == len(found) else []
 

@@ -198,7 +198,7 @@ def test_a_gate_that_fails_is_in_the_summary(workspace):
     assert "test_the_ekf_is_consistent | overconfident | x" in done.summary
 
 
-def test_runs_of_a_program_get_a_report(tmp_path: Path) -> None:
+def test_runs_of_a_program_get_a_report(tmp_path):
     """Three runs decide nothing, so the job fails."""
     at = tmp_path / "workspace"
     at.mkdir()

@@ -46,6 +46,8 @@ from consistency.referee.readers.truth_matching import Estimator
 from consistency.referee.system.progress import Advance, progress, say
 
 ALIKE = 3  # first runs that failed alike stop a study
+HOPELESS = 20  # and so many that failed in any way
+IS_WINDOWS = os.name == "nt"
 PROOF = 2  # first runs whose tables must differ
 
 
@@ -114,8 +116,9 @@ def run_study(
         say(
             f"consistency: no word of the command holds {what}; runs then differ only if the program reads it by itself"
         )
-    with opened(out, _manifest(program, plan, estimates, r), resume) as study:
-        loop = _Loop(program, plan, study, r)
+    about = _manifest(program, plan, estimates, r)
+    with opened(out, about, resume) as study:
+        loop = _Loop(program, plan, study, r, about)
         loop.do_runs()
         records, verdicts = loop.judged()
         write_manifest(out, {**loop.fields, "complete": True})
@@ -142,7 +145,7 @@ def _required(plan: Plan, r: Reading) -> Reading:
         raise InputError("--runs and --until-decided do not go with --each, which has a run for each file")
     if r.error == GUESS:
         raise InputError(f"--error {GUESS}: goes with 'consistency analyse DIR' when the runs are there")
-    if os.name == "nt":
+    if IS_WINDOWS:
         raise InputError("monte-carlo needs process groups of POSIX; on Windows run it in WSL")
     return checked_options(r)
 
@@ -176,16 +179,17 @@ def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[
         "words": list(program.words), "files": program.files(), "cwd": program.cwd and str(program.cwd),
         "seed": plan.seed, "inputs": [os.path.relpath(path, here) for path in plan.inputs] or None,
         "estimates": estimates, "reading": reading, "runs": plan.runs, "until_decided": None, "complete": False,
-        "keep": plan.keep,
+        "keep": plan.keep, "settings": {key: value for key, value in vars(plan.settings).items() if value is not None},
+        "skip": plan.skip and plan.skip.option, "optimal_gain": plan.optimal_gain,
     }  # fmt: skip
 
 
 class _Loop:
     """Runs in progress and done, and what is known of them so far."""
 
-    def __init__(self, program: Program, plan: Plan, study: ProgramStudy, r: Reading) -> None:
+    def __init__(self, program: Program, plan: Plan, study: ProgramStudy, r: Reading, fields: dict[str, Any]) -> None:
         self.program, self.plan, self.study, self.options = program, plan, study, r
-        self.fields = {key: value for key, value in study.manifest.items() if key in _KEYS}
+        self.fields = fields  # of the manifest
         self.runs = Runs(study, r, found_in)
         self.logs: dict[int, ProgramRun] = {}
         self.total = len(plan.inputs) or plan.runs
@@ -283,11 +287,7 @@ class _Loop:
             self._plan_runs(records, stack)
         elif self.advance is not None:
             self.advance(1)
-        if (
-            not self.runs.found
-            and len(self.runs.failed) >= ALIKE
-            and len(set(map(kind_of_failure, self.runs.failed.values()))) == 1
-        ):
+        if self._is_hopeless:
             raise self._all_failed()
         if len(self.runs.found) == PROOF and records:
             self._require_different()
@@ -300,6 +300,7 @@ class _Loop:
         self.names = [record.name for record in records]
         planned = gate_runs(dof, settings.detect, rate, settings.power, settings.allow, settings.lost)
         if self.plan.until_decided:
+            _require_looks(records)
             looked: dict[str, Any] = {
                 "dof": dof, "detect": settings.detect, "false_alarm": settings.false_alarm, "power": settings.power,
                 "max_runs": self.plan.max_runs,
@@ -315,7 +316,8 @@ class _Loop:
         self.fields |= {"runs": self.total}
         write_manifest(self.study.folder, self.fields)
         self.advance = stack.enter_context(progress("runs", self.total or planned))
-        self.advance(len(self.logs))
+        if self.total is None or len(self.logs) < self.total:
+            self.advance(len(self.logs))
 
     def _look(self) -> None:
         """Look at the first runs, where as many are there as the next look takes."""
@@ -339,6 +341,14 @@ class _Loop:
         return records, {record.name: judge(record, self.plan.settings, self.design, True) for record in records}
 
     # --- programs that cannot work -------------------------------------------------------------------
+
+    @property
+    def _is_hopeless(self) -> bool:
+        """Whether the first runs have all failed, alike or many of them."""
+        failed = self.runs.failed
+        if self.runs.found or len(failed) < ALIKE:
+            return False
+        return len(failed) >= HOPELESS or len(set(map(kind_of_failure, failed.values()))) == 1
 
     def _all_failed(self) -> InputError:
         """Message that no run can be judged, after the last lines of the first one's log."""
@@ -374,7 +384,12 @@ class _Loop:
             say("--check-seed: run 0 done twice gave different tables; the program is not reproducible by {seed}")
 
 
-_KEYS = ("words", "files", "cwd", "seed", "inputs", "estimates", "reading", "runs", "until_decided", "complete", "keep")
+def _require_looks(records: Sequence[Record]) -> None:
+    """Refuse records whose verdict has no form for looks at growing numbers of runs."""
+    for record in records:
+        if record.parts or record.independent or record.unshown or record.truth_covariance is not None:
+            what = "components, windows or a truth that are judged by themselves"
+            raise InputError(f"--until-decided: {record.name} has {what}; give --runs")
 
 
 def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:

@@ -31,6 +31,9 @@ class Source:
     scenario: str | None = None
     trials: tuple[Any, Any] = (None, None)  # scenario hash and seed, or what a log holds: equal for the same trials
     unfinished: str = ""  # number of runs, where some are missing
+    settings: Settings | None = None  # by which they were judged when they were run; the defaults if None
+    skip: Skip | None = None  # first steps that were left out then
+    optimal_gain: bool = False  # declared then
 
 
 def source_of(of: Source | Sequence[Record]) -> Source:
@@ -48,14 +51,17 @@ def source_of(of: Source | Sequence[Record]) -> Source:
 
 
 def files_source(path: Path, records: Sequence[Record]) -> Source:
-    """Return records of files as a source, with the looks of a program's runs that were made until decided."""
+    """Return records of files as a source; runs of a program are judged as they were when they were run."""
     source = source_of(records)
     if not is_program_runs(path):
         return source
     from consistency.referee.readers.pipeline.program_runs import study_in
 
     study = study_in(path)
-    return replace(source, design=lambda: study.design, unfinished=study.unfinished)
+    return replace(
+        source, design=lambda: study.design, unfinished=study.unfinished, settings=study.settings,
+        skip=skip_asked(study.manifest["skip"]), optimal_gain=study.manifest["optimal_gain"],
+    )  # fmt: skip
 
 
 def judge_all(
@@ -71,13 +77,13 @@ def judge_all(
     if settings is None:
         settings = settings_of(confidence)
         if confidence is None:
-            design = source.design()
-    first, verdicts = skip_asked(skip), {}
+            settings, design = source.settings or settings, source.design()
+    first, verdicts = skip_asked(skip) or source.skip, {}
     for name in filters or source.filters:
         record = source.record(name)
-        if first is not None:
+        if first is not None and record.skipped is None:
             record = record.without_first(first)
-        if optimal_gain:
+        if optimal_gain or source.optimal_gain:
             record = replace(record, optimal_gain=True)
         verdicts[name] = judge(record, settings, design)
     return verdicts

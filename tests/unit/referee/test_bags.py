@@ -69,6 +69,18 @@ def test_a_folder_of_bags_has_a_run_in_each(tmp_path):
     assert cs.read(tmp_path / "bags", truth_topic="/vicon", axes=["x", "yaw"]).axes == ("x", "yaw")
 
 
+def test_bags_of_a_program_are_deleted_once_they_are_read(tmp_path, monkeypatch, capsys):
+    for seed in range(3):
+        write(tmp_path / f"recorded/{seed}", 2, "pose", Drive(seed), ".mcap")
+    monkeypatch.chdir(tmp_path)
+    reading = ("--each", "recorded/*", "--estimates", "bag", "--truth-topic", "/vicon", "--json")
+    words = ("--keep", "failed", "--out", "out", "--", "cp", "-r", "{input}", "bag")
+    judged, _ = consistency(capsys, "monte-carlo", *reading, *words)
+    assert "undecided" in judged
+    assert consistency(capsys, "analyse", "out", "--json")[0] == judged
+    assert not list((tmp_path / "out").rglob("bag"))
+
+
 @pytest.mark.parametrize(
     "variances, unstated", [((0.2, 1e-3, 1e-3), ""), ((0.0, 1e-3, 1e-3), "z"), ((2e9, 0.1, 0.1), "z")]
 )

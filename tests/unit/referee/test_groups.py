@@ -333,6 +333,15 @@ def test_honest_columns_are_not_refused() -> None:
     assert selects_on_outcome(Column("n_matches", number), ("x", "y"), flat, flat, covariance) == ""
 
 
+def test_the_way_of_one_run_is_not_its_drift() -> None:
+    """Errors that only grow are in the order of the way, of which they are not made."""
+    way = np.linspace(0.0, 100.0, 200)
+    drift = np.column_stack([0.01 * way, 0.001 * way**2])
+    assert made_from_errors("way", way, drift, np.square(drift).sum(axis=1)) == ""
+    assert made_from_errors("far", 1.0 * (way > 50.0), drift, np.square(drift).sum(axis=1)) == ""
+    assert selects_on_outcome(Column("way", way), ("x", "y"), truth=np.column_stack([way, way])) == ""
+
+
 @pytest.mark.parametrize("name", ["x", "true_x", "x_gt", "est_y", "sigma", "P_xx", "std_y"])
 def test_names_that_select_on_the_outcome(name: str) -> None:
     assert selects_on_outcome(Column(name, np.arange(40.0)), ("x", "y")) != ""
@@ -466,6 +475,7 @@ def test_a_key_of_an_archive(tmp_path: Path) -> None:
     [
         (["--by", "nope"], "--by nope: .*est.csv has no such column; there are: run, step"),
         (["--bins", "4"], "--bins: goes with --by COLUMN"),
+        (["--by", "site", "--bins", "4"], "--bins: site holds words, each of which is a group"),
         (["--by", "site", "--by-file", "one.csv"], "one.csv: column 't' or 'run' is missing"),
         (["--by", "site", "--by-file", "two.csv"], "two.csv: holds no run 0"),
         (["--by", "site", "--by-file", "three.csv"], "three.csv, line 3: run 0 has several rows; they need a column t"),

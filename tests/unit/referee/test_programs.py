@@ -155,6 +155,13 @@ def test_a_recorded_file_needs_its_option(place, capsys):
     assert "named by --state A,B" in capsys.readouterr().err
 
 
+def test_windows_is_refused_in_one_line(place, capsys, monkeypatch):
+    monkeypatch.setattr("consistency.referee.programs.study.IS_WINDOWS", True)
+    status, _, err = monte_carlo("--out", "out", "--", "./filter", "{run}", capsys=capsys)
+    assert (status, err.count("\n"), (place / "out").exists()) == (2, 1, False)
+    assert "on Windows run it in WSL" in err
+
+
 def test_a_relative_path_is_pointed_out(place, capsys):
     (place / "ekf.yaml").touch()
     words = ("--runs", "2", "--out", "out", "--", "./filter", "{run}", "--config=ekf.yaml", "{here}/ekf.yaml")
@@ -190,6 +197,9 @@ def test_the_folder_is_read_by_other_commands(place, capsys):
     assert monte_carlo("--runs", "40", "--out", "out", "--", "./filter", "{run}", capsys=capsys)[0] == 0
     before = monte_carlo("--runs", "40", "--json", "--out", "two", "--", "./filter", "{run}", capsys=capsys)[1]
     assert consistency("analyse", "out", "--json", capsys=capsys)[1] == before
+    words = ("--runs", "40", "--skip", "1", "--detect", "3", "--json", "--out", "skipped", "--", "./filter", "{run}")
+    skipped = monte_carlo(*words, capsys=capsys)[1]
+    assert consistency("analyse", "skipped", "--json", capsys=capsys)[1] == skipped != before
     assert consistency("baseline", "out", "--out", "base.json", capsys=capsys)[0] == 0
     status, out, _ = consistency("compare", "two", "base.json", capsys=capsys)
     assert status == 0
@@ -237,6 +247,14 @@ def test_looks_end_the_runs_and_the_folder_keeps_them(place, capsys):
     words = ("--until-decided", "--max-runs", "5", "--out", "few", "--", "./filter", "{run}")
     assert "undecided" in monte_carlo(*words, capsys=capsys)[1]
     assert len(run_files(place / "few", "run.json")) == 5
+
+
+def test_looks_need_whole_covariances(place, capsys):
+    script(place, 'cut -d, -f1-8,11,13 "$CONSISTENCY_HERE/tables/$1.csv" > estimates.csv')  # variances alone
+    words = ("--overwrite", "--out", "out", "--", "./filter", "{run}")
+    status, _, err = monte_carlo("--until-decided", *words, capsys=capsys)
+    assert (status, "--until-decided: estimates has components" in err) == (2, True)
+    assert monte_carlo("--runs", "12", *words, capsys=capsys)[0] == 0
 
 
 def test_one_run_for_each_recorded_file(place, capsys):
@@ -345,6 +363,8 @@ def test_estimates_that_end_before_their_truth_have_failed(place, capsys):
     words = ("--runs", "8", "--truth", "truth.csv", "--out", "out", "--overwrite", "--", "./filter", "{run}")
     monte_carlo(*words, capsys=capsys)
     assert failures(place / "out", capsys) == {4: "its estimates end at 2, its truth at 4"}
+    table = np.loadtxt(place / "tables/6.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(cs.read(place / "out").error[6], table[:, 4:7] - table[:, 1:4])  # its own truth
     script(place, text + "head -n 3 all.csv > estimates.csv")  # this is how the program works
     monte_carlo(*words, capsys=capsys)
     assert failures(place / "out", capsys) == {}
@@ -372,6 +392,9 @@ def test_first_runs_that_fail_alike_end_the_study(place, capsys):
     status, _, err = monte_carlo("--runs", "6", "--overwrite", "--out", "out", "--", "./filter", "{run}", capsys=capsys)
     assert status == 2
     assert "the first 6 runs failed: it ended with status 1" in err
+    script(place, "[ $(($1 % 2)) = 1 ] && kill -TERM $$; exit 1")
+    status, _, err = monte_carlo("--jobs", "1", "--overwrite", "--out", "out", "--", "./filter", "{run}", capsys=capsys)
+    assert (status, "the first 20 runs failed" in err) == (2, True)
 
 
 def test_two_runs_with_the_same_table_end_the_study(place, capsys):
@@ -403,7 +426,9 @@ def test_missing_runs_are_done_in_new_folders(place, capsys):
     runs = place / "out/runs"
     for run in (2, 9):
         (runs / f"{run:04d}/run.json").unlink()
-    (runs / "0005/run.json").write_text('{"speed": 3}')  # of the program itself
+    (runs / "0005/run.json").write_text(
+        '{"kind": "mine", "run": 5, "values": {}, "failure": "", "seconds": 0}'
+    )  # of the program itself
     kept = (runs / "0003/estimates.csv").stat().st_mtime_ns
     assert "exists already" in monte_carlo(*words, capsys=capsys)[2]
     status, after, _ = monte_carlo("--resume", *words, capsys=capsys)

@@ -61,7 +61,7 @@ def selects_on_outcome(
     covariance : (..., n, n)
     """
     name, values, words = column.name, column.values.ravel(), _words_of(column.name)
-    if words <= OF_TIME:
+    if words and words <= OF_TIME:
         return ""
     components = {axis.lower() for axis in axes}
     is_stated = words & OF_SIGMAS and words <= OF_SIGMAS | OF_POSES | components
@@ -134,7 +134,7 @@ def _is_linear(values: Array, other: Array) -> bool:
     """Is a column something else in other units, to rounding?"""
     both = np.isfinite(values) & np.isfinite(other)
     v, o = values[both] - values[both].mean(), other[both] - other[both].mean()
-    if len(v) < FEWEST or len(np.unique(v)) <= 2 or not o.any():
+    if len(v) < FEWEST or len(np.unique(v)) <= 2 or not o.any() or _goes_one_way(v):
         return False
     rest = v - o * (v @ o) / (o @ o)
     return bool(rest.std() <= ALIKE * v.std())
@@ -142,7 +142,7 @@ def _is_linear(values: Array, other: Array) -> bool:
 
 def _is_ordered_by(values: Array, size: Array) -> bool:
     """Is a column an increasing or falling function of something that is continuous, or a threshold on it?"""
-    if len(values) < FEWEST:
+    if len(values) < FEWEST or _goes_one_way(values):
         return False
     different = np.unique(values)
     if len(different) == 2:
@@ -154,6 +154,12 @@ def _is_ordered_by(values: Array, size: Array) -> bool:
     signs = np.sign(values[some, None] - values[some]) * np.sign(size[some, None] - size[some])
     untied = np.abs(signs).sum()
     return bool(untied and np.abs(signs.sum()) >= (1.0 - ALIKE) * untied)
+
+
+def _goes_one_way(values: Array) -> bool:
+    """Does a column only grow, or only fall, as the time and the way of one run do? So may the errors of a drift."""
+    steps = np.diff(values)
+    return bool((steps >= 0).all() or (steps <= 0).all())
 
 
 def _is_threshold(below: Array, above: Array) -> bool:

@@ -7,13 +7,31 @@ import numpy as np
 from consistency.referee.diagnostics.questions.scale import FEW
 from consistency.referee.diagnostics.records.groups import range_name
 from consistency.referee.diagnostics.verdict.parts import SIDES, ByGroup, Group
+from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import is_or_are, off_by, p_text, plural, ratio_text
 
-MOST = 3  # groups that a sentence names
+MOST = 3  # groups, or parts, that a sentence names
 MUCH = 100_000  # runs; more are no advice
 
 
-def faults_of_groups(by: ByGroup) -> str:
+def groups_text(by: ByGroup, is_fault: bool) -> str:
+    """The worst group where one is at fault, otherwise what is shown of the groups."""
+    if is_fault:
+        return _faults(by)
+    return _without_fault(by)
+
+
+def right_groups(v: Findings) -> str:
+    """What is shown of the groups of the whole, or of each part, where none is at fault."""
+    if v.by_group is not None:
+        return f"; {_without_fault(v.by_group)}"
+    texts = [f"; {name}: {_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
+    if len(texts) > MOST:
+        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
+    return "".join(texts)
+
+
+def _faults(by: ByGroup) -> str:
     """The worst group and those beside it, then where the covariance is shown to be right."""
     worst = by.worst
     others = [group for group in by.groups if group.status in SIDES and group is not worst]
@@ -28,7 +46,7 @@ def faults_of_groups(by: ByGroup) -> str:
     return text
 
 
-def groups_without_fault(by: ByGroup) -> str:
+def _without_fault(by: ByGroup) -> str:
     """What is shown of the groups where none is at fault, and the one that is farthest."""
     worst, count = by.worst, len(by.groups)
     if not worst.status:

@@ -11,7 +11,7 @@ from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, GROUP, JOINT, SCALE, SHAPE, Settings
-from consistency.referee.diagnostics.verdict.parts import ByGroup, Equivalence, Innovations, Location, Scale, Within
+from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Location, Scale, Within
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.words.faults import (
     MOST,
@@ -24,7 +24,7 @@ from consistency.referee.diagnostics.words.faults import (
     shape_text,
     tails_text,
 )
-from consistency.referee.diagnostics.words.groups import faults_of_groups, groups_without_fault, lines_of_groups
+from consistency.referee.diagnostics.words.groups import groups_text, lines_of_groups, right_groups
 from consistency.referee.diagnostics.words.numbers import is_or_are, p_text, percent, plural, ratio_text, short
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
@@ -154,7 +154,7 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
         if JOINT in faults and v.joint is not None:
             parts.append(joint_text(v, v.joint))
     if v.by_group is not None:
-        parts.append(_groups(v.by_group, faults))
+        parts.append(groups_text(v.by_group, GROUP in faults))
     if len(faults) == 1:
         parts += [ALONE[question] for question in faults if question in ALONE]
     if "innovation scale" in faults and v.innovations is not None:
@@ -164,23 +164,6 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
     if (of_scale or GROUP in faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
-
-
-def _groups(by: ByGroup, faults: Faults) -> str:
-    """The worst group where one is at fault, otherwise what is shown of the groups."""
-    if GROUP in faults:
-        return faults_of_groups(by)
-    return groups_without_fault(by)
-
-
-def _groups_of_all(v: Findings) -> str:
-    """What is shown of the groups of the whole, or of each part, where none is at fault."""
-    if v.by_group is not None:
-        return f"; {groups_without_fault(v.by_group)}"
-    texts = [f"; {name}: {groups_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
-    if len(texts) > MOST:
-        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
-    return "".join(texts)
 
 
 def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
@@ -209,7 +192,7 @@ def _no_fault(v: Findings, s: Scale) -> str:
     if v.worst_axis is not None:
         name, ratio = v.worst_axis
         axis = f" (worst axis: {name}, {ratio_text(ratio)})"
-    axis += _groups_of_all(v)
+    axis += right_groups(v)
     if shown.shown:
         return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
     do = "do"

@@ -74,7 +74,7 @@ def beside_states(
     values = np.concatenate([p.by[k.rows] for p, k in rows if p.by is not None])
     states = [] if e.convention == "" else _columns_of(e, judged)  # errors of an archive stand in the place of a truth
     truth, estimate = (
-        np.concatenate([state[:, states] for state in of_runs])
+        np.concatenate([state[:, [i for i in states if i < state.shape[1]]] for state in of_runs])
         for of_runs in ([k.truth for k in some], [p.estimate[k.rows] for p, k in rows])
     )
     P = np.concatenate([p.covariance[k.rows] for p, k in rows])[:, judged][:, :, judged]
@@ -106,6 +106,10 @@ def grouped(record: Record, column: Column | None, r: Reading, option: str = "--
         return record
     if record.nees is None:
         raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
+    if column.words and r.bins is not None:
+        raise InputError(
+            f"{option.replace('by', 'bins')}: {column.name} holds words, each of which is a group; leave the option out"
+        )
     counted = np.isfinite(record.nees)
     if not counted.any():
         return record

@@ -21,6 +21,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
 from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
@@ -124,6 +125,11 @@ class ProgramStudy:
         return stem if "{" not in stem else "estimates"
 
     @property
+    def settings(self) -> Settings:
+        """Settings by which the runs were judged."""
+        return Settings(**self.manifest["settings"])
+
+    @property
     def design(self) -> Design | None:
         """Looks at growing numbers of runs, if the runs were made until decided."""
         plan = self.manifest["until_decided"]
@@ -157,7 +163,7 @@ class ProgramStudy:
 def study_in(folder: Path) -> ProgramStudy:
     """The study in a folder; raises InputError where its manifest is damaged."""
     manifest = read_manifest(folder)
-    keys = ("reading", "estimates", "until_decided", "complete", "runs", "keep")
+    keys = ("reading", "estimates", "until_decided", "complete", "runs", "settings", "skip", "optimal_gain")
     if missing := [key for key in keys if key not in manifest]:
         raise InputError(f"{folder / 'manifest.json'}: key '{missing[0]}' is missing; run it again with --overwrite")
     return ProgramStudy(folder, manifest)
@@ -172,7 +178,7 @@ def with_options(study: ProgramStudy, r: Reading) -> Reading:
         An option of files that were deleted.
     """
     deleted = [name for name in r.given() if name not in OF_NUMBERS]
-    if study.manifest["keep"] == "failed" and deleted:
+    if deleted and any(study.folder.glob(f"runs/*/{NUMBERS}")):
         raise InputError(f"{flag_of(deleted[0])}: {study.folder} has the numbers alone that were read (--keep failed)")
     return replace(study.reading, **{each.name: value for each in fields(r) if (value := getattr(r, each.name))})
 

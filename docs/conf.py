@@ -75,12 +75,13 @@ html_title = project
 html_context = {"default_mode": "auto"}
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_sidebars = {"tutorial": []}  # one page, no section around it
+html_sidebars = {"**": ["globaltoc.html"]}  # all pages, in the sections of the landing page
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
     "logo": {"text": project},
     "navbar_align": "left",
+    "navbar_center": [],
     "navbar_end": ["theme-switcher"],
     "navigation_with_keys": False,
     "show_prev_next": True,

@@ -1,6 +1,6 @@
 """
 A monitor of innovations of a deployed filter
-===================================
+=============================================
 
 A deployed filter has no truth, but it has innovations. From step 600 on their variance is twice what the filter
 states. The alarm of the monitor is false with probability 0.1 % or less, however long the mission; it says

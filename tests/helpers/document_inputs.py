@@ -136,6 +136,18 @@ def planar(folder: Path, steps: int = 20) -> None:
     table(folder / "truth.csv", [key | dict.fromkeys(names, 0.0) for key in keys])
 
 
+def grouped(folder: Path) -> None:
+    """est.csv with columns to group by, and truth.csv; est.txt, truth.txt, P.txt with a table beside them."""
+    trajectories(folder)
+    planar(folder)
+    with (folder / "poses.csv").open(newline="") as file:
+        rows: list[dict[str, Any]] = list(csv.DictReader(file))
+    for k, row in enumerate(rows):
+        row |= {"n_matches": 10 * (k % 20), "weather": ("sun", "rain")[k % 2]}
+    table(folder / "est.csv", rows)
+    table(folder / "matches.csv", [{"t": t, "n_matches": 10 * (k % 20)} for k, t in enumerate(T.tolist())])
+
+
 def started(folder: Path) -> None:
     """est.csv, new.csv and old.csv of one truth.csv, and a folder of results."""
     planar(folder, 60)
@@ -285,6 +297,7 @@ PREPARE: dict[str, list[Callable[[Path], None]]] = {
     "docs/reference/file-kinds.md Logs": [log("LOG")],
     "docs/files.md Relative poses": [motions],
     "docs/front-end.md": [images],
+    "docs/groups.md": [grouped],
     "docs/monitor.md": [innovations],
     "docs/referee.md": [results("results", "DIR", "NEW")],
     "docs/regime.md": [log("log")],
@@ -328,6 +341,10 @@ def names_of(page: str, folder: Path) -> dict[str, Any]:
         return {"assert_not_worse": assert_not_worse, "results": done, **arrays}
     if page == "docs/front-end.md":
         return {"paths": [folder / f"IMAGES/image_{side}/00000{k}.png" for k in (0, 1) for side in (0, 1)]}
+    if page == "docs/groups.md":
+        covariances = np.broadcast_to(np.eye(3), (60, 20, 3, 3))
+        errors_of_runs = RNG.normal(size=(60, 20, 3))
+        return {"cs": cs, "errors": errors_of_runs, "covariances": covariances, "matches": RNG.uniform(0, 200, 60)}
     if page == "docs/long-runs.md":
         return {"cs": cs, "scenario": cs.load_scenario("herath2007-stereo")}
     return {"cs": cs, "scenario": world, "my_filter": Wrapped()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,18 +113,35 @@ def test_a_filter_without_a_name_has_that_of_its_class(xyz: cs.Scenario) -> None
     assert cs.run_trials(xyz, [Nameless()], runs=1, jobs=1).filters == ["Nameless"]
 
 
+def test_a_pose_that_is_no_gaussian_is_named(xyz: cs.Scenario) -> None:
+    class Tuple(Mine):
+        name = "tuple"
+
+        def pose(self, state: Any) -> Any:
+            estimate = super().pose(state)
+            return estimate.mean, estimate.covariance
+
+    results = cs.run_trials(xyz, [Tuple()], runs=1, jobs=1)
+    (reason,) = results.failures["reason"]
+    assert reason == "TypeError: pose must return cs.Gaussian(mean, covariance), not tuple"
+
+
 def test_a_filter_that_breaks_at_once(xyz: cs.Scenario) -> None:
     class Stillborn(Mine):
         name = "stillborn"
 
         def init(self, problem: Any) -> Any:
+            return self.look_up(problem)
+
+        def look_up(self, problem: Any) -> Any:
             raise KeyError("no such map")
 
     results = cs.run_trials(xyz, [Stillborn()], runs=3, jobs=1)
     assert len(results.estimates) == 0
     assert list(results.failures["step"]) == [1, 1, 1]
     (reason,) = set(results.failures["reason"])
-    assert re.fullmatch(r"KeyError: 'no such map' \(test_montecarlo\.py:\d+\)", reason)  # the line that raised
+    place = re.fullmatch(r"KeyError: 'no such map' \(test_montecarlo\.py:(\d+)\)", reason)
+    assert "raise KeyError" in Path(__file__).read_text("utf-8").splitlines()[int(place[1]) - 1]
     verdict = cs.analyse(results)["stillborn"]
     assert verdict.status == "failed"
     assert verdict.statistics["runs"] == 3

@@ -46,6 +46,7 @@ from consistency.referee.readers.truth_matching import Estimator
 from consistency.referee.system.progress import Advance, progress, say
 
 ALIKE = 3  # first runs that failed alike stop a study
+HOPELESS = 20  # and so many that failed in any way
 IS_WINDOWS = os.name == "nt"
 PROOF = 2  # first runs whose tables must differ
 
@@ -286,11 +287,7 @@ class _Loop:
             self._plan_runs(records, stack)
         elif self.advance is not None:
             self.advance(1)
-        if (
-            not self.runs.found
-            and len(self.runs.failed) >= ALIKE
-            and len(set(map(kind_of_failure, self.runs.failed.values()))) == 1
-        ):
+        if self._is_hopeless:
             raise self._all_failed()
         if len(self.runs.found) == PROOF and records:
             self._require_different()
@@ -344,6 +341,14 @@ class _Loop:
         return records, {record.name: judge(record, self.plan.settings, self.design, True) for record in records}
 
     # --- programs that cannot work -------------------------------------------------------------------
+
+    @property
+    def _is_hopeless(self) -> bool:
+        """Whether the first runs have all failed, alike or many of them."""
+        failed = self.runs.failed
+        if self.runs.found or len(failed) < ALIKE:
+            return False
+        return len(failed) >= HOPELESS or len(set(map(kind_of_failure, failed.values()))) == 1
 
     def _all_failed(self) -> InputError:
         """Message that no run can be judged, after the last lines of the first one's log."""

@@ -392,6 +392,9 @@ def test_first_runs_that_fail_alike_end_the_study(place, capsys):
     status, _, err = monte_carlo("--runs", "6", "--overwrite", "--out", "out", "--", "./filter", "{run}", capsys=capsys)
     assert status == 2
     assert "the first 6 runs failed: it ended with status 1" in err
+    script(place, "[ $(($1 % 2)) = 1 ] && kill -TERM $$; exit 1")
+    status, _, err = monte_carlo("--jobs", "1", "--overwrite", "--out", "out", "--", "./filter", "{run}", capsys=capsys)
+    assert (status, "the first 20 runs failed" in err) == (2, True)
 
 
 def test_two_runs_with_the_same_table_end_the_study(place, capsys):

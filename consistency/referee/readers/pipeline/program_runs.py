@@ -163,7 +163,7 @@ class ProgramStudy:
 def study_in(folder: Path) -> ProgramStudy:
     """The study in a folder; raises InputError where its manifest is damaged."""
     manifest = read_manifest(folder)
-    keys = ("reading", "estimates", "until_decided", "complete", "runs", "keep", "settings", "skip", "optimal_gain")
+    keys = ("reading", "estimates", "until_decided", "complete", "runs", "settings", "skip", "optimal_gain")
     if missing := [key for key in keys if key not in manifest]:
         raise InputError(f"{folder / 'manifest.json'}: key '{missing[0]}' is missing; run it again with --overwrite")
     return ProgramStudy(folder, manifest)
@@ -178,7 +178,7 @@ def with_options(study: ProgramStudy, r: Reading) -> Reading:
         An option of files that were deleted.
     """
     deleted = [name for name in r.given() if name not in OF_NUMBERS]
-    if study.manifest["keep"] == "failed" and deleted:
+    if deleted and any(study.folder.glob(f"runs/*/{NUMBERS}")):
         raise InputError(f"{flag_of(deleted[0])}: {study.folder} has the numbers alone that were read (--keep failed)")
     return replace(study.reading, **{each.name: value for each in fields(r) if (value := getattr(r, each.name))})
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from consistency.referee.readers.formats.file_head import fields_of, head_of
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     is_bag,
@@ -21,7 +22,7 @@ from consistency.referee.readers.formats.file_kinds import (
     table_files,
     trajectory_files,
 )
-from consistency.referee.readers.formats.named_columns import DEVIATIONS, fields_of, head_of, roles_of
+from consistency.referee.readers.formats.named_columns import DEVIATIONS, roles_of
 from consistency.referee.readers.formats.other_names import covariance_places
 from consistency.referee.readers.formats.pose_rows import DEVIATED, FULL, TRIANGLE
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS as SIZES
@@ -104,6 +105,8 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
     name : of the estimator, where a file holds several
     """
     if is_bag(estimates) or estimates.suffix.lower() in ARCHIVES or is_solution(estimates):
+        return []
+    if r.columns or r.world or r.body_axes:  # names and axes of the file are not those of the record
         return []
     by = r.by if r.by_file is None else None
     axes = tuple(r.state or POSE)

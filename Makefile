@@ -54,6 +54,7 @@ calibrate-alignment-quick: .venv/.done
 calibrate-fit: .venv/.done
 	$(BIN)/python benchmarks/fit_covariance.py
 	$(BIN)/python benchmarks/fit_sides.py
+	$(BIN)/python benchmarks/correct.py
 
 RECURSIVE := ekf-uvd ukf-uvd parked-ekf-uvd robocentric-ekf-uvd anchored-ekf-uvd eqf-uvd ri-ekf-uvd fej-ekf-uvd oc-ekf-uvd \
 	ckf-uvd iekf-uvd ispkf-uvd

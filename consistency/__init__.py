@@ -8,6 +8,7 @@ from typing import Any
 _MODULES = {
     "Alarm": "referee.diagnostics.monitoring.monitor",
     "Control": "bench.types",
+    "Correction": "referee.fit_covariance.correct",
     "Drive": "referee.fit_covariance.drives",
     "Finding": "bench.types",
     "Gaussian": "bench.types",
@@ -27,6 +28,7 @@ _MODULES = {
     "analyse": "bench.runs.analyse_results",
     "anees": "referee.diagnostics.statistics.nees",
     "anees_interval": "referee.diagnostics.statistics.nees",
+    "correct": "referee.fit_covariance.correct",
     "drive_of": "referee.fit_covariance.drives",
     "filter_names": "bench.filters",
     "fit_covariance": "referee.fit_covariance.noise_model",

@@ -1,7 +1,9 @@
-"""``consistency fit-covariance``: parses, calls, prints."""
+"""``consistency fit-covariance`` and ``correct``: parse, call, print."""
 
 from __future__ import annotations
 
+import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
@@ -10,14 +12,21 @@ import typer
 from consistency.commands.shared_options import (
     ESTIMATES,
     AsJson,
+    Skip,
     print_document,
+    read_files,
     reads_files,
     require_word,
     require_written,
+    tell_notes,
 )
+from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
 
-KEPT = ("truth", "max_dt", "time_offset", "topic", "truth_topic", "body")
+KEPT = (
+    "truth", "max_dt", "time_offset", "topic", "truth_topic", "body", "columns", "truth_columns", "world", "body_axes",
+    "truth_world", "truth_body_axes",
+)  # fmt: skip
 
 
 @reads_files(only=KEPT)
@@ -51,9 +60,10 @@ def fit_covariance_command(
         Path | None,
         typer.Option("--second", help="Poses of another estimator of these drives, to separate errors of the truth."),
     ] = None,
-    no_correct: Annotated[
-        bool, typer.Option("--no-correct", help="Do not correct mean errors of scale and heading.")
+    keep_mean_error: Annotated[
+        bool, typer.Option("--keep-mean-error", help="Do not correct mean errors of scale and heading.")
     ] = False,
+    no_correct: Annotated[bool, typer.Option("--no-correct", hidden=True)] = False,
     by_turn: Annotated[
         bool, typer.Option("--by-turn", help="Also correct a displacement that each turn adds, such as wheel slip.")
     ] = False,
@@ -84,15 +94,93 @@ def fit_covariance_command(
         require_free(out, overwrite, "noise")
     drives = read_drives(path, reading=replace(files, motions=motions or None))
     other = None if second is None else read_drives(second, reading=files)
+    mean = not (keep_mean_error or no_correct)
     model = fit(
-        drives, span, held_out=held_out, axes=axes, correct=not no_correct, by_turn=by_turn, cautious=cautious,
-        second=other, name=path.stem,
+        drives, span, held_out=held_out, axes=axes, correct=mean, by_turn=by_turn, cautious=cautious, second=other,
+        name=path.stem,
     )  # fmt: skip
     written: list[Path] = []
     if out is not None:
         from consistency.referee.fit_covariance.writing import write_model
 
         written = write_model(model, out, overwrite)
+    if no_correct:
+        print("consistency: --no-correct is now called --keep-mean-error", file=sys.stderr)
     print_document(noise_document(model), as_json, written)
     if fail_on and model.status != "consistent":
+        raise typer.Exit(1)
+
+
+NOT_CORRECTED = ("relative", "motions", "windows", "truth_covariance", "truth_errors", "truth_shared")
+CORRECTABLE = [each.name for each in fields(Reading) if each.name not in NOT_CORRECTED]
+
+
+@reads_files(only=CORRECTABLE)
+def correct_command(
+    path: Annotated[Path, typer.Argument(metavar="ESTIMATES", help=f"Estimates with covariances: {ESTIMATES}.")],
+    files: Reading,
+    per: Annotated[
+        str | None,
+        typer.Option("--per", metavar="axis", help="'axis': a factor for each component [for each block of them]."),
+    ] = None,
+    held_out: Annotated[
+        str | None,
+        typer.Option(
+            "--held-out",
+            metavar="A,B|half",
+            help="Runs that are judged and not fitted, or the second half [each by the factors of the others].",
+        ),
+    ] = None,
+    skip: Skip = None,
+    name: Annotated[
+        str | None, typer.Option("--filter", metavar="NAME", help="Which, if the files hold several estimators.")
+    ] = None,
+    anyway: Annotated[
+        bool, typer.Option("--anyway", help="Write a correction also where no factor mends what is wrong.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for correction.toml, corrected runs, lines for other programs, page."),
+    ] = None,
+    as_json: AsJson = False,
+    fail_on: Annotated[
+        str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless consistent after.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
+) -> None:
+    """Find factors for a covariance that is stated, and judge them on runs that chose nothing."""
+    from consistency.referee.fit_covariance.correct import correct, the_record
+    from consistency.referee.fit_covariance.correction_text import correction_document
+    from consistency.referee.readers.formats.restated import text_files
+    from consistency.referee.system.folders import require_free
+    from consistency.referee.verdicts.command_settings import skip_asked
+
+    require_word("--per", per, "axis")
+    require_word("--fail-on", fail_on, "inconsistent")
+    require_written(overwrite, out, "--out")
+    if out is not None:
+        require_free(out, overwrite, "correction")
+    if per is not None and files.align not in (None, "none", "origin"):
+        raise InputError(f"--per axis: does not go with --align {files.align}, which turns the axes of the covariances")
+    records = read_files(path, files)
+    record = the_record(records, name).without_first(skip_asked(skip))
+    texts = text_files(path, files, record.name)
+    names = None
+    if len(texts) == len(record.run_numbers) and record.unit == "run" and texts[0].run_column is None:
+        names = [texts[run].path.stem for run in record.run_numbers]
+    found = correct(record, held_out=held_out, per_axis=per is not None, names=names)
+    tell_notes(records)
+    written: list[Path] = []
+    is_written = out is not None and (anyway or found.status != "inconsistent")
+    if out is not None and is_written:
+        from consistency.referee.fit_covariance.correction_files import write_correction
+
+        written = write_correction(found, record, texts, out, overwrite)
+    print_document(correction_document(found), as_json, written)
+    if out is not None and not is_written:
+        print(
+            f"consistency: {out} is not written, as no factor mends what is wrong; --anyway writes it", file=sys.stderr
+        )
+        raise typer.Exit(1)
+    if fail_on and found.status != "consistent":
         raise typer.Exit(1)

@@ -80,11 +80,14 @@ def analyse_command(
         Path | None,
         typer.Option("--report", help="Folder for an HTML and a PDF page, or FILE.xml (JUnit), or FILE.md."),
     ] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Show p values of all questions and credibility indices, too.")
+    ] = False,
     as_json: AsJson = False,
     fail_on: Annotated[
         str | None, typer.Option("--fail-on", help="'inconsistent': exit with status 1 unless all are consistent.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing report files.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite files that are no report of this.")] = False,
 ) -> None:
     """Check whether stated covariances match the errors. Explain the verdict."""
     from consistency.referee.document.judged_filters import document
@@ -102,6 +105,10 @@ def analyse_command(
     refused: InputError | None = None  # of a report, said below the verdict
     is_file = report is not None and report.suffix.lower() in FORMATS.keys() - {".html", ".json"}  # a folder has both
     require_written(overwrite, report, "--report")
+    if report is not None:
+        from consistency.referee.pages.write_pages import require_report
+
+        overwrite = require_report(report, overwrite)
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
         source = files_source(path, recordings)
@@ -111,10 +118,8 @@ def analyse_command(
         if report is not None and not is_file:
             from consistency.referee.pages.write_pages import write_file_reports
             from consistency.referee.show.as_json import render
-            from consistency.referee.system.folders import require_free
 
             try:
-                require_free(report, overwrite, "verdict", "--report")
                 data = render(document(verdicts))
                 written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
                 if missing("report"):
@@ -133,12 +138,12 @@ def analyse_command(
             )
         verdicts = judge_all(results, filters, settings=settings, skip=first)
         _refuse_unfinished(path, results, "run", fail_on)
-    shown = document(verdicts, path.name)
+    shown = document(verdicts, path.name, verbose=verbose)
     if report is not None and is_file:
         from consistency.referee.pages.write_pages import write_text_file
 
         try:
-            written = [write_text_file(shown, report, overwrite)]
+            written = [write_text_file(shown, report)]
         except InputError as error:
             refused = error
     print_document(shown, as_json, written)

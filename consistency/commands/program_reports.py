@@ -11,10 +11,8 @@ from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.document.blocks import Document
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy
-from consistency.referee.pages.write_pages import require_writable, write_file_reports, write_text_file
-from consistency.referee.show import FORMATS
+from consistency.referee.pages.write_pages import is_one_file, require_report, write_file_reports, write_text_file
 from consistency.referee.show.as_json import render
-from consistency.referee.system.folders import require_free
 
 
 def require_reports(report: Path | None, junit: Path | None, overwrite: bool) -> None:
@@ -28,10 +26,8 @@ def require_reports(report: Path | None, junit: Path | None, overwrite: bool) ->
     if junit is not None and junit.suffix.lower() != ".xml":
         raise InputError(f"--junit {junit}: must end in .xml")
     for path in (report, junit):
-        if path is not None and _is_file(path):
-            require_writable(path, overwrite)
-        elif path is not None:
-            require_free(path, overwrite, "verdict", "--report")
+        if path is not None:
+            require_report(path, overwrite)
 
 
 def write_reports(
@@ -47,15 +43,12 @@ def write_reports(
     for path in (report, junit):
         if path is None:
             continue
-        if _is_file(path):
-            written.append(write_text_file(document, path, overwrite))
+        if is_one_file(path):
+            written.append(write_text_file(document, path))
             continue
-        written += write_file_reports(records, verdicts, path, document.title, render(document), overwrite)
+        written += write_file_reports(
+            records, verdicts, path, document.title, render(document), require_report(path, overwrite)
+        )
         if missing("report"):
             print(f"consistency: pictures and the PDF need {remedy('report')}", file=sys.stderr)
     return written
-
-
-def _is_file(path: Path) -> bool:
-    """Whether a report is one file; a folder has the HTML page and the JSON."""
-    return path.suffix.lower() in FORMATS.keys() - {".html", ".json"}

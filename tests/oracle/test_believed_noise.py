@@ -69,7 +69,7 @@ def believing(scenario, **changes):
     return scenario.variant("other", **{f"belief__sensor__{key}": value for key, value in changes.items()})
 
 
-@pytest.mark.parametrize(("name", "kernel"), CASES)
+@pytest.mark.parametrize("name, kernel", CASES)
 def test_where_all_disparities_are_alike_a_growth_is_another_sigma(small, name, kernel):
     """At the measured disparity, except where a filter takes all its noise at the prediction, which is not 6 px."""
     scenario, trial = short(small)
@@ -83,7 +83,7 @@ def test_where_all_disparities_are_alike_a_growth_is_another_sigma(small, name, 
     assert not same(grown, run_filter(filter_, trial, scenario.belief), 1e-3)  # negative control
 
 
-@pytest.mark.parametrize(("name", "kernel"), [case for case in CASES if case[0] in PREDICTING | {"ekf-uvd"}])
+@pytest.mark.parametrize("name, kernel", [case for case in CASES if case[0] in PREDICTING | {"ekf-uvd"}])
 def test_filters_with_their_noise_at_the_prediction_take_the_growth_there(small, name, kernel):
     """One landmark is seen at 6 px, is expected near that in the next step, and is measured at 9 px."""
     scenario, trial = short(small)
@@ -98,7 +98,7 @@ def test_filters_with_their_noise_at_the_prediction_take_the_growth_there(small,
     assert same(grown, scaled, 1e-9) == (name in PREDICTING)
 
 
-@pytest.mark.parametrize(("name", "kernel"), CASES)
+@pytest.mark.parametrize("name, kernel", CASES)
 def test_a_believed_bias_is_subtracted_before_anything_else(small, name, kernel):
     scenario, trial = short(small)
     filter_ = filter_of(name, kernel)

@@ -20,7 +20,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("name", "world", "changes"), CASES)
+@pytest.mark.parametrize("name, world, changes", CASES)
 def test_filterpy_agrees(small, name, world, changes):
     scenario = small(world, **changes)
     trial = cs.simulate(scenario, run=2)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,7 +18,6 @@ from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import PointSensor, heading_matrix
 from consistency.bench.models import motion, point, stereo
 from consistency.bench.protocols import Problem
-from consistency.bench.types import Control, Estimates, Gaussian, Observation, Trial
 from consistency.referee.types import Array
 
 gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
@@ -29,25 +26,24 @@ from consistency.bench.filters.external import gtsam_factors  # noqa: E402
 from consistency.bench.filters.external.gtsam import FixedLag, Incremental, WholeTrialSmoother  # noqa: E402
 from consistency.bench.filters.external.gtsam_factors import PlanarStereo, custom_factor, landmark_key, pose_key  # noqa: E402
 
-Small = Callable[..., cs.Scenario]
 NAMES = ("gtsam-batch-uvd", "gtsam-lag-uvd", "gtsam-map-uvd")
 
 
 @pytest.fixture(scope="module")
-def sparse(small: Small, tilted: dict[str, list[float]]) -> cs.Scenario:
+def sparse(small, tilted):
     """Few landmarks, seen by a tilted sensor that stands apart from the robot's centre; no search range believed."""
     scenario = small("herath2007-stereo", truth__steps=25, truth__landmarks__count=40)
     scenario = scenario.variant("sparse", truth__sensor__mount=tilted, belief__sensor__mount=tilted)
     return told(scenario, None)
 
 
-def told(scenario: cs.Scenario, disparity: tuple[float, float] | None) -> cs.Scenario:
+def told(scenario, disparity):
     """The scenario with another believed search range."""
     sensor = scenario.belief.sensor.model_copy(update={"disparity": disparity})
     return scenario.model_copy(update={"belief": scenario.belief.model_copy(update={"sensor": sensor})})
 
 
-def smoothed(trial: Trial, scenario: cs.Scenario) -> Estimates:
+def smoothed(trial, scenario):
     estimates = run_filter(cs.get_filter("gtsam-map-uvd"), trial, scenario.belief)
     assert estimates.failure is None
     return estimates
@@ -59,32 +55,32 @@ def smoothed(trial: Trial, scenario: cs.Scenario) -> Estimates:
 class Dense:
     """The noise of each step and world points as variables, so that no pose is one; derivatives by complex steps."""
 
-    def __init__(self, trial: Trial, scenario: cs.Scenario) -> None:
+    def __init__(self, trial, scenario):
         self.trial, self.belief = trial, scenario.belief
         self.labels = np.unique(trial.landmark)
         self.sigma_motion = np.array([self.belief.motion.sigma_v, self.belief.motion.sigma_omega])
         self.rows = trial.step - 1
         self.start = np.concatenate([np.zeros(2 * trial.steps), trial.landmarks[self.labels].ravel()])
 
-    def poses(self, x: Array) -> Array:
+    def poses(self, x):
         controls = np.array(self.trial.controls, complex)
         controls[:, 1:] += x[: 2 * self.trial.steps].reshape(-1, 2)
         return motion.dead_reckoning(self.trial.start, controls)[1:]
 
-    def landmarks(self, x: Array) -> Array:
+    def landmarks(self, x):
         return x[2 * self.trial.steps :].reshape(-1, 3)
 
-    def expected(self, x: Array) -> Array:
+    def expected(self, x):
         pose, where = self.poses(x)[self.rows], self.landmarks(x)[np.searchsorted(self.labels, self.trial.landmark)]
         sensor = self.belief.sensor
         c = point.to_sensor(*point.to_robot(*pose.T, *where.T), sensor.mount.packed())
         return np.array(stereo.project(*c, sensor.f or 0.0, sensor.B or 0.0)).T
 
-    def residual(self, x: Array) -> Array:
+    def residual(self, x):
         noise = x[: 2 * self.trial.steps].reshape(-1, 2) / self.sigma_motion
         return np.concatenate([noise.ravel(), ((self.expected(x) - self.trial.z) / self.belief.sensor.sigma).ravel()])
 
-    def solved(self) -> tuple[Array, Array]:
+    def solved(self):
         """Variables where the likelihood is greatest, and their covariance to first order."""
         x = self.start
         for _ in range(15):
@@ -94,12 +90,12 @@ class Dense:
         return x, np.linalg.inv(J.T @ J)
 
 
-def complex_step(f: Callable[[Array], Array], x: Array) -> Array:
+def complex_step(f, x):
     """Derivatives (k, n) of f at x (n,)."""
     return np.array([f(x + 1e-30j * e).imag.ravel() / 1e-30 for e in np.eye(len(x))]).T
 
 
-def test_every_pose_and_landmark_is_that_of_a_dense_gauss_newton(sparse: cs.Scenario) -> None:
+def test_every_pose_and_landmark_is_that_of_a_dense_gauss_newton(sparse):
     trial = cs.simulate(sparse, run=1)
     dense = Dense(trial, sparse)
     x, P = dense.solved()
@@ -118,7 +114,7 @@ def test_every_pose_and_landmark_is_that_of_a_dense_gauss_newton(sparse: cs.Scen
 
 
 @pytest.mark.parametrize("name", ["gtsam-batch-uvd", "gtsam-lag-uvd"])
-def test_the_last_pose_of_a_stepwise_smoother_is_that_of_the_whole_trial(sparse: cs.Scenario, name: str) -> None:
+def test_the_last_pose_of_a_stepwise_smoother_is_that_of_the_whole_trial(sparse, name):
     """To the thresholds at which they linearise again; all of a short trial is in the window."""
     trial = cs.simulate(sparse, run=1)
     whole, step = smoothed(trial, sparse), run_filter(cs.get_filter(name), trial, sparse.belief)
@@ -132,7 +128,7 @@ def test_the_last_pose_of_a_stepwise_smoother_is_that_of_the_whole_trial(sparse:
     assert np.abs(step.pose[12] - whole.pose[12]).max() > 1e-4  # which knows what comes after
 
 
-def test_a_short_window_forgets_what_it_linearised(sparse: cs.Scenario) -> None:
+def test_a_short_window_forgets_what_it_linearised(sparse):
     trial = cs.simulate(sparse, run=1)
     whole = smoothed(trial, sparse)
     short = run_filter(FixedLag("short", 2), trial, sparse.belief)
@@ -141,7 +137,7 @@ def test_a_short_window_forgets_what_it_linearised(sparse: cs.Scenario) -> None:
     assert np.abs(short.pose[-1] - whole.pose[-1]).max() < 1.0 * np.sqrt(whole.covariance[-1].max())
 
 
-def test_certainty_across_the_heading_is_a_limit(sparse: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_certainty_across_the_heading_is_a_limit(sparse, monkeypatch):
     trial = cs.simulate(sparse, run=1)
     ours = smoothed(trial, sparse)
     assert np.isnan(cs.run_trials(sparse, ["gtsam-lag-uvd"], runs=1).estimates["nees"][0])  # of rank two
@@ -156,13 +152,13 @@ def test_certainty_across_the_heading_is_a_limit(sparse: cs.Scenario, monkeypatc
 # --- the likelihood with its search range ----------------------------------------------------------
 
 
-def test_the_whole_likelihood_is_greatest_with_the_search_range(sparse: cs.Scenario) -> None:
+def test_the_whole_likelihood_is_greatest_with_the_search_range(sparse):
     searched = (1.0, 32.0)
     far = sparse.variant("far", truth__sensor__range=(2.0, 6.0), truth__landmarks__count=25)
     trial = cs.simulate(far, run=3)
     assert trial.z[:, 2].min() < 1.5
 
-    def slopes(scenario: cs.Scenario) -> Array:
+    def slopes(scenario):
         """Derivatives of -log likelihood by noise and landmarks, in standard deviations."""
         dense, ours = Dense(trial, far), smoothed(trial, scenario)
         poses = np.vstack([trial.start, ours.pose])
@@ -194,31 +190,31 @@ class LinearWorld:
     origins: dict[int, Array] = field(default_factory=dict)
     reference: dict[int, Array] = field(default_factory=dict)
 
-    def moved(self, pose: Array, control: Control) -> Array:
+    def moved(self, pose, control):
         step = len(self.reference)
         at = self.reference.setdefault(0, self.problem.start) if step == 0 else self.reference[step - 1]
         self.reference[max(step, 1)] = basics.move(at, control)
         F, _ = basics.motion_jacobians(at, control)
         return self.reference[max(step, 1)] + F @ (pose - at)
 
-    def motion(self, step: int, control: Control) -> Any:
+    def motion(self, step, control):
         at, belief = self.reference[step - 1], self.problem.belief.motion
         F, _ = basics.motion_jacobians(at, control)
         turn, ahead = heading_matrix(at[2]).T, self.reference[step]
         sigmas = control.dt * np.array([belief.sigma_v, 1e-7 * belief.sigma_v, belief.sigma_omega])
 
-        def error(poses: list[Array]) -> tuple[Array, list[Array]]:
+        def error(poses):
             before, after = poses if step > 1 else (at, *poses)
             J = [-turn @ F, turn] if step > 1 else [turn]
             return turn @ (after - ahead - F @ (before - at)), J
 
         return custom_factor([pose_key(k) for k in (step - 1, step) if k > 0], sigmas, error)
 
-    def placed(self, label: int, pose: Array, z: Array) -> Array:
+    def placed(self, label, pose, z):
         self.origins[label] = self.problem.landmarks[label]
         return self.origins[label]
 
-    def sight(self, step: int, observation: Observation) -> Any:
+    def sight(self, step, observation):
         sensor = PointSensor(self.problem.belief.sensor, uvd=False)
         labels, at = [int(label) for label in observation.landmarks], self.reference[step]
         known = [self.origins[label] for label in labels]
@@ -226,7 +222,7 @@ class LinearWorld:
         expected = [sensor.measure(at, place) for place in known]
         sigmas = np.tile(self.problem.belief.sensor.sigma, len(labels))
 
-        def error(values: list[Array]) -> tuple[Array, list[Array]]:
+        def error(values):
             gaps = [e + Hp @ (values[0] - at) + Hl @ (value - place) - z for e, (Hp, Hl), value, place, z
                     in zip(expected, H, values[1:], known, observation.z, strict=True)]  # fmt: skip
             J = [np.vstack([Hp for Hp, _ in H])]
@@ -238,11 +234,11 @@ class LinearWorld:
 
         return custom_factor([pose_key(step), *map(landmark_key, labels)], sigmas, error)
 
-    def point(self, label: int, landmark: Gaussian) -> Gaussian:
+    def point(self, label, landmark):
         return landmark
 
 
-def test_in_a_linear_world_they_are_the_kalman_filter(linear: cs.Scenario) -> None:
+def test_in_a_linear_world_they_are_the_kalman_filter(linear):
     trial = cs.simulate(linear, run=2)
     exact = run_filter(cs.get_filter("kf"), trial, linear.belief)
     sigma = np.sqrt(np.einsum("kii->ki", exact.covariance))[1:]
@@ -267,14 +263,14 @@ def test_in_a_linear_world_they_are_the_kalman_filter(linear: cs.Scenario) -> No
 class BlindWorld(PlanarStereo):
     """From step 4 on the observations say nothing."""
 
-    def sight(self, step: int, observation: Observation) -> Any:
+    def sight(self, step, observation):
         if step < 4:
             return super().sight(step, observation)
         keys = [pose_key(step), *(landmark_key(int(label)) for label in observation.landmarks)]
         return custom_factor(keys, np.ones(3), lambda values: (np.zeros(3), [np.zeros((3, 3)) for _ in values]))
 
 
-def test_what_cannot_be_solved_is_a_result_with_step_and_reason(sparse: cs.Scenario) -> None:
+def test_what_cannot_be_solved_is_a_result_with_step_and_reason(sparse):
     trial = cs.simulate(sparse, run=1)
     new = [k for k in range(4, 26) if set(trial.landmark[trial.first[k - 1] : trial.first[k]])
            - set(trial.landmark[: trial.first[k - 1]])]  # fmt: skip
@@ -285,7 +281,7 @@ def test_what_cannot_be_solved_is_a_result_with_step_and_reason(sparse: cs.Scena
         assert "\n" not in failure.reason
 
 
-def test_they_run_beside_ours_in_threads_and_processes(small: Small) -> None:
+def test_they_run_beside_ours_in_threads_and_processes(small):
     scenario = small("herath2007-stereo", truth__steps=12, truth__landmarks__count=40)
     alone = cs.run_trials(scenario, NAMES, runs=2, jobs=1)
     assert len(alone.failures) == 0
@@ -298,15 +294,15 @@ def test_they_run_beside_ours_in_threads_and_processes(small: Small) -> None:
     )
 
 
-def test_the_smoother_of_whole_trials_is_marked_and_cannot_be_stepped(sparse: cs.Scenario) -> None:
+def test_the_smoother_of_whole_trials_is_marked_and_cannot_be_stepped(sparse):
     marked = {name for name in usable_names() if getattr(cs.get_filter(name), "causal", True) is False}
     assert marked == SMOOTHERS
     with pytest.raises(cs.InputError, match="'gtsam-map-uvd' smooths whole trials and cannot be stepped"):
         cs.get_filter("gtsam-map-uvd").init(None)
 
 
-def test_gtsam_is_loaded_when_it_is_asked_for() -> None:
-    def loaded(name: str) -> bool:
+def test_gtsam_is_loaded_when_it_is_asked_for():
+    def loaded(name):
         code = f"import sys, consistency; consistency.get_filter('{name}'); print('gtsam' in sys.modules)"
         out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
         return out.stdout.strip() == "True"
@@ -315,11 +311,11 @@ def test_gtsam_is_loaded_when_it_is_asked_for() -> None:
     assert loaded("gtsam-map-uvd")
 
 
-def test_a_world_without_stereo_is_refused(xyz: cs.Scenario) -> None:
+def test_a_world_without_stereo_is_refused(xyz):
     with pytest.raises(cs.InputError, match="filter 'gtsam-map-uvd' works on a sensor uvd, not 'xyz'"):
         cs.run_trials(xyz, ["gtsam-map-uvd"], runs=1)
 
 
-def test_the_registry_knows_them() -> None:
+def test_the_registry_knows_them():
     assert set(NAMES) <= set(filter_names())
     assert set(EXTRAS) == {"external.filterpy", "external.gtsam"}

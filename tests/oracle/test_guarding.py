@@ -1,11 +1,7 @@
 """Guards: their decisions against brute force and literal updates, and kernels against the plain form over trials."""
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,16 +20,14 @@ from consistency.bench.filters.kernel.part_functions import make_watch
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Observation
-from consistency.referee.types import Array, Indices
 
-Small = Callable[..., cs.Scenario]
 SETTINGS = GuardSettings(confidence=0.95, threshold=1.5)
 
 
 class Step:
     """A linear step: m landmarks with s values each of a state that is common to them, some observations far off."""
 
-    def __init__(self, rng: np.random.Generator, m: int, s: int) -> None:
+    def __init__(self, rng, m, s):
         n = 3 + s * m
         self.m, self.s, self.P = m, s, np.diag(rng.uniform(0.1, 1.0, n))
         self.H = np.hstack([rng.normal(size=(s * m, 3)) * 3.0, np.eye(s * m)])
@@ -42,10 +36,10 @@ class Step:
         self.y = np.linalg.cholesky(self.S) @ rng.normal(size=s * m)
         self.y += np.repeat(rng.random(m) < 0.4, s) * rng.normal(size=s * m) * 6.0
 
-    def rows(self, which: Any) -> Array:
+    def rows(self, which):
         return np.concatenate([np.arange(self.s * i, self.s * i + self.s) for i in which]).astype(int)
 
-    def after(self, which: Any) -> tuple[Array, Array]:
+    def after(self, which):
         """Innovation and S of all after an update with some, by the Kalman filter's equations."""
         rows = self.rows(which)
         H, S = self.H[rows], self.S[np.ix_(rows, rows)]
@@ -53,19 +47,19 @@ class Step:
         P = self.P - K @ S @ K.T
         return self.y - self.H @ (K @ self.y[rows]), self.H @ P @ self.H.T + self.R
 
-    def far(self, which: Any, y: Array, S: Array) -> float:
+    def far(self, which, y, S):
         rows = self.rows(which)
         return float(y[rows] @ np.linalg.inv(S[np.ix_(rows, rows)]) @ y[rows])
 
-    def passes(self, which: Any, y: Array, S: Array) -> bool:
+    def passes(self, which, y, S):
         return stats.chi2.cdf(self.far(which, y, S), self.s * len(which)) <= SETTINGS.confidence
 
 
-def by_gate(step: Step) -> list[int]:
+def by_gate(step):
     return [i for i in range(step.m) if step.passes([i], step.y, step.S)]
 
 
-def by_subsets(step: Step) -> list[int]:
+def by_subsets(step):
     for size in range(len(by_gate(step)), 0, -1):
         sets = [c for c in itertools.combinations(by_gate(step), size) if step.passes(c, step.y, step.S)]
         if sets:
@@ -73,7 +67,7 @@ def by_subsets(step: Step) -> list[int]:
     return []
 
 
-def by_updates(step: Step) -> list[int]:
+def by_updates(step):
     candidates = by_gate(step)
     support = {
         i: [j for j in candidates if j == i or step.far([j], *step.after([i])) <= SETTINGS.threshold**2]
@@ -90,15 +84,15 @@ def by_updates(step: Step) -> list[int]:
 ORACLES = {"gate": by_gate, "joint": by_subsets, "ransac": by_updates}
 
 
-def by_kernel(kind: str, step: Step) -> Array:
+def by_kernel(kind, step):
     guard = guard_part(kind, SETTINGS, step.s, step.m)
-    watch: Any = make_watch(guard, step.s, step.m, step.m, step.m)
+    watch = make_watch(guard, step.s, step.m, step.m, step.m)
     assert keep_agreeing(guard, step.s, step.m, step.y, np.triu(step.S), watch)  # the upper half alone
     return np.array(watch.kept)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_decisions_are_those_of_the_definitions(kind: str, rng: np.random.Generator) -> None:
+def test_decisions_are_those_of_the_definitions(kind, rng):
     sizes = set()
     for _ in range(150):
         step = Step(rng, int(rng.integers(1, 7)), int(rng.integers(2, 4)))
@@ -111,9 +105,7 @@ def test_decisions_are_those_of_the_definitions(kind: str, rng: np.random.Genera
 
 
 @pytest.mark.parametrize("nodes", [1, 3, 7, 20])
-def test_a_search_that_is_cut_short_is_so_at_the_same_node(
-    nodes: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_search_that_is_cut_short_is_so_at_the_same_node(nodes, rng, monkeypatch):
     for module in (plain_rules, kernel_guard):
         monkeypatch.setattr(module, "MOST_NODES", nodes)
     for _ in range(40):
@@ -122,11 +114,11 @@ def test_a_search_that_is_cut_short_is_so_at_the_same_node(
         assert plain.tolist() == by_kernel("joint", step).tolist()
 
 
-def test_a_covariance_that_is_not_definite_ends_the_run(rng: np.random.Generator) -> None:
+def test_a_covariance_that_is_not_definite_ends_the_run(rng):
     step = Step(rng, 2, 3)
     step.S[2, 2] = -1.0
     guard = guard_part("gate", SETTINGS, 3, 2)
-    watch: Any = make_watch(guard, 3, 2, 2, 2)
+    watch = make_watch(guard, 3, 2, 2, 2)
     assert not keep_agreeing(guard, 3, 2, step.y, step.S, watch)
     with pytest.raises(np.linalg.LinAlgError):
         kept_observations("gate", step.y, step.S, 3, limits_of(SETTINGS, 3, 2))
@@ -150,12 +142,12 @@ INTERPRETED = [
 ]  # fmt: skip
 
 
-def first_sightings(trial: cs.Trial) -> Indices:
+def first_sightings(trial):
     """Row of the first observation of each landmark."""
     return np.unique(trial.landmark, return_index=True)[1]
 
 
-def agree(name: str, scenario: cs.Scenario, rng: np.random.Generator) -> None:
+def agree(name, scenario, rng):
     trial, filter_ = corrupted(cs.simulate(scenario, run=2), rng), cs.get_filter(name)
     wrong = np.concatenate([2.0 * trial.z[:1], trial.z[1:]])  # a landmark begins anew with the first row of all, too
     trial = replace(trial, z=wrong)
@@ -171,44 +163,40 @@ def agree(name: str, scenario: cs.Scenario, rng: np.random.Generator) -> None:
 
 
 @pytest.fixture
-def no_local_updating(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_local_updating(monkeypatch):
     """Kernels that compile sooner; whether guards go with local updating has tests of its own."""
     monkeypatch.setattr(Compiled, "local_from", 10**9)
 
 
 @pytest.fixture
-def interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+def interpreted(monkeypatch):
     """Kernels as Python runs them; guards meet all filters in one place, which is compiled in other tests."""
     for name, stand_in in {"by_reference": lambda record: record, "keep": lambda _: None}.items():
         monkeypatch.setattr(loop, name, stand_in)
     monkeypatch.setattr(Kernel, "__call__", lambda kernel, *args: kernel.function(*args))
 
 
-def of_tracks(scenario: cs.Scenario) -> cs.Scenario:
+def of_tracks(scenario):
     """The world with rules on tracks in the belief."""
     return scenario.variant("tracks", belief__guard=TRACKS)
 
 
 @pytest.mark.usefixtures("no_local_updating")
-@pytest.mark.parametrize(("name", "world"), COMPILED)
-def test_a_guarded_kernel_is_the_guarded_twin(small: Small, name: str, world: str, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("name, world", COMPILED)
+def test_a_guarded_kernel_is_the_guarded_twin(small, name, world, rng):
     agree(name, small(world, truth__steps=200), rng)
     agree(name, of_tracks(small(world, truth__steps=200)), rng)
 
 
 @pytest.mark.usefixtures("no_local_updating", "interpreted")
-@pytest.mark.parametrize(("name", "world"), INTERPRETED)
-def test_what_is_compiled_of_a_guarded_filter_is_its_guarded_twin(
-    small: Small, name: str, world: str, rng: np.random.Generator
-) -> None:
+@pytest.mark.parametrize("name, world", INTERPRETED)
+def test_what_is_compiled_of_a_guarded_filter_is_its_guarded_twin(small, name, world, rng):
     agree(name, of_tracks(small(world, truth__steps=STEPS)), rng)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ekf-uvd+gate", "parked-ekf-uvd+gate"])
-def test_a_guarded_kernel_is_its_twin_while_it_updates_locally(
-    small: Small, name: str, rng: np.random.Generator
-) -> None:
+def test_a_guarded_kernel_is_its_twin_while_it_updates_locally(small, name, rng):
     agree(name, small("herath2007-stereo", truth__steps=500), rng)
 
 
@@ -216,7 +204,7 @@ AGAIN = {33: (483, 484), 42: (495, 496), 30: (48, 52)}  # steps, from 0, of the 
 
 
 @pytest.mark.parametrize("name", ["parked-ekf-uvd+gate", "ekf-uvd+gate"])
-def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None:
+def test_a_landmark_that_was_parked_begins_anew(small, name):
     """Seen once, wrongly, and again when the loop closes: nothing of it is left, neither its clone nor its place.
 
     One is seen again shortly before landmarks are parked, and stays in use.
@@ -245,7 +233,7 @@ def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None
         assert gap @ np.linalg.solve(ours.map.covariance[at], gap) < 45
 
 
-def test_a_parked_landmark_that_is_forgotten_takes_its_clone_along(small: Small) -> None:
+def test_a_parked_landmark_that_is_forgotten_takes_its_clone_along(small):
     scenario = small("herath2007-stereo", truth__steps=120)
     trial = cs.simulate(scenario, run=2)
     twin = cs.get_filter("parked-ekf-uvd").textbook

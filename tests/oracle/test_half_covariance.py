@@ -30,7 +30,7 @@ def both(name, scenario):
 
 
 @pytest.mark.parametrize(
-    ("name", "world"),
+    "name, world",
     [
         ("kf", "linear-gaussian"),
         ("ekf-xyz", "herath2007-xyz"),

@@ -7,7 +7,7 @@ import pytest
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
 
-RUNS, SEED = 3, 5
+RUNS, SEED = 2, 5
 # filter, its observation model, scenario, steps
 CASES = [
     ("ekf-uvd", "uvd", "herath2007-stereo", 500),

@@ -5,34 +5,27 @@ map together can be shifted in the plane and turned, and no observation tells; h
 the robot is known. So three singular values of M are zero unless the filter gains information that is not there.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 import consistency as cs
 from consistency.bench.filters.compiled import problem_for
-from consistency.bench.filters.textbook.basics import SlamState
-from consistency.bench.types import Control, Observation, Trial
-from consistency.referee.types import Array
+from consistency.bench.types import Observation
 
-Small = Callable[..., cs.Scenario]
 WORLDS = {"xyz": "herath2007-xyz", "uvd": "herath2007-wide-baseline"}
 ZERO, CLEAR = 1e-13, 1e-6  # singular values, relative to the largest
 
 
-def of_the_robot(state: SlamState, block: Array) -> SlamState:
+def of_the_robot(state, block):
     """The state with a covariance of the robot and none of the map."""
     P = np.zeros_like(state.P)
     P[:3, :3] = block
     return replace(state, P=P)
 
 
-def motion_jacobian(twin: Any, state: SlamState, control: Control) -> Array:
+def motion_jacobian(twin, state, control):
     """F (3, 3), from what it makes of two covariances."""
     noise, all_ = (twin.predict(of_the_robot(state, P), control).P for P in (np.zeros((3, 3)), np.eye(3)))
     square, F = (all_ - noise)[:3, :3], np.eye(3)
@@ -41,14 +34,14 @@ def motion_jacobian(twin: Any, state: SlamState, control: Control) -> Array:
     return F
 
 
-def split(state: SlamState, observation: Observation) -> tuple[Observation, Observation]:
+def split(state, observation):
     """What is seen of landmarks in the state, and of new ones."""
     known = np.isin(observation.landmarks, state.landmarks)
     old, new = (Observation(observation.landmarks[rows], observation.z[rows]) for rows in (known, ~known))
     return old, new
 
 
-def observability_matrix(twin: Any, trial: Trial, belief: Any) -> Array:
+def observability_matrix(twin, trial, belief):
     """M over all landmarks of the trial, a row for each number that was observed."""
     state, Phi, blocks = twin.init(problem_for(twin, trial, belief)), np.eye(3), []
     for k in range(1, trial.steps + 1):
@@ -67,7 +60,7 @@ def observability_matrix(twin: Any, trial: Trial, belief: Any) -> Array:
     return np.vstack([np.pad(block, ((0, 0), (0, width - block.shape[1]))) for block in blocks])
 
 
-def unobserved(name: str, scenario: cs.Scenario) -> int:
+def unobserved(name, scenario):
     """How many directions of robot and map M leaves at zero; all others are clearly not."""
     M = observability_matrix(cs.get_filter(name).textbook, cs.simulate(scenario, run=3), scenario.belief)
     assert M.shape[0] > M.shape[1] > 30
@@ -77,9 +70,9 @@ def unobserved(name: str, scenario: cs.Scenario) -> int:
     return int(zero.sum())
 
 
-@pytest.mark.parametrize(("method", "directions"), [("ekf", 2), ("fej-ekf", 3), ("oc-ekf", 3), ("ideal-ekf", 3)])
+@pytest.mark.parametrize("method, directions", [("ekf", 2), ("fej-ekf", 3), ("oc-ekf", 3), ("ideal-ekf", 3)])
 @pytest.mark.parametrize("sensor", ["xyz", "uvd"])
-def test_unobserved_directions(small: Small, tilted: dict[str, Any], method: str, sensor: str, directions: int) -> None:
+def test_unobserved_directions(small, tilted, method, sensor, directions):
     """Three where the filter is a remedy; the EKF believes that it sees the heading."""
     scenario = small(WORLDS[sensor], truth__sensor__mount=tilted, belief__sensor__mount=tilted)
     assert unobserved(f"{method}-{sensor}", scenario) == directions

@@ -1,10 +1,7 @@
 """The robot-centred filter: geometry by finite differences, conversion by quadrature, kernel by its twin."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,25 +22,24 @@ from consistency.bench.filters.textbook import robocentric as textbook
 from consistency.bench.filters.textbook.basics import heading_matrix
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.types import Control
-from consistency.referee.types import Array
 
 Small = Callable[..., cs.Scenario]
 Y = np.array([[0.3, -0.2, 0.4], [-0.6, 0.1, 0.15], [2.4, 0.3, 0.9]])  # the last one is behind the robot
 STEP = 1e-6
 
 
-def close(a: Array, b: Array, tolerance: float = 1e-7) -> bool:
+def close(a, b, tolerance=1e-7):
     return bool(np.abs(a - b).max() <= tolerance)
 
 
-def along(function: Callable[[Array], Array], x: Array) -> Array:
+def along(function, x):
     """Derivative of a function of x by central differences, its last axis that of x."""
     steps = STEP * np.eye(len(x))
     return np.stack([(function(x + d) - function(x - d)) / (2.0 * STEP) for d in steps], axis=-1)
 
 
 @pytest.fixture
-def sensor(small: Small, tilted: dict[str, Any]) -> Any:
+def sensor(small, tilted):
     return small("herath2007-stereo", belief__sensor__mount=tilted).belief.sensor
 
 
@@ -51,14 +47,14 @@ def sensor(small: Small, tilted: dict[str, Any]) -> Any:
 
 
 @pytest.mark.parametrize("i", range(len(Y)))
-def test_carrying_a_landmark_has_the_derivatives_it_says(sensor: Any, i: int) -> None:
+def test_carrying_a_landmark_has_the_derivatives_it_says(sensor, i):
     R, t = heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
     _, J, _, _ = inverse_range.carried(Y, R, t, sensor)
     assert close(J[i], along(lambda y: inverse_range.carried(y[None], R, t, sensor)[0][0], Y[i]))
     assert not close(1.001 * J[i], along(lambda y: inverse_range.carried(y[None], R, t, sensor)[0][0], Y[i]))
 
 
-def test_carrying_there_and_back_changes_nothing(sensor: Any) -> None:
+def test_carrying_there_and_back_changes_nothing(sensor):
     R, t = heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
     there = inverse_range.carried(Y, R, t, sensor)[0]
     assert close(inverse_range.carried(there, R.T, -R.T @ t, sensor)[0], Y, 1e-12)
@@ -67,10 +63,10 @@ def test_carrying_there_and_back_changes_nothing(sensor: Any) -> None:
 DRIVE, TURN = 0.4, 0.3  # m, rad
 
 
-def bends(sensor: Any, i: int) -> tuple[Array, Array]:
+def bends(sensor, i):
     """First derivatives of a landmark by drive and turn, and half of the second ones, (3, 2) each."""
 
-    def there(drive: float, about: float) -> Array:
+    def there(drive, about):
         R = heading_matrix(-TURN - about)
         return inverse_range.carried(Y, R, -R[:, 0] * (DRIVE + drive), sensor)[0][i]
 
@@ -81,7 +77,7 @@ def bends(sensor: Any, i: int) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("i", range(len(Y)))
-def test_the_noise_of_a_motion_spreads_landmarks_to_second_order(small: Small, tilted: dict[str, Any], i: int) -> None:
+def test_the_noise_of_a_motion_spreads_landmarks_to_second_order(small, tilted, i):
     scenario = small("herath2007-stereo", belief__sensor__mount=tilted)
     motion, trial, of_rho, dt = scenario.belief.motion, cs.simulate(scenario), 0.003, 0.5
     P = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, of_rho])
@@ -102,7 +98,7 @@ def test_the_noise_of_a_motion_spreads_landmarks_to_second_order(small: Small, t
 
 
 @pytest.mark.parametrize("i", range(len(Y)))
-def test_the_noise_of_a_motion_moves_the_mean_by_half_of_its_second_derivatives(sensor: Any, i: int) -> None:
+def test_the_noise_of_a_motion_moves_the_mean_by_half_of_its_second_derivatives(sensor, i):
     sigmas, exact = (0.05, 0.2), bends(sensor, i)[1] * np.square((0.05, 0.2))
     R = heading_matrix(-TURN)
     _, _, D, b = inverse_range.carried(Y, R, -R[:, 0] * DRIVE, sensor)
@@ -114,12 +110,12 @@ def test_the_noise_of_a_motion_moves_the_mean_by_half_of_its_second_derivatives(
 
 
 @pytest.mark.parametrize("y", Y)
-def test_a_parked_landmark_has_the_derivatives_it_says(small: Small, tilted: dict[str, Any], y: Array) -> None:
+def test_a_parked_landmark_has_the_derivatives_it_says(small, tilted, y):
     scenario = small("herath2007-stereo", belief__sensor__mount=tilted)
     trial = cs.simulate(scenario)
     clone, pose = np.array([1.0, -0.5, 0.4]), np.array([1.6, 0.3, -0.7])
 
-    def seen(y: Array, clone: Array, pose: Array) -> tuple[Array, Array, Array]:
+    def seen(y, clone, pose):
         state = robocentric_state.CentredState(pose, np.zeros((3, 3)), problem_of(trial, scenario.belief))
         return robocentric_state.seen_from(state, clone, y)
 
@@ -130,7 +126,7 @@ def test_a_parked_landmark_has_the_derivatives_it_says(small: Small, tilted: dic
     assert not close(by_shift, 0.0 * by_shift, 1e-3)
 
 
-def test_the_left_jacobian_is_that_of_exp_up_to_the_third_order() -> None:
+def test_the_left_jacobian_is_that_of_exp_up_to_the_third_order():
     pose = np.array([1.0, -0.5, 0.4])
     gaps = []
     for size in (0.2, 0.1):
@@ -154,7 +150,7 @@ def test_the_left_jacobian_is_that_of_exp_up_to_the_third_order() -> None:
 Z = np.array([[20.0, -35.0, 4.0], [-110.0, 60.0, 1.7], [5.0, 90.0, 12.0]])
 
 
-def test_the_conversion_is_the_inverse_of_the_image_and_has_the_derivatives_it_says(sensor: Any) -> None:
+def test_the_conversion_is_the_inverse_of_the_image_and_has_the_derivatives_it_says(sensor):
     y, J = inverse_range.converted(Z, sensor)
     assert close(inverse_range.imaged(y, sensor), Z, 1e-9)
     for i in range(len(Z)):
@@ -164,7 +160,7 @@ def test_the_conversion_is_the_inverse_of_the_image_and_has_the_derivatives_it_s
         assert y[i, 2] == pytest.approx(1.0 / np.linalg.norm(point))
 
 
-def test_the_bias_is_that_of_quadrature(sensor: Any) -> None:
+def test_the_bias_is_that_of_quadrature(sensor):
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     u, v = np.meshgrid(nodes * sensor.sigma[0], nodes * sensor.sigma[1], indexing="ij")
     weight = np.outer(weights, weights).ravel() / (2.0 * np.pi)
@@ -178,7 +174,7 @@ def test_the_bias_is_that_of_quadrature(sensor: Any) -> None:
 
 
 @pytest.mark.parametrize("expected", [0.6, 1.0, 1.69, 5.0, 31.5])
-def test_a_disparity_freed_of_its_range_has_the_expected_mean_and_the_variance_it_says(expected: float) -> None:
+def test_a_disparity_freed_of_its_range_has_the_expected_mean_and_the_variance_it_says(expected):
     low, high, sigma = 1.0, 32.0, 0.65
     inside = truncnorm((low - expected) / sigma, (high - expected) / sigma, loc=expected, scale=sigma)
     d = np.array([inside.mean()])
@@ -191,19 +187,19 @@ def test_a_disparity_freed_of_its_range_has_the_expected_mean_and_the_variance_i
 # --- charts of poses ------------------------------------------------------------------------------
 
 
-def charted(rng: np.random.Generator, size: float) -> tuple[Array, Array]:
+def charted(rng, size):
     return rng.normal(size=(5, 3)), size * rng.normal(size=(5, 3))
 
 
 @pytest.mark.parametrize("on", [0, 2, 3])
 @pytest.mark.parametrize("chart", ["apart", "chained"])
-def test_a_chart_has_the_derivatives_it_says(rng: np.random.Generator, chart: str, on: int) -> None:
+def test_a_chart_has_the_derivatives_it_says(rng, chart, on):
     """Errors about the moved poses are those on the left; J_l is that of SE(2) to second order."""
     poses, xi = charted(rng, 0.01)
     function = inverse_range.poses_moved if chart == "apart" else partial(inverse_range.chained, on=on)
     moved, C = function(poses, xi)
 
-    def error(flat: Array) -> Array:
+    def error(flat):
         there = function(poses, flat.reshape(-1, 3))[0]
         turn = there[:, 2] - moved[:, 2]
         c, s = np.cos(turn), np.sin(turn)
@@ -215,11 +211,11 @@ def test_a_chart_has_the_derivatives_it_says(rng: np.random.Generator, chart: st
     assert not close(np.eye(len(C)), slope, 1e-3)
 
 
-def test_the_motion_between_two_poses_of_a_chain_hangs_on_its_own_error(rng: np.random.Generator) -> None:
+def test_the_motion_between_two_poses_of_a_chain_hangs_on_its_own_error(rng):
     poses, xi = charted(rng, 0.3)
     other = xi + rng.normal(size=3)  # another error before the first pose; the same from each to the next
 
-    def between(errors: Array) -> Array:
+    def between(errors):
         moved, _ = inverse_range.chained(poses, errors, on=3)
         turn = heading_matrix(-moved[3, 2])[:2, :2]
         return np.append(turn @ (moved[4, :2] - moved[3, :2]), moved[4, 2] - moved[3, 2])
@@ -230,7 +226,7 @@ def test_the_motion_between_two_poses_of_a_chain_hangs_on_its_own_error(rng: np.
     assert abs(gaps[0] - gaps[1]) > 1e-3
 
 
-def test_a_robot_moved_by_the_noise_of_its_last_motion_keeps_its_older_error() -> None:
+def test_a_robot_moved_by_the_noise_of_its_last_motion_keeps_its_older_error():
     """T_true = Exp(xi) Exp(nu) T: about Exp(nu) T the error is xi, and was xi + nu about T to first order."""
     xi, nu, pose = np.array([0.05, -0.08, 0.1]), np.array([0.1, 0.2, 0.3]), np.array([2.0, -1.0, 0.7])
     poses, C = inverse_range.poses_moved(np.array([pose, pose]), np.array([nu, nu]), recency=True)
@@ -242,7 +238,7 @@ def test_a_robot_moved_by_the_noise_of_its_last_motion_keeps_its_older_error() -
     assert not close(turned, inverse_range.moved_pose(poses[-1], xi), 1e-3)
 
 
-def test_the_covariance_of_a_pose_is_that_of_its_exponential() -> None:
+def test_the_covariance_of_a_pose_is_that_of_its_exponential():
     """By quadrature, with a heading known to 0.4 rad: that of a linear error is off by 0.09 of its deviations."""
     pose, root = np.array([3.0, -2.0, 0.7]), np.array([[0.5, 0.0, 0.0], [-0.2, 0.3, 0.0], [-0.15, 0.25, 0.27]])
     C = root @ root.T
@@ -263,7 +259,7 @@ def test_the_covariance_of_a_pose_is_that_of_its_exponential() -> None:
     assert np.array_equal(kernel, on_a_line)  # without full rank, as after the first step
 
 
-def test_parking_waits_where_the_robot_saw_something_lately_and_sees_nothing(small: Small) -> None:
+def test_parking_waits_where_the_robot_saw_something_lately_and_sees_nothing(small):
     lost = {"truth__sensor__effects": [{"kind": "frames", "every": [1, 1, 2, 3]}]}
     scenario = small("herath2007-stereo", **CLOSING | lost)
     trial, made, late = cs.simulate(scenario, run=3), dict[bool, set[int]](), dict[bool, int]()
@@ -286,7 +282,7 @@ def test_parking_waits_where_the_robot_saw_something_lately_and_sees_nothing(sma
 
 
 @pytest.mark.parametrize("on", [0, 1, 2])
-def test_the_chain_of_the_kernel_is_that_of_its_twin(rng: np.random.Generator, on: int) -> None:
+def test_the_chain_of_the_kernel_is_that_of_its_twin(rng, on):
     m, clones, number = 2, 3, np.array([2, 0, 1])
     poses, xi = rng.normal(size=(4, 3)), 0.3 * rng.normal(size=(4, 3))
     moved, C = inverse_range.chained(poses, xi, on=on)
@@ -322,7 +318,7 @@ CLOSING = {  # a lap in 150 steps: what was parked is seen again
 
 
 @pytest.mark.parametrize("left_out", ["nothing", *inverse_range.Corrections._fields])
-def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any], left_out: str) -> None:
+def test_kernel_equals_its_twin_round_a_loop(small, tilted, left_out):
     changes = {"truth__sensor__mount": tilted, "belief__sensor__mount": tilted}
     scenario = small("herath2007-stereo", **CLOSING, **changes)
     trial = cs.simulate(scenario, run=3)
@@ -345,9 +341,7 @@ def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any
 
 
 @pytest.mark.parametrize("local_from", [10, 40])
-def test_updating_locally_changes_no_number_round_a_loop(
-    monkeypatch: pytest.MonkeyPatch, small: Small, local_from: int
-) -> None:
+def test_updating_locally_changes_no_number_round_a_loop(monkeypatch, small, local_from):
     """Clones are called back, freed and taken again while the rest is passive."""
     scenario = small("herath2007-stereo", **CLOSING)
     filter_ = rc.compiled(textbook.RobotCentredKalman("trial", inverse_range.Corrections()))
@@ -367,7 +361,7 @@ def test_updating_locally_changes_no_number_round_a_loop(
         assert not np.array_equal(local.covariance, dense.covariance), "nothing was updated locally"
 
 
-def test_worlds_in_which_it_was_overconfident_are_mended() -> None:
+def test_worlds_in_which_it_was_overconfident_are_mended():
     """Two that `consistency challenge` found: with the pose turned by whole corrections the mean NEES of the first is
     10.6, without the chain that of the second 46.
 
@@ -376,7 +370,7 @@ def test_worlds_in_which_it_was_overconfident_are_mended() -> None:
     """
     scenario = cs.load_scenario("herath2007-stereo")
 
-    def world(name: str, odometry: float, sensor: float, **changes: Any) -> cs.Scenario:
+    def world(name, odometry, sensor, **changes):
         motion, sigma = scenario.truth.motion, [sensor * each for each in scenario.truth.sensor.sigma]
         both = {"sensor__sigma": sigma, "motion__sigma_v": odometry * motion.sigma_v,
                 "motion__sigma_omega": odometry * motion.sigma_omega}  # fmt: skip
@@ -398,7 +392,7 @@ def test_worlds_in_which_it_was_overconfident_are_mended() -> None:
         assert results.estimates["nees"].mean() < most
 
 
-def test_a_chain_that_does_not_settle_is_given_up(monkeypatch: pytest.MonkeyPatch, small: Small) -> None:
+def test_a_chain_that_does_not_settle_is_given_up(monkeypatch, small):
     scenario = small("herath2007-stereo", **CLOSING)
     trial = cs.simulate(scenario, run=3)
     filter_ = rc.compiled(textbook.RobotCentredKalman("trial", inverse_range.Corrections()))
@@ -411,7 +405,7 @@ def test_a_chain_that_does_not_settle_is_given_up(monkeypatch: pytest.MonkeyPatc
     assert np.abs(ours.pose - twin.pose).max() < 1e-9
 
 
-def test_alone_and_in_doubt_a_landmark_waits(small: Small) -> None:
+def test_alone_and_in_doubt_a_landmark_waits(small):
     """Seen beside what is in use it is called back at once, and alone once the turn since its clone is known."""
     scenario = small("herath2007-stereo", **CLOSING | {"truth__landmarks__count": 6})
     filter_, waited, joined = textbook.RobotCentredKalman("trial", inverse_range.Corrections()), 0, 0
@@ -434,7 +428,7 @@ def test_alone_and_in_doubt_a_landmark_waits(small: Small) -> None:
     assert joined > 5
 
 
-def test_a_return_whose_place_is_hardly_known_finds_the_robot() -> None:
+def test_a_return_whose_place_is_hardly_known_finds_the_robot():
     """One landmark, 2 m away, returns where the robot is known to 2.5 m and 0.5 rad."""
     landmarks = {"layout": "uniform", "count": 44, "seed": 2007, "x": (-8, 8), "y": (-8, 8), "z": (-1.25, 1.25)}
     tilted = {"position": (0.0, 0.0, 0.0), "rotation": (0.0, np.deg2rad(40.0), 0.0)}
@@ -459,7 +453,7 @@ def test_a_return_whose_place_is_hardly_known_finds_the_robot() -> None:
     assert lost[1] >= 4
 
 
-def test_a_return_whose_distance_is_hardly_known_turns_nothing_around() -> None:
+def test_a_return_whose_distance_is_hardly_known_turns_nothing_around():
     """A landmark that was seen 8 m away by a baseline of 5 cm is parked, and seen again as the robot passes it."""
     path = {"shape": "rounded-rectangle", "length": 8.0, "width": 5.0, "corner_radius": 1.0, "speed": 0.5}
     landmarks = {"layout": "uniform", "count": 49, "seed": 2008, "x": (-8, 8), "y": (-6.5, 6.5), "z": (-1.25, 1.25)}
@@ -476,7 +470,7 @@ def test_a_return_whose_distance_is_hardly_known_turns_nothing_around() -> None:
     assert worst[1] > 1.0
 
 
-def test_where_the_heading_is_little_known_a_return_tells_nothing_of_the_world() -> None:
+def test_where_the_heading_is_little_known_a_return_tells_nothing_of_the_world():
     """Landmarks are parked and seen again within ten steps, where the robot is known to 1.5 m and 0.45 rad."""
     path = {"shape": "rounded-rectangle", "length": 8.27, "width": 5.17, "corner_radius": 1.01, "speed": 0.5}
     landmarks = {"layout": "uniform", "count": 100, "seed": 40, "x": (-8.1, 8.1), "y": (-6.6, 6.6), "z": (-1.25, 1.25)}
@@ -498,7 +492,7 @@ def test_where_the_heading_is_little_known_a_return_tells_nothing_of_the_world()
     assert ratio[1] > 5.0
 
 
-def test_landmarks_are_parked_and_come_back(small: Small) -> None:
+def test_landmarks_are_parked_and_come_back(small):
     scenario = small("herath2007-stereo", **CLOSING)
     trial, filter_ = cs.simulate(scenario, run=3), textbook.RobotCentredKalman("trial", inverse_range.Corrections())
     state = filter_.init(problem_of(trial, scenario.belief))
@@ -514,7 +508,7 @@ def test_landmarks_are_parked_and_come_back(small: Small) -> None:
     assert len(back) > 5
 
 
-def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
+def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again():
     clones = make_clones(Parking(50, 20, 4e-4, np.inf, True, True, start=10), 3, 36, 100, 2)
     clones.factors.Phi[:] = 1.0
     clones.of[:], clones.uses[0], clones.here[0] = 0, 2, 9
@@ -533,7 +527,7 @@ def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
     assert clones.factors.Phi[:9].all()
 
 
-def test_the_state_is_split_only_where_the_step_has_room() -> None:
+def test_the_state_is_split_only_where_the_step_has_room():
     """Room for 18 variables: those of the robot, of four landmarks in use, and of one more."""
     clones = make_clones(Parking(50, 20, 4e-4, np.inf, True, True, start=10), 3, 36, 100, 9)
     clones.of[4:] = 0
@@ -546,7 +540,7 @@ def test_the_state_is_split_only_where_the_step_has_room() -> None:
 # --- bad input -----------------------------------------------------------------------------------
 
 
-def test_a_belief_without_search_range_is_refused(small: Small) -> None:
+def test_a_belief_without_search_range_is_refused(small):
     scenario = small("herath2007-stereo", belief__sensor__disparity=None)
     with pytest.raises(cs.InputError, match=r"key 'belief.sensor.disparity_px': missing; filter 'parked-ekf-uvd'"):
         cs.run_trials(scenario, ["parked-ekf-uvd"], runs=1)

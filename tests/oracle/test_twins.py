@@ -51,7 +51,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("name", "world", "steps", "changes"), CASES)
+@pytest.mark.parametrize("name, world, steps, changes", CASES)
 def test_kernel_equals_its_twin(small, name, world, steps, changes):
     scenario = small(world, truth__steps=steps, **changes)
     trial = cs.simulate(scenario, run=1)

@@ -104,7 +104,9 @@ def test_growth_and_bias_are_read_back_as_they_were_found(tmp_path, rng):
     assert np.allclose(at, of.growth.nodes / 20.0, rtol=0.15)
     u, v = np.array([-80.0, 80.0]), np.array([10.0, -30.0])
     assert np.allclose(read.bias.at(u, v)[:, 2], 1.0 + 0.005 * u, atol=0.35)
-    assert "±" in path.read_text()
+    rows = [line.split() for line in path.read_text().splitlines() if "±" in line]
+    assert [len(row) - 1 for row in rows] == [len(of.bias.grid.u)] * len(of.bias.grid.v), "a line for each row of nodes"
+    assert rows[0][1] == f"±{of.bias.half[2, 0]:.2g}"
     tomllib.loads(path.read_text())
 
 

@@ -4,8 +4,6 @@ A page has an empty folder with the files that tests/helpers/document_inputs.py 
 there in ``NOT_RUN``; tests/unit/test_documents.py parses that, too, and commands that a sentence mentions.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import re
@@ -14,13 +12,12 @@ import subprocess
 import sys
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import document_inputs as inputs
 import numpy as np
 import pytest
 import scene
-from documents import PAGES, SHELL, Block, Command, blocks, typed
+from documents import PAGES, SHELL, Command, blocks, typed
 
 from consistency.commands import main
 
@@ -58,7 +55,7 @@ PRINTED = {  # page: first words of a printed block whose first line has the for
 }
 
 
-def smaller(words: list[str]) -> str:
+def smaller(words):
     """What is appended to a command, so that it takes seconds; of an option the last one counts."""
     name = words[1]
     if name == "run" and "--log" not in words:
@@ -77,7 +74,7 @@ def smaller(words: list[str]) -> str:
     }.get(name, "")  # fmt: skip
 
 
-def run_command(command: Command, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+def run_command(command, capsys, monkeypatch):
     """What it prints; its exit status must be 0, or 1 after --fail-on."""
     words = [STAND_INS.get(word, word) for word in [*command.words, *smaller(command.words).split()]]
     for option, place in (("--board", "BOARDS"), ("--at-rest", "RESTING")):
@@ -95,12 +92,12 @@ def run_command(command: Command, capsys: pytest.CaptureFixture[str], monkeypatc
     return said.out
 
 
-def run_process(*words: str) -> None:
+def run_process(*words):
     done = subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=300, env=os.environ)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def run_code(block: Block, names: dict[str, Any]) -> None:
+def run_code(block, names):
     """A script, or tests where it defines some."""
     text = block.text
     for old, new in SMALLER_CODE.items():
@@ -116,20 +113,20 @@ def run_code(block: Block, names: dict[str, Any]) -> None:
     exec(compile(text, str(block), "exec"), names)
 
 
-def parts(page: str) -> list[tuple[str, list[Block]]]:
+def parts(page):
     """The page, but for parts with inputs of their own."""
     found = [(f"{page} {block.part}", block) for block in blocks(page)]
     named = [(name if name in inputs.PREPARE else page, block) for name, block in found]
     return [(key, [b for _, b in group]) for key, group in groupby(sorted(named, key=lambda p: p[0]), lambda p: p[0])]
 
 
-def runs(block: Block) -> bool:
+def runs(block):
     if block.language in SHELL:
         return any(runs_command(command) for command in typed(block))
     return block.language.startswith("python") and not inputs.not_run(block.page, block.text)
 
 
-def runs_command(command: Command) -> bool:
+def runs_command(command):
     left_out = command.synopsis or command.words[0] in OF_THE_CHECKOUT
     return not left_out and not inputs.not_run(command.page, command.text)
 
@@ -137,16 +134,14 @@ def runs_command(command: Command) -> bool:
 ALL = [(name, found) for page in PAGES for name, found in parts(page) if any(map(runs, found))]
 
 
-@pytest.mark.parametrize(("name", "found"), ALL, ids=[name for name, _ in ALL])
-def test_it_runs(
-    name: str, found: list[Block], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("name, found", ALL, ids=[name for name, _ in ALL])
+def test_it_runs(name, found, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(inputs, "RNG", np.random.default_rng(20070))  # the same in whatever order pages are run
     for prepare in inputs.PREPARE.get(name, []):
         prepare(tmp_path)
     page, printed = found[0].page, ""
-    names: dict[str, Any] = {"__name__": "__main__", **inputs.names_of(page, tmp_path)}
+    names = {"__name__": "__main__", **inputs.names_of(page, tmp_path)}
     for block in filter(runs, found):
         if block.language not in SHELL:
             run_code(block, names)
@@ -163,14 +158,12 @@ def test_it_runs(
         assert form(shown.text.splitlines()[0]) in map(form, printed.splitlines())
 
 
-def form(line: str) -> list[str]:
+def form(line):
     """A line without its digits."""
     return re.sub(r"[\d.]+", "#", line).split()
 
 
 @pytest.mark.parametrize("text", ["consistency analyse nowhere", "consistency list --jsn"])
-def test_a_command_that_does_not_work_is_seen(
-    text: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_command_that_does_not_work_is_seen(text, capsys, monkeypatch):
     with pytest.raises(AssertionError):
         run_command(Command("page.md", 1, text), capsys, monkeypatch)

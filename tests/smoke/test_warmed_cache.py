@@ -1,9 +1,5 @@
 """A run warms the cache of kernels, also one for an image: another processor, read by every user."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from own_process import consistency
 
@@ -11,7 +7,7 @@ RUN = ("run", "linear-gaussian", "--filter", "kf", "--runs", "1")
 
 
 @pytest.mark.slow
-def test_a_folder_for_an_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_for_an_image(tmp_path, monkeypatch):
     """The commands of docs/long-runs.md: what the first run compiles, the second finds."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
     monkeypatch.setenv("NUMBA_CPU_NAME", "x86-64-v2")

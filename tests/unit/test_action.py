@@ -297,7 +297,7 @@ def test_names_are_no_commands_of_the_runner(gate, tmp_path, monkeypatch, capfd)
     assert gate.main() == 2
     assert "\x1b" not in (said := "".join(capfd.readouterr()))
     assert commands(said) == [
-        "::error title=Consistency gate::not as it must be: tests; the summary has the verdicts",
+        "::error title=Consistency gate::an estimator test failed; the summary has the verdicts",
         "::error title=Consistency gate::ekf ::add-mask::x ::warning::y [2J of 5%250A",
     ]
 

@@ -304,7 +304,7 @@ def test_nothing_that_looks_like_a_command_is_missed():
 # --- what is not run ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("page", "begin", "why"), NOT_RUN)
+@pytest.mark.parametrize("page, begin, why", NOT_RUN)
 def test_what_is_not_run_is_still_in_the_documents(page, begin, why):
     found = [command.text for command in commands(page)] + [block.text for block in blocks(page, *PYTHON)]
     assert any(text.startswith(begin) for text in found)

@@ -4,8 +4,6 @@ Pages without their code and quotations; docstrings, help and messages of the pa
 right uses ("there is no truth") are left out by its pattern.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path
@@ -48,7 +46,7 @@ PHRASES = {  # pattern: what to write
 }
 
 
-def pages(root: Path = ROOT) -> dict[str, str]:
+def pages(root=ROOT):
     """Text of each page without code, quotations and links' addresses."""
     found = {}
     for path in sorted({path for pattern in PAGES for path in root.glob(pattern)}):
@@ -60,7 +58,7 @@ def pages(root: Path = ROOT) -> dict[str, str]:
     return found
 
 
-def strings(root: Path = ROOT) -> dict[str, list[str]]:
+def strings(root=ROOT):
     """Docstrings, help and messages of each module: all texts in it that are sentences or parts of some."""
     found = {}
     for path in sorted({path for pattern in MODULES for path in root.glob(pattern)}):
@@ -71,7 +69,7 @@ def strings(root: Path = ROOT) -> dict[str, list[str]]:
     return found
 
 
-def counted(root: Path = ROOT) -> dict[str, list[str]]:
+def counted(root=ROOT):
     """Where each phrase stands, with some words around it."""
     texts = [(name, text) for name, text in pages(root).items() if name != "CHANGELOG.md"]
     texts += [(name, text) for name, each in strings(root).items() for text in each]
@@ -86,10 +84,10 @@ def counted(root: Path = ROOT) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("phrase", PHRASES)
-def test_a_turn_of_phrase_does_not_come_back(phrase: str, found: dict[str, list[str]]) -> None:
+def test_a_turn_of_phrase_does_not_come_back(phrase, found):
     assert found[phrase] == [], f"write: {PHRASES[phrase]}"
 
 
 @pytest.fixture(scope="module")
-def found() -> dict[str, list[str]]:
+def found():
     return counted()

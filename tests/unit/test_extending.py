@@ -1,7 +1,5 @@
 """The worked example "Add a sensor effect" of docs/extending.md, followed in a copy of the package."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re
@@ -22,19 +20,19 @@ PAGE = "docs/extending.md"
 EFFECTS = Path("consistency/bench/scenario/effects")
 
 
-def code(heading: str) -> list[str]:
+def code(heading):
     """Code blocks of one part of the document."""
     return [block.text for block in blocks(PAGE, "python", "toml", part=heading)]
 
 
-def example(name: str) -> str:
+def example(name):
     """A file to copy, to which the document links."""
     assert f"(examples/extending/{name})" in read(PAGE)
     return (ROOT / "docs/examples/extending" / name).read_text(encoding="utf-8")
 
 
 @pytest.fixture
-def copy(tmp_path: Path) -> Path:
+def copy(tmp_path):
     ignore = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
     for name in ("consistency", "scenarios"):
         shutil.copytree(PACKAGE.parent / name, tmp_path / name, ignore=ignore)
@@ -45,12 +43,12 @@ def copy(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def python(folder: Path, code: str, imports: str = "import scipy.stats, typer") -> subprocess.CompletedProcess[str]:
+def python(folder, code, imports="import scipy.stats, typer"):
     """Code that finds the copy, in a fork of a process that has imported nothing of ours."""
     return forks.done(imports, f"sys.path.insert(0, {str(folder)!r})\n{code}", "-c", cwd=folder)
 
 
-def test_the_command_of_the_document_works(copy: Path) -> None:
+def test_the_command_of_the_document_works(copy):
     """One new file and one row; it is in the help, reads files, and loads nothing heavy before it is called."""
     module, (row,) = example("worst.py"), code("Add a command")
     assert row.count("\n") == 1
@@ -72,14 +70,14 @@ def test_the_command_of_the_document_works(copy: Path) -> None:
     assert done.stdout == "est: run 7, mean NEES 49\n", done.stderr
 
 
-def changed(path: Path, old: str, new: str) -> None:
+def changed(path, old, new):
     """Replace the one place where ``old`` stands."""
     text = path.read_text(encoding="utf-8")
     assert text.count(old) == 1
     path.write_text(text.replace(old, new), encoding="utf-8")
 
 
-def test_the_question_of_the_document_is_asked(copy: Path) -> None:
+def test_the_question_of_the_document_is_asked(copy):
     """Two files; runs whose errors grow are found at fault, the same runs in random order are not."""
     statistic, (table, line) = example("trend.py"), code("Add a question of the verdict")
     folder = copy / "consistency/referee/diagnostics"
@@ -118,7 +116,7 @@ for order in (np.arange(n), np.arange(n) * 37 % n):
     assert mixed.endswith("True")
 
 
-def test_the_renderer_of_the_document_works(copy: Path) -> None:
+def test_the_renderer_of_the_document_works(copy):
     """One file; the command line and the gates have the format at once."""
     (copy / "consistency/referee/show/as_csv.py").write_text(example("as_csv.py"), encoding="utf-8")
     words = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a", "--report", "out.csv"]
@@ -132,7 +130,7 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
     assert ".csv" in python(copy, refusal).stdout
 
 
-def test_the_kind_of_files_of_the_document_is_read(copy: Path) -> None:
+def test_the_kind_of_files_of_the_document_is_read(copy):
     """One file and a row; what is refused of it is refused, and what is broken is said."""
     load, row = code("Add a kind of files")
     module = copy / "consistency/referee/readers/formats/run_lines.py"
@@ -151,7 +149,7 @@ def test_the_kind_of_files_of_the_document_is_read(copy: Path) -> None:
     assert "each line must be an object" in python(copy, call.format(["analyse", "bad.runs"])).stderr
 
 
-def test_a_default_stands_once(copy: Path) -> None:
+def test_a_default_stands_once(copy):
     """One file: the command line, its help, Python and the gates have it."""
     changed(copy / "consistency/referee/defaults.py", "FALSE_ALARM = 0.05", "FALSE_ALARM = 0.037")
     asked = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a"]
@@ -161,7 +159,7 @@ def test_a_default_stands_once(copy: Path) -> None:
     assert "0.037" in python(copy, gate).stdout
 
 
-def test_the_bias_of_the_document_works(copy: Path) -> None:
+def test_the_bias_of_the_document_works(copy):
     """One new file, one line elsewhere, a key in a scenario; and the document's own test passes."""
     effect, test, (line, key) = example("bias.py"), example("check_bias.py"), code("Add a sensor effect")
     assert line.count("\n") == 1
@@ -187,7 +185,7 @@ def test_the_bias_of_the_document_works(copy: Path) -> None:
 METHODS = PACKAGE / "bench" / "filters" / "methods"
 
 
-def test_excerpts_of_filters_are_the_code_that_runs() -> None:
+def test_excerpts_of_filters_are_the_code_that_runs():
     registry = (PACKAGE / "bench" / "filters" / "__init__.py").read_text(encoding="utf-8")
     sources = [registry, *(path.read_text(encoding="utf-8") for path in METHODS.glob("*.py"))]
     excerpts = code("Add a filter")
@@ -197,10 +195,8 @@ def test_excerpts_of_filters_are_the_code_that_runs() -> None:
         assert all(any(piece in source for source in sources) for piece in pieces), excerpt
 
 
-@pytest.mark.parametrize(
-    ("method", "names"), [("iekf", {"iekf"}), ("riekf", {"ri-ekf"}), ("anchored", {"anchored-ekf"})]
-)
-def test_a_filter_is_one_file_and_a_line_for_each_name(method: str, names: set[str]) -> None:
+@pytest.mark.parametrize("method, names", [("iekf", {"iekf"}), ("riekf", {"ri-ekf"}), ("anchored", {"anchored-ekf"})])
+def test_a_filter_is_one_file_and_a_line_for_each_name(method, names):
     """Nothing else in the package but its textbook knows the file or what it defines."""
     registered = {name: module for name, (module, _) in consistency.bench.filters.MODULES.items()}
     mine = {name for name, module in registered.items() if module == f"methods.{method}"}
@@ -213,7 +209,7 @@ def test_a_filter_is_one_file_and_a_line_for_each_name(method: str, names: set[s
     assert defined & words_of_code(source)  # negative control
 
 
-def words_of_code(source: str) -> set[str]:
+def words_of_code(source):
     """Names, attributes, what is imported and defined, and texts: all but comments, and words in a docstring."""
     words = set()
     for node in ast.walk(ast.parse(source)):
@@ -221,7 +217,7 @@ def words_of_code(source: str) -> set[str]:
     return words
 
 
-def test_the_experiment_of_the_document_runs(tmp_path: Path) -> None:
+def test_the_experiment_of_the_document_runs(tmp_path):
     (tmp_path / "e13_iterated.py").write_text(example("e13_iterated.py"), encoding="utf-8")
     program = "import sys, runpy; sys.argv = ['e13', '2', '0']; runpy.run_path('e13_iterated.py', run_name='__main__')"
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}

@@ -1,12 +1,9 @@
 """The README and the pages of the documentation: how long they are, and that what they print is printed."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from documents import ROOT, blocks
@@ -20,11 +17,11 @@ EXAMPLE = DOCS / "examples/repository"
 LONG = {"fit-covariance.md"}  # the one page above the limits
 
 
-def test_the_readme_is_short() -> None:
+def test_the_readme_is_short():
     assert (ROOT / "README.md").read_text("utf-8").count("\n") <= 110
 
 
-def test_pages_are_few_and_short() -> None:
+def test_pages_are_few_and_short():
     assert len(PAGES) <= 22
     for page in (page for page in DOCS.glob("*.md") if page.name not in LONG):
         text = page.read_text("utf-8")
@@ -37,9 +34,7 @@ def test_pages_are_few_and_short() -> None:
 
 
 @pytest.mark.parametrize("fix", ["0.3", "0.2"], ids=["as it is", "trusts its fixes too much"])
-def test_the_readme_prints_what_is_printed(
-    fix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_readme_prints_what_is_printed(fix, tmp_path, monkeypatch, capsys):
     (tmp_path / "cart").mkdir()
     for name in ("simulate.py", "cart/__init__.py", "cart/world.py", "cart/ekf.py"):
         text = (EXAMPLE / name).read_text("utf-8")
@@ -53,7 +48,7 @@ def test_the_readme_prints_what_is_printed(
     assert shown[0 if fix == "0.3" else 1] in printed
 
 
-def test_the_commands_of_the_readme_are_those_that_ci_runs() -> None:
+def test_the_commands_of_the_readme_are_those_that_ci_runs():
     done = subprocess.run([sys.executable, ROOT / ".ci/readme"], capture_output=True, text=True, check=True)
     first, second = (block for block in blocks("README.md", "indented") if block.part == "First verdict")
     typed = (first.text + second.text).replace(
@@ -62,7 +57,7 @@ def test_the_commands_of_the_readme_are_those_that_ci_runs() -> None:
     assert done.stdout.split("\n") == [line for line in typed.split("\n") if line] + [""]
 
 
-def test_documents_have_the_address_of_the_project() -> None:
+def test_documents_have_the_address_of_the_project():
     """Set in pyproject.toml; `python docs/address.py` writes it into them."""
     address = runpy.run_path(str(DOCS / "address.py"))
     for document in address["DOCUMENTS"]:

@@ -4,14 +4,10 @@ Draws with rates have a fixed seed that was not chosen and limits at 1e-5 or fur
 the limit of their word that they are missed less often than that.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import re
-from collections.abc import Callable, Iterator
 from html import escape
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,19 +16,19 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
-from consistency.diagnostics import Interval, Record, Settings, Verdict, judge
+from consistency.diagnostics import Interval, Record, Settings, judge
 from consistency.referee.diagnostics.questions.outliers import outliers
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import off_by, p_text, plural, short
-from consistency.referee.types import Array, Failure
+from consistency.referee.types import Failure
 
 SURE = 1e-5
 ALARMS = ("overconfident", "conservative", "biased", "heavy-tailed", "inconsistent")
 # --- the status ------------------------------------------------------------------------------------------
 
 
-def test_a_pure_offset_is_biased(rng: np.random.Generator) -> None:
+def test_a_pure_offset_is_biased(rng):
     """One sigma along one axis, over AR(.95) steps, and over steps that are one."""
     for world in (autoregression, fully_dependent):
         verdict = verdict_on(world(rng, 100, 40, 3) + np.array([1.0, 0.0, 0.0]), false_alarm=SURE)
@@ -43,7 +39,7 @@ def test_a_pure_offset_is_biased(rng: np.random.Generator) -> None:
         assert "without the bias the covariance ratio is" in verdict.reasons[0]
 
 
-def test_an_offset_in_some_steps_is_biased(rng: np.random.Generator) -> None:
+def test_an_offset_in_some_steps_is_biased(rng):
     error = independent(rng, 100, 30, 3)
     error[:, 11, 1] += 2.0
     verdict = verdict_on(error, false_alarm=SURE)
@@ -52,7 +48,7 @@ def test_an_offset_in_some_steps_is_biased(rng: np.random.Generator) -> None:
     assert verdict.reasons[0].lower().count("biased") == 1
 
 
-def test_an_offset_and_a_wrong_scale_are_both_said(rng: np.random.Generator) -> None:
+def test_an_offset_and_a_wrong_scale_are_both_said(rng):
     verdict = verdict_on(2.0 * independent(rng, 100, 30, 3) + np.array([2.0, 0.0, 0.0]), false_alarm=SURE)
     assert verdict.status == "overconfident"
     assert {"scale", "bias"} <= set(verdict.faults)
@@ -60,15 +56,15 @@ def test_an_offset_and_a_wrong_scale_are_both_said(rng: np.random.Generator) -> 
     assert "covariance about the mean too small by x" in verdict.reasons[0]
 
 
-def test_an_offset_does_not_make_a_small_error_large(rng: np.random.Generator) -> None:
+def test_an_offset_does_not_make_a_small_error_large(rng):
     """Errors of half the stated variance about a mean of 1.2 sigma in every axis: not 'overconfident'."""
     verdict = verdict_on(np.sqrt(0.5) * independent(rng, 100, 30, 3) + 1.2, false_alarm=SURE)
     assert verdict.bias.inflation_without.high < 0.6
     assert verdict.status in ("biased", "conservative")
 
 
-@pytest.mark.parametrize(("ratio", "status"), [(2.0, "overconfident"), (0.5, "conservative")])
-def test_a_wrong_scale(rng: np.random.Generator, ratio: float, status: str) -> None:
+@pytest.mark.parametrize("ratio, status", [(2.0, "overconfident"), (0.5, "conservative")])
+def test_a_wrong_scale(rng, ratio, status):
     verdict = verdict_on(np.sqrt(ratio) * autoregression(rng, 61, 40, 3), false_alarm=SURE)
     assert verdict.status == status
     side = "too small" if ratio > 1 else "too large"
@@ -76,7 +72,7 @@ def test_a_wrong_scale(rng: np.random.Generator, ratio: float, status: str) -> N
     assert verdict.reasons[0].endswith("no bias found")
 
 
-def test_a_few_large_errors_are_heavy_tails(rng: np.random.Generator) -> None:
+def test_a_few_large_errors_are_heavy_tails(rng):
     """Every hundredth error eight times as large as stated, the others smaller: a right covariance, 100 runs."""
     error = independent(rng, 100, 20, 3) * np.sqrt((1.0 - 0.01 * 64.0) / 0.99)
     large = rng.random((100, 20)) < 0.01
@@ -88,7 +84,7 @@ def test_a_few_large_errors_are_heavy_tails(rng: np.random.Generator) -> None:
     assert "sigma from the other runs in run " in verdict.reasons[0]
 
 
-def test_heavy_tails_of_the_right_covariance_are_not_a_wrong_scale(rng: np.random.Generator) -> None:
+def test_heavy_tails_of_the_right_covariance_are_not_a_wrong_scale(rng):
     """60 draws of 21 runs with Laplace errors in independent steps; at 5 % more than 12 have a probability of 1e-5."""
     laplace = (rng.laplace(0.0, np.sqrt(0.5), (21, 60, 3)) for _ in range(60))
     statuses = [verdict_on(error).status for error in laplace]
@@ -96,14 +92,14 @@ def test_heavy_tails_of_the_right_covariance_are_not_a_wrong_scale(rng: np.rando
     assert count <= stats.binom.isf(SURE, 60, 0.05)
 
 
-def test_heavy_tails_of_many_runs_are_called_so(rng: np.random.Generator) -> None:
+def test_heavy_tails_of_many_runs_are_called_so(rng):
     """100 runs of t5 errors in independent steps: 20 draws, with the limit of the test above."""
     statuses = [verdict_on(np.sqrt(0.6) * rng.standard_t(5, (100, 60, 3))).status for _ in range(20)]
     assert statuses.count("heavy-tailed") >= 14
     assert statuses.count("overconfident") + statuses.count("conservative") <= stats.binom.isf(SURE, 20, 0.05)
 
 
-def test_a_wrong_correlation_is_inconsistent(rng: np.random.Generator) -> None:
+def test_a_wrong_correlation_is_inconsistent(rng):
     error = independent(rng, 100, 30, 3)
     error[..., 2] = 0.8 * error[..., 0] + 0.6 * error[..., 2]
     verdict = verdict_on(error, false_alarm=SURE)
@@ -112,14 +108,14 @@ def test_a_wrong_correlation_is_inconsistent(rng: np.random.Generator) -> None:
     assert "stated +0.00, of axis 0 and axis 2" in verdict.reasons[0]
 
 
-def test_axes_that_err_in_opposite_directions_are_inconsistent(rng: np.random.Generator) -> None:
+def test_axes_that_err_in_opposite_directions_are_inconsistent(rng):
     verdict = verdict_on(independent(rng, 100, 30, 2) * np.sqrt([1.6, 0.4]), false_alarm=SURE)
     assert "scale" not in verdict.faults or abs(verdict.inflation - 1.0) < 0.1
     assert re.search(r"too small by x1\.\d\d \[[^]]+\] in axis 0, too large by x2\.", verdict.reasons[0])
     assert verdict.status == "inconsistent"
 
 
-def test_failures_are_failed_unless_a_fault_is_found(rng: np.random.Generator) -> None:
+def test_failures_are_failed_unless_a_fault_is_found(rng):
     broke = (Failure("f", 3, 7, "LinAlgError: singular"),)
     for ratio, status in ((1.0, "failed"), (4.0, "overconfident")):
         error = np.sqrt(ratio) * independent(rng, 60, 20, 3)
@@ -131,7 +127,7 @@ def test_failures_are_failed_unless_a_fault_is_found(rng: np.random.Generator) -
     assert judge(Record("f", single, identities(single), failures=broke), Settings(SURE)).status == "failed"
 
 
-def test_statuses_of_alarm_have_a_fault_and_the_others_none(rng: np.random.Generator) -> None:
+def test_statuses_of_alarm_have_a_fault_and_the_others_none(rng):
     seen = set()
     for _ in range(60):
         runs = int(rng.integers(1, 40))
@@ -147,18 +143,18 @@ def test_statuses_of_alarm_have_a_fault_and_the_others_none(rng: np.random.Gener
 # --- where and since when ----------------------------------------------------------------------------------
 
 
-def named(verdict: Verdict) -> bool:
+def named(verdict):
     return verdict.subset is not None or "mainly" in verdict.reasons[0]
 
 
 @pytest.mark.parametrize("runs", [21, 61])
-def test_a_uniform_fault_names_no_axis_and_no_beginning(rng: np.random.Generator, runs: int) -> None:
+def test_a_uniform_fault_names_no_axis_and_no_beginning(rng, runs):
     """x1.2 with AR(.95) in 60 draws; at 5 % more than 12 have a probability below 1e-5."""
     verdicts = [verdict_on(np.sqrt(1.2) * autoregression(rng, runs, 100, 3)) for _ in range(60)]
     assert sum(named(v) or " since step" in v.reasons[0] for v in verdicts) <= stats.binom.isf(SURE, 60, 0.05)
 
 
-def test_the_axis_that_is_wrong_is_named(rng: np.random.Generator) -> None:
+def test_the_axis_that_is_wrong_is_named(rng):
     """x1.5 in one of three axes with AR(.95), 61 runs; 30 draws at 90 %, less than 18 have a probability of 1e-5."""
     count = 0
     for _ in range(30):
@@ -169,7 +165,7 @@ def test_the_axis_that_is_wrong_is_named(rng: np.random.Generator) -> None:
     assert count >= stats.binom.ppf(SURE, 30, 0.9)
 
 
-def test_a_fault_that_begins_is_dated(rng: np.random.Generator) -> None:
+def test_a_fault_that_begins_is_dated(rng):
     """x1.5 from step 51 of 100 with AR(.95), 61 runs; 30 draws at 90 %."""
     dated = []
     for _ in range(30):
@@ -187,7 +183,7 @@ def test_a_fault_that_begins_is_dated(rng: np.random.Generator) -> None:
     assert 51 <= np.median(dated) <= 60
 
 
-def test_a_fault_from_the_start_has_no_date(rng: np.random.Generator) -> None:
+def test_a_fault_from_the_start_has_no_date(rng):
     verdict = verdict_on(np.sqrt(3.0) * independent(rng, 61, 30, 3), false_alarm=SURE)
     assert "since" not in verdict.reasons[0]
     assert "visible" not in verdict.reasons[0]
@@ -196,7 +192,7 @@ def test_a_fault_from_the_start_has_no_date(rng: np.random.Generator) -> None:
     assert growing.location.since is None or growing.location.since > 1
 
 
-def test_the_chief_axis_has_the_name_it_was_given(rng: np.random.Generator) -> None:
+def test_the_chief_axis_has_the_name_it_was_given(rng):
     error = independent(rng, 61, 20, 3)
     error[..., 2] *= np.sqrt(3.0)
     evidence = Record("f", error, identities(error), axes=["x", "y", "heading"])
@@ -211,7 +207,7 @@ def test_the_chief_axis_has_the_name_it_was_given(rng: np.random.Generator) -> N
 RUNS = [1, 2, 3, 5, 19, 20, 50]
 
 
-def worlds(rng: np.random.Generator, runs: int, n: int = 3, steps: int = 8) -> Iterator[Array]:
+def worlds(rng, runs, n=3, steps=8):
     """Right and wrong, by little and by much."""
     for world in (independent, fully_dependent):
         yield world(rng, runs, steps, n)
@@ -230,17 +226,17 @@ def worlds(rng: np.random.Generator, runs: int, n: int = 3, steps: int = 8) -> I
     yield tilted
 
 
-def one_component(rng: np.random.Generator, runs: int) -> Iterator[Array]:
+def one_component(rng, runs):
     yield from worlds(rng, runs, n=1, steps=1)
     yield from worlds(rng, runs, n=1, steps=5)
 
 
-def six_components(rng: np.random.Generator, runs: int) -> Iterator[Array]:
+def six_components(rng, runs):
     yield independent(rng, runs, 8, 6) + 3.0
     yield independent(rng, runs, 8, 6) * np.sqrt([3.0, 0.3, 3.0, 0.3, 3.0, 0.3])
 
 
-def some_diverged(rng: np.random.Generator, runs: int, n: int = 3, steps: int = 8) -> Iterator[Array]:
+def some_diverged(rng, runs, n=3, steps=8):
     for size in (1e2, 1e4, 1e6):
         error = independent(rng, runs, steps, n)
         error[0] *= size
@@ -252,66 +248,66 @@ def some_diverged(rng: np.random.Generator, runs: int, n: int = 3, steps: int = 
         yield np.sqrt(2.1 / rng.chisquare(2.1, (runs, 1, 1))) * independent(rng, runs, steps, n)
 
 
-def without_error(rng: np.random.Generator, runs: int) -> Iterator[Array]:
+def without_error(rng, runs):
     yield np.zeros((runs, 8, 3))
     axis = independent(rng, runs, 8, 3)
     axis[..., 0] = 0.0
     yield axis
 
 
-def infinite(text: str) -> bool:
+def infinite(text):
     return re.search(r"\binf\b|\bnan\b", text, re.I) is not None
 
 
-def placeholder(text: str) -> bool:
+def placeholder(text):
     """A number that only keeps a division from failing."""
     return re.search(r"e[+-](2\d\d|30\d)", text) is not None
 
 
-def zero_end(text: str) -> bool:
+def zero_end(text):
     """An interval of a ratio from 0, or up to 0."""
     return re.search(r"\[0(\.0+)?,|, 0(\.0+)?\]|ratio 0\.0+\b", text) is not None
 
 
-def wrong_number(text: str) -> bool:
+def wrong_number(text):
     """Singular for plural, or plural for singular."""
     singular = re.search(r"(?<![\d.])1 (runs|steps|questions)\b|of 1 steps", text)
     return bool(singular or re.search(r"(?<![\d.])(0|[2-9]|\d\d+) (run|step|question)\b", text))
 
 
-def gap(text: str) -> bool:
+def gap(text):
     """Nothing where something was to be said."""
     return re.search(r": ?$|: ;|; ?;|; ?$|  |\bNone\b", text) is not None
 
 
-def long(text: str) -> bool:
+def long(text):
     return len(text) >= 400
 
 
-def same_correlations(text: str) -> bool:
+def same_correlations(text):
     pair = re.search(r"correlation ([+-]\d\.\d\d), stated ([+-]\d\.\d\d)", text)
     return pair is not None and abs(float(pair[1]) - float(pair[2])) < 0.05
 
 
-def outside(text: str) -> bool:
+def outside(text):
     """A value outside its own interval."""
     ends = re.findall(r"(-?[\d.]+(?:e[+-]\d+)?)(?: sigma)? \[([^,\]]+), ([^\]]+)\]", text)
     return any(not float(low) <= abs(float(v)) <= float(high) for v, low, high in ends if float(low) >= 0.0)
 
 
-def contradiction(text: str) -> bool:
+def contradiction(text):
     """The headline says one side, and the covariance is only wrong to the other."""
     if text.startswith("overconfident"):
         return "too large" in text and "too small" not in text
     return text.startswith("conservative") and "too small" in text and "too large" not in text
 
 
-def must_grow(text: str) -> bool:
+def must_grow(text):
     """A conservative covariance, and a factor by which it must grow."""
     return text.startswith("conservative") and re.search(r"too small by", text) is not None
 
 
-def said_twice(text: str) -> bool:
+def said_twice(text):
     return text.count("biased") > 1
 
 
@@ -323,7 +319,7 @@ KINDS = [worlds, one_component, six_components, some_diverged, without_error]
 
 
 @functools.cache
-def sentences(kind: Callable[..., Iterator[Array]]) -> list[tuple[str, int]]:
+def sentences(kind):
     """Sentences of verdicts with their number of runs; fixed seed."""
     rng, texts = np.random.default_rng(61), []
     for runs in RUNS:
@@ -337,17 +333,17 @@ def sentences(kind: Callable[..., Iterator[Array]]) -> list[tuple[str, int]]:
 
 @pytest.mark.parametrize("flaw", FLAWS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_sentences_are_sound(kind: Callable[..., Iterator[Array]], flaw: Callable[[str], bool]) -> None:
+def test_sentences_are_sound(kind, flaw):
     assert [text for text, _ in sentences(kind) if flaw(text)] == []
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_one_run_does_is_not_that_of_a_few(kind: Callable[..., Iterator[Array]]) -> None:
+def test_what_one_run_does_is_not_that_of_a_few(kind):
     none_errs = kind is without_error
     assert not any("a few runs" in text for text, runs in sentences(kind) if runs == 1 or none_errs)
 
 
-def test_the_flaws_are_seen() -> None:
+def test_the_flaws_are_seen():
     """Negative control of the patterns."""
     bad = {
         infinite: "x2.00 [1.00, inf]",
@@ -372,14 +368,14 @@ def test_the_flaws_are_seen() -> None:
     assert not zero_end("covariance ratio 0.95 [0.87, 1.04]")
 
 
-def test_a_few_runs_that_make_the_mean_are_said(rng: np.random.Generator) -> None:
+def test_a_few_runs_that_make_the_mean_are_said(rng):
     """The words that must not be said of one run are said where they are due."""
     error = independent(rng, 30, 10, 3)
     error[0] *= 1e3
     assert "which a few runs make" in verdict_on(error).reasons[0]
 
 
-def test_correlations_that_look_the_same_are_not_named(rng: np.random.Generator) -> None:
+def test_correlations_that_look_the_same_are_not_named(rng):
     """Stated .68 and .69 found in 400,000 errors: a fault of the shape, which no person reads off two such numbers."""
     stated, true = (np.array([[1.0, c], [c, 1.0]]) for c in (0.68, 0.70))
     error = independent(rng, 4000, 40, 2) @ np.linalg.cholesky(true).T
@@ -392,7 +388,7 @@ def test_correlations_that_look_the_same_are_not_named(rng: np.random.Generator)
     assert "correlation +0.90, stated +0.68" in far.reasons[0]
 
 
-def test_one_run_that_failed_is_said_in_the_singular(rng: np.random.Generator) -> None:
+def test_one_run_that_failed_is_said_in_the_singular(rng):
     error = independent(rng, 40, 10, 2)
     covariance = identities(error).copy()
     covariance[3, 4] = -np.eye(2)
@@ -405,26 +401,26 @@ def test_one_run_that_failed_is_said_in_the_singular(rng: np.random.Generator) -
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
+    "value, text",
     [(1.234, "1.23"), (12.34, "12.3"), (123.4, "123"), (12345.0, "1.2e+04"), (0.5, "0.50"), (1e4, "1.0e+04")],
 )
-def test_three_digits(value: float, text: str) -> None:
+def test_three_digits(value, text):
     assert short(value) == text
 
 
-def test_small_numbers_keep_their_digits() -> None:
+def test_small_numbers_keep_their_digits():
     for value in (0.004, 1e-3, 3e-6):
         assert float(short(value)) == pytest.approx(value, rel=0.05)
 
 
-def test_factor_is_above_one_on_either_side() -> None:
+def test_factor_is_above_one_on_either_side():
     assert off_by(Interval(2.0, 1.6, 2.5)) == "too small by x2.00 [1.60, 2.50]"
     assert off_by(Interval(0.5, 0.4, 0.625)) == "too large by x2.00 [1.60, 2.50] (ratio 0.50)"
     assert off_by(Interval(0.0, 0.0, 0.0)) == "too large: there is hardly any error"
     assert off_by(Interval(2.0, 0.01, 20.0)) == "too small by x2.00 (known to no better than a factor of 100)"
 
 
-def test_plural_and_p() -> None:
+def test_plural_and_p():
     assert [plural(n, "run") for n in (0, 1, 2)] == ["0 runs", "1 run", "2 runs"]
     assert [p_text(p) for p in (0.04567, 1e-6, 9e-7, 0.0)] == ["0.046", "1e-06", "below 1e-6", "below 1e-6"]
 
@@ -432,7 +428,7 @@ def test_plural_and_p() -> None:
 # --- the whole verdict in text -------------------------------------------------------------------------------
 
 
-def test_print_is_short(rng: np.random.Generator) -> None:
+def test_print_is_short(rng):
     verdict = verdict_on(1.5 * independent(rng, 1000, 500, 3))
     text = str(verdict)
     assert len(text) < 1500
@@ -444,7 +440,7 @@ def test_print_is_short(rng: np.random.Generator) -> None:
     assert "\n" not in repr(verdict)
 
 
-def test_html_escapes_what_others_named(rng: np.random.Generator) -> None:
+def test_html_escapes_what_others_named(rng):
     hostile = "<script>alert('x')</script>&\""
     error = 3.0 * independent(rng, 20, 5, 2)
     evidence = Record(hostile, error, identities(error), axes=["<b>x", "y&z"],
@@ -472,12 +468,12 @@ OF_INNOVATIONS = {"autocorrelation", "autocorrelation_bound", "nis_dof", "nis_in
 OF_ANY = {"allow", "answers", "confidence", "failures", "false_alarm", "p_value", "runs", "steps"}
 
 
-def test_statistics_have_every_key_that_files_have_had(rng: np.random.Generator) -> None:
+def test_statistics_have_every_key_that_files_have_had(rng):
     """What older files and reports hold, and JSON can hold all of it."""
     error = independent(rng, 40, 12, 3)
     P, nees = identities(error), np.square(error).sum(axis=-1)
     nis = {"nis": rng.chisquare(2, (40, 12)), "nis_dof": np.full((40, 12), 2)}
-    cases: list[tuple[Verdict, set[str]]] = [
+    cases = [
         (judge(Record("f", error, P)), OF_ERRORS | OF_SHAPE),
         (judge(Record("f", error + 1.0, P)), OF_ERRORS | OF_SHAPE | {"ratio_without_bias", "bias_axis"}),
         (judge(Record("f", error, P), Settings(allow="conservative")), OF_ERRORS),
@@ -495,7 +491,7 @@ def test_statistics_have_every_key_that_files_have_had(rng: np.random.Generator)
         assert not answer or {"question", "p_value", "share", "adjusted", "found"} <= set(answer)
 
 
-def test_statistics_are_the_numbers_of_the_arrays(rng: np.random.Generator) -> None:
+def test_statistics_are_the_numbers_of_the_arrays(rng):
     """The flat names mean what they say: nothing swapped between the parts."""
     error = np.sqrt(1.3) * independent(rng, 40, 12, 3)
     nees = np.square(error).sum(axis=-1)
@@ -520,7 +516,7 @@ def test_statistics_are_the_numbers_of_the_arrays(rng: np.random.Generator) -> N
 # --- tolerance -------------------------------------------------------------------------------------------
 
 
-def test_four_percent_may_be_tolerated(rng: np.random.Generator) -> None:
+def test_four_percent_may_be_tolerated(rng):
     """1,000 runs of AR(.5) steps, x1.04."""
     error = np.sqrt(1.04) * autoregression(rng, 1000, 40, 3, 0.5)
     assert verdict_on(error, false_alarm=1e-3).status == "overconfident"
@@ -533,14 +529,14 @@ def test_four_percent_may_be_tolerated(rng: np.random.Generator) -> None:
     assert verdict_on(error, false_alarm=1e-3, tolerance=1 / 1.1).status == "consistent"
 
 
-def test_what_is_not_found_is_not_tolerated_either(rng: np.random.Generator) -> None:
+def test_what_is_not_found_is_not_tolerated_either(rng):
     verdict = verdict_on(independent(rng, 300, 10, 3), false_alarm=SURE, tolerance=1.3)
     assert not any(a.tolerated for a in verdict.answers)
     assert not any("tolerance" in line for line in verdict.reasons)
     assert verdict.p_value == pytest.approx(min(min(1.0, a.p_value / a.share) for a in verdict.answers))
 
 
-def test_more_than_the_tolerance_is_a_fault(rng: np.random.Generator) -> None:
+def test_more_than_the_tolerance_is_a_fault(rng):
     for ratio, status in ((1.2, "overconfident"), (1 / 1.2, "conservative")):
         error = np.sqrt(ratio) * autoregression(rng, 1000, 40, 3, 0.5)
         verdict = verdict_on(error, false_alarm=1e-3, tolerance=1.1)
@@ -548,7 +544,7 @@ def test_more_than_the_tolerance_is_a_fault(rng: np.random.Generator) -> None:
         assert not any(a.tolerated for a in verdict.answers)
 
 
-def test_a_tolerance_is_not_for_what_was_not_shown(rng: np.random.Generator) -> None:
+def test_a_tolerance_is_not_for_what_was_not_shown(rng):
     """x1.5 with 21 runs is found; that it is inside 1.6 is not shown, so that it stays a fault."""
     for _ in range(10):
         error = np.sqrt(1.5) * independent(rng, 21, 4, 3)
@@ -559,7 +555,7 @@ def test_a_tolerance_is_not_for_what_was_not_shown(rng: np.random.Generator) -> 
     pytest.fail("no draw was found at fault")
 
 
-def test_a_tolerance_does_not_excuse_other_faults(rng: np.random.Generator) -> None:
+def test_a_tolerance_does_not_excuse_other_faults(rng):
     """Bias, shape, outliers, one axis, one step: each with a mean NEES inside the tolerance."""
     runs, steps = 400, 20
     biased = independent(rng, runs, steps, 3) * np.sqrt(0.98) + 0.15
@@ -582,7 +578,7 @@ def test_a_tolerance_does_not_excuse_other_faults(rng: np.random.Generator) -> N
         assert verdict.status not in ("consistent", "undecided")
 
 
-def test_a_tolerance_wider_than_what_is_to_be_shown(rng: np.random.Generator) -> None:
+def test_a_tolerance_wider_than_what_is_to_be_shown(rng):
     """Consistent then means: inside the tolerance."""
     error = np.sqrt(1.8) * independent(rng, 300, 10, 3)
     verdict = verdict_on(error, false_alarm=1e-3, tolerance=2.0)
@@ -600,12 +596,10 @@ def test_a_tolerance_wider_than_what_is_to_be_shown(rng: np.random.Generator) ->
     st.integers(1, 6),
     st.sampled_from([0.5, 1, 3]),
 )
-def test_innovations_of_no_declared_gain_change_nothing(
-    seed: int, size: float, runs: int, steps: int, ratio: float
-) -> None:
+def test_innovations_of_no_declared_gain_change_nothing(seed, size, runs, steps, ratio):
     rng = np.random.default_rng(seed)
     error = np.sqrt(ratio) * independent(rng, runs, steps, 2)
-    nis: dict[str, Any] = {"nis": size * rng.chisquare(2, (runs, steps)), "nis_dof": np.full((runs, steps), 2)}
+    nis = {"nis": size * rng.chisquare(2, (runs, steps)), "nis_dof": np.full((runs, steps), 2)}
     alone = judge(Record("f", error, identities(error)))
     beside = judge(Record("f", error, identities(error), **nis))
     assert (alone.status, alone.faults, alone.answers) == (beside.status, beside.faults, beside.answers)
@@ -615,9 +609,9 @@ def test_innovations_of_no_declared_gain_change_nothing(
     assert (only.status, only.answers) == ("undecided", ())
 
 
-def test_innovations_of_a_declared_gain_count(rng: np.random.Generator) -> None:
+def test_innovations_of_a_declared_gain_count(rng):
     error = independent(rng, 60, 20, 2)
-    nis: dict[str, Any] = {"nis": 2.0 * rng.chisquare(2, (60, 20)), "nis_dof": np.full((60, 20), 2)}
+    nis = {"nis": 2.0 * rng.chisquare(2, (60, 20)), "nis_dof": np.full((60, 20), 2)}
     verdict = judge(Record("f", error, identities(error), optimal_gain=True, **nis), Settings(SURE))
     assert verdict.faults == ("innovation scale",)
     assert verdict.status == "inconsistent"
@@ -638,7 +632,7 @@ def test_innovations_of_a_declared_gain_count(rng: np.random.Generator) -> None:
 
 
 @st.composite
-def evidence(draw: Callable[..., Any]) -> Record:
+def evidence(draw):
     """Errors of any finite kind: gaps, ragged ends, zeros, duplicates, unlike scales."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     runs, steps, n = draw(st.integers(1, 25)), draw(st.integers(1, 6)), draw(st.integers(1, 4))
@@ -674,7 +668,7 @@ def evidence(draw: Callable[..., Any]) -> Record:
     )  # fmt: skip
 
 
-def only_one_run_errs(evidence: Record) -> bool:
+def only_one_run_errs(evidence):
     """What the next test is for."""
     assert evidence.error is not None
     return int((np.nan_to_num(evidence.error) != 0.0).any(axis=(1, 2)).sum()) == 1
@@ -682,7 +676,7 @@ def only_one_run_errs(evidence: Record) -> bool:
 
 @pytest.mark.parametrize("runs", [2, 25])
 @pytest.mark.parametrize("size", [1e9, 1e12])
-def test_there_is_a_verdict_on_a_run_that_diverged(rng: np.random.Generator, runs: int, size: float) -> None:
+def test_there_is_a_verdict_on_a_run_that_diverged(rng, runs, size):
     error = independent(rng, runs, 5, 2)
     error[0] *= size
     text = verdict_on(error).reasons[0]
@@ -691,13 +685,13 @@ def test_there_is_a_verdict_on_a_run_that_diverged(rng: np.random.Generator, run
 
 
 @pytest.mark.parametrize("runs", [2, 5, 25])
-def test_there_is_a_verdict_where_only_one_run_errs(runs: int) -> None:
+def test_there_is_a_verdict_where_only_one_run_errs(runs):
     error = np.zeros((runs, 3, 2))
     error[0, 1] = 0.1
     assert verdict_on(error).status in STATUSES
 
 
-def test_a_run_far_from_copies_is_an_outlier_without_a_warning() -> None:
+def test_a_run_far_from_copies_is_an_outlier_without_a_warning():
     for seed in range(100):
         rng = np.random.default_rng(seed)
         error = np.repeat(rng.standard_normal((1, 2, 4)), 7, axis=0)
@@ -712,7 +706,7 @@ SETTINGS = st.sampled_from(
 
 
 @given(evidence(), SETTINGS)
-def test_there_is_a_verdict_on_anything(given_: Record, settings: Settings) -> None:
+def test_there_is_a_verdict_on_anything(given_, settings):
     """Warnings are errors here. The status, the faults and the texts agree with each other."""
     assume(not only_one_run_errs(given_))
     verdict = judge(given_, settings)

@@ -16,6 +16,11 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
+FAILED = {
+    "tests": "an estimator test failed",
+    "consistent": "an estimator is not consistent",
+    "no worse": "an estimator is less consistent than before",
+}  # by what should have passed
 FAIL_ON = ("inconsistent", "worse", "nothing")
 NO_TESTS = 5  # exit status of pytest
 OF_ANALYSE = ("--confidence", "--detect", "--innovations", "--tolerance")  # which compare has not
@@ -230,7 +235,8 @@ def main() -> int:
         for row in rows:
             print(plain(f"{row.what}: {row.verdict} - {row.why}"))
     if failed:
-        print(f"::error title=Consistency gate::not as it must be: {', '.join(failed)}; the summary has the verdicts")
+        why = ", ".join(FAILED[name] for name in failed)
+        print(f"::error title=Consistency gate::{why}; the summary has the verdicts")
     return 1 if failed and given.fail_on != "nothing" else 0
 
 

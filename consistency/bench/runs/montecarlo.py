@@ -21,7 +21,7 @@ from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.local_threads import LocalThreads
 from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork, Workers
 from consistency.bench.scenario import Belief, Scenario
-from consistency.bench.scenario.toml_tables import UNITS
+from consistency.bench.scenario.tables.toml_tables import UNITS
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.log import Log, require_format, write_log

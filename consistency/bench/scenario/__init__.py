@@ -12,8 +12,8 @@ from consistency.bench.scenario.sensor import (
     TrueSensor,
     UvdSensor,
 )
-from consistency.bench.scenario.sensor_view import PLANAR_SENSORS, Mount
-from consistency.bench.scenario.toml_tables import Count, Finite, Positive, Table, explain, read_table
+from consistency.bench.scenario.tables.sensor_view import PLANAR_SENSORS, Mount
+from consistency.bench.scenario.tables.toml_tables import Count, Finite, Positive, Table, explain, read_table
 from consistency.bench.scenario.truth import (
     AnnularLandmarks,
     Circle,

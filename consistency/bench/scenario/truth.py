@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from consistency.bench.scenario.sensor import TrueSensor_
-from consistency.bench.scenario.toml_tables import Count, Finite, Interval, NonNegative, Positive, Table, Triple
+from consistency.bench.scenario.tables.toml_tables import Count, Finite, Interval, NonNegative, Positive, Table, Triple
 
 MOST_STEPS = 1_000_000  # a trial of so many steps takes some hundred MiB
 MOST_LANDMARKS = 1_000_000

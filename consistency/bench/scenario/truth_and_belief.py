@@ -15,7 +15,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from consistency.bench.scenario.effects import LocalBias
 from consistency.bench.scenario.sensor import BelievedSensor
-from consistency.bench.scenario.toml_tables import UNITS, Count, Finite, NonNegative, Positive, Table, read_table
+from consistency.bench.scenario.tables.toml_tables import UNITS, Count, Finite, NonNegative, Positive, Table, read_table
 from consistency.bench.scenario.truth import Truth
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_folder, one_line

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.scenario import Belief, scenario_text, toml_text
-from consistency.bench.scenario.toml_tables import SIGMA_UNITS
+from consistency.bench.scenario.tables.toml_tables import SIGMA_UNITS
 from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.log import Log, sensor_text
 from consistency.bench.tuning.fit import LIMIT

@@ -18,6 +18,7 @@ from consistency.referee.diagnostics.verdict.parts import RejectionScore, Scale
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, MapScore, Verdict
 from consistency.referee.diagnostics.words.sentences import (
     LATER,
+    details,
     other_ways,
     reasons,
     sentences_of_conventions,
@@ -106,7 +107,9 @@ class Beside(NamedTuple):
 
 def verdict_of(found: Findings, first: str = "") -> Verdict:
     """The verdict on errors and innovations alone; ``first`` stands in the place of the first sentence."""
-    return Verdict(**vars(found), reasons=tuple(reasons(found, first)), axis=deciding_axis(found))
+    return Verdict(
+        **vars(found), reasons=tuple(reasons(found, first)), details=tuple(details(found)), axis=deciding_axis(found)
+    )
 
 
 def _not_shown(scale: Scale) -> Scale:
@@ -130,6 +133,7 @@ def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdi
     return Verdict(
         **fields,
         reasons=(sentence, *figures, *causes, *other_ways(found.status, record)),
+        details=tuple(details(found)),
         axis=deciding_axis(found),
         convention=convention,
         align=align,

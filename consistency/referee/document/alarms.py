@@ -47,6 +47,11 @@ def monitor_document(name: str, monitor: Monitor, alarm: Alarm | None, t: float,
 def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -> str:
     if alarm is None:
         sentence = f"no alarm: no evidence that the NIS is off ({accepted_scales(monitor.tolerance)}). {CAVEAT}."
+        if monitor.tolerance > 1.0:
+            sentence += (
+                " 'consistency analyse --innovations optimal' tests whether it is right exactly, and so may find what "
+                "is accepted here; --tolerance 1 asks the same here."
+            )
     else:
         sentence = str(alarm)
         if np.isfinite(t):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from consistency.referee.diagnostics.judging.status import clear
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, p_text, percent, plural, ratio_text, short
 from consistency.referee.diagnostics.words.sentences import question_text
@@ -76,6 +77,8 @@ def factor(v: Verdict) -> Quantity:
 
 def true_over_stated(v: Verdict, whole: Quantity) -> Cell:
     """Ratio of true to stated covariance: of the axis that decides, with its name, or of the whole."""
+    if v.status == "biased" and v.bias is not None and v.bias.inflation_without is not None:
+        return f"{ratio_text(v.bias.inflation_without)} about the mean"
     return whole if v.axis is None else f"{ratio_text(v.axis[1])} in {v.axis[0]}"
 
 
@@ -113,6 +116,11 @@ def _coverage(v: Verdict) -> Cell:
     return " / ".join(number(100 * share, ".1f") for share in shares) if np.isfinite(shares).any() else NONE
 
 
+def _worst_axis(v: Verdict) -> Cell:
+    worst = clear(v.worst_axis)
+    return NONE if worst is None else f"{worst[0]}, {ratio_text(worst[1])}"
+
+
 def _failed(v: Verdict) -> Cell:
     return f"{len(v.failures)} of {v.runs}"
 
@@ -131,7 +139,7 @@ TERMINAL = (
     Measure(Column("ANEES", number=True), lambda v: _mean_anees(v, ".2f")),
     Measure(
         Column("true / stated", number=True),
-        lambda v: true_over_stated(v, Quantity(v.inflation, v.inflation_interval)),
+        lambda v: true_over_stated(v, Quantity(v.inflation, v.inflation_interval, limit=UNCERTAIN)),
     ),
     Measure(Column("RMSE m", number=True), _rmse_position),
     Measure(Column("RMSE deg", number=True), _rmse_heading),
@@ -168,7 +176,7 @@ def page(inside: str) -> tuple[Measure, ...]:
         Measure(Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True), shown_inside),
         Measure(
             Column("Worst axis", "Worst\naxis", number=True),
-            lambda v: f"{v.worst_axis[0]}, {ratio_text(v.worst_axis[1])}" if v.worst_axis else NONE,
+            _worst_axis,
         ),
         Measure(Column("Mainly", number=True), lambda v: v.subset or NONE),
         Measure(
@@ -185,9 +193,11 @@ def page(inside: str) -> tuple[Measure, ...]:
     )
 
 
-def reason(v: Verdict, name: str = "", look: Look | None = None) -> Reason:
-    """The sentence, and the figures behind it."""
+def reason(v: Verdict, name: str = "", look: Look | None = None, verbose: bool = True) -> Reason:
+    """The sentence, and the figures behind it; ``verbose`` shows also those that a first reading leaves out."""
     sentence, *others = v.reasons
+    if not verbose:
+        others = [text for text in others if text not in v.details]
     return Reason(name or v.filter, sentence, tuple(others), look, v.consistent)
 
 
@@ -211,7 +221,7 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], true / stated"))
         if v.axis is not None:
             rows.append(("decided by", f"{v.axis[0]}, {ratio_text(v.axis[1])}"))
-        elif (worst := v.worst_axis) is not None:
+        elif (worst := clear(v.worst_axis)) is not None:
             rows.append(("worst axis", f"{worst[0]}, {ratio_text(worst[1])}"))
         if s.within is not None:
             rows.append(("within the log", f"{ratio_text(s.within.ratio)}, if errors decorrelate as within it"))
@@ -252,7 +262,7 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
 # --- several verdicts -------------------------------------------------------------------------------
 
 
-def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = True) -> Document:
+def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = True, verbose: bool = False) -> Document:
     """A row for each filter, what goes for all of them below, and with ``reasons`` also why; the data are all numbers.
 
     ``true / stated``: ratio of the covariances, 95 % interval; of the axis that decides, where one does. A filter that
@@ -260,7 +270,7 @@ def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = T
     """
     blocks: list[Block] = [_overview(verdicts), *(Text(line) for line in _below(verdicts))]
     if reasons:
-        blocks.append(Reasons(tuple(reason(v, name) for name, v in verdicts.items())))
+        blocks.append(Reasons(tuple(reason(v, name, verbose=verbose) for name, v in verdicts.items())))
     return Document(title, "", (), tuple(blocks), {name: v.as_dictionary() for name, v in verdicts.items()})
 
 
@@ -281,8 +291,8 @@ def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
         lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
-    if worst := [(name, *v.worst_axis) for name, v in verdicts.items() if v.worst_axis is not None]:
-        texts = "; ".join(f"{name} {axis}, {ratio_text(ratio)}" for name, axis, ratio in worst)
+    if worst := {name: axis for name, v in verdicts.items() if (axis := clear(v.worst_axis)) is not None}:
+        texts = "; ".join(f"{name} {axis}, {ratio_text(ratio)}" for name, (axis, ratio) in worst.items())
         lines.append(f"ratio of the worst axis: {texts}")
     if maps := {name: v.map for name, v in verdicts.items() if v.map is not None}:
         from consistency.referee.document.map import map_lines

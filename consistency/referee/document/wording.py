@@ -46,6 +46,8 @@ def _quantity(q: Quantity, signs: Signs) -> str:
     text = f"{signs.factor * q.is_factor}{_digits(q.value, q.digits, signs)}{q.unit}"
     if q.interval is not None:
         low, high = q.interval
+        if np.isfinite(q.limit) and low > 1.0 and high >= q.limit * low:
+            return f"at least {signs.factor}{_digits(low, q.digits, signs)}{q.unit}"
         known = np.isinf(q.limit) or high < q.limit * low
         text += f" [{', '.join(_digits(end, q.digits, signs) for end in (low, high)) if known else 'unknown'}]"
     return f"({text})" if q.is_aside else text

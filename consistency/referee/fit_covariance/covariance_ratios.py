@@ -116,7 +116,7 @@ def folds_of(
         judged = np.unique(windows.drive)[:, None]
         folds = [Fold(fit(windows.of(windows.drive != i)), i, begin) for i in judged]
         return fit(windows), folds
-    judged = _named(windows, held_out)
+    judged = named([drive.name for drive in windows.drives], held_out)
     is_judged = np.isin(windows.drive, judged)
     if is_judged.all() or not is_judged.any():
         raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if is_judged.all() else 'judge'}")
@@ -129,12 +129,18 @@ def _middle(ends: Indices) -> int:
     return int(ends[(len(ends) - 1) // 2]) if len(ends) else 0
 
 
-def _named(windows: DriveWindows, held_out: str) -> Indices:
+def named(known: Sequence[str], held_out: str, what: str = "drive") -> Indices:
+    """Places of the names of ``--held-out`` among those that are known.
+
+    Raises
+    ------
+    InputError
+        A name is not there.
+    """
     names = [name.strip() for name in held_out.split(",")]
-    known = [drive.name for drive in windows.drives]
     for name in names:
         if name not in known:
-            raise InputError(f"--held-out {held_out}: no drive '{name}'; there are {listed(known)}, or 'half'")
+            raise InputError(f"--held-out {held_out}: no {what} '{name}'; there are {listed(known)}, or 'half'")
     return np.array([known.index(name) for name in names])
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.geometry.groups import composed, matrices
+from consistency.referee.readers.declared_axes import in_axes_of_estimates
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
@@ -111,19 +112,19 @@ def drive_of(
 
 def _poses(path: Path, r: Reading) -> list[Poses]:
     """The poses of each drive, without covariances."""
-    if not is_bag(path) and path.is_dir() and not trajectory_files(path):
+    if not is_bag(path) and path.is_dir() and not trajectory_files(path, r.columns):
         return _of_folder(path, r)
     kind = kind_of(path, r)
     if kind is None or is_solution(path):
         raise _no_poses(path)
-    return _of_one(path, kind.read(path, r, True))
+    return _of_one(path, kind.read(path, r, True), r)
 
 
 def _no_poses(path: Path) -> InputError:
     return unknown_kind(path, (*TABLES, *ARCHIVES, ".bag", *TRAJECTORIES), "estimates=poses, truth=true_poses")
 
 
-def _of_one(path: Path, found: Found) -> list[Poses]:
+def _of_one(path: Path, found: Found, r: Reading) -> list[Poses]:
     """The runs of the one estimator of a file."""
     if len(found) > 1:
         raise InputError(f"{path}: holds several estimators in its column 'filter'; keep the rows of one")
@@ -132,12 +133,12 @@ def _of_one(path: Path, found: Found) -> list[Poses]:
         raise _no_poses(path)
     if one.innovations_alone:
         raise InputError(f"{path}: needs --truth FILE, poses in any world")
-    return list(one.runs)
+    return list(in_axes_of_estimates(one, r).runs)
 
 
 def _of_folder(folder: Path, r: Reading) -> list[Poses]:
     """Tables of a folder, one for each drive, with truths of the same names in another."""
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in TABLES or is_plane(path))
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in TABLES or is_plane(path, r.columns))
     if not files:
         raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
     found = []
@@ -148,7 +149,7 @@ def _of_folder(folder: Path, r: Reading) -> list[Poses]:
         if truth is not None and not truth.exists():
             raise InputError(f"--truth {r.truth}: holds no file '{path.name}' for {path}")
         stem = path.name.split(".")[0]
-        for poses in _of_one(path, read_tables(path, replace(r, truth=truth), poses_alone=True)):
+        for poses in _of_one(path, read_tables(path, replace(r, truth=truth), poses_alone=True), r):
             found.append(replace(poses, name=stem if poses.name == path.stem else f"{stem}, {poses.name}"))
     return found
 

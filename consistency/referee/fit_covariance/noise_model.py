@@ -186,7 +186,7 @@ def fit_covariance(
     if cautious is not None and not 0.5 < cautious < 1.0:
         raise InputError(f"--cautious {cautious:g}: must be a probability between 0.5 and 1, such as 0.9")
     if by_turn and not correct:
-        raise InputError("--by-turn is a correction; leave --no-correct out")
+        raise InputError("--by-turn is a correction; leave --keep-mean-error out")
     length = span_of(span)
     require_poses(drives)
     windows = cut_windows(drives, length, planar)

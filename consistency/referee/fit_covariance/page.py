@@ -1,4 +1,4 @@
-"""Pictures of a fitted model: errors with ellipses by span, growth over spans, ratios by drive; and its page."""
+"""Pages of a fitted noise model and of a correction, with their pictures."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from scipy import stats
 from consistency.referee.defaults import CONFIDENCE, DETECT
 from consistency.referee.document.blocks import Chapter, Document, Figure
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, ZERO, solid, style
+from consistency.referee.fit_covariance.correct import Correction
+from consistency.referee.fit_covariance.correction_text import correction_document
 from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan
 from consistency.referee.fit_covariance.model_text import noise_document
 from consistency.referee.fit_covariance.motion_windows import span_of
@@ -24,6 +26,7 @@ from consistency.referee.show.painting import (
     canvas,
     curve,
     dots,
+    intervals,
     log_axis,
     name_rows,
     panel_legend,
@@ -31,12 +34,14 @@ from consistency.referee.show.painting import (
     points,
     stroke,
 )
+from consistency.referee.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
 SHOWN = 3  # spans with a panel of errors
+MOST_ROWS = 30  # runs that have a row
 MANY = 2000  # errors of motions that are drawn
 CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 EACH = replace(style(0), size=2.0, alpha=0.7)
@@ -124,11 +129,62 @@ def _draw_drives(axes: Axes, model: NoiseModel) -> None:
     """Ratio of true to stated covariance, a row for each drive."""
     ratios = model.spans[0].by_drive[:, 0]
     known = np.flatnonzero(np.isfinite(ratios))
-    name_rows(axes, [model.drives[i].name for i in known])
+    draw_ratios(axes, [model.drives[i].name for i in known], ratios[known])
+    axes.axvline(model.ratio.value, **stroke(LIMIT))
+    axes.set(title=f"ratios over {span_of(model.span).text}", xlim=(0.0, max(2.0, 1.1 * float(ratios[known].max()))))
+
+
+def draw_ratios(axes: Axes, names: Sequence[str], *ratios: Array) -> None:
+    """Ratios of true to stated covariance, a row for each name, beside those that count as consistent."""
+    name_rows(axes, names)
     axes.axvspan(1.0 / DETECT, DETECT, color=BAND, linewidth=0, zorder=0.4)
     axes.axvline(1.0, **stroke(EXPECTED))
-    axes.axvline(model.ratio.value, **stroke(LIMIT))
-    axes.plot(ratios[known], np.arange(len(known)), **dots(style(0)))
-    most = max(2.0, 1.1 * float(ratios[known].max()))
-    title = f"ratios over {span_of(model.span).text}"
-    axes.set(xlabel="true over stated covariance", xlim=(0.0, most), title=title)
+    for number, values in enumerate(ratios):
+        axes.plot(values, np.arange(len(values)), **dots(style(number)))
+    axes.set_xlabel("true over stated covariance")
+
+
+# --- corrections ------------------------------------------------------------------------------------------------------
+
+
+def correction_page(found: Correction) -> Document:
+    """What a correction says, and its pictures."""
+    said = correction_document(found)
+    caption = (
+        "Ratio of true to stated covariance of each held-out run, as stated and corrected; the factor of each block "
+        "with its interval; and the share of held-out errors inside the ellipsoid of each probability."
+    )
+    figure = Figure("Held-out runs, factors and coverage", caption, (partial(draw_correction, found),))
+    return Document(said.title, "", (Chapter("", "", "", (figure,)),), said.opening, said.data)
+
+
+def plot_correction(found: Correction, at: str | Path | None) -> Drawing:
+    """The pictures of a correction as a figure of Matplotlib; see :meth:`Correction.plot`."""
+    return plotted(partial(draw_correction, found), at)
+
+
+def draw_correction(found: Correction) -> Drawing:
+    """Ratios of held-out runs, factors, and coverage."""
+    figure, (runs, factors, coverage) = canvas(2.4, 3, 3)
+    both = (found.before, found.after)
+    ratios = [one.ratios for one in both]
+    shown = np.linspace(0, len(ratios[0]) - 1, min(MOST_ROWS, len(ratios[0]))).round().astype(int)
+    draw_ratios(runs, [found.judged[i] for i in shown], *(each[shown] for each in ratios))
+    log_axis(runs, "x")
+    names = [f"{group} {block.name}".strip() for group in found.shown for block in found.blocks]
+    name_rows(factors, names)
+    factors.axvline(1.0, **stroke(EXPECTED))
+    values = np.array([factor for fit in found.shown.values() for factor in fit.factor])
+    high = values[:, 2].max()
+    low = max(values[:, 1].min(), 1e-3 * high)  # a factor may be 0
+    factors.set_xlim(min(0.7, 0.8 * low), max(1.4, 1.25 * high))
+    intervals(factors, np.arange(len(names), dtype=float), values, style(1))
+    log_axis(factors, "x")
+    factors.set(xlabel="factor on variances")
+    levels = np.linspace(0.01, 0.99, 50)
+    coverage.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED))
+    for number, label in enumerate(("stated", "corrected")):
+        curve(coverage, levels, both[number].covered(levels), solid(style(number)), label)
+    coverage.set(xlabel="probability of the ellipsoid", ylabel="share of errors inside")
+    panel_legend(coverage)
+    return figure

@@ -226,6 +226,15 @@ def interval_of(value: float, left_out: Sequence[float] | Array) -> Interval:
     return Interval(value, max(root - reach, 0.0) ** 3, (root + reach) ** 3)
 
 
+def interval_of_ratio(value: float, left_out: Array) -> Interval:
+    """Interval of a positive ratio from its values with each run left out (k,): Student's, of its logarithm."""
+    logs = np.log(left_out)
+    k = len(logs)
+    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1) * np.sqrt(k - 1) * logs.std())
+    factor = float(np.exp(min(reach, 700.0)))
+    return Interval(value, value / factor, value * factor)
+
+
 # --- maximum likelihood -----------------------------------------------------------------------------------------------
 
 
@@ -268,13 +277,13 @@ def fit_terms(
     floor : (n,), variances that are there in any case
     """
     theta = _start(error, F) if start is None else np.maximum(start, 1e-12 * start.max())
-    value = _likelihood(error, sum_of_terms(theta, F, floor))
+    value = likelihood(error, sum_of_terms(theta, F, floor))
     for _ in range(STEPS):
         target = _target(error, F, floor, theta)
         step, gain = 1.0, -np.inf
         while gain < 0 and step >= 5e-4:
             trial = theta + step * (target - theta)
-            gain = _likelihood(error, sum_of_terms(trial, F, floor)) - value
+            gain = likelihood(error, sum_of_terms(trial, F, floor)) - value
             step *= 0.5
         if gain > 0:
             theta = trial
@@ -294,7 +303,7 @@ def _target(error: Array, F: Array, floor: Array, theta: Array) -> Array:
     u = (inverse @ error[..., None])[..., 0]
     of_errors = np.einsum("wi,wpij,wj->p", u, F, u, optimize=True)
     of_floor = np.einsum("wpij,wji->p", G, inverse * floor, optimize=True)
-    return _nonnegative(H, of_errors - of_floor)
+    return nonnegative(H, of_errors - of_floor)
 
 
 def _start(error: Array, F: Array) -> Array:
@@ -305,7 +314,7 @@ def _start(error: Array, F: Array) -> Array:
     return np.asarray(square / (2 * np.where(own > 0, own, np.inf)) + 1e-30)
 
 
-def _likelihood(error: Array, C: Array) -> float:
+def likelihood(error: Array, C: Array) -> float:
     """Log density of the errors but for its constant; -inf where a covariance is not positive definite."""
     sign, logdet = np.linalg.slogdet(C)
     if not (sign > 0).all():
@@ -319,7 +328,7 @@ def nees_of(error: Array, C: Array) -> Array:
     return np.asarray((error * solved).sum(axis=1))
 
 
-def _nonnegative(H: Array, g: Array) -> Array:
+def nonnegative(H: Array, g: Array) -> Array:
     """The minimum of x'Hx / 2 - g'x with x >= 0."""
     scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))

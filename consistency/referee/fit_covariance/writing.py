@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from consistency.referee.fit_covariance.model_text import correction, data, noise_document
+from consistency.referee.document.blocks import Document
+from consistency.referee.fit_covariance.model_text import correction, data
 from consistency.referee.fit_covariance.motion_windows import PIECES, ways
 from consistency.referee.fit_covariance.motions import write_motions
 from consistency.referee.fit_covariance.noise_model import NoiseModel
@@ -19,27 +22,46 @@ from consistency.referee.types import Array
 
 
 def write_model(model: NoiseModel, folder: Path, overwrite: bool = False) -> list[Path]:
-    """Write the folder, which appears whole or not at all; its files.
+    """Write the folder of a noise model; its files."""
+    motions = partial(write_motions, model.stretches)
+    return write_fit(folder, ("noise", model.name), snippets(model), noise_page(model), motions, overwrite)
+
+
+def write_fit(
+    folder: Path,
+    kind_and_source: tuple[str, str],
+    texts: dict[str, str],
+    page: Document,
+    data: Callable[[Path], Sequence[str]],
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write what a fit leaves, as a folder that appears whole or not at all; its files.
 
     Pictures need ``[plot]``; without it the page has none.
+
+    Parameters
+    ----------
+    texts : files by name, the model first
+    page : what is shown, and as data
+    data : writes files of data into a folder, and returns their names
 
     Raises
     ------
     InputError
         The folder exists or cannot be written.
     """
-    texts = snippets(model)
-    texts["verdict.json"] = as_json.render(noise_document(model)) + "\n"
-    texts["report.html"] = as_html.render(noise_page(model))
+    kind, source = kind_and_source
+    texts = texts | {"verdict.json": as_json.render(page) + "\n", "report.html": as_html.render(page)}
     names: list[str] = []
 
     def contents(at: Path) -> None:
-        names.extend(write_motions(model.stretches, at))
+        names.extend(data(at))
         for name, text in texts.items():
             (at / name).write_text(text, encoding="utf-8")
 
-    write_folder(folder, manifest_of(kind="noise", source=model.name), contents, overwrite)
-    return [folder / name for name in ("noise.toml", *names, *(each for each in texts if each != "noise.toml"))]
+    write_folder(folder, manifest_of(kind=kind, source=source), contents, overwrite)
+    first, *rest = texts
+    return [folder / name for name in (first, *names, *rest)]
 
 
 PLACES = {3: (0, 1, 5), 6: (0, 1, 2, 3, 4, 5)}  # of the axes in messages of ROS: x, y, z, roll, pitch, yaw
@@ -55,16 +77,16 @@ def toml(model: NoiseModel) -> str:
         "# Cov Log(D^-1 M) = factor * (sum over steps of A diag(variance_per_m |way| + variance_per_rad |turn|) A'",
         "# + diag(floor)); D is the estimated motion after the correction of [mean], M the true one, and A",
         "# carries a step's error to the end of the motion. Shown for motions over the span, and for no others.",
-        *_pairs(known),
+        *pairs(known),
     ]
     for key, values in tables.items():
-        lines += ["", f"[{key}]", *_pairs(values)]
+        lines += ["", f"[{key}]", *pairs(values)]
     for span in spans:
-        lines += ["", "[[spans]]", *_pairs(span)]
+        lines += ["", "[[spans]]", *pairs(span)]
     return "\n".join(lines) + "\n"
 
 
-def _pairs(values: dict[str, Any]) -> list[str]:
+def pairs(values: dict[str, Any]) -> list[str]:
     """Lines ``key = value``; what is not known is left out."""
     return [f"{key} = {_toml(value)}" for key, value in values.items() if value is not None]
 
@@ -78,7 +100,7 @@ def _toml(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_toml, value))}]"
     if isinstance(value, dict):
-        return f"{{ {', '.join(_pairs(value))} }}"
+        return f"{{ {', '.join(pairs(value))} }}"
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value)

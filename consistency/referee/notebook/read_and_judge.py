@@ -47,6 +47,12 @@ def read(
     by: str | None = None,
     by_file: str | Path | None = None,
     bins: int | Sequence[float] | None = None,
+    columns: Mapping[str, str] | None = None,
+    truth_columns: Mapping[str, str] | None = None,
+    world: str | None = None,
+    body_axes: str | None = None,
+    truth_world: str | None = None,
+    truth_body_axes: str | None = None,
     filter: str | None = None,
 ) -> Record:
     """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
@@ -82,6 +88,9 @@ def read(
         measured so far
     by_file : table with the column and ``t`` (s, the last value at or before a step counts), ``run``, or both
     bins : number of quantile bins of ``by`` (5), or the edges between them
+    columns, truth_columns : names of columns here and in the file: ``{"x": "pos_n", "P*": "cov_*"}``
+    world, body_axes, truth_world, truth_body_axes : axes of each file, a letter each: "enu" or "ned"; "flu" or "frd".
+        A pose maps from its body axes to its world axes
     filter : which estimator, where the files hold several
 
     Raises
@@ -96,7 +105,8 @@ def read(
     reading = Reading(
         true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
         motions or None, windows, align, lever_arm, split, of_truth, truth_errors,
-        truth_shared or None, by, None if by_file is None else Path(by_file), bins,
+        truth_shared or None, by, None if by_file is None else Path(by_file), bins, columns, truth_columns, world,
+        body_axes, truth_world, truth_body_axes,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates

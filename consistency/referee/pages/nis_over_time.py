@@ -26,7 +26,7 @@ FAULT = replace(style(1), dash=(), width=1.1)
 
 
 def monitor_drawing(shown: Watched | Sequence[GateRatios]) -> Drawing:
-    """NIS / dof above, the e-value below, over the steps of the file, or test ratios, a sensor above the other."""
+    """NIS / dof above, the e-value below, over time, or the steps of a file without; or test ratios of each sensor."""
     if isinstance(shown, Watched):
         figure, (above, below) = canvas(HEIGHT, panels=2, sharex=True)
         _draw_sizes(above, shown)
@@ -50,7 +50,7 @@ def _draw_ratios(axes: Axes, each: GateRatios) -> None:
 
 def _draw_sizes(axes: Axes, watched: Watched) -> None:
     """NIS over its degrees of freedom."""
-    step, ratio, together = averaged(watched.step, watched.nis_over_dof)
+    step, ratio, together = averaged(_clock(watched)[0], watched.nis_over_dof)
     points(axes, step, ratio, EACH, limit=POINTS)
     axes.axhline(1.0, **stroke(EXPECTED))
     axes.set(ylabel="NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})", title=watched.name)
@@ -64,14 +64,25 @@ def _draw_evidence(axes: Axes, watched: Watched) -> None:
     What continues beyond the square of that value is cut off.
     """
     threshold, alarm = watched.monitor.threshold, watched.alarm
+    clock, label = _clock(watched)
     if alarm is not None:
-        axes.axvspan(float(alarm.since), float(alarm.step), color=FAULT.colour, alpha=0.15, linewidth=0)
-        axes.axvline(float(alarm.step), **stroke(FAULT))
+        since, raised = float(alarm.since), float(alarm.step)
+        if label != "step":
+            since, raised = watched.since_t, watched.alarm_t
+        axes.axvspan(since, raised, color=FAULT.colour, alpha=0.15, linewidth=0)
+        axes.axvline(raised, **stroke(FAULT))
     axes.axhline(threshold, **stroke(LIMIT))
-    curve(axes, watched.step, watched.evidence, style(0))
-    axes.set(xlabel="step", ylabel="e-value")
+    curve(axes, clock, watched.evidence, style(0))
+    axes.set(xlabel=label, ylabel="e-value")
     log_axis(axes, "y")
     axes.set_ylim(top=min(axes.get_ylim()[1], threshold**2))
+
+
+def _clock(watched: Watched) -> tuple[Array, str]:
+    """Times of the steps, s, or their numbers where some have none; and what they are."""
+    if len(watched.t) and np.isfinite(watched.t).all():
+        return watched.t, "t / s"
+    return watched.step, "step"
 
 
 def averaged(step: Array, ratio: Array) -> tuple[Array, Array, int]:

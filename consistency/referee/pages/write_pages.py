@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
-from consistency.referee.show import rendered
+from consistency.referee.show import FORMATS, rendered
 from consistency.referee.system.atomic import write_whole
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from consistency.referee.document.blocks import Document
     from consistency.referee.system.progress import Advance
 
+REPORT_FILES = ("report.html", "report.pdf", "verdict.json")
+MARK = "<!-- written by consistency analyse, which replaces it -->\n"  # the end of a file of a verdict
 KINDS = (".png", ".pdf", ".svg")  # of a plot
 
 
@@ -86,21 +88,55 @@ def write_file_reports(
         write_file(at / "verdict.json", data.encode("utf-8"))
 
     write_folder(folder, manifest, contents, overwrite)
-    names = ("report.html", "report.pdf", "verdict.json")
-    return [path for path in (folder / name for name in names) if path.exists()]
+    return [path for path in (folder / name for name in REPORT_FILES) if path.exists()]
 
 
-def write_text_file(document: Document, path: Path, overwrite: bool) -> Path:
-    """One file, in the format of its suffix.
+def write_text_file(document: Document, path: Path) -> Path:
+    """One file, in the format of its suffix, with a mark by which :func:`is_own_report` knows it.
 
     Raises
     ------
     InputError
-        The file exists or cannot be written.
+        The file cannot be written.
     """
-    require_writable(path, overwrite)
-    write_file(path, rendered(document, path).encode("utf-8"))
+    write_file(path, f"{rendered(document, path)}{MARK}".encode())
     return path
+
+
+def require_report(report: Path, overwrite: bool) -> bool:
+    """Refuse, before any work, a report that cannot be written; return whether it replaces what is there.
+
+    Raises
+    ------
+    InputError
+        Something is there that is no report of a verdict, without ``overwrite``; or the system refuses.
+    """
+    from consistency.referee.system.folders import require_free
+
+    replaces = overwrite or is_own_report(report)
+    if is_one_file(report):
+        require_writable(report, replaces)
+    else:
+        require_free(report, replaces, "verdict", "--report")
+    return replaces
+
+
+def is_one_file(report: Path) -> bool:
+    """Whether a report is one file; a folder has the HTML page and the JSON."""
+    return report.suffix.lower() in FORMATS.keys() - {".html", ".json"}
+
+
+def is_own_report(path: Path) -> bool:
+    """Whether a folder or a file was written by ``analyse --report``, so that the next one replaces it."""
+    from consistency.referee.system.folders import read_manifest
+
+    try:
+        if path.is_dir():
+            others = {each.name for each in path.iterdir()} - {"manifest.json", *REPORT_FILES}
+            return read_manifest(path).get("kind") == "verdict" and not others
+        return path.read_bytes().endswith(MARK.encode())
+    except (InputError, OSError):
+        return False
 
 
 def write_document(

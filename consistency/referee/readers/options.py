@@ -34,6 +34,19 @@ def _lengths(text: str) -> list[float]:
     return [each if isinstance(each, float) else math.nan for each in numbers]
 
 
+def _columns(text: str) -> dict[str, str]:
+    """Names of columns here and in a file, of a text such as ``x=pos_n,y=pos_e``."""
+    pairs = [part.split("=") for part in text.split(",")]
+    if not all(len(pair) == 2 and all(name.strip() for name in pair) for pair in pairs):
+        raise InputError(f"'{text}': columns are named as x=pos_n,y=pos_e: the name here, then that in the file")
+    names = [new.strip() for new, _ in pairs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"'{text}': column '{twice[0]}' is named twice")
+    if uneven := ["=".join(pair) for pair in pairs if ("*" in pair[0]) != ("*" in pair[1])]:
+        raise InputError(f"'{uneven[0]}': a * stands in both names or in none")
+    return dict(zip(names, (old.strip() for _, old in pairs), strict=True))
+
+
 def _bins(text: str) -> int | list[float]:
     """A number of bins, or edges, of which a single one ends with a comma; NaN where one is none."""
     if text.strip().isdecimal():
@@ -100,6 +113,20 @@ class Reading:
     bins: int | Sequence[float] | None = _option(
         "Quantile bins of --by [5], or edges between them (40, is one edge).", "N|A,B,C", _bins
     )
+    columns: Mapping[str, str] | None = _option(
+        "What columns of the estimates are called: x=pos_n,y=pos_e; P*=cov_* for all that begin alike.",
+        "NAME=COLUMN,…",
+        _columns,
+    )
+    truth_columns: Mapping[str, str] | None = _option(
+        "What columns of the truth are called, as --columns.", "NAME=COLUMN,…", _columns
+    )
+    world: str | None = _option(
+        "Axes of the world of the estimates, a letter each: enu [default], ned, nwu ...", "AXES"
+    )
+    body_axes: str | None = _option("Axes of the body of the estimates: flu [default], frd ...", "AXES")
+    truth_world: str | None = _option("Axes of the world of the truth [enu].", "AXES")
+    truth_body_axes: str | None = _option("Axes of the body of the truth [flu].", "AXES")
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,20 @@ class CutNote(str):
 def cut_note(path: Path, line: int) -> CutNote:
     """A note that the last line of a text is left out."""
     return CutNote(f"{path}: the last line, {line}, has no end and is left out; it seems to be cut short")
+
+
+def one_of_each_kind(notes: Iterable[str]) -> tuple[str, ...]:
+    """Notes of files, ``est/0.csv: read as poses``, of which three or more that say the same are one."""
+    files: dict[str, list[str]] = {}
+    for note in dict.fromkeys(filter(None, notes)):
+        file, _, text = note.partition(": ")
+        files.setdefault(text, []).append(file)
+    out: list[str] = []
+    for text, names in files.items():
+        if len(names) > 2:
+            names = [f"{names[0]} and {len(names) - 1} others"]
+        out += [f"{name}: {text}" if text else name for name in names]
+    return tuple(out)
 
 
 def listed(items: Sequence[object], most: int = 5) -> str:

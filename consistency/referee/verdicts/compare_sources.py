@@ -25,18 +25,18 @@ class Compared:
     failures: FailedRuns
     note: str = ""
     same_runs: bool = True  # failures are of the same trials
+    sources: tuple[str, str] = ("", "")  # files or folders of both, where they differ
 
     @property
     def sentence(self) -> str:
-        c, reference = self.comparison, self.b
-        if self.a == self.b:
-            reference = "the reference"
+        c = self.comparison
+        own, reference = self.names
         found, way = "not found less consistent", "as independent samples"
         if c.worse:
             found = "less consistent"
         if c.paired:
             way = "run by run on the same trials"
-        text = f"{self.a} is {found} than {reference}: {c.runs} runs, {way}, p {c.p_value:.2g}"
+        text = f"{own} is {found} than {reference}: {c.runs} runs, {way}, p {c.p_value:.2g}"
         if c.distance == c.standard_error == 0.0:
             text += "; every run is the same in both"
         elif c.worse and c.conservative:
@@ -51,10 +51,20 @@ class Compared:
                     f"; {c.needed_runs(DETECT)} runs find a covariance farther off by x{DETECT:g} with power {POWER:g}"
                 )
         if any(self.failures):
-            text += f"; failed runs {self.failures.a}, {self.failures.b} in the reference"
+            text += f"; failed runs: {self.failures.a} of {own}, {self.failures.b} of {reference}"
         if self.note:
             return f"{text}. {self.note}".rstrip(". ")
         return text
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """What both are called: by their sources where they have one name."""
+        if self.a != self.b:
+            return self.a, self.b
+        own, other = self.sources
+        if own == other:
+            return self.a, "the reference"
+        return f"{self.a} of {own}", f"{self.b} of {other}"
 
     @property
     def _limit(self) -> str:
@@ -140,13 +150,14 @@ def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, 
         comparison = compare(a.filters[of_a], b.filters[of_b], false_alarm, axes, paired)
     except ValueError as error:
         raise InputError(f"{of_a} against {of_b}: {error}") from None
-    return Compared(of_a, of_b, comparison, FailedRuns(a.failures[of_a], b.failures[of_b]))
+    failures = FailedRuns(a.failures[of_a], b.failures[of_b])
+    return Compared(of_a, of_b, comparison, failures, sources=(a.name, b.name))
 
 
 def document(compared: Sequence[Compared]) -> Document:
     blocks: list[Block] = []
     for each in compared:
-        blocks += [comparison_table(each.a, each.b, each.comparison), Text(each.sentence), Text("")]
+        blocks += [comparison_table(*each.names, each.comparison), Text(each.sentence), Text("")]
     data = [
         {"a": each.a, "b": each.b, "worse": each.worse, "sentence": each.sentence, "failures": each.failures}
         | asdict(each.comparison)

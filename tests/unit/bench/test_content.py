@@ -1,7 +1,5 @@
 """What the key of a kernel covers, and who compiles: a small kernel in modules of a user's own."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -16,7 +14,6 @@ import forks
 import kernel_keys
 import numba
 import pytest
-from forks import Program
 from numba.core import config
 from numba.core.registry import cpu_target
 
@@ -105,7 +102,7 @@ def shift(x: float) -> float:
 
 
 @pytest.fixture
-def script(tmp_path: Path) -> Path:
+def script(tmp_path):
     folder = tmp_path / "scripts"
     folder.mkdir()
     for name, text in (("kinds", KINDS), ("rules", RULES), ("numbers_of_mine", NUMBERS), ("uses_rules", SCRIPT)):
@@ -121,14 +118,14 @@ numba.njit(lambda x: x + 1.0)(1.0)  # the first of a process takes long
 """
 
 
-def started(script: Path, order: str, imports: str = IMPORTS) -> Program:
+def started(script, order, imports=IMPORTS):
     """The script in a fork."""
     cache = str(script.parents[1] / "cache")
     code = f"import runpy; os.environ['NUMBA_CACHE_DIR'] = {cache!r}; runpy.run_path(sys.argv[0], None, '__main__')"
     return forks.begun(imports, code, str(script), order, cwd=script.parent)
 
 
-def ended(process: Program) -> tuple[str, str]:
+def ended(process):
     try:
         out, err = process.communicate()
         assert process.returncode == 0, err
@@ -137,13 +134,13 @@ def ended(process: Program) -> tuple[str, str]:
         process.end()
 
 
-def finished(process: Program) -> tuple[list[float], int, int]:
+def finished(process):
     """Values of the kernels, how many were read from disk, and how many were ready beforehand."""
     *values, loaded, ready = ended(process)[0].split()
     return [float(value) for value in values], int(loaded), int(ready)
 
 
-def hits(script: Path, order: str, imports: str = IMPORTS) -> int:
+def hits(script, order, imports=IMPORTS):
     """Kernels read from disk, which are just those that were ready."""
     values, loaded, ready = finished(started(script, order, imports))
     assert values == [{"Single": 10.0, "Triple": 30.0}[name] for name in order.split()]
@@ -151,7 +148,7 @@ def hits(script: Path, order: str, imports: str = IMPORTS) -> int:
     return loaded
 
 
-def test_place_and_time_are_no_content(script: Path) -> None:
+def test_place_and_time_are_no_content(script):
     """And another order in another process has the same keys."""
     assert hits(script, "Single Triple") == 0
     (script.parent / "rules.py").touch()
@@ -166,12 +163,12 @@ Keys = Callable[..., str]
 
 
 @pytest.fixture
-def key(monkeypatch: pytest.MonkeyPatch) -> Keys:
+def key(monkeypatch):
     """Key of the kernel of a kind, with one text in a module replaced by another."""
 
-    def of(module: str = "rules", old: str = "", new: str = "", kind: str = "Single") -> str:
+    def of(module="rules", old="", new="", kind="Single"):
         assert not old or TEXTS[module].count(old) == 1
-        parts: dict[str, type] = {}
+        parts = {}
         for owner, name in ((dispatch, "PARTS"), (content_key, "PARTS"), (dispatch, "_named_bodies")):
             monkeypatch.setattr(owner, name, parts if name == "PARTS" else {})
         for name, text in TEXTS.items():
@@ -184,7 +181,7 @@ def key(monkeypatch: pytest.MonkeyPatch) -> Keys:
     return of
 
 
-def test_comments_and_docstrings_are_no_content(key: Keys) -> None:
+def test_comments_and_docstrings_are_no_content(key):
     assert key() == key()
     assert key() == key("rules", '"""Twice a half."""', '"""Half of it, twice."""')
     assert key() == key("numbers_of_mine", '"""x, where it was."""', '"""x."""\n    # as it was')
@@ -202,23 +199,23 @@ EDITS = {
 
 
 @pytest.mark.parametrize("name", EDITS)
-def test_what_the_kernel_reads_is_content(key: Keys, name: str) -> None:
+def test_what_the_kernel_reads_is_content(key, name):
     assert key(*EDITS[name]) != key()
 
 
-def test_constants_in_tuples_and_functions_of_numba_are_content(key: Keys) -> None:
+def test_constants_in_tuples_and_functions_of_numba_are_content(key):
     triple = key(kind="Triple")
     assert key("numbers_of_mine", "(2.0,)", "(3.0,)", kind="Triple") != triple
     assert key("rules", "return x + 1.0", "return 1.0 + x", kind="Triple") != triple
 
 
-def test_what_other_kernels_are_made_of_is_no_content(key: Keys) -> None:
+def test_what_other_kernels_are_made_of_is_no_content(key):
     assert key("numbers_of_mine", "(2.0,)", "(3.0,)") == key()
     assert key(kind="Triple") != key()
 
 
 @pytest.mark.parametrize("setting", ["OPT", "LOOP_VECTORIZE", "BOUNDSCHECK"])
-def test_settings_are_content(key: Keys, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
+def test_settings_are_content(key, monkeypatch, setting):
     before = key()
     monkeypatch.setattr(config, setting, 17)
     content_key._versions.cache_clear()
@@ -227,7 +224,7 @@ def test_settings_are_content(key: Keys, monkeypatch: pytest.MonkeyPatch, settin
     content_key._versions.cache_clear()
 
 
-def test_the_processor_is_content(key: Keys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_processor_is_content(key, monkeypatch):
     before, codegen = key(), cpu_target.target_context.codegen()
     monkeypatch.setattr(codegen, "magic_tuple", lambda: ("x86_64", "another", ""))
     content_key._versions.cache_clear()
@@ -236,7 +233,7 @@ def test_the_processor_is_content(key: Keys, monkeypatch: pytest.MonkeyPatch) ->
     content_key._versions.cache_clear()
 
 
-def test_what_cannot_be_compared_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_what_cannot_be_compared_is_not_kept(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     kernel = Kernel(with_something)
     assert not kernel.is_ready(1j)
@@ -252,7 +249,7 @@ class Something:
 real = Something()
 
 
-def with_something(x: complex) -> float:
+def with_something(x):
     """Reads an attribute; to a key it might be the global of that name."""
     return x.real
 
@@ -260,15 +257,15 @@ def with_something(x: complex) -> float:
 # --- textbook -----------------------------------------------------------------------------------------------
 
 
-def keys_with_other_numbers(folder: str) -> dict[str, str]:
+def keys_with_other_numbers(folder):
     """Keys of the kernels of built-in filters, with every number in a folder of the filters doubled."""
     code = "import runpy; runpy.run_path(sys.argv[0], None, '__main__')"
     out, _ = ended(forks.begun(IMPORTS, code, kernel_keys.__file__, folder, cwd=Path.cwd()))
-    keys: dict[str, str] = json.loads(out)
+    keys = json.loads(out)
     return keys
 
 
-def test_the_textbook_is_no_content() -> None:
+def test_the_textbook_is_no_content():
     before, after = kernel_keys.keys(), keys_with_other_numbers("methods")
     assert len(before) > 30
     assert keys_with_other_numbers("textbook") == before
@@ -278,13 +275,13 @@ def test_the_textbook_is_no_content() -> None:
 # --- processes --------------------------------------------------------------------------------------------
 
 
-def test_of_four_processes_that_start_at_once_one_compiles(script: Path) -> None:
+def test_of_four_processes_that_start_at_once_one_compiles(script):
     found = [finished(process)[1] for process in [started(script, "Single Triple") for _ in range(4)]]
     assert sorted(found)[-1] == 2
     assert sum(found) == 6, "each of the two kernels is compiled once, and loaded by the other three"
 
 
-def test_a_killed_compiler_leaves_nothing_that_is_loaded(script: Path) -> None:
+def test_a_killed_compiler_leaves_nothing_that_is_loaded(script):
     """Wherever it is killed: before, while or after it writes."""
     for wait in (0.05, 0.2, 0.5):
         process = started(script, "Single Triple")
@@ -297,7 +294,7 @@ def test_a_killed_compiler_leaves_nothing_that_is_loaded(script: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="there are no modes on this system")
-def test_a_folder_that_others_may_write_is_not_trusted(script: Path) -> None:
+def test_a_folder_that_others_may_write_is_not_trusted(script):
     assert hits(script, "Single") == 0
     folder = script.parents[1] / "cache" / "filter-consistency"
     assert folder.stat().st_mode & 0o777 == 0o700

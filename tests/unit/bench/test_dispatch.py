@@ -1,8 +1,6 @@
 """Parts and the functions chosen by their types: what is refused, what is cached, who compiles."""
 
-from __future__ import annotations
-
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ import pytest
 import consistency as cs
 from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.compiler.dispatch import fits, generic, implement, part, require_fitting
-from consistency.bench.filters.kernel.part_functions import Slam
 from consistency.bench.filters.methods.riekf import RightInvariant
 from consistency.bench.filters.methods.ukf import Unscented
 from consistency.bench.filters.parts.local import Local
@@ -31,31 +28,31 @@ class Stranger(NamedTuple):
 
 
 @generic()
-def times(rule: NamedTuple, x: float) -> float:
+def times(rule, x):
     """x, multiplied."""
     raise NotImplementedError
 
 
 @implement(times, Doubling)
-def doubled(rule: Doubling, x: float) -> float:
+def doubled(rule, x):
     return 2.0 * x
 
 
-def another_doubling() -> type:
-    namespace: dict[str, object] = {"__name__": __name__, "NamedTuple": NamedTuple}
+def another_doubling():
+    namespace = {"__name__": __name__, "NamedTuple": NamedTuple}
     exec("class Doubling(NamedTuple):\n    pass\n", namespace)
     cls = namespace["Doubling"]
     assert isinstance(cls, type)
     return cls
 
 
-def test_two_parts_of_one_name_are_refused() -> None:
+def test_two_parts_of_one_name_are_refused():
     """They would run each other's compiled code, silently."""
     with pytest.raises(TypeError, match=r"a part named 'Doubling' is there already, in .*test_dispatch"):
         part()(another_doubling())
 
 
-def test_a_part_must_be_a_named_tuple_at_module_level() -> None:
+def test_a_part_must_be_a_named_tuple_at_module_level():
     class Inside(NamedTuple):
         pass
 
@@ -64,8 +61,8 @@ def test_a_part_must_be_a_named_tuple_at_module_level() -> None:
             part()(cls)
 
 
-def test_bodies_must_stand_at_module_level_and_alone() -> None:
-    def body(rule: Doubling, x: float) -> float:
+def test_bodies_must_stand_at_module_level_and_alone():
+    def body(rule, x):
         return x
 
     with pytest.raises(TypeError, match="module level"):
@@ -74,28 +71,28 @@ def test_bodies_must_stand_at_module_level_and_alone() -> None:
         implement(times, Doubling)(doubled)
 
 
-def test_two_bodies_of_one_name_are_refused() -> None:
-    namespace: dict[str, Any] = {"__name__": __name__}
+def test_two_bodies_of_one_name_are_refused():
+    namespace = {"__name__": __name__}
     exec("def doubled(rule, x):\n    return x\n", namespace)
     with pytest.raises(TypeError, match=r"'.*test_dispatch.doubled' must .* under a name of its own"):
         implement(times, Stranger)(namespace["doubled"])
 
 
-def test_one_body_may_serve_two_parts() -> None:
+def test_one_body_may_serve_two_parts():
     assert implement(times, Twofold)(doubled) is doubled
     assert times(Twofold(), 3.0) == 6.0
 
 
-def test_a_function_without_a_body_says_what_there_is() -> None:
+def test_a_function_without_a_body_says_what_there_is():
     assert times(Doubling(), 3.0) == 6.0
     with pytest.raises(TypeError, match="'times' has no body for Stranger; there are Doubling"):
         times(Stranger(), 3.0)
 
 
-def parts(name: str, world: str) -> Slam:
+def parts(name, world):
     scenario = cs.load_scenario(world)
     trial = cs.simulate(scenario.variant("short", truth__steps=3))
-    slam: Slam = cs.get_filter(name).parts(problem_of(trial, scenario.belief), np.array(trial.controls))
+    slam = cs.get_filter(name).parts(problem_of(trial, scenario.belief), np.array(trial.controls))
     return slam
 
 
@@ -113,10 +110,8 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("name", "world", "changes", "message"), REFUSED, ids=lambda value: str(value)[:20])
-def test_combinations_that_mean_nothing_are_refused(
-    name: str, world: str, changes: dict[str, NamedTuple], message: str
-) -> None:
+@pytest.mark.parametrize("name, world, changes, message", REFUSED, ids=lambda value: str(value)[:20])
+def test_combinations_that_mean_nothing_are_refused(name, world, changes, message):
     slam = parts(name, world)
     require_fitting(slam)
     with pytest.raises(TypeError, match=message):

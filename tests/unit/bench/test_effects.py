@@ -16,7 +16,7 @@ from consistency.bench.filters.stepping import step_through
 from consistency.bench.models import point, stereo
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.scenario.effects import EFFECTS, Context, FieldOfView, ListedEffect, Observations
-from consistency.bench.scenario.toml_tables import Count, Positive, Triple
+from consistency.bench.scenario.tables.toml_tables import Count, Positive, Triple
 from consistency.bench.simulation import World, draw_landmarks, planned_controls
 from consistency.bench.simulation.world import purpose_of
 from consistency.bench.store.log import read_log

@@ -1,13 +1,11 @@
 """The worked example "Add a report section" of docs/extending.md works as it is printed."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 from documents import ROOT, blocks
+from numpy.testing import assert_allclose
 from painted import by_title, lines, panels
 
 import consistency as cs
@@ -17,7 +15,7 @@ from consistency.bench.pages.sections import study_sections
 
 
 @pytest.fixture
-def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def example(monkeypatch):
     """The module of sections with the example and its place, as the guide says."""
     code = (ROOT / "docs/examples/extending/position_errors.py").read_text(encoding="utf-8")
     (order,) = (block.text for block in blocks("docs/extending.md", "python") if "`pose_errors`" in block.before)
@@ -28,19 +26,19 @@ def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return module
 
 
-def test_the_section_with_one_plot_is_in_both_reports(uvd, tmp_path: Path, example: ModuleType) -> None:
+def test_the_section_with_one_plot_is_in_both_reports(uvd, tmp_path, example):
     cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=3, seed=0, jobs=1).write(tmp_path / "run")
     report = build_report(tmp_path / "run")
     (study,) = report.studies
     error = study.tracks[0].record().in_world.error
     expected = np.sqrt((error[..., :2] ** 2).sum(-1).mean(axis=0))
-    np.testing.assert_allclose(example.rmse(study.tracks[0]), expected)
+    assert_allclose(example.rmse(study.tracks[0]), expected)
 
     document = build.compose(report)
     titles = [figure.title for figure in document.figures]
     assert titles.index("Error of the position") == titles.index("Pose errors, run 0") + 1
     (axes,) = panels(by_title(document)["Error of the position"])
-    np.testing.assert_allclose(lines(axes, "ekf-uvd")[0].get_ydata(), expected)
+    assert_allclose(lines(axes, "ekf-uvd")[0].get_ydata(), expected)
     targets = tmp_path / "r.html", tmp_path / "r.pdf"
     write_reports(tmp_path / "run", *targets, overwrite=False)
     page = targets[0].read_text(encoding="utf-8")
@@ -50,7 +48,7 @@ def test_the_section_with_one_plot_is_in_both_reports(uvd, tmp_path: Path, examp
     assert targets[1].read_bytes().startswith(b"%PDF")
 
 
-def test_the_section_does_not_apply_without_truth(example: ModuleType) -> None:
+def test_the_section_does_not_apply_without_truth(example):
     class Blind:
         has_truth = False
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.filters import BOUNDS, usable_names
+from consistency.bench.filters import BOUNDS, filter_summaries, usable_names
 from consistency.bench.filters.compiled import is_realisable, problem_for, problem_of
 from consistency.bench.filters.stepping import run_filter, step_through
 from consistency.bench.runs.montecarlo import run_log, simulate_log
@@ -15,6 +15,13 @@ from consistency.bench.store.log import read_log
 
 def test_only_the_ideal_filters_are_marked():
     assert {name for name in usable_names() if not is_realisable(cs.get_filter(name))} == BOUNDS
+
+
+def test_a_name_says_the_data_and_the_summary_too():
+    said = filter_summaries()
+    assert said["iekf-uvd"] == "EKF with an iterated update, on pixels"
+    assert said["iekf-rb"] == "EKF with an iterated update, in the plane, on range and bearing"
+    assert said["kf"].startswith("Kalman filter of a linear world")
 
 
 def test_no_other_filter_is_told_the_truth(uvd):

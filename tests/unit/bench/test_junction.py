@@ -94,7 +94,7 @@ def test_the_matcher_takes_one_edge_or_the_other(share):
     assert np.all(edges.by_far == (share == 1.0))
 
 
-@pytest.mark.parametrize(("x", "seen"), [(3.0, True), (1.0, False)])
+@pytest.mark.parametrize("x, seen", [(3.0, True), (1.0, False)])
 def test_the_far_edge_must_be_behind_the_near_one(x, seen):
     _, effect, context = world_of()
     edges = Crossings(np.array([[2.0, 0.0, 0.2]]), np.array([[x, 0.0, 0.3]]), np.array([[0.0, 1.0]]), np.zeros(1, bool))

@@ -229,9 +229,7 @@ def test_an_error_while_writing_leaves_nothing(uvd, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("runs", "seed", "complaint"), [(0, 0, "runs must be at least 1"), (1, -1, "seed must not be")]
-)
+@pytest.mark.parametrize("runs, seed, complaint", [(0, 0, "runs must be at least 1"), (1, -1, "seed must not be")])
 def test_counts_are_checked(uvd, tmp_path, runs, seed, complaint):
     with pytest.raises(cs.InputError, match=complaint):
         simulate_log(uvd, runs, seed, tmp_path / "log")

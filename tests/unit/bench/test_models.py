@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from consistency.bench.filters.believed_noise import sensor_noise
+from consistency.bench.filters.kernel import unicycle
 from consistency.bench.filters.kernel.part_functions import Slam, State
 from consistency.bench.filters.kernel.update_steps import linearise, linearise_at, make_work, observe, place_observed
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.kf import Reference, place_about_reference
-from consistency.bench.filters.parts import unicycle
 from consistency.bench.filters.textbook.basics import PointSensor, motion_jacobians
 from consistency.bench.models import motion, point, stereo
 from consistency.bench.protocols import Problem

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from functools import partial
 from io import BytesIO
 
@@ -316,18 +317,53 @@ def test_a_run_without_any_innovation_can_be_drawn():
 
 def test_evidence_is_drawn_with_its_threshold_and_alarm():
     watched = changed()
-    alarm, threshold = watched.alarm, watched.monitor.threshold
+    threshold = watched.monitor.threshold
     axes = drawn(partial(monitor_drawing, watched)).axes[1]
     line = axes.lines[-1]
-    assert_array_equal(line.get_ydata(), watched.evidence[np.searchsorted(watched.step, line.get_xdata())])
+    assert_array_equal(line.get_ydata(), watched.evidence[np.searchsorted(watched.t, line.get_xdata())])
     assert line.get_ydata().max() == watched.evidence.max()
     assert [line.get_ydata()[0] for line in axes.lines if list(line.get_xdata()) == [0, 1]] == [threshold]
     assert axes.get_yscale() == "log"
     assert axes.get_ylim()[1] <= threshold**2 < watched.evidence.max()
     span = axes.patches[0]
-    assert (span.get_x(), span.get_x() + span.get_width()) == (alarm.since, alarm.step)
-    assert [line for line in axes.lines if list(line.get_xdata()) == [alarm.step, alarm.step]]
+    assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx((watched.since_t, watched.alarm_t))
+    assert [line for line in axes.lines if list(line.get_xdata()) == [watched.alarm_t] * 2]
     quiet = watch(
         NisLog("f", np.arange(1.0, 6), np.full(5, np.nan), np.full(5, 3.0), np.full(5, 3.0)), make_monitor("optimal")
     )
     assert not drawn(partial(monitor_drawing, quiet)).axes[1].patches
+
+
+def test_innovations_with_their_covariances(tmp_path):
+    rng = np.random.default_rng(3)
+    v, S = rng.normal(size=(2, 40, 2)), np.broadcast_to([[2.0, 0.5], [0.5, 1.0]], (2, 40, 2, 2)).copy()
+    v[1, 5] = np.nan
+    np.savez(tmp_path / "a.npz", innovations=v, innovation_covariances=S)
+    log = read_innovations(tmp_path / "a.npz", run=1)
+    np.testing.assert_allclose(log.nis, np.einsum("ki,kij,kj->k", v[1], np.linalg.inv(S[1]), v[1]))
+    assert log.dof.tolist() == [2.0] * 5 + [0.0] + [2.0] * 34
+    np.savez(tmp_path / "a.npz", innovations=v[0], innovation_covariances=S[0])
+    assert len(read_innovations(tmp_path / "a.npz").nis) == 40
+    S[0, 7, 0, 0] = -1.0
+    np.savez(tmp_path / "a.npz", innovations=v[0], innovation_covariances=S[0])
+    with pytest.raises(InputError, match=r"'innovation_covariances' is not positive definite at \[7\] \(step"):
+        read_innovations(tmp_path / "a.npz")
+    np.savez(tmp_path / "a.npz", innovations=v[0], innovation_covariances=S[0, 0])
+    with pytest.raises(InputError, match=r"must be numbers of shape \(steps, m\) and \(steps, m, m\)"):
+        read_innovations(tmp_path / "a.npz")
+
+
+def test_the_plot_is_over_time_where_there_is_one() -> None:
+    watched = changed()
+    _, below = drawn(partial(monitor_drawing, watched)).axes
+    assert below.get_xlabel() == "t / s"
+    assert below.lines[-1].get_xdata()[-1] == pytest.approx(watched.t[-1])
+    assert below.lines[0].get_xdata()[0] == pytest.approx(watched.alarm_t)
+    unknown = replace(watched, t=np.full(len(watched.t), np.nan))
+    assert drawn(partial(monitor_drawing, unknown)).axes[1].get_xlabel() == "step"
+
+
+def test_no_alarm_says_what_analyse_asks() -> None:
+    quiet = str(document_of(changed(1.0)).opening)
+    assert "'consistency analyse --innovations optimal' tests whether it is right exactly" in quiet
+    assert "analyse" not in str(document_of(changed(1.0, tolerance=1.0)).opening)

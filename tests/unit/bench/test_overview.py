@@ -1,7 +1,5 @@
 """What a report of several studies opens with: one picture and one table of all verdicts."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +11,7 @@ from painted import lines, panels
 import consistency as cs
 from consistency.bench.pages.build import answer, build_report, compose
 from consistency.bench.pages.sections import overview
-from consistency.bench.pages.sections.report_input import STEREO, Report
+from consistency.bench.pages.sections.report_input import STEREO
 from consistency.referee.document.blocks import Figure, Name, Status, Table
 from consistency.referee.document.wording import written
 from consistency.referee.show import pdf
@@ -23,7 +21,7 @@ FILTERS = ("ekf-uvd", "ekf-xyz")
 
 
 @pytest.fixture(scope="module")
-def report(uvd, tmp_path_factory) -> Report:
+def report(uvd, tmp_path_factory):
     """Two worlds with two filters, the second of them judged in the first world alone."""
     folder = tmp_path_factory.mktemp("overview") / "run"
     cs.run_trials(uvd, FILTERS, runs=4, seed=61, jobs=1).write(folder)
@@ -33,14 +31,14 @@ def report(uvd, tmp_path_factory) -> Report:
     return replace(one, manifest={"studies": ["first", "second"]}, studies=(replace(study, name="first"), second))
 
 
-def opening(report: Report) -> tuple[Figure, Table]:
+def opening(report):
     _, picture, verdicts = overview.opening(report)
     assert isinstance(picture, Figure)
     assert isinstance(verdicts, Table)
     return picture, verdicts
 
 
-def test_every_verdict_is_in_the_table(report: Report) -> None:
+def test_every_verdict_is_in_the_table(report):
     [(_, rows)] = opening(report)[1].groups
     expected = [
         (study.name, track.name, track.verdict.status, f"{track.verdict.scale.mean_anees:.3g}")
@@ -53,7 +51,7 @@ def test_every_verdict_is_in_the_table(report: Report) -> None:
     assert all(isinstance(row[1], Name) and isinstance(row[2], Status) for row in rows)
 
 
-def test_the_picture_has_every_ratio_in_the_row_of_its_world(report: Report) -> None:
+def test_the_picture_has_every_ratio_in_the_row_of_its_world(report):
     (axes,) = panels(opening(report)[0])
     worlds = [label.get_text() for label in axes.get_yticklabels()]
     assert worlds == ["first", "second"]
@@ -72,14 +70,14 @@ def test_the_picture_has_every_ratio_in_the_row_of_its_world(report: Report) -> 
     assert all(low < ratio.value < high for ratio in ratios.values())
 
 
-def test_what_is_tolerated_is_shaded(report: Report) -> None:
+def test_what_is_tolerated_is_shaded(report):
     (axes,) = panels(opening(report)[0])
     factor = report.studies[0].tracks[0].verdict.settings.factor
     (shade,) = [patch for patch in axes.patches if str(patch.get_label()).startswith("tolerated")]
     assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx((1.0 / factor, factor))
 
 
-def test_a_filter_without_a_ratio_stays_in_the_table(report: Report) -> None:
+def test_a_filter_without_a_ratio_stays_in_the_table(report):
     study = report.studies[1]
     blind = replace(study.tracks[0], verdict=replace(study.tracks[0].verdict, scale=None))
     changed = replace(report, studies=(report.studies[0], replace(study, tracks=(blind,))))
@@ -89,13 +87,13 @@ def test_a_filter_without_a_ratio_stays_in_the_table(report: Report) -> None:
     assert tuple(map(written, verdicts.groups[0][1][-1][3:])) == ("–", "–")
 
 
-def test_one_study_opens_with_its_answer_alone(report: Report) -> None:
+def test_one_study_opens_with_its_answer_alone(report):
     single = replace(report, studies=report.studies[:1])
     assert overview.opening(single) == ()
     assert compose(single).opening == ()
 
 
-def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> None:
+def test_the_opening_stands_before_the_contents_of_the_page(report):
     document = compose(report)
     assert document.figures[0].title == overview.TITLE
     page = render(document)
@@ -106,7 +104,7 @@ def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> N
     assert page[:first].count('class="chart') == 1
 
 
-def test_the_opening_is_printed(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_opening_is_printed(report, monkeypatch):
     monkeypatch.setattr(pdf.typst, "compile", lambda path, **_: Path(path).with_name("data.json").read_bytes())
     data = json.loads(pdf.render_pdf(compose(report)))
     assert [block["kind"] for block in data["opening"]] == ["Text", "Figure", "Table"]
@@ -114,14 +112,14 @@ def test_the_opening_is_printed(report: Report, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.fixture
-def of_paper(report: Report) -> Report:
+def of_paper(report):
     """The same with the sensor of the paper as its first world."""
     first, second = report.studies
     manifest = report.manifest | {"date": "2026-01-02", "command": "consistency reproduce", "git_commit": "abc"}
     return replace(report, manifest=manifest, studies=(replace(first, name=STEREO), second))
 
 
-def test_the_first_page_has_question_answer_curves_and_origin(of_paper: Report) -> None:
+def test_the_first_page_has_question_answer_curves_and_origin(of_paper):
     made = compose(of_paper)
     question, curves, origin, picture, _ = made.opening
     assert "Herath, Kodagoda and Dissanayake (2007)" in question.text
@@ -133,7 +131,7 @@ def test_the_first_page_has_question_answer_curves_and_origin(of_paper: Report) 
     assert all(name in made.answer and status in made.answer for name, status in statuses.items())
 
 
-def test_of_several_studies_the_paper_has_verdicts_and_their_first_figure(of_paper: Report) -> None:
+def test_of_several_studies_the_paper_has_verdicts_and_their_first_figure(of_paper):
     made = compose(of_paper)
     on_paper = {chapter.anchor: chapter.blocks for chapter in made.paper}
     assert list(on_paper) == ["study-0", "study-1"]
@@ -144,19 +142,19 @@ def test_of_several_studies_the_paper_has_verdicts_and_their_first_figure(of_pap
     assert on_paper["study-0"][2] in whole["study-0"]
 
 
-def test_one_study_is_printed_whole_but_for_the_rates_of_the_referee(report: Report) -> None:
+def test_one_study_is_printed_whole_but_for_the_rates_of_the_referee(report):
     made = compose(replace(report, studies=report.studies[:1]))
     assert {chapter.anchor for chapter in made.chapters} - {chapter.anchor for chapter in made.paper} == {"calibration"}
 
 
-def test_the_answer_counts_where_the_table_names(report: Report) -> None:
+def test_the_answer_counts_where_the_table_names(report):
     text = answer(report.studies, ())
     assert "In 2 worlds, of 3 verdicts on a filter " in text
     assert "ekf-uvd" not in text
     assert "ekf-uvd" in answer(report.studies[:1], ())
 
 
-def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report: Report) -> None:
+def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report):
     track = report.studies[0].tracks[0]
     scale = track.verdict.scale
     wide = replace(scale, inflation=scale.inflation._replace(value=2.0, low=0.5, high=np.inf))

@@ -176,7 +176,10 @@ BAD = {
     "disparity reversed": ((put("truth.sensor.disparity_px", [32.0, 1.0]),), r"disparity"),
     "true is not a number": ((put("truth.motion.sigma_v", True),), r"truth\.motion\.sigma_v"),
     "text is not a number": ((put("truth.motion.sigma_v", "0.1"),), r"truth\.motion\.sigma_v"),
-    "two mistakes": ((put("truth.steps", -1), put("belief.motion.sigma_v", -1.0)), r"\(and 1 more\)"),
+    "two mistakes": (
+        (put("truth.steps", -1), put("belief.motion.sigma_v", -1.0)),
+        r"'truth\.steps'.*; key 'belief\.motion\.sigma_v'",
+    ),
     "name inside": ((put("name", "other"),), r"'name': not allowed here"),
     "corner too round": (
         (
@@ -264,3 +267,12 @@ def test_every_kind_of_path_landmarks_and_mount_is_written(tmp_path):
     assert cs.load_scenario(tmp_path / "odd.toml").hash == scenario.hash
     assert "position = [0.1, 0.0, 0.2]" in text
     assert text.startswith("summary")
+
+
+def test_every_wrong_key_is_named(tmp_path):
+    changes = {"sensor.colour": 1, "motion.sigma_v": -1.0, "steps": 0}
+    with pytest.raises(cs.InputError) as error:
+        load(tmp_path, *(put(f"truth.{key}", value) for key, value in changes.items()))
+    for key in changes:
+        assert f"key 'truth.{key}': " in str(error.value)
+    assert "more)" not in str(error.value)

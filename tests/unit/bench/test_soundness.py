@@ -84,7 +84,7 @@ TABLES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "edit", "said"), TABLES)
+@pytest.mark.parametrize("name, edit, said", TABLES)
 def test_a_changed_table_is_refused(folder, name, edit, said):
     change(folder, name, edit)
     with pytest.raises(cs.InputError, match=said):
@@ -109,7 +109,7 @@ NUMBERS = [
 ]
 
 
-@pytest.mark.parametrize(("edit", "said"), NUMBERS)
+@pytest.mark.parametrize("edit, said", NUMBERS)
 def test_a_missing_nees_or_nis_is_refused(folder, edit, said):
     """A run without a NEES would otherwise count as one that was never judged."""
     change(folder, "estimates", singular_start)
@@ -157,7 +157,7 @@ MANIFESTS = [
 ]
 
 
-@pytest.mark.parametrize(("edit", "said"), MANIFESTS, ids=lambda value: str(value)[:40])
+@pytest.mark.parametrize("edit, said", MANIFESTS, ids=lambda value: str(value)[:40])
 def test_a_changed_manifest_is_refused(folder, edit, said):
     change_manifest(folder, **edit)
     with pytest.raises(cs.InputError, match=said):

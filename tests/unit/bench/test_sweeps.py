@@ -281,7 +281,7 @@ def test_more_values_and_filters_go_into_the_same_folder(at, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "what"),
+    "old, new, what",
     [("max_runs = 12", "max_runs = 13", "max_runs"), ("seed = 3", "seed = 4", "seed"), ("seed", "seed", "source code")],
 )
 def test_changed_inputs_are_refused_or_run_again(at, monkeypatch, old, new, what):

@@ -1,15 +1,11 @@
 """Tuning: what a factor scales, how runs are scored, how data are divided, and what is said of the outcome."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +17,7 @@ from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.stepping import run_filter, step_through
 from consistency.bench.store.log import Log
 from consistency.bench.tuning.noise_groups import groups_of, rounded, scaled, sigma_by_channel
-from consistency.bench.tuning.result import Tuning, factor_text, tuning_data, tuning_lines
+from consistency.bench.tuning.result import factor_text, tuning_data, tuning_lines
 from consistency.bench.tuning.scores import BeliefScorer, score_of
 from consistency.bench.tuning.split import part_of, parts_of
 from consistency.bench.tuning.tune import MOST_TOLERATED, tolerant
@@ -30,11 +26,10 @@ from consistency.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import short
 
-Small = Callable[..., cs.Scenario]
 RUNS, SEED = 8, 60_321
 
 
-def off(scenario: cs.Scenario, q: float, r: float) -> cs.Scenario:
+def off(scenario, q, r):
     """A belief whose variances of Q and R have to be multiplied by ``q`` and ``r`` to be right."""
     motion, sensor = scenario.truth.motion, scenario.truth.sensor
     return scenario.variant(
@@ -48,7 +43,7 @@ def off(scenario: cs.Scenario, q: float, r: float) -> cs.Scenario:
 # --- groups ------------------------------------------------------------------------------------------
 
 
-def test_a_factor_scales_the_variances_of_its_channels(uvd: cs.Scenario) -> None:
+def test_a_factor_scales_the_variances_of_its_channels(uvd):
     before = sigma_by_channel(uvd.belief)
     groups = groups_of("Q.omega, R.u+R.d", uvd.belief)
     assert [group.name for group in groups] == ["Q.omega", "R.u+R.d"]
@@ -58,13 +53,13 @@ def test_a_factor_scales_the_variances_of_its_channels(uvd: cs.Scenario) -> None
     assert ratios == pytest.approx(wanted)
 
 
-def test_all_of_q_leaves_out_a_noise_that_is_zero(uvd: cs.Scenario) -> None:
+def test_all_of_q_leaves_out_a_noise_that_is_zero(uvd):
     still = uvd.variant("still", belief__motion__sigma_omega=0.0)
     assert [group.channels for group in groups_of("Q,R", still.belief)] == [("Q.v",), ("R.u", "R.v", "R.d")]
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    "text, said",
     [
         ("Q,P0", "unknown noise 'P0'; there are Q, Q.v, Q.omega, R, R.u, R.v, R.d"),
         ("Q,Q.v", "'Q.v' is named twice"),
@@ -73,14 +68,14 @@ def test_all_of_q_leaves_out_a_noise_that_is_zero(uvd: cs.Scenario) -> None:
         ("", "unknown noise ''"),
     ],
 )
-def test_groups_that_mean_nothing_are_refused(uvd: cs.Scenario, text: str, said: str) -> None:
+def test_groups_that_mean_nothing_are_refused(uvd, text, said):
     still = uvd.variant("still", belief__motion__sigma_omega=0.0)
     with pytest.raises(cs.InputError, match=f"--groups {text}".replace("+", r"\+")) as refused:
         groups_of(text, still.belief)
     assert said in str(refused.value)
 
 
-def test_what_is_judged_has_the_digits_that_are_written(uvd: cs.Scenario) -> None:
+def test_what_is_judged_has_the_digits_that_are_written(uvd):
     belief = rounded(scaled(uvd.belief, groups_of("Q,R", uvd.belief), np.array([0.1, 0.2])))
     assert all(value == float(f"{value:.6g}") for value in sigma_by_channel(belief).values())
 
@@ -88,7 +83,7 @@ def test_what_is_judged_has_the_digits_that_are_written(uvd: cs.Scenario) -> Non
 # --- scores ------------------------------------------------------------------------------------------
 
 
-def test_the_score_by_innovations_is_their_log_density(linear: cs.Scenario) -> None:
+def test_the_score_by_innovations_is_their_log_density(linear):
     trial, twin = cs.simulate(linear, seed=SEED), cs.get_filter("kf").textbook
     state, wanted = twin.init(problem_of(trial, linear.belief)), []
     for step in range(1, trial.steps + 1):
@@ -107,27 +102,27 @@ class Silent:
 
     name = "silent"
 
-    def init(self, problem: Any) -> Any:
+    def init(self, problem):
         return problem
 
-    def predict(self, state: Any, control: cs.Control) -> Any:
+    def predict(self, state, control):
         return state
 
-    def update(self, state: Any, observation: cs.Observation) -> tuple[Any, None]:
+    def update(self, state, observation):
         return state, None
 
-    def pose(self, state: Any) -> cs.Gaussian:
+    def pose(self, state):
         return cs.Gaussian(state.start, np.eye(3))
 
 
 class Broken(Silent):
     name = "broken"
 
-    def pose(self, state: Any) -> cs.Gaussian:
+    def pose(self, state):
         return cs.Gaussian(state.start, -np.eye(3))
 
 
-def test_what_cannot_be_scored_is_refused(uvd: cs.Scenario) -> None:
+def test_what_cannot_be_scored_is_refused(uvd):
     with pytest.raises(cs.InputError, match="reports no innovations: its update must return an Info"):
         cs.tune(uvd, Silent(), runs=2, seed=SEED, jobs=1)
     with pytest.raises(cs.InputError, match=r"'ekf-uvd\+gate' leaves observations out"):
@@ -138,13 +133,13 @@ def test_what_cannot_be_scored_is_refused(uvd: cs.Scenario) -> None:
         cs.tune(uvd, "ekf-uvd", runs=0)
 
 
-def test_a_run_that_fails_makes_the_setting_impossible(uvd: cs.Scenario) -> None:
+def test_a_run_that_fails_makes_the_setting_impossible(uvd):
     with BeliefScorer(Broken(), [cs.simulate(uvd, seed=SEED)], uvd.belief, 1) as bench:
         scores = bench(uvd.belief)
     assert scores.failures[0].startswith("run 0, step 1: ")
 
 
-def test_the_same_trials_are_scored_alike_by_any_number_of_workers(uvd: cs.Scenario) -> None:
+def test_the_same_trials_are_scored_alike_by_any_number_of_workers(uvd):
     trials = [cs.simulate(uvd, run, SEED) for run in range(4)]
     benches = [BeliefScorer(cs.get_filter("ekf-uvd"), trials, uvd.belief, jobs) for jobs in (1, 2)]
     with benches[0] as alone, benches[1] as together:
@@ -154,12 +149,12 @@ def test_the_same_trials_are_scored_alike_by_any_number_of_workers(uvd: cs.Scena
 class Believer(Silent):
     """Says its noise as its pose, and the process that it is in as its variance."""
 
-    def pose(self, state: Any) -> cs.Gaussian:
+    def pose(self, state):
         x = np.array([state.belief.motion.sigma_v, 0.0, 0.0])
         return cs.Gaussian(x, np.diag([float(os.getpid()), 1.0, 1.0]))
 
 
-def test_a_filter_keeps_its_process_and_takes_each_belief(uvd: cs.Scenario) -> None:
+def test_a_filter_keeps_its_process_and_takes_each_belief(uvd):
     trials = [cs.simulate(uvd, run, SEED) for run in range(2)]
     said = set()
     with BeliefScorer(Believer(), trials, uvd.belief, 1) as bench:
@@ -177,7 +172,7 @@ def test_a_filter_keeps_its_process_and_takes_each_belief(uvd: cs.Scenario) -> N
 # --- parts -------------------------------------------------------------------------------------------
 
 
-def test_the_two_parts_of_a_scenario_share_no_trial(uvd: cs.Scenario) -> None:
+def test_the_two_parts_of_a_scenario_share_no_trial(uvd):
     parts = parts_of(uvd, 2, SEED)
     results = parts.on_fresh(cs.get_filter("ekf-uvd"), uvd.belief, 1, None)
     fresh = results.estimates["heading"].to_numpy()
@@ -186,7 +181,7 @@ def test_the_two_parts_of_a_scenario_share_no_trial(uvd: cs.Scenario) -> None:
     assert f"--runs 2 --seed {results.manifest['seed']}" == parts.again
 
 
-def test_a_drive_is_cut_in_two(uvd: cs.Scenario) -> None:
+def test_a_drive_is_cut_in_two(uvd):
     trial, ekf = cs.simulate(uvd, seed=SEED), cs.get_filter("ekf-uvd")
     whole, first = run_filter(ekf, trial, uvd.belief), run_filter(ekf, part_of(trial, 0, 25), uvd.belief)
     assert np.array_equal(first.pose, whole.pose[:25])
@@ -198,7 +193,7 @@ def test_a_drive_is_cut_in_two(uvd: cs.Scenario) -> None:
     assert np.array_equal(part_of(replace(trial, truth=None), 25, 60).start, np.zeros(3))
 
 
-def test_runs_of_a_log_are_divided_and_its_only_run_is_cut(uvd: cs.Scenario, linear: cs.Scenario) -> None:
+def test_runs_of_a_log_are_divided_and_its_only_run_is_cut(uvd, linear):
     log = Log("log", [cs.simulate(uvd, run, SEED) for run in range(5)], uvd.belief, None)
     parts = parts_of(log, 50, 0)
     assert [trial.run for trial in parts.trials] == [0, 1, 2]
@@ -215,11 +210,11 @@ def test_runs_of_a_log_are_divided_and_its_only_run_is_cut(uvd: cs.Scenario, lin
 
 
 @pytest.fixture(scope="module")
-def tuned(small: Small) -> Tuning:
+def tuned(small):
     return cs.tune(off(small("linear-gaussian"), 4.0, 0.25), "kf", runs=RUNS, seed=SEED)
 
 
-def test_factors_are_found_in_a_world_in_which_the_filter_is_exact(tuned: Tuning) -> None:
+def test_factors_are_found_in_a_world_in_which_the_filter_is_exact(tuned):
     """Q is known to 7 % and R to 2 % (480 steps): a bound of a third is beyond 4.5 standard deviations."""
     q, r = tuned.factors
     assert q.value == pytest.approx(4.0, rel=1.0 / 3.0)
@@ -232,7 +227,7 @@ def test_factors_are_found_in_a_world_in_which_the_filter_is_exact(tuned: Tuning
     assert tuned.chosen.settings < 120
 
 
-def test_before_and_after_are_judged_on_the_same_fresh_runs(tuned: Tuning) -> None:
+def test_before_and_after_are_judged_on_the_same_fresh_runs(tuned):
     """The belief before is wrong by a factor of 4 in all innovations: NIS says so in any sample."""
     before, after = tuned.before.innovations, tuned.verdict.innovations
     assert before.dof == after.dof
@@ -240,7 +235,7 @@ def test_before_and_after_are_judged_on_the_same_fresh_runs(tuned: Tuning) -> No
     assert after.ratio == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_filter_that_is_not_compiled_hears_the_factors(small: Small) -> None:
+def test_a_filter_that_is_not_compiled_hears_the_factors(small):
     scenario = off(small("linear-gaussian", truth__steps=20), 1.0, 4.0)
     kf = cs.get_filter("kf")
     compiled, plain = (cs.tune(scenario, filter_, runs=3, seed=SEED, jobs=2) for filter_ in (kf, kf.textbook))
@@ -249,7 +244,7 @@ def test_a_filter_that_is_not_compiled_hears_the_factors(small: Small) -> None:
     assert plain.factors[1].value > 2.0
 
 
-def test_the_words_say_what_came_of_it(tuned: Tuning) -> None:
+def test_the_words_say_what_came_of_it(tuned):
     text = str(tuned)
     assert text == "\n".join(tuning_lines(tuned))
     assert "kf on off: fitted by the likelihood of the innovations on 8 runs" in text
@@ -263,16 +258,16 @@ def test_the_words_say_what_came_of_it(tuned: Tuning) -> None:
 
 
 @pytest.mark.parametrize(
-    ("status", "is_said"),
+    "status, is_said",
     [("overconfident", True), ("biased", True), ("failed", True), ("undecided", False), ("consistent", False)],
 )
-def test_a_fault_that_is_left_is_not_blamed_on_the_noises(tuned: Tuning, status: str, is_said: bool) -> None:
+def test_a_fault_that_is_left_is_not_blamed_on_the_noises(tuned, status, is_said):
     changed = replace(tuned, chosen=replace(tuned.chosen, verdict=replace(tuned.verdict, status=status)))
     said = "the size of Q, R is not all that is wrong, unless the fault was found by chance, as in one of 20 verdicts"
     assert (said in str(changed)) is is_said
 
 
-def with_interval(tuned: Tuning, low: float, high: float, edge: int = 0) -> Tuning:
+def with_interval(tuned, low, high, edge=0):
     """The same outcome with another interval of Q."""
     q, r = tuned.factors
     changed = replace(q, interval=Interval(q.value, low, high), edge=edge)
@@ -280,7 +275,7 @@ def with_interval(tuned: Tuning, low: float, high: float, edge: int = 0) -> Tuni
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "edge", "said"),
+    "low, high, edge, said",
     [
         (0.0, 0.004, 0, ", at most x0.004 with 95 %"),
         (3.0, np.inf, 0, ", at least x3.00 with 95 %"),
@@ -290,7 +285,7 @@ def with_interval(tuned: Tuning, low: float, high: float, edge: int = 0) -> Tuni
         (0.0, np.inf, 1, "is at the limit of what is tried, x10000; not known with 95 %"),
     ],
 )
-def test_an_open_interval_is_said_and_exported(tuned: Tuning, low: float, high: float, edge: int, said: str) -> None:
+def test_an_open_interval_is_said_and_exported(tuned, low, high, edge, said):
     changed = with_interval(tuned, low, high, edge)
     text = said if edge else f"x{short(changed.factors[0].value)}{said}"
     assert factor_text(changed.factors[0]) == text
@@ -301,7 +296,7 @@ def test_an_open_interval_is_said_and_exported(tuned: Tuning, low: float, high: 
     assert exported["edge"] == edge
 
 
-def test_a_process_noise_that_few_short_runs_hardly_tell_has_an_open_interval(small: Small) -> None:
+def test_a_process_noise_that_few_short_runs_hardly_tell_has_an_open_interval(small):
     """A tenth of the true noise, in 6 runs of 4 steps: what it adds to a step is a ten-thousandth of R."""
     scenario = off(small("linear-gaussian", truth__steps=4, truth__motion__sigma_v=0.005,
                          truth__motion__sigma_omega=0.0087), 1.0, 1.0)  # fmt: skip
@@ -313,7 +308,7 @@ def test_a_process_noise_that_few_short_runs_hardly_tell_has_an_open_interval(sm
     assert f"at most x{short(q.interval.high)} with 95 %" in str(tuning)
 
 
-def test_the_uncertainty_of_a_fit_is_no_fault_but_no_more_is() -> None:
+def test_the_uncertainty_of_a_fit_is_no_fault_but_no_more_is():
     settings = Settings()
     assert tolerant(settings, np.array([[-0.05, 0.05], [-0.01, 0.01]])).tolerated == pytest.approx(np.exp(0.05))
     assert tolerant(settings, np.array([[-1.0, 1.0]])).tolerated == MOST_TOLERATED
@@ -324,7 +319,7 @@ def test_the_uncertainty_of_a_fit_is_no_fault_but_no_more_is() -> None:
 # --- the command -------------------------------------------------------------------------------------
 
 
-def status_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+def status_of(capsys, *arguments):
     with pytest.raises(SystemExit) as ended:
         main(["tune", *map(str, arguments)])
     out, err = capsys.readouterr()
@@ -335,7 +330,7 @@ SCENARIO = "linear-gaussian"
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    "arguments, said",
     [
         ((), "give either a SCENARIO or --log DIR"),
         ((SCENARIO, "--log", "x"), "give either a SCENARIO or --log DIR"),
@@ -346,17 +341,13 @@ SCENARIO = "linear-gaussian"
         ((SCENARIO, "--out", "."), "--out .: exists already"),
     ],
 )
-def test_unusable_options_are_refused_in_a_sentence(
-    capsys: pytest.CaptureFixture[str], arguments: tuple[object, ...], said: str
-) -> None:
+def test_unusable_options_are_refused_in_a_sentence(capsys, arguments, said):
     status, out, err = status_of(capsys, *arguments, "--filter", "kf")
     assert (status, out, len(err.strip().splitlines())) == (2, "", 1)
     assert said in err
 
 
-def test_the_folder_holds_a_scenario_that_can_be_run(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, small: Small
-) -> None:
+def test_the_folder_holds_a_scenario_that_can_be_run(capsys, tmp_path, small):
     from consistency.bench.scenario import scenario_text
 
     world, out = tmp_path / "wrong.toml", tmp_path / "out"
@@ -379,7 +370,7 @@ def test_the_folder_holds_a_scenario_that_can_be_run(
     assert f"consistency run {out}/wrong-tuned.toml --filter kf --runs 4 --seed" in text
 
 
-def test_a_log_is_tuned_to_a_sensor_file(capsys: pytest.CaptureFixture[str], tmp_path: Path, small: Small) -> None:
+def test_a_log_is_tuned_to_a_sensor_file(capsys, tmp_path, small):
     from consistency.bench.runs.montecarlo import simulate_log
 
     scenario, log, out = off(small("herath2007-stereo"), 4.0, 1.0), tmp_path / "log", tmp_path / "out"
@@ -397,7 +388,7 @@ def test_a_log_is_tuned_to_a_sensor_file(capsys: pytest.CaptureFixture[str], tmp
 # --- the manual --------------------------------------------------------------------------------------
 
 
-def test_the_filterpy_filter_of_the_manual(tmp_path: Path) -> None:
+def test_the_filterpy_filter_of_the_manual(tmp_path):
     script = (ROOT / "docs/examples/tune_my_ekf.py").read_text(encoding="utf-8")
     short = script.replace("runs=20", "runs=2").replace("truth__steps=50", "truth__steps=6")
     assert short != script
@@ -412,7 +403,7 @@ def test_the_filterpy_filter_of_the_manual(tmp_path: Path) -> None:
 # --- a real robot ------------------------------------------------------------------------------------
 
 
-def test_one_robot_of_mrclam() -> None:
+def test_one_robot_of_mrclam():
     """Innovations of the second half are as large as stated after a fit to the first; the drive is still at fault."""
     folder = Path(os.environ.get("CONSISTENCY_DATA", "")) / "mrclam" / "MRCLAM_Dataset6"
     if not os.environ.get("CONSISTENCY_DATA") or not folder.is_dir():

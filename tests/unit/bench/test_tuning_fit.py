@@ -1,9 +1,5 @@
 """The best setting and its interval, on log densities whose maximum and curvature are known."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy import optimize, stats
@@ -11,7 +7,6 @@ from scipy import optimize, stats
 from consistency.bench.tuning.fit import (
     LIMIT,
     UNITS,
-    FactorFit,
     KnownScores,
     depth_of,
     derivatives,
@@ -19,24 +14,23 @@ from consistency.bench.tuning.fit import (
     maximise,
     profile_intervals,
 )
-from consistency.referee.types import Array
 
 SIGMAS = 4.8  # bound on a normal number, so that each assertion fails by chance in less than 1e-5 of all runs
 QUANTILE = 1.96
 
 
-def gaussian(z: Array) -> Callable[[Array], Array]:
+def gaussian(z):
     """Log density of z (R, T) with a variance of e^x times 1."""
     return lambda x: -0.5 * (z**2 * np.exp(-x[0]) + x[0])
 
 
-def fitted(score: Callable[[Array], Array | None], *starts: float, p: int = 1) -> FactorFit:
+def fitted(score, *starts, p=1):
     fit = maximise(score, [np.full(p, start) for start in starts or (0.0,)])
     assert fit is not None
     return fit
 
 
-def outside(score: Callable[[Array], Array], best: Array, x: Array) -> float:
+def outside(score, best, x):
     """How far outside a setting is: the root of W over its quantile, by chi-square or by the spread of runs."""
     falls = (score(best) - score(x)).sum(axis=1)
     n, W = len(falls), max(2.0 * falls.sum(), 0.0)  # 0 where the other factor does better than the best setting
@@ -44,7 +38,7 @@ def outside(score: Callable[[Array], Array], best: Array, x: Array) -> float:
     return float(min(np.sqrt(W) / QUANTILE, W / (student * np.sqrt(n * n / (n - len(x)) * falls.var()))))
 
 
-def test_the_factor_is_that_of_greatest_likelihood(rng: np.random.Generator) -> None:
+def test_the_factor_is_that_of_greatest_likelihood(rng):
     z = rng.normal(0.0, 1.7, (40, 30))
     fit = fitted(gaussian(z))
     assert fit.log_factors[0] == pytest.approx(np.log((z**2).mean()), abs=1e-3)
@@ -52,21 +46,21 @@ def test_the_factor_is_that_of_greatest_likelihood(rng: np.random.Generator) -> 
     assert fit.settings < 30
 
 
-def test_the_interval_is_that_of_theory(rng: np.random.Generator) -> None:
+def test_the_interval_is_that_of_theory(rng):
     """The log of a mean square of N numbers has the standard deviation sqrt(2 / N); its estimate spreads by 11 %."""
     z = rng.normal(size=(40, 30))
     low, high = fitted(gaussian(z)).interval[0]
     assert (high - low) / 2.0 == pytest.approx(QUANTILE * np.sqrt(2.0 / z.size), rel=SIGMAS * 0.12)
 
 
-def test_steps_that_repeat_each_other_count_once(rng: np.random.Generator) -> None:
+def test_steps_that_repeat_each_other_count_once(rng):
     """Runs whose steps are one number: the interval is that of R numbers, not of R T."""
     z = np.repeat(rng.normal(size=(60, 1)), 30, axis=1)
     low, high = fitted(gaussian(z)).interval[0]
     assert (high - low) / 2.0 == pytest.approx(QUANTILE * np.sqrt(2.0 / 60), rel=SIGMAS * 0.12)
 
 
-def test_one_run_is_cut_into_blocks(rng: np.random.Generator) -> None:
+def test_one_run_is_cut_into_blocks(rng):
     z = rng.normal(size=(1, 2000))
     low, high = fitted(gaussian(z)).interval[0]
     wanted = stats.t.ppf(0.975, UNITS - 1) * np.sqrt(2.0 / z.size)
@@ -74,12 +68,12 @@ def test_one_run_is_cut_into_blocks(rng: np.random.Generator) -> None:
     assert np.isfinite([low, high]).all()
 
 
-def test_two_factors_that_share_what_is_seen(rng: np.random.Generator) -> None:
+def test_two_factors_that_share_what_is_seen(rng):
     """Of z ~ N(0, a) and y ~ N(0, a + b) the intervals are those of the Fisher information, correlation included."""
     n = 4000
     z, y = rng.normal(0.0, 1.0, (100, n // 100)), rng.normal(0.0, np.sqrt(3.0), (100, n // 100))
 
-    def score(x: Array) -> Array:
+    def score(x):
         a, total = np.exp(x[0]), np.exp(x[0]) + 2.0 * np.exp(x[1])
         return -0.5 * (z**2 / a + np.log(a) + y**2 / total + np.log(total))
 
@@ -92,11 +86,11 @@ def test_two_factors_that_share_what_is_seen(rng: np.random.Generator) -> None:
     assert np.diff(fit.interval, axis=1)[:, 0] / 2.0 == pytest.approx(wanted, rel=SIGMAS * 0.1)
 
 
-def test_slope_and_curvature_are_those_of_a_parabola() -> None:
+def test_slope_and_curvature_are_those_of_a_parabola():
     """Away from its top, where central differences are exact, too; 0 by a factor that is left out."""
     A, top = np.array([[2.0, -0.7, 0.4], [-0.7, 1.0, 0.3], [0.4, 0.3, 3.0]]), np.array([0.5, -0.3, 0.1])
 
-    def score(x: Array) -> Array:
+    def score(x):
         return np.full((25, 2), (7.0 - 0.5 * (x - top) @ A @ (x - top)) / 50)
 
     slope, curvature = derivatives(KnownScores(score), np.zeros(3), [0, 1, 2])
@@ -107,11 +101,11 @@ def test_slope_and_curvature_are_those_of_a_parabola() -> None:
     assert curvature == pytest.approx(-A * np.outer([1, 0, 1], [1, 0, 1]), abs=1e-9)
 
 
-def test_a_noise_that_is_not_there_is_bounded_from_above(rng: np.random.Generator) -> None:
+def test_a_noise_that_is_not_there_is_bounded_from_above(rng):
     """y ~ N(0, 1 + e^x) with a mean square below 1: the best factor is none."""
     y = rng.normal(0.0, 0.9, (40, 50))
 
-    def score(x: Array) -> Array:
+    def score(x):
         total = 1.0 + np.exp(x[0])
         return -0.5 * (y**2 / total + np.log(total))
 
@@ -123,16 +117,16 @@ def test_a_noise_that_is_not_there_is_bounded_from_above(rng: np.random.Generato
     assert outside(score, np.array([-LIMIT]), np.array([high])) == pytest.approx(1.0, abs=0.05)
 
 
-def test_data_that_say_nothing_bound_nothing() -> None:
+def test_data_that_say_nothing_bound_nothing():
     fit = fitted(lambda x: np.zeros((30, 5)))
     assert np.isinf(fit.interval).all()
 
 
-def test_a_start_at_which_a_run_fails_is_left_for_the_next(rng: np.random.Generator) -> None:
+def test_a_start_at_which_a_run_fails_is_left_for_the_next(rng):
     z = rng.normal(0.0, 1.5, (40, 30))
     score = gaussian(z)
 
-    def failing(x: Array) -> Array | None:
+    def failing(x):
         return None if x[0] < 0.2 else score(x)
 
     fit = fitted(failing, 0.0, 1.5)
@@ -143,14 +137,14 @@ def test_a_start_at_which_a_run_fails_is_left_for_the_next(rng: np.random.Genera
 # --- the profile -------------------------------------------------------------------------------------
 
 
-def test_a_setting_is_outside_by_chi_square_and_by_the_spread_of_runs(rng: np.random.Generator) -> None:
+def test_a_setting_is_outside_by_chi_square_and_by_the_spread_of_runs(rng):
     """A parabola whose runs have slopes of known spread: below 1 the spread makes no interval shorter."""
     runs, H, distance = 40, 50.0, 0.2
     for spread in (0.2, 3.0):
         slopes = rng.normal(size=(runs, 1))
         slopes = spread * np.sqrt(H / runs) * (slopes - slopes.mean()) / slopes.std()
 
-        def score(x: Array, slopes: Array = slopes) -> Array:
+        def score(x, slopes=slopes):
             return slopes * x[0] - 0.5 * H / runs * x[0] ** 2
 
         student = stats.t.ppf(0.975, runs - 1) * spread * np.sqrt(runs / (runs - 1))
@@ -163,7 +157,7 @@ def test_a_setting_is_outside_by_chi_square_and_by_the_spread_of_runs(rng: np.ra
         assert found == pytest.approx(np.array([[-half, half]]), rel=1e-3)
 
 
-def test_runs_without_scatter_have_the_interval_of_the_likelihood() -> None:
+def test_runs_without_scatter_have_the_interval_of_the_likelihood():
     """Errors that are all of one size: their scatter alone would say that the factor is known exactly."""
     z = np.where(np.arange(40 * 30).reshape(40, 30) % 2, 1.0, -1.0)
     score = gaussian(z)
@@ -173,13 +167,13 @@ def test_runs_without_scatter_have_the_interval_of_the_likelihood() -> None:
         assert 2.0 * fall == pytest.approx(QUANTILE**2, rel=0.05)
 
 
-def test_an_interval_is_open_where_the_data_do_not_bound_it() -> None:
+def test_an_interval_is_open_where_the_data_do_not_bound_it():
     """y of variance 1 + e^x, hardly more than 1: e^x may be 0, and in 1 + e^-x it may be anything large."""
     y = np.linspace(-1.0, 1.0, 800).reshape(40, 20)
     y *= np.sqrt(1.05 / (y**2).mean())
     for sign in (1.0, -1.0):
 
-        def score(x: Array, sign: float = sign) -> Array:
+        def score(x, sign=sign):
             total = 1.0 + np.exp(sign * x[0])
             return -0.5 * (y**2 / total + np.log(total))
 
@@ -193,12 +187,12 @@ def test_an_interval_is_open_where_the_data_do_not_bound_it() -> None:
 
 
 @pytest.mark.parametrize("first", [0.02, 1.0])
-def test_ends_are_those_of_the_profile(rng: np.random.Generator, first: float) -> None:
+def test_ends_are_those_of_the_profile(rng, first):
     """Of z ~ N(0, first e^a + e^b) and y ~ N(0, e^b): the other factor is at its best at each end, as by a search."""
     z = rng.normal(0.0, np.sqrt(first + 1.0), (30, 12))
     y = rng.normal(0.0, 1.0, (30, 3))
 
-    def score(x: Array) -> Array:
+    def score(x):
         sizes = (first * np.exp(x[0]) + np.exp(x[1]), np.exp(x[1]))
         return np.hstack([-0.5 * (d**2 / v + np.log(v)) for d, v in zip((z, y), sizes, strict=True)])
 
@@ -206,7 +200,7 @@ def test_ends_are_those_of_the_profile(rng: np.random.Generator, first: float) -
     for i in range(2):
         for end in fit.interval[i]:
 
-            def at(other: float, i: int = i, end: float = end) -> Array:
+            def at(other, i=i, end=end):
                 value = float(np.clip(end, -LIMIT, LIMIT))
                 return np.array([value, other] if i == 0 else [other, value])
 
@@ -218,7 +212,7 @@ def test_ends_are_those_of_the_profile(rng: np.random.Generator, first: float) -
     assert fit.settings < 200
 
 
-def test_an_end_lies_before_settings_at_which_a_run_fails(rng: np.random.Generator) -> None:
+def test_an_end_lies_before_settings_at_which_a_run_fails(rng):
     z = rng.normal(0.0, 1.5, (40, 5))
     z *= 1.5 / np.sqrt((z**2).mean())
     score = gaussian(z)
@@ -228,7 +222,7 @@ def test_an_end_lies_before_settings_at_which_a_run_fails(rng: np.random.Generat
     assert low == pytest.approx(fitted(score, best).interval[0, 0], abs=0.02)
 
 
-def test_a_run_that_fails_near_the_best_setting_leaves_an_interval(rng: np.random.Generator) -> None:
+def test_a_run_that_fails_near_the_best_setting_leaves_an_interval(rng):
     z = rng.normal(0.0, 1.0, (40, 5))
     z /= np.sqrt((z**2).mean())
     score = gaussian(z)

@@ -3,11 +3,6 @@
 Every statistical test here is a two-sided chi-square test with a false-alarm rate of 1e-5.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -15,26 +10,24 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.filters.textbook.basics import PointSensor, motion_jacobians
 from consistency.bench.simulation import draw_landmarks, planned_controls, planned_path, require_landmarks_in_view
-from consistency.bench.types import Control, Trial
+from consistency.bench.types import Control
 from consistency.referee.geometry import rotation
-from consistency.referee.types import Array
 
 FALSE_ALARM = 1e-5
-Small = Callable[..., cs.Scenario]
 
 
-def variance_fits(normalised: Array) -> bool:
+def variance_fits(normalised):
     """Whether the sum of squares of standard normal values is inside its 1 - 1e-5 interval."""
     total = float(np.sum(np.square(normalised)))
     low, high = stats.chi2.interval(1 - FALSE_ALARM, normalised.size)
     return bool(low <= total <= high)
 
 
-def same(a: Trial, b: Trial) -> bool:
+def same(a, b):
     return all(np.array_equal(x, y) for x, y in zip(_arrays(a), _arrays(b), strict=True))
 
 
-def _arrays(t: Trial) -> tuple[Array, ...]:
+def _arrays(t):
     assert t.truth is not None
     assert t.landmarks is not None
     return t.start, t.controls, t.first, t.landmark, t.z, t.truth, t.landmarks
@@ -44,7 +37,7 @@ def _arrays(t: Trial) -> tuple[Array, ...]:
 
 
 @pytest.mark.parametrize("name", ["herath2007-xyz", "herath2007-stereo", "linear-gaussian"])
-def test_a_run_depends_on_nothing_but_scenario_seed_and_number(small: Small, name: str) -> None:
+def test_a_run_depends_on_nothing_but_scenario_seed_and_number(small, name):
     scenario = small(name)
     alone = cs.simulate(scenario, run=7, seed=3)
     among = [cs.simulate(scenario, run=run, seed=3) for run in range(9)]
@@ -55,25 +48,25 @@ def test_a_run_depends_on_nothing_but_scenario_seed_and_number(small: Small, nam
         assert not np.array_equal(alone.controls, other.controls) or name == "linear-gaussian"
 
 
-def test_belief_and_name_do_not_change_the_world(small: Small) -> None:
+def test_belief_and_name_do_not_change_the_world(small):
     told_less = small("herath2007-xyz", belief__motion__sigma_v=0.4, belief__sensor__sigma=(1.0, 1.0, 1.0))
     assert same(cs.simulate(small("herath2007-xyz"), 2, 5), cs.simulate(told_less, 2, 5))
 
 
-def test_motion_noise_does_not_depend_on_the_sensor(small: Small) -> None:
+def test_motion_noise_does_not_depend_on_the_sensor(small):
     blind = small("herath2007-xyz", truth__sensor__range=(0.5, 1.0), truth__sensor__sigma=(1.0, 1.0, 1.0))
     a, b = cs.simulate(small("herath2007-xyz")), cs.simulate(blind)
     assert np.array_equal(a.controls, b.controls)
     assert len(a.z) != len(b.z)
 
 
-def test_a_longer_trial_begins_like_the_shorter_one(small: Small) -> None:
+def test_a_longer_trial_begins_like_the_shorter_one(small):
     short, long = (cs.simulate(small("herath2007-xyz", truth__steps=steps)) for steps in (60, 90))
     assert np.array_equal(long.controls[:60], short.controls)
     assert np.array_equal(long.z[: len(short.z)], short.z)
 
 
-def test_streams_of_runs_and_purposes_are_independent(small: Small) -> None:
+def test_streams_of_runs_and_purposes_are_independent(small):
     """Correlation of any two of 16 streams of 3000 values in order of drawing: Fisher's z, 1e-5 over all pairs."""
     scenario = small("herath2007-xyz", truth__steps=1500)
     motion, planned = scenario.truth.motion, planned_controls(scenario.truth)
@@ -88,7 +81,7 @@ def test_streams_of_runs_and_purposes_are_independent(small: Small) -> None:
 
 
 @pytest.mark.parametrize("name", ["herath2007-xyz", "linear-gaussian"])
-def test_landmarks_are_the_same_in_all_runs_and_inside_their_box(small: Small, name: str) -> None:
+def test_landmarks_are_the_same_in_all_runs_and_inside_their_box(small, name):
     scenario = small(name)
     worlds = [cs.simulate(scenario, run, seed).landmarks for run, seed in ((0, 0), (1, 0), (0, 9))]
     assert np.array_equal(worlds[0], worlds[1])
@@ -101,7 +94,7 @@ def test_landmarks_are_the_same_in_all_runs_and_inside_their_box(small: Small, n
     assert not np.array_equal(draw_landmarks(other.truth), worlds[0])
 
 
-def test_listed_landmarks_stand_where_they_are_listed(small: Small) -> None:
+def test_listed_landmarks_stand_where_they_are_listed(small):
     points = [[3.0, 1.0, 0.5], [2.0, 2.0, 0.0]]
     scenario = small("herath2007-xyz", truth__landmarks={"layout": "listed", "points": points})
     assert np.array_equal(cs.simulate(scenario).landmarks, points)
@@ -110,7 +103,7 @@ def test_listed_landmarks_stand_where_they_are_listed(small: Small) -> None:
 # --- what is seen ------------------------------------------------------------------------------
 
 
-def seen_by_hand(scenario: cs.Scenario, path: Array, landmarks: Array) -> set[tuple[int, int]]:
+def seen_by_hand(scenario, path, landmarks):
     """The contract's rule, landmark by landmark: true position in range, true projection in the image."""
     sensor = scenario.truth.sensor
     turn, seen = rotation(*sensor.mount.rotation), set()
@@ -129,7 +122,7 @@ def seen_by_hand(scenario: cs.Scenario, path: Array, landmarks: Array) -> set[tu
     return seen
 
 
-WORLDS: dict[str, dict[str, Any]] = {
+WORLDS = {
     "as published": {},
     "principal point aside": {"truth__sensor__principal_point": (100.0, 60.0)},
     "no image": {"truth__sensor__image": None},
@@ -138,7 +131,7 @@ WORLDS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_seen_is_what_is_in_range_and_in_the_image(small: Small, world: str) -> None:
+def test_seen_is_what_is_in_range_and_in_the_image(small, world):
     scenario = small("herath2007-xyz", truth__steps=40, **WORLDS[world])
     trial = cs.simulate(scenario, run=1)
     expected = seen_by_hand(scenario, trial.truth, trial.landmarks)
@@ -148,7 +141,7 @@ def test_seen_is_what_is_in_range_and_in_the_image(small: Small, world: str) -> 
         assert expected != seen_by_hand(scenario, planned_path(scenario.truth), trial.landmarks)
 
 
-def test_nothing_in_view_is_unusable_input(small: Small) -> None:
+def test_nothing_in_view_is_unusable_input(small):
     scenario = small("herath2007-xyz", truth__landmarks={"layout": "listed", "points": [[500.0, 0.0, 0.0]]})
     with pytest.raises(cs.InputError, match=r"no landmark comes into view.*truth\.sensor.*truth\.landmarks"):
         require_landmarks_in_view(scenario)
@@ -159,7 +152,7 @@ def test_nothing_in_view_is_unusable_input(small: Small) -> None:
 
 
 @pytest.mark.parametrize("name", ["herath2007-xyz", "herath2007-stereo", "linear-gaussian"])
-def test_observation_noise_has_the_stated_variance(small: Small, name: str) -> None:
+def test_observation_noise_has_the_stated_variance(small, name):
     sigma = (0.02, 0.05, 0.11) if name != "herath2007-stereo" else (1.34, 1.53, 0.2)
     scenario = small(name, truth__sensor__sigma=sigma, truth__steps=250)
     trial = cs.simulate(scenario)
@@ -169,7 +162,7 @@ def test_observation_noise_has_the_stated_variance(small: Small, name: str) -> N
         assert not variance_fits(residual[:, axis] / (1.3 * sigma[axis]))  # negative control
 
 
-def _noise_free(scenario: cs.Scenario, trial: Trial) -> Array:
+def _noise_free(scenario, trial):
     sensor = PointSensor(scenario.belief.sensor, uvd=scenario.truth.sensor.model == "uvd")
     pose, landmark = trial.truth[trial.step], trial.landmarks[trial.landmark]
     if scenario.truth.sensor.model != "linear":
@@ -180,7 +173,7 @@ def _noise_free(scenario: cs.Scenario, trial: Trial) -> Array:
 
 
 @pytest.mark.parametrize("noise_on", ["odometry", "motion"])
-def test_motion_noise_has_the_stated_variance(small: Small, noise_on: str) -> None:
+def test_motion_noise_has_the_stated_variance(small, noise_on):
     scenario = small("herath2007-xyz", truth__steps=1500, truth__motion__noise_on=noise_on)
     trial = cs.simulate(scenario)
     driven = _driven(trial)
@@ -191,7 +184,7 @@ def test_motion_noise_has_the_stated_variance(small: Small, noise_on: str) -> No
         assert not variance_fits(noise / (1.3 * sigma))  # negative control
 
 
-def _driven(trial: Trial) -> Array:
+def _driven(trial):
     """The true (v, omega) of each step, from the true poses by eq. 18."""
     dt, move = trial.controls[:, 0], np.diff(trial.truth, axis=0)
     heading = trial.truth[:-1, 2]
@@ -201,7 +194,7 @@ def _driven(trial: Trial) -> Array:
     return np.column_stack([forward, move[:, 2]]) / dt[:, None]
 
 
-def test_noise_on_odometry_drives_the_path_and_tells_noise(small: Small) -> None:
+def test_noise_on_odometry_drives_the_path_and_tells_noise(small):
     scenario = small("herath2007-xyz")
     a, b = cs.simulate(scenario, 0), cs.simulate(scenario, 1)
     assert np.array_equal(a.truth, planned_path(scenario.truth))
@@ -209,7 +202,7 @@ def test_noise_on_odometry_drives_the_path_and_tells_noise(small: Small) -> None
     assert not np.array_equal(a.controls, b.controls)
 
 
-def test_noise_on_motion_tells_the_plan_and_drives_noise(small: Small) -> None:
+def test_noise_on_motion_tells_the_plan_and_drives_noise(small):
     scenario = small("herath2007-xyz", truth__motion__noise_on="motion")
     a, b = cs.simulate(scenario, 0), cs.simulate(scenario, 1)
     assert np.array_equal(a.controls, planned_controls(scenario.truth))
@@ -217,7 +210,7 @@ def test_noise_on_motion_tells_the_plan_and_drives_noise(small: Small) -> None:
     assert not np.array_equal(a.truth, b.truth)
 
 
-def test_start_is_exact_and_time_counts_from_zero(uvd: cs.Scenario) -> None:
+def test_start_is_exact_and_time_counts_from_zero(uvd):
     trial = cs.simulate(uvd)
     assert np.array_equal(trial.truth[0], trial.start)
     assert np.allclose(trial.t, 0.1 * np.arange(61))
@@ -226,7 +219,7 @@ def test_start_is_exact_and_time_counts_from_zero(uvd: cs.Scenario) -> None:
 # --- the linear world ----------------------------------------------------------------------------
 
 
-def test_linear_world_superposes(small: Small) -> None:
+def test_linear_world_superposes(small):
     """Three times the noise is three times the deviation, in the path and in every observation."""
     changes = {"truth__motion__sigma_v": 0.3, "truth__motion__sigma_omega": 0.5}
     threefold = {key: 3 * value for key, value in changes.items()}
@@ -241,7 +234,7 @@ def test_linear_world_superposes(small: Small) -> None:
     assert np.abs(a.truth - reference).max() > 0.1
 
 
-def test_linear_world_moves_by_the_jacobians_at_the_plan(linear: cs.Scenario) -> None:
+def test_linear_world_moves_by_the_jacobians_at_the_plan(linear):
     """Deviation <- F deviation + G noise: the part across the planned heading has no noise of its own."""
     trial, reference = cs.simulate(linear), planned_path(linear.truth)
     deviation, noises = trial.truth - reference, []
@@ -253,7 +246,7 @@ def test_linear_world_moves_by_the_jacobians_at_the_plan(linear: cs.Scenario) ->
     assert variance_fits(np.array(noises) / [linear.truth.motion.sigma_v, linear.truth.motion.sigma_omega])
 
 
-def test_linear_world_sees_the_same_in_every_run(linear: cs.Scenario) -> None:
+def test_linear_world_sees_the_same_in_every_run(linear):
     a, b = cs.simulate(linear, 0), cs.simulate(linear, 1)
     assert np.array_equal(a.landmark, b.landmark)
     assert np.array_equal(a.first, b.first)
@@ -262,7 +255,7 @@ def test_linear_world_sees_the_same_in_every_run(linear: cs.Scenario) -> None:
     assert set(zip(a.step, a.landmark, strict=True)) == expected
 
 
-def test_waypoints_that_lead_nowhere_are_refused() -> None:
+def test_waypoints_that_lead_nowhere_are_refused():
     path = {
         "shape": "waypoints", "points": [(1.0, 2.0)], "turn_rate": 1.0,
         "start": (1.0, 2.0), "heading": 0.0, "speed": 1.0,

@@ -1,7 +1,5 @@
 """The calibration of the referee: worlds, how their gates are counted, and the committed table."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import partial
@@ -16,8 +14,9 @@ import calibration_worlds as worlds
 import numpy as np
 import pytest
 from calibration_cases import Case, Claim
-from calibration_gates import Draw, Gate, joined, random_walk_filter, turned
+from calibration_gates import Draw, joined, random_walk_filter, turned
 from calibration_rows import Row, kept
+from numpy.testing import assert_allclose, assert_array_equal
 from recorded import read_recordings
 from scipy import stats
 
@@ -33,7 +32,7 @@ RIGHT = {name: world for name, world in (worlds.WORLDS | worlds.LOGS).items() if
 
 
 @pytest.fixture(autouse=True)
-def _pool(monkeypatch: pytest.MonkeyPatch) -> None:
+def _pool(monkeypatch):
     """A stand-in for the runs of the Kalman filter, whose errors are exact by their own tests."""
     error = np.random.default_rng(7).standard_normal((301, 100, 3))
     monkeypatch.setitem(worlds.POOL, "linear-gaussian", (error, np.eye(3)))
@@ -42,7 +41,7 @@ def _pool(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- the committed table ------------------------------------------------------------------------------------
 
 
-def test_every_case_was_measured_with_all_its_gates() -> None:
+def test_every_case_was_measured_with_all_its_gates():
     measured = {(r.world, r.question, r.ratio, r.runs, r.stated, r.bound): r.gates for r in ROWS}
     for case in calibration_cases.cases():
         for claim in case.claims:
@@ -51,15 +50,15 @@ def test_every_case_was_measured_with_all_its_gates() -> None:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.question}-{row.world}-{row.ratio:.3g}-{row.runs}")
-def test_what_was_measured_keeps_the_promise(row: Row) -> None:
+def test_what_was_measured_keeps_the_promise(row):
     assert kept(row)
 
 
-def test_the_documentation_shows_it() -> None:
+def test_the_documentation_shows_it():
     assert calibration_rows.markdown(TABLE) in (ROOT / "docs/reference/rates.md").read_text(encoding="utf-8")
 
 
-def test_rows_of_one_module_take_the_place_of_their_questions_in_their_worlds() -> None:
+def test_rows_of_one_module_take_the_place_of_their_questions_in_their_worlds():
     old = ROWS[0]
     new = replace(old, world="a new world", question="a new question", gates=7, found=1)
     table = calibration_rows.merged(TABLE, [new], {"a new world": "it", "a new question": "asked"})
@@ -73,7 +72,7 @@ def test_rows_of_one_module_take_the_place_of_their_questions_in_their_worlds() 
     assert [row for row in calibration_rows.rows_of(beside) if row.world != "a new world"] == list(ROWS)
 
 
-def test_every_question_and_world_of_the_table_is_explained() -> None:
+def test_every_question_and_world_of_the_table_is_explained():
     assert {row.question for row in ROWS} == set(TABLE["questions"])
     assert {row.world for row in ROWS} == set(TABLE["worlds"])
 
@@ -85,7 +84,7 @@ POWER = Row("w", "power", 1.5, 61, 1, 0.95, ">=", 1000, 950)
 
 
 @pytest.mark.parametrize(
-    ("row", "good"),
+    "row, good",
     [
         (ALARMS, True), (replace(ALARMS, found=0), True), (replace(ALARMS, found=66), True),
         (replace(ALARMS, found=70), False), (replace(ALARMS, stated=0.01, found=21), False),
@@ -94,11 +93,11 @@ POWER = Row("w", "power", 1.5, 61, 1, 0.95, ">=", 1000, 950)
         (replace(ALARMS, stated=0.0, found=0), True), (replace(ALARMS, stated=0.0, found=1), False),
     ],
 )  # fmt: skip
-def test_a_promise_is_broken_beyond_its_binomial_limit(row: Row, good: bool) -> None:
+def test_a_promise_is_broken_beyond_its_binomial_limit(row, good):
     assert kept(row) is good
 
 
-def test_the_quick_rows_of_a_referee_that_keeps_its_promises_fail_less_than_once_in_5000() -> None:
+def test_the_quick_rows_of_a_referee_that_keeps_its_promises_fail_less_than_once_in_5000():
     """At rates exactly as stated, which is as bad as a promise that is kept can be."""
     claims = [(case.gates, claim) for case in calibration_cases.quick_cases() for claim in case.claims]
     confidence = calibration_cases.quick_confidence(len(claims))
@@ -114,7 +113,7 @@ def test_the_quick_rows_of_a_referee_that_keeps_its_promises_fail_less_than_once
 # --- worlds -------------------------------------------------------------------------------------------------
 
 
-def p_values(gate: Gate, step: int) -> list[float]:
+def p_values(gate, step):
     """That one step of a gate is N(0, P), whose runs are independent: of the NEES, and of the NIS."""
     found = []
     if gate.error is not None or gate.nees is not None:
@@ -135,12 +134,12 @@ def p_values(gate: Gate, step: int) -> list[float]:
     return found
 
 
-def two_sided(total: float, dof: int) -> float:
+def two_sided(total, dof):
     return 2.0 * float(min(stats.chi2.sf(total, dof), stats.chi2.cdf(total, dof)))
 
 
 @pytest.mark.parametrize("name", RIGHT)
-def test_every_step_of_a_right_world_is_as_stated(name: str) -> None:
+def test_every_step_of_a_right_world_is_as_stated(name):
     """Under 150 p values at 1e-7; one and the same in every run of the tests."""
     rng = np.random.default_rng(20070)
     gate = RIGHT[name].draw(Draw(rng, 3000, 30))
@@ -152,7 +151,7 @@ def test_every_step_of_a_right_world_is_as_stated(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", worlds.HEAVY)
-def test_heavy_tails_have_the_stated_covariance(name: str) -> None:
+def test_heavy_tails_have_the_stated_covariance(name):
     """Means of squares over 6,000 runs, whose standard error is worked out from the sample: 6 of them."""
     gate = worlds.HEAVY[name].draw(Draw(np.random.default_rng(20070), 6000, 4))
     products = np.einsum("rti,rtj->rij", gate.error, gate.error).reshape(6000, 9) / 4
@@ -161,54 +160,54 @@ def test_heavy_tails_have_the_stated_covariance(name: str) -> None:
     assert np.abs(gate.error).max() > 6.0 or name.startswith("t10")  # the tails are there
 
 
-def test_errors_of_a_filter_have_its_variance_and_turn_with_it() -> None:
+def test_errors_of_a_filter_have_its_variance_and_turn_with_it():
     """Means of products over 4,000 runs against their stated values, 6 standard errors of theirs."""
     draw = Draw(np.random.default_rng(20070), 4000, 6)
     error, variance = random_walk_filter(draw, start=2.0, process=0.5, noise=3.0, n=2)
     stretched, variance = error * [1.0, 3.0], variance * [1.0, 9.0]
-    np.testing.assert_allclose(variance[0, 0], 1.0 / (1.0 / 2.5 + 1.0 / 3.0))  # information adds up
+    assert_allclose(variance[0, 0], 1.0 / (1.0 / 2.5 + 1.0 / 3.0))  # information adds up
     heading = np.array([0.0, 0.3, 1.2, -2.0, 4.0, 0.7])
     for each in (0.0 * heading, heading):
         body, covariance = turned(stretched, variance, np.broadcast_to(each, (4000, 6)))
         products = np.einsum("rti,rtj->rtij", body, body)
         away = products.mean(axis=0) - covariance[0]
         assert (np.abs(away) < 6 * products.std(axis=0) / np.sqrt(4000)).all()
-    np.testing.assert_allclose(body[:, 1], stretched[:, 1] @ [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    assert_allclose(body[:, 1], stretched[:, 1] @ [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
 
 
-def test_gates_take_their_own_runs_of_the_pool() -> None:
+def test_gates_take_their_own_runs_of_the_pool():
     case = Case("linear-gaussian", 43, 7, ())
     gates = [calibration.Growing(case, number, 1)(43).error for number in range(7)]
     assert len(np.unique(np.concatenate(gates)[:, 0, 0])) == 301
     grown = calibration.Growing(case, 2, 1)
     grown(10)
-    np.testing.assert_array_equal(grown(43).error, gates[2])
+    assert_array_equal(grown(43).error, gates[2])
 
 
 # --- planar poses -------------------------------------------------------------------------------------------
 
 
-def test_poses_have_exactly_the_left_invariant_errors_that_were_drawn(tmp_path: Path) -> None:
+def test_poses_have_exactly_the_left_invariant_errors_that_were_drawn(tmp_path):
     """In memory and as a file for ``analyse --error left``; under another convention they are others."""
     truth, estimate, covariance = worlds.left_poses(Draw(np.random.default_rng(20070), 6, 20))
     recording = worlds.recorded(truth, estimate, covariance)
     path = tmp_path / "poses.npz"
     np.savez(path, estimates=estimate, truth=truth, covariances=covariance)
     (read,) = read_recordings(path, error="left")
-    np.testing.assert_array_equal(recording.error, read.error)
-    np.testing.assert_array_equal(recording.covariance, read.covariance)
-    np.testing.assert_array_equal(recording.nees, read.nees)
+    assert_array_equal(recording.error, read.error)
+    assert_array_equal(recording.covariance, read.covariance)
+    assert_array_equal(recording.nees, read.nees)
     assert recording.failures == read.failures == ()
     (other,) = read_recordings(path, error="so2")
     assert np.abs(other.error - read.error).max() > 0.01
 
 
-def test_an_estimate_less_its_error_is_the_truth() -> None:
+def test_an_estimate_less_its_error_is_the_truth():
     rng = np.random.default_rng(20070)
     pose, error = rng.standard_normal((2, 50, 3))
     error[0] = 0.0
     motion = worlds._composed(pose, worlds._se2_exp(error))
-    np.testing.assert_allclose(planar_error(motion, pose, "left"), error, atol=1e-12)
+    assert_allclose(planar_error(motion, pose, "left"), error, atol=1e-12)
 
 
 # --- gates and rows -----------------------------------------------------------------------------------------
@@ -216,30 +215,30 @@ def test_an_estimate_less_its_error_is_the_truth() -> None:
 CASE = Case("AR(.95)", 30, 4, (Claim("false alarm", "fault", 0.05, "<="), Claim("all-clear", "consistent", 0.9, ">=")))
 
 
-def test_a_gate_depends_on_its_number_and_not_on_how_it_is_drawn() -> None:
+def test_a_gate_depends_on_its_number_and_not_on_how_it_is_drawn():
     case = replace(CASE, mode="until decided")
     at_once, grown = calibration.Growing(case, 3, 1), calibration.Growing(case, 3, 1)
     for runs in (5, 5, 12, 30, 8):
         part = grown(runs)
         assert len(part.error) == len(part.covariance) == runs
-    np.testing.assert_array_equal(grown(30).first(12).error, grown(12).error)
+    assert_array_equal(grown(30).first(12).error, grown(12).error)
     assert not np.array_equal(at_once(5).error, calibration.Growing(case, 4, 1)(5).error)
-    np.testing.assert_array_equal(at_once(5).error, grown(5).error)
+    assert_array_equal(at_once(5).error, grown(5).error)
 
 
-def test_a_fault_scales_every_covariance_that_is_stated() -> None:
+def test_a_fault_scales_every_covariance_that_is_stated():
     gate = worlds.WORLDS["fixed gain"].draw(Draw(np.random.default_rng(1), 4, 5))
     wrong = gate.wrong_by(2.0)
-    np.testing.assert_allclose(wrong.covariance, gate.covariance / 2.0)
-    np.testing.assert_allclose(wrong.innovation_covariances, gate.innovation_covariances / 2.0)
-    np.testing.assert_array_equal(wrong.error, gate.error)
+    assert_allclose(wrong.covariance, gate.covariance / 2.0)
+    assert_allclose(wrong.innovation_covariances, gate.innovation_covariances / 2.0)
+    assert_array_equal(wrong.error, gate.error)
     alone = worlds.WORLDS["NIS alone"].draw(Draw(np.random.default_rng(1), 4, 5))
-    np.testing.assert_allclose(alone.wrong_by(0.5).nis, 0.5 * alone.nis)
+    assert_allclose(alone.wrong_by(0.5).nis, 0.5 * alone.nis)
     values = worlds.WORLDS["independent"].draw(Draw(np.random.default_rng(1), 4, 5))
-    np.testing.assert_allclose(joined([values, values]).wrong_by(3.0).nees[4:], 3.0 * values.nees)
+    assert_allclose(joined([values, values]).wrong_by(3.0).nees[4:], 3.0 * values.nees)
 
 
-def test_outcomes_are_counted_as_each_claim_says() -> None:
+def test_outcomes_are_counted_as_each_claim_says():
     outcomes = [
         calibration.Outcome(status, fault, wrong_scale, located, runs)
         for status, fault, wrong_scale, located, runs in (
@@ -259,7 +258,7 @@ def test_outcomes_are_counted_as_each_claim_says() -> None:
     assert {(row.mean_runs, row.late_runs, row.looks, row.gates) for row in rows} == {(40.0, 90.0, 0, 5)}
 
 
-def test_the_e_process_stops_where_it_crosses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_e_process_stops_where_it_crosses(monkeypatch):
     monkeypatch.setattr(calibration, "_evidence_values", lambda means, dof: np.cumprod(np.full(len(means), 2.0)))
     (outcome,) = calibration.judged(replace(CASE, mode="e-process", ratio=3.0), range(1), 3)
     assert (outcome.runs, outcome.status, outcome.fault) == (5, "overconfident", True)  # 2^5 is the first above 20
@@ -268,29 +267,29 @@ def test_the_e_process_stops_where_it_crosses(monkeypatch: pytest.MonkeyPatch) -
     assert (outcome.runs, outcome.fault) == (30, False)
 
 
-def test_means_of_runs_take_the_steps_that_a_run_has() -> None:
+def test_means_of_runs_take_the_steps_that_a_run_has():
     gate = worlds.WORLDS["ragged"].draw(Draw(np.random.default_rng(2), 5, 10))
     for run, mean in enumerate(calibration.run_means(gate)):
         there = np.isfinite(gate.error[run, :, 0])
         pairs = zip(gate.error[run, there], gate.covariance[run, there], strict=True)
         by_hand = [e @ np.linalg.inv(P) @ e for e, P in pairs]
-        np.testing.assert_allclose(mean, np.mean(by_hand))
+        assert_allclose(mean, np.mean(by_hand))
 
 
-def test_rows_do_not_depend_on_the_number_of_workers() -> None:
+def test_rows_do_not_depend_on_the_number_of_workers():
     one, two = (list(calibration.measure([replace(CASE, gates=30)], 5, workers)) for workers in (1, 2))
     assert one == two
     assert [row.question for row in one] == ["false alarm", "all-clear"]
 
 
-def test_quick_rows_end_where_nothing_is_doubtful() -> None:
+def test_quick_rows_end_where_nothing_is_doubtful():
     of = partial(calibration.measure, seed=5, workers=1)
     assert list(of([replace(CASE, gates=75)], quick=True)) == list(of([replace(CASE, gates=50)]))
     wrong = replace(CASE, gates=75, ratio=3.0)
     assert list(of([wrong], quick=True)) == list(of([wrong]))
 
 
-def test_rows_of_other_modules_join_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_other_modules_join_the_table(monkeypatch):
     row = {
         "world": "gated", "question": "monitor", "ratio": 1.0, "runs": 1, "looks": 0, "stated": 0.05, "bound": "<=",
         "gates": 100, "found": 3, "mean_runs": 1.0, "late_runs": 1.0,
@@ -310,7 +309,7 @@ def test_rows_of_other_modules_join_the_table(monkeypatch: pytest.MonkeyPatch) -
 # --- command ------------------------------------------------------------------------------------------------
 
 
-def test_the_table_replaces_what_stands_between_its_marks(tmp_path: Path) -> None:
+def test_the_table_replaces_what_stands_between_its_marks(tmp_path):
     path = tmp_path / "referee.md"
     start, end = calibration_rows.MARKS
     path.write_text(f"before\n{start}\nold\n{end}\nafter\n")
@@ -328,10 +327,8 @@ def test_the_table_replaces_what_stands_between_its_marks(tmp_path: Path) -> Non
         calibration_rows.write_docs(table, path)
 
 
-@pytest.mark.parametrize(("found", "status"), [(5, 0), (90, 1)])
-def test_a_broken_promise_is_the_exit_status(
-    found: int, status: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("found, status", [(5, 0), (90, 1)])
+def test_a_broken_promise_is_the_exit_status(found, status, monkeypatch, tmp_path, capsys):
     row = replace(ALARMS, gates=100, found=found)
     monkeypatch.setattr(calibration, "measure", lambda *arguments: iter([row]))
     monkeypatch.setattr(calibration, "further_rows", lambda *arguments: ([], {"w": "a world"}))
@@ -347,7 +344,7 @@ def test_a_broken_promise_is_the_exit_status(
 
 @pytest.mark.parametrize("gate", [None, 0.99, 0.95])
 @pytest.mark.parametrize("name", list(calibration_monitor.WORLDS))
-def test_monitors_at_once_are_the_monitor(name: str, gate: float | None) -> None:
+def test_monitors_at_once_are_the_monitor(name, gate):
     """Step by step, with a fault, so that there are rejections and alarms."""
     world = calibration_monitor.WORLDS[name](np.random.default_rng(), 4)
     at_once = [calibration_monitor.Monitors(4, world.dof, tolerance, gate) for tolerance in (1.0, 1.2)]
@@ -358,14 +355,14 @@ def test_monitors_at_once_are_the_monitor(name: str, gate: float | None) -> None
             evidence = many.update(nis)
             for single, value in zip(singles, nis, strict=True):
                 single.update(value, world.dof)
-            np.testing.assert_allclose(evidence, [single.evidence for single in singles], rtol=1e-9)
+            assert_allclose(evidence, [single.evidence for single in singles], rtol=1e-9)
         world.move(nis <= at_once[0].limit)
     if gate is not None:
         assert sum(single.rejections for single in one_by_one[0])
 
 
 @pytest.mark.parametrize("name", list(calibration_monitor.WORLDS))
-def test_innovations_of_the_filters_are_white_with_the_stated_covariance(name: str) -> None:
+def test_innovations_of_the_filters_are_white_with_the_stated_covariance(name):
     """Without a gate: the total NIS and the product of neighbouring innovations, two-sided at 1e-6 together."""
     world = calibration_monitor.WORLDS[name](np.random.default_rng(), 4000)
     total, product, before = 0.0, [], None
@@ -384,7 +381,7 @@ def test_innovations_of_the_filters_are_white_with_the_stated_covariance(name: s
 
 
 @pytest.mark.parametrize("name", list(calibration_monitor.WORLDS))
-def test_a_filter_that_misses_a_measurement_knows_it(name: str) -> None:
+def test_a_filter_that_misses_a_measurement_knows_it(name):
     """After five rejections that have nothing to do with the values the NIS still has its degrees of freedom (1e-6)."""
     world = calibration_monitor.WORLDS[name](np.random.default_rng(), 20_000)
     before = world.P.copy()
@@ -396,7 +393,7 @@ def test_a_filter_that_misses_a_measurement_knows_it(name: str) -> None:
     assert low < world.nis().sum() < high
 
 
-def test_rows_are_those_of_the_calibration_table(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_are_those_of_the_calibration_table(monkeypatch):
     monkeypatch.setattr(calibration_monitor, "STEPS", 60)
     monkeypatch.setattr(calibration_monitor, "PATIENCE", 200)
     monkeypatch.setattr(calibration_monitor, "QUICK_MISSIONS", {0.05: 20, 0.01: 40})
@@ -417,7 +414,7 @@ def test_rows_are_those_of_the_calibration_table(monkeypatch: pytest.MonkeyPatch
     assert {row.world for row in rows} | {row.question for row in rows} <= set(calibration_monitor.ABOUT)
 
 
-def test_a_delay_counts_the_steps_of_the_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_delay_counts_the_steps_of_the_fault(monkeypatch):
     """So gross a fault is found in its first step; at a rate of 50 % many missions have had an alarm before it."""
     monkeypatch.setattr(calibration_monitor, "LATE", 20)
     monkeypatch.setattr(calibration_monitor, "RATIOS", (1e6,))

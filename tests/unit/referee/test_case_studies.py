@@ -3,18 +3,16 @@
 A verdict here is not statistical: the draws are stored, so that it is the same each time.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
 import sys
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import consistency as cs
 from consistency.diagnostics import gate_runs
@@ -43,11 +41,11 @@ CASES = sorted(path.stem for path in FOLDER.glob("*.py") if "\nCASE = " in path.
 
 
 @cache
-def verdict(version: str, kind: str = "") -> cs.Verdict:
+def verdict(version, kind=""):
     return cs.judge(cs.read(FOLDER / f"gtsam-{version}{kind}.npz"))
 
 
-def ratio(version: str, kind: str = "") -> str:
+def ratio(version, kind=""):
     found = verdict(version, kind)
     low, high = found.inflation_interval
     return f"x{found.inflation:.2f} [{low:.2f}, {high:.2f}]"
@@ -56,20 +54,20 @@ def ratio(version: str, kind: str = "") -> str:
 # --- what is kept, and the documents -----------------------------------------------------------------
 
 
-def test_the_documents_are_what_the_kept_verdicts_make_of_the_templates() -> None:
+def test_the_documents_are_what_the_kept_verdicts_make_of_the_templates():
     """No figure is typed."""
     for path, text in page.pages().items():
         assert path.read_text("utf-8") == text, f"run python docs/case-studies/page.py: {path}"
 
 
-def test_each_script_is_kept_and_short() -> None:
+def test_each_script_is_kept_and_short():
     assert {key.split()[0] for key in STUDIES} == set(CASES)
     for case in CASES:
         assert len((FOLDER / f"{case}.py").read_text("utf-8").splitlines()) <= 60, case
 
 
 @pytest.mark.parametrize("key", STUDIES)
-def test_controls_are_consistent_and_second_arguments_agree(key: str) -> None:
+def test_controls_are_consistent_and_second_arguments_agree(key):
     """With as many runs as a plan asks for; all that is found at fault is argued twice, but for two approximations."""
     kept = STUDIES[key]
     assert "failed" not in kept
@@ -84,13 +82,13 @@ def test_controls_are_consistent_and_second_arguments_agree(key: str) -> None:
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("row", ROWS)
-def test_kept_figures_of_gtsam_are_those_of_the_archives(row: str, version: str) -> None:
+def test_kept_figures_of_gtsam_are_those_of_the_archives(row, version):
     kept = page.row_of(STUDIES, "gtsam_imu " + ("old" if version == "4.2.1" else "new"), row)
     assert page.ratio(kept["ratio"]) == ratio(version, ROWS[row])
 
 
 @pytest.mark.parametrize("path", sorted((FOLDER / "draws").glob("*.npz")), ids=lambda path: path.stem)
-def test_the_referee_says_of_the_draws_what_is_kept(path: Path) -> None:
+def test_the_referee_says_of_the_draws_what_is_kept(path):
     with np.load(path) as stored:
         (key,) = {"covariances", "deviations"} & {*stored}
         errors, stated, axes = stored["errors"], stored[key], stored["axes"].tolist()
@@ -101,16 +99,16 @@ def test_the_referee_says_of_the_draws_what_is_kept(path: Path) -> None:
     kept = named[path.name]
     found = study.told(study.verdict(kept["row"], errors, stated, axes))
     assert (found["status"], found["failed"], found["runs"]) == (kept["status"], kept["failed"], kept["runs"])
-    np.testing.assert_allclose(found["ratio"], kept["ratio"], rtol=1e-3)
+    assert_allclose(found["ratio"], kept["ratio"], rtol=1e-3)
     assert path.stat().st_size <= study.LARGEST_ARCHIVE
 
 
-def test_unreported_cases_are_neither_in_the_readme_nor_on_the_landing_page() -> None:
+def test_unreported_cases_are_neither_in_the_readme_nor_on_the_landing_page():
     for name in ("README.md", "docs/index.md"):
         assert not re.search("pycolmap|Stone ?Soup.*Cubature|pykalman", (ROOT / name).read_text("utf-8")), name
 
 
-def test_what_is_undecided_is_not_listed_as_a_pass() -> None:
+def test_what_is_undecided_is_not_listed_as_a_pass():
     rows = [
         {"row": status, "role": "judged", "status": status, "ratio": [1, 0.9, 1.1], "axes": {}, "failed": 0}
         for status in ("consistent", "undecided", "overconfident")
@@ -122,17 +120,17 @@ def test_what_is_undecided_is_not_listed_as_a_pass() -> None:
     assert page.table({}, "undecided") == "None."
 
 
-@pytest.mark.parametrize(("interval", "said"), [
+@pytest.mark.parametrize("interval, said", [
     ([2.0, 1.5, 3.0], "too small by x2.00 [1.50, 3.00]"),
     ([0.25, 0.2, 0.5], "too large by x4.00 [2.00, 5.00] (ratio 0.25)"),
     ([117.0, 20.04, 2.4e6], "too small by x117 [20.0, 2e6]"),
 ])  # fmt: skip
-def test_both_directions_in_words(interval: list[float], said: str) -> None:
+def test_both_directions_in_words(interval, said):
     assert page.words(interval) == said
 
 
-def test_the_axis_that_decides() -> None:
-    row: dict[str, Any] = {"status": "heavy-tailed", "ratio": [0.95, 0.9, 1.0], "row": "r", "runs": 9, "failed": 2}
+def test_the_axis_that_decides():
+    row = {"status": "heavy-tailed", "ratio": [0.95, 0.9, 1.0], "row": "r", "runs": 9, "failed": 2}
     row["axes"] = {"position": [0.2, 0.1, 0.3], "velocity": [0.1, 0.01, 1.2]}  # the second interval has 1
     assert page.decisive(row) == "position"
     assert page.cells(row) == "heavy-tailed, x0.95 [0.90, 1.00]; position x0.20 [0.10, 0.30]; 2 of 9 runs failed"
@@ -143,7 +141,7 @@ def test_the_axis_that_decides() -> None:
 # --- the frame of the scripts -----------------------------------------------------------------------
 
 
-def test_a_run_that_breaks_down_is_counted_and_the_rest_is_judged(rng: np.random.Generator) -> None:
+def test_a_run_that_breaks_down_is_counted_and_the_rest_is_judged(rng):
     errors, covariances = rng.normal(size=(60, 5, 2)), np.tile(np.eye(2), (60, 5, 1, 1))
     whole = study.verdict("all", errors, covariances, ("a", "b"))
     errors[3, 2], covariances[7, 1] = np.nan, -np.eye(2)
@@ -154,7 +152,7 @@ def test_a_run_that_breaks_down_is_counted_and_the_rest_is_judged(rng: np.random
     assert found.inflation == pytest.approx(whole.inflation, rel=0.2)
 
 
-def test_deviations_alone_are_judged_axis_by_axis_with_one_rate(rng: np.random.Generator, tmp_path: Path) -> None:
+def test_deviations_alone_are_judged_axis_by_axis_with_one_rate(rng, tmp_path):
     case = study.Case("numpy", ("a", "b"), 300, None, None, None)  # type: ignore[arg-type]
     errors, stated, axes = case.rounded(rng.normal(size=(300, 2)) * [1.0, 3.0], np.ones((300, 2)))
     assert (errors.shape, stated.shape, axes) == ((300, 1, 2), (300, 1, 2), ("a", "b"))
@@ -169,11 +167,11 @@ def test_deviations_alone_are_judged_axis_by_axis_with_one_rate(rng: np.random.G
     assert (whole["dof"], whole["parts"]) == (2, 1)
 
 
-def test_cases_that_share_a_control_draw_other_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cases_that_share_a_control_draw_other_numbers(monkeypatch):
     drawn = []
     for name in ("one.py", "two.py", "one.py"):
         monkeypatch.setattr(sys, "argv", [name])
-        seen: list[float] = []
+        seen = []
         case = study.Case(
             "numpy", ("a",), 9, lambda rng, runs, seen=seen: seen.append(rng.random()), None, lambda _: {}
         )  # type: ignore[misc, arg-type]
@@ -182,7 +180,7 @@ def test_cases_that_share_a_control_draw_other_numbers(monkeypatch: pytest.Monke
     assert drawn[0] == drawn[2] != drawn[1]
 
 
-def test_second_arguments_are_compared() -> None:
+def test_second_arguments_are_compared():
     rows = [{"row": "r", "ratio": [2.0, 1.8, 2.2], "axes": {"a": [0.5, 0.4, 0.6]}}]
     for argument, agrees in (
         (study.Argument("r", "", 2.3), True), (study.Argument("r", "", 2.5), False),
@@ -194,30 +192,30 @@ def test_second_arguments_are_compared() -> None:
         assert argument.told(rows)["agrees"] == agrees, argument
 
 
-def test_exact_ratios_of_a_linear_estimator(rng: np.random.Generator) -> None:
+def test_exact_ratios_of_a_linear_estimator(rng):
     """The Kalman filter has 1, with half of the covariance 2; one of a fixed gain has what 20,000 runs show."""
     F, Q = np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[0.1, 0.02], [0.02, 0.2]])
     model = linear.Model(np.array([F, 2 * F, F]), np.array([Q, Q, 3 * Q]), 0.5, np.diag([1.0, 2.0]))
 
-    def right(data: tuple[Any, Any], scale: float = 1.0) -> tuple[Any, Any]:
+    def right(data, scale=1.0):
         errors, covariances = linear.textbook(data)["textbook filter"]
         return errors, scale * covariances
 
-    np.testing.assert_allclose([each.found for each in linear.STEADY.exact("r", right)], 1.0)
+    assert_allclose([each.found for each in linear.STEADY.exact("r", right)], 1.0)
     half = linear.STEADY.exact("r", lambda data: right(data, 0.5))
-    np.testing.assert_allclose([each.found for each in half], 2.0)
+    assert_allclose([each.found for each in half], 2.0)
 
-    def fixed(data: tuple[Any, Any]) -> tuple[Any, Any]:
+    def fixed(data):
         truth, z = data
         return truth - z[..., None] * [0.7, 0.2], np.tile([[2.0, 0.3], [0.3, 1.0]], (len(z), 4, 1, 1))
 
     errors, P = fixed(model.simulate(rng, 20_000))
     shown = [cs.nees(errors, P).mean() / 2, *(errors**2 / np.diagonal(P, axis1=2, axis2=3)).mean(axis=(0, 1))]
     exact = [each.found for each in model.exact("r", fixed)]
-    np.testing.assert_allclose(exact, shown, rtol=0.1)  # eight standard errors
+    assert_allclose(exact, shown, rtol=0.1)  # eight standard errors
 
 
-def test_without_a_python_one_line_and_status_2(tmp_path: Path) -> None:
+def test_without_a_python_one_line_and_status_2(tmp_path):
     code = f"import sys; sys.path.insert(0, {str(FOLDER)!r}); import run; run.python()"
     hidden = "import subprocess; subprocess.run = lambda *a, **k: subprocess.CompletedProcess(a, 1); " + code
     done = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, check=False)
@@ -225,7 +223,7 @@ def test_without_a_python_one_line_and_status_2(tmp_path: Path) -> None:
     assert "3.10, 3.11 or 3.12" in done.stderr
 
 
-def test_an_unknown_case_is_named() -> None:
+def test_an_unknown_case_is_named():
     done = subprocess.run([sys.executable, FOLDER / "run.py", "gtsam"], capture_output=True, text=True, check=False)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert "gtsam_imu" in done.stderr
@@ -234,7 +232,7 @@ def test_an_unknown_case_is_named() -> None:
 # --- GTSAM's IMU factor ------------------------------------------------------------------------------
 
 
-def test_the_factor_of_the_older_version_alone_is_overconfident() -> None:
+def test_the_factor_of_the_older_version_alone_is_overconfident():
     """Both are judged by the same noise; the interval has the ratio that the two covariances of 4.3.0 give."""
     old, new = (verdict(version) for version in VERSIONS)
     assert (old.status, new.status) == ("overconfident", "consistent")
@@ -243,6 +241,6 @@ def test_the_factor_of_the_older_version_alone_is_overconfident() -> None:
     assert verdict("4.2.1", "-tenth").inflation < 1.2
 
 
-def test_the_figure_of_the_readme_is_that_of_the_archive() -> None:
+def test_the_figure_of_the_readme_is_that_of_the_archive():
     factor = f"by a factor of {verdict('4.2.1').inflation:.1f}"
     assert factor in " ".join((DOCS.parent / "README.md").read_text("utf-8").split())

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command import consistency
 from numpy.testing import assert_allclose
 from recorded import read_recordings
 from scipy import optimize, special, stats
@@ -436,3 +437,23 @@ def test_files_whose_truth_is_not_known_are_other_trials(tmp_path):
     (compared,) = compare_with(a, b, [])
     assert not compared.comparison.paired
     assert "Log or truth differ" in compared.sentence
+
+
+def test_files_of_one_name_are_told_apart_by_their_paths(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(3)
+    names, stated = "run,t,x,y,heading", ",1,0,0,1,0,1"
+    rows = [(run, t) for run in range(20) for t in range(4)]
+    (tmp_path / "truth.csv").write_text(f"{names}\n" + "".join(f"{run},{t},0,0,0\n" for run, t in rows))
+    for side in ("new", "old"):
+        (tmp_path / side).mkdir()
+        lines = [",".join(map(repr, [run, t, *rng.normal(size=3).tolist()])) + stated for run, t in rows]
+        head = f"{names},P_xx,P_xy,P_xh,P_yy,P_yh,P_hh"
+        (tmp_path / side / "est.csv").write_text("\n".join([head, *lines, ""]))
+    files = ["new/est.csv", "old/est.csv"]
+    shown, _ = consistency(capsys, "compare", *files, "--truth", tmp_path / "truth.csv")
+    assert f"est of {files[0]} is not found less consistent than est of {files[1]}: 20 runs" in shown
+    assert f"est of {files[1]} (reference)" in shown
+    assert {"RMSE x (m)", "RMSE heading (rad)"} <= {line.split("  ")[0] for line in shown.splitlines()}
+    same, _ = consistency(capsys, "compare", files[0], files[0], "--truth", tmp_path / "truth.csv")
+    assert "than the reference" in same

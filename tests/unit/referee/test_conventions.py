@@ -1,12 +1,9 @@
 """The page of conventions: the example of each library, with right options and wrong ones; sources to verdict."""
 
-from __future__ import annotations
-
 import json
 import re
 import runpy
 import secrets
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +14,6 @@ from drives import write_drive, write_states
 from scipy.spatial.transform import Rotation
 from test_drives import estimates
 
-from consistency.referee.types import Array
-
 PAGE = read("docs/reference/conventions.md")
 SECTIONS = dict(part.split("\n", 1) for part in PAGE.split("\n## ")[1:])
 NEEDED = {"GTSAM Pose2": "gtsam", "GTSAM Pose3": "gtsam", "Stone Soup": "stonesoup"}
@@ -27,11 +22,11 @@ WRONG = "Wrong, and seen:"
 RATE = ("--false-alarm", "1e-5")
 
 
-def commands(text: str) -> list[list[str]]:
+def commands(text):
     return [line.split()[1:] for line in text.splitlines() if line.startswith("    consistency analyse est")]
 
 
-def run_example(name: str, at: Path, monkeypatch: pytest.MonkeyPatch, *changes: tuple[str, str]) -> None:
+def run_example(name, at, monkeypatch, *changes):
     """The code of a section, with random numbers of its own."""
     if name in NEEDED:
         pytest.importorskip(NEEDED[name], reason=f"{NEEDED[name]} is not installed")
@@ -45,16 +40,14 @@ def run_example(name: str, at: Path, monkeypatch: pytest.MonkeyPatch, *changes: 
     runpy.run_path("make.py")
 
 
-def statuses(command: list[str], capsys: pytest.CaptureFixture[str]) -> set[str]:
+def statuses(command, capsys):
     options = ["--time-offset", "0"] if command[1] == "est" else []  # without a look at the clocks, which takes seconds
     out, _ = consistency(capsys, *command, "--json", *RATE, *options)
     return {verdict["status"] for verdict in json.loads(out).values()}
 
 
 @pytest.mark.parametrize("name", SECTIONS)
-def test_what_is_declared_is_right_and_its_neighbour_is_seen(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_declared_is_right_and_its_neighbour_is_seen(name, tmp_path, monkeypatch, capsys):
     """False-alarm rate 1e-5 for each verdict, three or fewer an example."""
     run_example(name, tmp_path, monkeypatch)
     right, *wrong = SECTIONS[name].split(WRONG)
@@ -66,9 +59,7 @@ def test_what_is_declared_is_right_and_its_neighbour_is_seen(
     assert wrong or name == "Stone Soup"
 
 
-def test_the_names_of_stone_soup_are_in_the_order_of_its_state(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_names_of_stone_soup_are_in_the_order_of_its_state(tmp_path, monkeypatch, capsys):
     """The mix-up is seen; the truth keeps its names."""
     truth = ("truth.append(key | dict(zip(NAMES,", 'truth.append(key | dict(zip(["x", "vx", "y", "vy"],')
     names = 'NAMES = ["x", "y", "vx", "vy"]'
@@ -77,9 +68,7 @@ def test_the_names_of_stone_soup_are_in_the_order_of_its_state(
     assert statuses(commands(SECTIONS["Stone Soup"])[0], capsys) & FAULTS
 
 
-def test_the_notebook_says_what_the_command_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_notebook_says_what_the_command_says(tmp_path, monkeypatch, capsys):
     run_example("GTSAM Pose3", tmp_path, monkeypatch)
     out, _ = consistency(capsys, *commands(SECTIONS["GTSAM Pose3"])[0], "--json")
     said = {verdict["status"] for verdict in json.loads(out).values()}
@@ -89,7 +78,7 @@ def test_the_notebook_says_what_the_command_says(
     assert {capsys.readouterr().out.strip()} == said
 
 
-def test_the_table_declares_what_the_examples_do() -> None:
+def test_the_table_declares_what_the_examples_do():
     rows = [line for line in PAGE.splitlines() if line.startswith("| [")]
     assert [re.search(r"\]\(#([^)]*)\)", row).group(1) for row in rows] == [  # type: ignore[union-attr]
         name.lower().replace(" ", "-") for name in SECTIONS
@@ -105,10 +94,9 @@ def test_the_table_declares_what_the_examples_do() -> None:
 
 STEPS = 80
 SIGMA = np.array([0.2, 0.1, 0.05, 0.01, 0.02, 0.01])
-Make = Callable[[pytest.MonkeyPatch], list[str]]
 
 
-def poses(rng: np.random.Generator) -> tuple[Array, Array, Array]:
+def poses(rng):
     """Times, estimates and truth, (N,) and (N, 7) twice; errors as ROS defines them."""
     t = 0.1 * np.arange(STEPS)
     turn = Rotation.from_rotvec(np.outer(t, [0.05, 0.1, 0.3]))
@@ -117,7 +105,7 @@ def poses(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     return t, np.column_stack([place - e[:, :3], own]), np.column_stack([place, turn.as_quat()])
 
 
-def tum(_: pytest.MonkeyPatch) -> list[str]:
+def tum(_):
     for name in ("est", "truth"):
         Path(name).mkdir()
     for run in range(5):
@@ -128,7 +116,7 @@ def tum(_: pytest.MonkeyPatch) -> list[str]:
     return ["est", "--truth", "truth"]
 
 
-def csv(_: pytest.MonkeyPatch) -> list[str]:
+def csv(_):
     rng = np.random.default_rng()
     true = np.column_stack([np.arange(1.0, STEPS + 1), rng.normal(size=(STEPS, 2))])
     own = true.copy()
@@ -140,29 +128,29 @@ def csv(_: pytest.MonkeyPatch) -> list[str]:
     return ["est.csv", "--truth", "truth.csv", "--state", "a,b"]
 
 
-def npz(_: pytest.MonkeyPatch) -> list[str]:
+def npz(_):
     errors = SIGMA[:3] * np.random.default_rng().normal(size=(6, STEPS, 3))
     np.savez("est.npz", errors=errors, covariances=np.broadcast_to(np.diag(SIGMA[:3] ** 2), (6, STEPS, 3, 3)))
     return ["est.npz"]
 
 
-def openvins(_: pytest.MonkeyPatch) -> list[str]:
+def openvins(_):
     write_states(Path())
     return ["state_estimate.txt", "--truth", "state_groundtruth.txt", "--covariance", "state_deviation.txt"]
 
 
-def pose2(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def pose2(monkeypatch):
     run_example("GTSAM Pose2", Path().absolute(), monkeypatch)
     return ["est.csv", "--truth", "truth.csv", "--error", "left"]
 
 
-def pose3(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def pose3(monkeypatch):
     run_example("GTSAM Pose3", Path().absolute(), monkeypatch)
     return ["est", "--truth", "truth", "--error", "left", "--covariance-order", "rotation-translation"]
 
 
-def bag(ros: int) -> Make:
-    def make(_: pytest.MonkeyPatch) -> list[str]:
+def bag(ros):
+    def make(_):
         pytest.importorskip("rosbags", reason="needs the extra 'ros'")
         from test_bags import Drive, write
 
@@ -173,21 +161,19 @@ def bag(ros: int) -> Make:
     return make
 
 
-def kitti(_: pytest.MonkeyPatch) -> list[str]:
+def kitti(_):
     estimates(write_drive(Path("drive_0001_sync")))
     return ["est.tum", "--truth", "drive_0001_sync"]
 
 
-SOURCES: dict[str, Make] = {
+SOURCES = {
     "TUM": tum, "CSV": csv, "npz": npz, "OpenVINS": openvins, "GTSAM Pose2": pose2, "GTSAM Pose3": pose3,
     "ROS 1 bag": bag(1), "ROS 2 bag": bag(2), "KITTI": kitti,
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_one_command_to_a_verdict_with_a_picture(
-    name: str, inside: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_command_to_a_verdict_with_a_picture(name, inside, monkeypatch, capsys):
     """Nothing is found in errors that have the stated covariance: false-alarm rate 1e-5 for each verdict."""
     out, _ = consistency(capsys, "analyse", *SOURCES[name](monkeypatch), "--report", "look", "--json", *RATE)
     verdicts = json.loads(out)

@@ -1,7 +1,5 @@
 """The tree of a document, and renderers that show the same tree."""
 
-from __future__ import annotations
-
 import json as standard
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +8,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from consistency.diagnostics import Comparison, Interval, MapScore, Record, Verdict, judge
+from consistency.diagnostics import Comparison, Interval, MapScore, Record, judge
 from consistency.referee.diagnostics.comparison import Difference
 from consistency.referee.diagnostics.verdict.answers import ABOUT, ALONE
 from consistency.referee.diagnostics.verdict.parts import JointScore, RejectionScore
@@ -18,7 +16,6 @@ from consistency.referee.diagnostics.words.sentences import reasons
 from consistency.referee.document.blocks import (
     Answer,
     Bullets,
-    Cell,
     Chapter,
     Column,
     Document,
@@ -62,7 +59,7 @@ TREE = Document(
 
 
 @pytest.mark.parametrize(
-    ("cell", "plain", "printed"),
+    "cell, plain, printed",
     [
         ("a", "a", "a"),
         (Quantity(None), "-", "–"),
@@ -86,16 +83,16 @@ TREE = Document(
         (BAD, BAD.sentence, BAD.sentence),
     ],
 )
-def test_a_cell_is_written_with_the_signs_of_its_medium(cell: Cell, plain: str, printed: str) -> None:
+def test_a_cell_is_written_with_the_signs_of_its_medium(cell, plain, printed):
     assert written(cell, PLAIN) == plain
     assert written(cell, PRINTED) == printed
 
 
-def test_what_was_judged_is_found_wherever_it_stands() -> None:
+def test_what_was_judged_is_found_wherever_it_stands():
     assert list(TREE.reasons) == [BAD, GOOD, OTHER]
 
 
-def test_junit_has_a_case_for_each_verdict() -> None:
+def test_junit_has_a_case_for_each_verdict():
     suite = ET.fromstring(as_xml.render(TREE))[0]
     assert suite.attrib == {"name": "Two `filters`", "tests": "3", "failures": "1", "errors": "0", "skipped": "0"}
     bad, good, _ = suite
@@ -110,7 +107,7 @@ def test_junit_has_a_case_for_each_verdict() -> None:
     assert said.text == "ekf is consistent: no fault found\n- mean NEES 3.0"
 
 
-def test_markdown_escapes_what_would_be_markup() -> None:
+def test_markdown_escapes_what_would_be_markup():
     said = as_md.render(TREE)
     assert said.startswith("## Two \\`filters\\`\n\nOne of them is honest.\n\n| filter | verdict | n |  |\n| --- | ---")
     assert "| ekf | consistent | 2.00 |  |" in said
@@ -120,11 +117,11 @@ def test_markdown_escapes_what_would_be_markup() -> None:
     assert said.endswith("- runs: 2\n\n- one\n- two\n\n")
 
 
-def test_json_holds_the_data_and_no_word_more() -> None:
+def test_json_holds_the_data_and_no_word_more():
     assert standard.loads(as_json.render(TREE)) == {"a": [1.0, None], "b": [2, None]}
 
 
-def test_text_puts_what_did_not_pass_below_its_row() -> None:
+def test_text_puts_what_did_not_pass_below_its_row():
     said = text.fragment(*TREE.opening, *TREE.chapters[0].blocks).splitlines()
     assert said[0] == "filter  verdict     n"
     assert said[1] == "ekf     consistent  2.00"
@@ -132,7 +129,7 @@ def test_text_puts_what_did_not_pass_below_its_row() -> None:
     assert said[-4:] == ["More", "  runs  2", "  - one", "  - two"]
 
 
-def test_a_static_page_shows_every_block_and_escapes_all_text() -> None:
+def test_a_static_page_shows_every_block_and_escapes_all_text():
     said = as_html.render(TREE)
     for part in (
         "<h1>Two `filters`</h1>", '<p class="answer">One of them is honest.</p>',
@@ -147,7 +144,7 @@ def test_a_static_page_shows_every_block_and_escapes_all_text() -> None:
     assert "a<b>" not in said
 
 
-def test_a_file_is_in_the_format_of_its_suffix() -> None:
+def test_a_file_is_in_the_format_of_its_suffix():
     for suffix in FORMATS:
         assert rendered(TREE, Path(f"x{suffix.upper()}")).endswith("\n")
     assert rendered(TREE, Path("x.xml")).startswith("<?xml")
@@ -156,14 +153,14 @@ def test_a_file_is_in_the_format_of_its_suffix() -> None:
 # --- verdicts ---------------------------------------------------------------------------------------
 
 
-def verdict_of(scale: float, name: str = "f", n: int = 2):
+def verdict_of(scale, name="f", n=2):
     rng = np.random.default_rng(5)
     error = scale * rng.standard_normal((60, 4, n))
     P = np.broadcast_to(np.eye(n), (60, 4, n, n))
     return judge(Record(name, error=error, covariance=P, nees=(error**2).sum(-1), dof=n, axes=("x", "y")))
 
 
-def test_every_view_takes_its_cells_from_the_verdict() -> None:
+def test_every_view_takes_its_cells_from_the_verdict():
     v = verdict_of(2.0)
     said = {m.column.head: written(m.cell(v), PLAIN) for m in (*TERMINAL, *page("[a, b]"), *FURTHER)}
     value, low, high = v.scale.inflation
@@ -176,13 +173,13 @@ def test_every_view_takes_its_cells_from_the_verdict() -> None:
     assert cells(TERMINAL[:1], v) == (Status("overconfident"),)
 
 
-def test_columns_without_any_value_are_left_out() -> None:
+def test_columns_without_any_value_are_left_out():
     heads = [m.column.head for m in with_values(page(""), [verdict_of(1.0), verdict_of(2.0)])]
     assert "NIS / dof" not in heads
     assert {"Verdict", "Mean ANEES", "Worst axis"} <= set(heads)
 
 
-def test_one_document_says_the_same_on_the_terminal_and_in_files() -> None:
+def test_one_document_says_the_same_on_the_terminal_and_in_files():
     verdicts = {"good": verdict_of(1.0), "bad": verdict_of(2.0)}
     tree = document(verdicts, "a.csv")
     assert standard.loads(as_json.render(tree))["bad"]["reasons"] == list(verdicts["bad"].reasons)
@@ -195,13 +192,13 @@ def test_one_document_says_the_same_on_the_terminal_and_in_files() -> None:
     assert not list(document(verdicts, reasons=False).reasons)
 
 
-def test_a_verdict_prints_itself_by_the_renderers() -> None:
+def test_a_verdict_prints_itself_by_the_renderers():
     v = verdict_of(2.0)
     assert str(v).splitlines()[0] == f"f is {v.reasons[0]}"
     assert v._repr_html_().startswith(f'<div><dl class="reasons"><div><dt> f</dt><dd>{v.reasons[0]}<')
 
 
-def test_a_terminal_has_words_of_verdicts_in_colour(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_a_terminal_has_words_of_verdicts_in_colour(monkeypatch, capsys):
     terminal.show(*TREE.opening)
     said = capsys.readouterr().out
     assert said.splitlines()[1].split() == ["ekf", "consistent", "2.00"]
@@ -212,7 +209,7 @@ def test_a_terminal_has_words_of_verdicts_in_colour(monkeypatch: pytest.MonkeyPa
 # --- what else is put into rows ---------------------------------------------------------------------
 
 
-def test_the_score_of_a_map_in_every_view() -> None:
+def test_the_score_of_a_map_in_every_view():
     bare = MapScore(Interval(1.2, 0.9, 1.6), 5, 40, 2)
     assert [written(cell) for cell in map_cells(bare)] == ["not judged", "1.20 [0.90, 1.60]", "–", "–", "5", "40", "2"]
     assert map_text(bare) == "1.20 [0.90, 1.60] (2 of 42 landmarks left out)"
@@ -228,7 +225,7 @@ def test_the_score_of_a_map_in_every_view() -> None:
     assert map_lines({}) == []
 
 
-def test_what_a_guard_rejected() -> None:
+def test_what_a_guard_rejected():
     share = Interval(0.5, 0.25, 0.75)
     score = RejectionScore(share, Interval(0.9, 0.8, 1.0), Interval(0.01, 0.0, 0.02), 5, 200, 10, 20)
     shown = [written(cell) for cell in rejection_cells(score)]
@@ -242,7 +239,7 @@ def test_what_a_guard_rejected() -> None:
 PLAN = {"runs": 9, "false_alarm": 0.05, "power": 0.95, "detect": 1.5, "one_step": 30, "looks": [12, 24], "dof": 3}
 
 
-def test_heads_of_a_comparison_and_lines_of_a_plan() -> None:
+def test_heads_of_a_comparison_and_lines_of_a_plan():
     c = Comparison(9, True, (Difference("mean NEES", 3.0, 4.0, 0.75, 0.5, 1.1),), 0.1, 0.1, 0.5, 0.05)
     one, two = (comparison_table(*names, c) for names in (("a", "b"), ("a", "a")))
     assert [column.head for column in one.columns][1:3] == ["a", "b (reference)"]
@@ -257,7 +254,7 @@ def test_heads_of_a_comparison_and_lines_of_a_plan() -> None:
     assert like.endswith("where some axes or some runs alone are slow, it may take up to 9")
 
 
-def test_the_rate_of_several_filters_is_said() -> None:
+def test_the_rate_of_several_filters_is_said():
     """Each filter has the rate; that of the call is at most their sum, and never above 1."""
     v = verdict_of(1.0)
     assert _rate_line({"a": v}) is None
@@ -267,12 +264,12 @@ def test_the_rate_of_several_filters_is_said() -> None:
     assert str(_rate_line({str(k): v for k in range(30)})).endswith("for all 30 together it is at most 1")
 
 
-def _rate_line(verdicts: dict[str, Verdict]) -> str | None:
+def _rate_line(verdicts):
     lines = [b.text for b in document(verdicts, reasons=False).opening if isinstance(b, Text)]
     return next((line for line in lines if line.startswith("false alarm")), None)
 
 
-def test_a_fault_of_one_question_alone_has_its_sentence() -> None:
+def test_a_fault_of_one_question_alone_has_its_sentence():
     v = verdict_of(1.0)
     answers = tuple(replace(a, found=a.question == "distribution") for a in v.answers)
     alone = replace(v, answers=answers, status="inconsistent")

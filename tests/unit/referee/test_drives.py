@@ -1,13 +1,11 @@
 """KITTI drives as truth, against pykitti, and the files of a simulation with OpenVINS."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 from drives import R_IV, R_VC, STEPS, T_IV, T_VC, write_drive, write_states
+from numpy.testing import assert_allclose
 from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
@@ -16,49 +14,48 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.geometry.groups import spatial_error
 from consistency.referee.readers.formats.kitti_files import mercator, read_drive
-from consistency.referee.types import Array
 
 
 @pytest.fixture
-def drive(tmp_path: Path) -> Path:
+def drive(tmp_path):
     return write_drive(tmp_path / "2011_09_26_drive_0001_sync")
 
 
-def matrices(lines: Array) -> Array:
+def matrices(lines):
     out = np.tile(np.eye(4), (len(lines), 1, 1))
     out[:, :3, :3], out[:, :3, 3] = Rotation.from_quat(lines[:, 4:]).as_matrix(), lines[:, 1:4]
     return out
 
 
-def test_poses_are_those_of_pykitti(drive: Path) -> None:
+def test_poses_are_those_of_pykitti(drive):
     utils = pytest.importorskip("pykitti.utils", reason="pykitti is not installed")
     files = sorted((drive / "oxts/data").iterdir())
     true = np.array([each.T_w_imu for each in utils.load_oxts_packets_and_poses(list(map(str, files)))])
     own = matrices(read_drive(drive).values)
-    np.testing.assert_allclose(own, np.linalg.inv(true[0]) @ true, atol=1e-6)
+    assert_allclose(own, np.linalg.inv(true[0]) @ true, atol=1e-6)
     velo = utils.transform_from_rot_trans(R_IV, T_IV)  # points of the imu, as the velodyne has them
     camera = utils.transform_from_rot_trans(R_VC, T_VC) @ velo
     for body, mount in (("velodyne", velo), ("camera", camera)):
         each = true @ np.linalg.inv(mount)
-        np.testing.assert_allclose(matrices(read_drive(drive, body).values), np.linalg.inv(each[0]) @ each, atol=1e-6)
+        assert_allclose(matrices(read_drive(drive, body).values), np.linalg.inv(each[0]) @ each, atol=1e-6)
 
 
-def test_seconds_are_counted_from_the_first_packet_across_midnight(drive: Path) -> None:
+def test_seconds_are_counted_from_the_first_packet_across_midnight(drive):
     t = read_drive(drive).t
     assert t[0] == 0.0
     assert ((t - np.arange(STEPS) / 10.0 >= -1e-9) & (t - np.arange(STEPS) / 10.0 < 1e-3)).all()
 
 
-def test_the_projection_is_right_to_the_millimetre() -> None:
+def test_the_projection_is_right_to_the_millimetre():
     """Against the ellipsoid's tangent, which differs by the sphere of Mercator: 0.4 % at most; shape exact."""
     place = np.array([[49.0, 8.4, 100.0], [49.0, 8.401, 100.0], [49.001, 8.4, 103.0]])
     x, y, z = (mercator(place) - mercator(place)[0]).T
-    np.testing.assert_allclose(x[1], np.deg2rad(0.001) * 6378137.0 * np.cos(np.deg2rad(49.0)), rtol=1e-9)
-    np.testing.assert_allclose(y[2], np.deg2rad(0.001) * 6378137.0, rtol=2e-5)
-    np.testing.assert_allclose((x[0], y[1], x[2], z[2]), (0.0, 0.0, 0.0, 3.0), atol=1e-9)
+    assert_allclose(x[1], np.deg2rad(0.001) * 6378137.0 * np.cos(np.deg2rad(49.0)), rtol=1e-9)
+    assert_allclose(y[2], np.deg2rad(0.001) * 6378137.0, rtol=2e-5)
+    assert_allclose((x[0], y[1], x[2], z[2]), (0.0, 0.0, 0.0, 3.0), atol=1e-9)
 
 
-def estimates(folder: Path, body: str | None = None) -> tuple[Array, Array]:
+def estimates(folder, body=None):
     """est.tum (44 columns) and est.csv beside a drive, and the errors that they have, spatial and planar."""
     lines, rng = read_drive(folder, body).values, np.random.default_rng()
     sigma = np.array([0.2, 0.1, 0.05, 0.01, 0.02, 0.01])
@@ -76,40 +73,40 @@ def estimates(folder: Path, body: str | None = None) -> tuple[Array, Array]:
     return spatial_error(lines[:, 1:], pose, "so3"), planar_error(flat, own, "so2")
 
 
-def test_a_trajectory_and_a_table_are_judged_by_a_drive(drive: Path) -> None:
+def test_a_trajectory_and_a_table_are_judged_by_a_drive(drive):
     spatial, planar = estimates(drive)
     [r] = read_recordings(drive.parent / "est.tum", drive)
-    np.testing.assert_allclose(r.error[0], spatial, atol=1e-8)  # type: ignore[index]
+    assert_allclose(r.error[0], spatial, atol=1e-8)  # type: ignore[index]
     assert "the path of the imu as its first pose sees it" in r.notes[0]
     [r] = read_recordings(drive.parent / "est.csv", drive)
-    np.testing.assert_allclose(r.error[0], planar, atol=1e-8)  # type: ignore[index]
+    assert_allclose(r.error[0], planar, atol=1e-8)  # type: ignore[index]
     record = cs.read(drive.parent / "est.csv", truth=drive, body="velodyne")
     assert np.abs(np.asarray(record.error)[0] - planar).max() > 0.01
 
 
-def test_the_body_is_chosen(drive: Path) -> None:
+def test_the_body_is_chosen(drive):
     spatial, _ = estimates(drive, "camera")
     [r] = read_recordings(drive.parent / "est.tum", drive, body="camera")
-    np.testing.assert_allclose(r.error[0], spatial, atol=1e-8)  # type: ignore[index]
+    assert_allclose(r.error[0], spatial, atol=1e-8)  # type: ignore[index]
     assert "the path of the camera" in r.notes[0]
     [other] = read_recordings(drive.parent / "est.tum", drive)
     assert np.abs(other.error[0] - spatial).max() > 1.0  # type: ignore[index]
 
 
-def test_a_folder_of_runs_has_a_drive_for_each_or_one_for_all(drive: Path) -> None:
+def test_a_folder_of_runs_has_a_drive_for_each_or_one_for_all(drive):
     spatial, _ = estimates(drive)
     (drive.parent / "est").mkdir()
     shutil.copy(drive.parent / "est.tum", drive.parent / "est" / f"{drive.name}.tum")
     for truth in (drive, drive.parent):
         [r] = read_recordings(drive.parent / "est", truth)
-        np.testing.assert_allclose(r.error[0], spatial, atol=1e-8)  # type: ignore[index]
+        assert_allclose(r.error[0], spatial, atol=1e-8)  # type: ignore[index]
 
 
-def test_what_is_wrong_with_a_drive_is_said(drive: Path) -> None:
+def test_what_is_wrong_with_a_drive_is_said(drive):
     estimates(drive)
     est, data = drive.parent / "est.tum", drive / "oxts/data"
 
-    def refused(match: str, path: Path = est, body: str | None = None) -> None:
+    def refused(match, path=est, body=None):
         with pytest.raises(InputError, match=match):
             read_recordings(path, drive, body=body)
 
@@ -156,21 +153,21 @@ def test_what_is_wrong_with_a_drive_is_said(drive: Path) -> None:
 # --- OpenVINS -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("cameras", "more"), [(1, 0), (2, 0), (1, 25)])
-def test_states_are_judged_component_by_component(cameras: int, more: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("cameras, more", [(1, 0), (2, 0), (1, 25)])
+def test_states_are_judged_component_by_component(cameras, more, tmp_path):
     e, sigma = write_states(tmp_path, cameras, more)
     files = [tmp_path / f"state_{name}.txt" for name in ("estimate", "groundtruth", "deviation")]
     found = read_recordings(*files)
     assert [r.name for r in found] == [f"state_estimate {axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
     for i, r in enumerate(found):
-        np.testing.assert_allclose(r.error[0, :, 0], e[:, i], atol=1e-9)  # type: ignore[index]
-        np.testing.assert_allclose(r.covariance[0, :, 0, 0], sigma[:, i] ** 2, rtol=1e-9)  # type: ignore[index]
+        assert_allclose(r.error[0, :, 0], e[:, i], atol=1e-9)  # type: ignore[index]
+        assert_allclose(r.covariance[0, :, 0, 0], sigma[:, i] ** 2, rtol=1e-9)  # type: ignore[index]
         assert r.convention == "so3-body"
     [yaw] = read_recordings(*files, axes=["yaw"])
     assert yaw.axes == ("yaw",)
 
 
-def test_velocity_and_biases_of_states(tmp_path: Path) -> None:
+def test_velocity_and_biases_of_states(tmp_path):
     """One recording more, each of whose components is judged by itself; EuRoC's truth has them, too."""
     e, sigma = write_states(tmp_path, moving=True)
     est, truth, deviation = (tmp_path / f"state_{name}.txt" for name in ("estimate", "groundtruth", "deviation"))
@@ -183,10 +180,10 @@ def test_velocity_and_biases_of_states(tmp_path: Path) -> None:
         assert rest.name == "state_estimate velocity and biases"
         assert rest.axes == ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")
         assert rest.parts == tuple((i,) for i in range(9))
-        np.testing.assert_allclose(rest.error[0], e[:, 6:], atol=1e-9)  # type: ignore[index]
-        np.testing.assert_allclose(np.diagonal(rest.covariance[0], axis1=1, axis2=2), sigma[:, 6:] ** 2, rtol=1e-9)  # type: ignore[index]
+        assert_allclose(rest.error[0], e[:, 6:], atol=1e-9)  # type: ignore[index]
+        assert_allclose(np.diagonal(rest.covariance[0], axis1=1, axis2=2), sigma[:, 6:] ** 2, rtol=1e-9)  # type: ignore[index]
     [bias] = read_recordings(est, truth, deviation, axes=["bgy"])
-    np.testing.assert_allclose(bias.error[0, :, 0], e[:, 10], atol=1e-9)  # type: ignore[index]
+    assert_allclose(bias.error[0, :, 0], e[:, 10], atol=1e-9)  # type: ignore[index]
     np.savetxt(tmp_path / "tum.txt", rows[:, [0, 5, 6, 7, 1, 2, 3, 4]])
     assert len(read_recordings(est, tmp_path / "tum.txt", deviation)) == 6
     found = read_recordings(est, truth, deviation, align="posyaw-all")
@@ -194,7 +191,7 @@ def test_velocity_and_biases_of_states(tmp_path: Path) -> None:
     assert f"{est}: with --align the poses alone are judged, not their velocities and biases" in found[0].notes
 
 
-def test_what_is_wrong_with_states_is_said(tmp_path: Path) -> None:
+def test_what_is_wrong_with_states_is_said(tmp_path):
     write_states(tmp_path)
     est, truth, deviation = (tmp_path / f"state_{name}.txt" for name in ("estimate", "groundtruth", "deviation"))
     with pytest.raises(InputError, match="give --covariance FILE, the standard deviations of t, three"):

@@ -252,7 +252,15 @@ def test_the_command_on_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert said["judged_drives"] == ["run 3"]
     same = cs.fit_covariance(cs.read_drives(estimates, truth), SPAN, held_out="run 3")
     assert said["noise"]["variance_per_m"] == pytest.approx(same.noise.per_m.tolist())
-    consistency(capsys, *words, "--held-out", "half", "--fail-on", "inconsistent", status=1)
+    half = (*words, "--held-out", "half", "--json")
+    consistency(capsys, *half, "--fail-on", "inconsistent", status=1)
+    kept, err = consistency(capsys, *half, "--keep-mean-error")
+    assert (json.loads(kept)["mean"], err) == (
+        {"way": 1.0, "turn": 1.0, "drift_rad_per_m": [0.0], "slip_m_per_rad": 0.0},
+        "",
+    )
+    same, err = consistency(capsys, *half, "--no-correct")
+    assert (same, err) == (kept, "consistency: --no-correct is now called --keep-mean-error\n")
 
 
 def test_every_kind_of_file_gives_the_same_drive(tmp_path: Path) -> None:
@@ -333,7 +341,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ((estimates, *good, "--cautious", "0.9"), "--cautious"),
         ((estimates, *good, "--fail-on", "wrong"), "--fail-on"),
         ((estimates, *good, "--time-offset", "fast"), "seconds"),
-        ((estimates, *good, "--no-correct", "--by-turn"), "--by-turn"),
+        ((estimates, *good, "--keep-mean-error", "--by-turn"), "--by-turn"),
         ((estimates, *good, "--out", str(tmp_path / "full")), "exists already"),
         ((estimates, *good, "--second", str(tmp_path / "none.csv")), "no such file"),
         ((estimates, *good, "--overwrite"), "--overwrite"),

@@ -1,7 +1,5 @@
 """The mean of noise models: on whose side the noise is, instruments, intervals, and what is not corrected."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import fit_sides as sides
@@ -9,12 +7,13 @@ import numpy as np
 import pytest
 from fit_covariance import World, drives
 from fit_sides import Side
+from numpy.testing import assert_allclose
 from scipy import stats
 
 import consistency as cs
 from consistency.referee.fit_covariance import systematic_errors as errors_
 from consistency.referee.fit_covariance.model_text import correction, data, noise_lines
-from consistency.referee.fit_covariance.motion_windows import DriveWindows, cut_windows, span_of
+from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of
 from consistency.referee.fit_covariance.systematic_errors import (
     BACKWARD,
     FORWARD,
@@ -44,13 +43,13 @@ FIT = MeanFit(
 )  # fmt: skip
 
 
-def cut(side: Side, seed: int) -> DriveWindows:
+def cut(side, seed):
     return cut_windows(sides.drives(np.random.default_rng(seed), side), span_of("1m"))
 
 
 @pytest.mark.parametrize("in_space", [False, True])
 @pytest.mark.parametrize("of_odometry", [True, False])
-def test_the_scale_is_found_on_whichever_side_the_noise_is(of_odometry: bool, in_space: bool) -> None:
+def test_the_scale_is_found_on_whichever_side_the_noise_is(of_odometry, in_space):
     """Turns with 3 times the variance of their noise, of which the estimates have 0.95: within 5 standard errors.
 
     Least squares finds 0.75 of it, or with the true motion as instruments 1.33 times as much where it is noisy.
@@ -65,7 +64,7 @@ def test_the_scale_is_found_on_whichever_side_the_noise_is(of_odometry: bool, in
     assert not fit.is_open
 
 
-def test_neighbours_are_those_of_the_same_drive_without_a_gap() -> None:
+def test_neighbours_are_those_of_the_same_drive_without_a_gap():
     w = cut(Side(3), 1).of(np.arange(5))
     first, last = np.array([0, 20, 40, 60, 81]), np.array([20, 40, 60, 80, 101])
     w = replace(w, drive=np.array([0, 0, 0, 1, 1]), first=first, last=last)
@@ -74,20 +73,20 @@ def test_neighbours_are_those_of_the_same_drive_without_a_gap() -> None:
 
 
 @pytest.mark.parametrize("in_space", [False, True])
-def test_instruments_are_of_neighbouring_motion_apart_from_shared_ends(in_space: bool) -> None:
+def test_instruments_are_of_neighbouring_motion_apart_from_shared_ends(in_space):
     w = cut(Side(3, in_space=in_space), 2).of(np.arange(3))
     Z = normal_equations(w, no_mean(w), np.tile(np.eye(len(w.axes)), (3, 1, 1)), [NEIGHBOURS])[NEIGHBOURS].Z
     P, one = w.pieces.shape[1], np.eye(w.d + 1)
     early, late = np.array(w.pieces[:1]), np.array(w.pieces[2:])
     early[:, P - GAP :], late[:, :GAP] = one, one
-    np.testing.assert_allclose(Z[1], (jacobian_of_mean(early) + jacobian_of_mean(late))[0], atol=1e-12)
+    assert_allclose(Z[1], (jacobian_of_mean(early) + jacobian_of_mean(late))[0], atol=1e-12)
     # another motion of a window, or next to it, does not change its instruments
     w.pieces[1], w.pieces[0, P - GAP :], w.pieces[2, :GAP] = one, one, one
     again = normal_equations(w, no_mean(w), np.tile(np.eye(len(w.axes)), (3, 1, 1)), [NEIGHBOURS])[NEIGHBOURS].Z
-    np.testing.assert_allclose(again[1], Z[1], atol=1e-12)
+    assert_allclose(again[1], Z[1], atol=1e-12)
 
 
-def test_moments_are_weighted_by_the_covariance() -> None:
+def test_moments_are_weighted_by_the_covariance():
     w = cut(Side(3), 3).of(np.arange(4))
     root = np.random.default_rng(0).normal(size=(4, 3, 3))
     C = root @ np.swapaxes(root, 1, 2) + np.eye(3)
@@ -95,11 +94,11 @@ def test_moments_are_weighted_by_the_covariance() -> None:
     X, Z = jacobian_of_mean(w.pieces), jacobian_of_mean(w.true_pieces)
     for k in range(4):
         for found, left in ((forward, X[k]), (backward, Z[k])):
-            np.testing.assert_allclose(found.A[k], left.T @ np.linalg.solve(C[k], X[k]), rtol=1e-9, atol=1e-12)
-            np.testing.assert_allclose(found.b[k], left.T @ np.linalg.solve(C[k], w.errors[k]), rtol=1e-9, atol=1e-12)
+            assert_allclose(found.A[k], left.T @ np.linalg.solve(C[k], X[k]), rtol=1e-9, atol=1e-12)
+            assert_allclose(found.b[k], left.T @ np.linalg.solve(C[k], w.errors[k]), rtol=1e-9, atol=1e-12)
 
 
-def test_an_interval_is_of_the_scatter_between_blocks() -> None:
+def test_an_interval_is_of_the_scatter_between_blocks():
     """Student's, of sums over 20 blocks that the solution leaves; a coefficient that is not fitted is that of none."""
     w = cut(Side(3, scale=0.9), 5)
     near = Mean(1.02, 0.9, (0.01,))
@@ -110,10 +109,8 @@ def test_an_interval_is_of_the_scatter_between_blocks() -> None:
     left = m.b - m.A @ step
     sums = np.array([part.sum(axis=0) for part in np.array_split(left, 20)]) @ np.linalg.inv(A).T
     reach = stats.t.ppf(0.975, 19) * np.sqrt((sums**2).sum(axis=0) * 20 / 19)
-    np.testing.assert_allclose(
-        mean.values, [1.02 * (1 + step[0]), 0.9 * (1 + step[1]), 0.01 * (1 + step[1]) + 1.02 * step[2]]
-    )
-    np.testing.assert_allclose(high - low, 2 * reach, rtol=1e-6)
+    assert_allclose(mean.values, [1.02 * (1 + step[0]), 0.9 * (1 + step[1]), 0.01 * (1 + step[1]) + 1.02 * step[2]])
+    assert_allclose(high - low, 2 * reach, rtol=1e-6)
     alone, _, _ = estimate(w, near, m, np.array([True, False, False]))
     assert alone.turn == 1.0
     assert alone.drift == (0.0,)
@@ -122,7 +119,7 @@ def test_an_interval_is_of_the_scatter_between_blocks() -> None:
     assert alone.way == pytest.approx(1.02 * (1 + rest))
 
 
-def test_what_is_none_is_not_corrected(rng: np.random.Generator) -> None:
+def test_what_is_none_is_not_corrected(rng):
     """White noise about a right scale: nothing is corrected unless an interval of 95 % misses."""
     found = choose_mean(cut(Side(3), 11))
     held = (found.low <= [1, 1, 0]) & (found.high >= [1, 1, 0])
@@ -136,8 +133,8 @@ def test_what_is_none_is_not_corrected(rng: np.random.Generator) -> None:
     assert choose_mean(w).mean.turn == pytest.approx(0.95, abs=1e-3)
 
 
-@pytest.mark.parametrize(("of_odometry", "snr"), [(True, 10), (False, 1)])
-def test_a_truth_that_drifts_leaves_the_scale_open(of_odometry: bool, snr: float) -> None:
+@pytest.mark.parametrize("of_odometry, snr", [(True, 10), (False, 1)])
+def test_a_truth_that_drifts_leaves_the_scale_open(of_odometry, snr):
     """Its errors outlast a window; the interval holds both directions."""
     found = choose_mean(cut(Side(snr, of_odometry, drifts=True), 8))
     assert found.lasts
@@ -147,7 +144,7 @@ def test_a_truth_that_drifts_leaves_the_scale_open(of_odometry: bool, snr: float
     assert found.mean.turn == 1.0
 
 
-def test_motion_that_lasts_for_less_than_a_window_is_a_weak_instrument() -> None:
+def test_motion_that_lasts_for_less_than_a_window_is_a_weak_instrument():
     """White turns: F is that of a chance correlation, above the limit of 10 in 0.2 %."""
     rng, made = np.random.default_rng(3), []
     for i in range(6):
@@ -163,14 +160,14 @@ def test_motion_that_lasts_for_less_than_a_window_is_a_weak_instrument() -> None
     assert found.turns == pytest.approx((0.5, 1.0), abs=0.25)
 
 
-def test_weak_instruments_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weak_instruments_are_not_used(monkeypatch):
     w = cut(Side(3, in_space=False), 4)
     assert choose_mean(w).instruments == NEIGHBOURS
     monkeypatch.setattr(errors_, "STRONG", 1e9)
     assert choose_mean(w).instruments == FORWARD
 
 
-def test_roads_without_turns_leave_turns_as_they_are() -> None:
+def test_roads_without_turns_leave_turns_as_they_are():
     """Estimated turns are noise alone: least squares is near 0, and the range holds 1."""
     found = choose_mean(cut(Side(0.0), 10))
     assert found.mean.turn == 1.0
@@ -178,7 +175,7 @@ def test_roads_without_turns_leave_turns_as_they_are() -> None:
     assert found.low[1] < 1.0 < found.high[1]
 
 
-def test_strength_is_the_first_stage_f() -> None:
+def test_strength_is_the_first_stage_f():
     """Of the weakest coefficient, each beside the other; robust to unequal variances."""
     rng = np.random.default_rng(0)
     Z = rng.normal(size=(400, 2, 2))
@@ -192,9 +189,9 @@ def test_strength_is_the_first_stage_f() -> None:
 
 
 @pytest.mark.parametrize(
-    ("weights", "expected"), [((1.0,), False), ((1.0, 1.0), True), ((1.0, 0.0, 1.0), True), ((1.0, -1.0), False)]
+    "weights, expected", [((1.0,), False), ((1.0, 1.0), True), ((1.0, 0.0, 1.0), True), ((1.0, -1.0), False)]
 )
-def test_errors_that_outlast_a_window(weights: tuple[float, ...], expected: bool) -> None:
+def test_errors_that_outlast_a_window(weights, expected):
     """Independent errors; errors that share a part with the next window, or the one after; jitter of shared ends.
 
     Independent errors are called lasting in 0.3 %.
@@ -211,20 +208,20 @@ def test_errors_that_outlast_a_window(weights: tuple[float, ...], expected: bool
 # --- variances -----------------------------------------------------------------------------------------
 
 
-def test_a_turn_of_its_own_does_not_stand_for_a_noisy_one() -> None:
+def test_a_turn_of_its_own_does_not_stand_for_a_noisy_one():
     w = cut(Side(3), 7).of(np.arange(6))
     F, found = terms_of(w.pieces), fitted_terms(w, replace(FIT, instruments=NEIGHBOURS))
-    np.testing.assert_allclose(found[:, :3], F[:, :3])
-    np.testing.assert_allclose(found[2, 3:], 0.5 * (F[1, 3:] + F[3, 3:]))
-    np.testing.assert_allclose(found[0, 3:], F[1, 3:])
+    assert_allclose(found[:, :3], F[:, :3])
+    assert_allclose(found[2, 3:], 0.5 * (F[1, 3:] + F[3, 3:]))
+    assert_allclose(found[0, 3:], F[1, 3:])
     for fit in (FIT, None):
-        np.testing.assert_allclose(fitted_terms(w, fit), F)
+        assert_allclose(fitted_terms(w, fit), F)
     lonely = replace(w, last=w.last - np.array([0, 0, 0, 0, 1, 0]))
     found = fitted_terms(lonely, replace(FIT, instruments=NEIGHBOURS))
-    np.testing.assert_allclose(found[5, 3:], found[:5, 3:].mean(axis=0))
+    assert_allclose(found[5, 3:], found[:5, 3:].mean(axis=0))
 
 
-def test_jitter_is_the_constant_of_mean_squares() -> None:
+def test_jitter_is_the_constant_of_mean_squares():
     stated, counts = np.array([1.0, 2.0, 4.0, 8.0]), np.array([800, 400, 200, 100])
     assert constant_of(2.0 * stated + 3.0, stated, counts) == pytest.approx(3.0)
     assert constant_of(stated, stated, counts) == 0.0
@@ -232,21 +229,21 @@ def test_jitter_is_the_constant_of_mean_squares() -> None:
     assert constant_of(20.0 - stated, stated, 1000 * counts) == 0.0  # errors do not grow
 
 
-def test_the_floor_is_added() -> None:
+def test_the_floor_is_added():
     w = cut(Side(3), 9).of(np.arange(4))
     theta, floor = np.arange(1.0, 7.0), np.array([0.1, 0.2, 0.3])
     noise = WhiteNoise(w.axes, no_mean(w), theta[:3], theta[3:], floor, 2.0)
     F = terms_of(w.pieces)
-    np.testing.assert_allclose(noise.covariance(w.pieces), 2.0 * (np.tensordot(theta, F, (0, 1)) + np.diag(floor)))
+    assert_allclose(noise.covariance(w.pieces), 2.0 * (np.tensordot(theta, F, (0, 1)) + np.diag(floor)))
 
 
-def test_jitter_of_the_truth_is_not_noise_of_the_way() -> None:
+def test_jitter_of_the_truth_is_not_noise_of_the_way():
     """The ratio at 20 spans, where jitter does not grow: 0.6 if it is taken for noise, 1 but for 10 % if it is not."""
     _, ratio = sides.fitted(np.random.default_rng(2), Side(3, False, jitters=True))
     assert 0.75 < ratio < 1.3
 
 
-def test_every_fit_that_is_judged_has_the_jitter(rng: np.random.Generator) -> None:
+def test_every_fit_that_is_judged_has_the_jitter(rng):
     made = drives(rng, 3, World(offset=0.1), 300.0)
     model = cs.fit_covariance(made, "10m")
     jitter = jitter_of(fit_noise(model.windows), model.windows)
@@ -255,7 +252,7 @@ def test_every_fit_that_is_judged_has_the_jitter(rng: np.random.Generator) -> No
         assert (noise.floor >= jitter).all()
 
 
-def test_a_ratio_over_twenty_spans_with_noise_of_the_odometry() -> None:
+def test_a_ratio_over_twenty_spans_with_noise_of_the_odometry():
     """1.8 by least squares; 1 but for 10 % here."""
     _, ratio = sides.fitted(np.random.default_rng(3), Side(1))
     assert 0.75 < ratio < 1.3
@@ -265,17 +262,17 @@ def test_a_ratio_over_twenty_spans_with_noise_of_the_odometry() -> None:
 
 
 @pytest.fixture(scope="module")
-def model() -> cs.NoiseModel:
+def model():
     return cs.fit_covariance(drives(np.random.default_rng(5), 3, length=300.0), "10m", name="wheels")
 
 
-def said(model: cs.NoiseModel, **changes: object) -> str:
+def said(model, **changes):
     fit = replace(FIT, **changes)  # type: ignore[arg-type]
     noise = replace(model.noise, mean=fit.mean, mean_fit=fit)
     return "\n".join([correction(replace(model, noise=noise)), *noise_lines(replace(model, noise=noise))])
 
 
-def test_sentences_of_the_mean(model: cs.NoiseModel) -> None:
+def test_sentences_of_the_mean(model):
     text = said(model)
     assert text.startswith("correct first: turn x0.95\n")
     assert "not corrected, as the interval holds none: way x[0.98, 1.03], heading [-0.01, 0.012]" in text
@@ -296,7 +293,7 @@ def test_sentences_of_the_mean(model: cs.NoiseModel) -> None:
     assert none.startswith("\n")
 
 
-def test_programs_have_the_evidence(model: cs.NoiseModel) -> None:
+def test_programs_have_the_evidence(model):
     fit, mean = model.noise.mean_fit, data(model)["mean"]
     assert fit is not None
     assert mean["low"] == fit.low.tolist()

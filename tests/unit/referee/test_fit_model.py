@@ -3,8 +3,6 @@
 Drives that no white noise describes are refused or named, with the reason and the remedy.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import fit_covariance as world
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 import relative_poses as spatial
 from fit_covariance import PER_M, World, drives, matrices_of
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
@@ -19,7 +18,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import Ratio, folds_of, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.model_text import noise_lines, sentence
-from consistency.referee.fit_covariance.motion_windows import DriveWindows, blocks_of, cut_windows, in_plane, span_of
+from consistency.referee.fit_covariance.motion_windows import blocks_of, cut_windows, in_plane, span_of
 from consistency.referee.fit_covariance.noise_model import caution
 from consistency.referee.fit_covariance.persistence import TERMS, PersistentError, variance_between
 from consistency.referee.fit_covariance.refusals import RotationGrowth, body_turn, revisits, rotation_growth
@@ -41,19 +40,18 @@ from consistency.referee.fit_covariance.white_noise import (
     terms_of,
 )
 from consistency.referee.geometry.groups import composed, inverse, log, vectors
-from consistency.referee.types import Array
 
 GROUPS = ("SE(2)", "SE(3)")
 
 
-def drive_in(group: str, rng: np.random.Generator, steps: int = 400, name: str = "a") -> Drive:
+def drive_in(group, rng, steps=400, name="a"):
     """A drive in the plane or in space whose motions err independently."""
     made = spatial.drive(rng, group, steps)
     T = composed(np.concatenate([np.eye(made.motions.shape[-1])[None], made.motions]))
     return drive_of(name, spatial.vectors(T), spatial.vectors(made.truth), 0.1 * np.arange(len(T)))
 
 
-def cut(group: str, rng: np.random.Generator, span: str = "3m") -> DriveWindows:
+def cut(group, rng, span="3m"):
     return cut_windows([drive_in(group, rng)], span_of(span))
 
 
@@ -61,16 +59,16 @@ def cut(group: str, rng: np.random.Generator, span: str = "3m") -> DriveWindows:
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_errors_are_those_of_whole_motions(group: str, rng: np.random.Generator) -> None:
+def test_errors_are_those_of_whole_motions(group, rng):
     drive = drive_in(group, rng)
     w = cut_windows([drive], span_of("3m"))
     D, M = (inverse(T[w.first]) @ T[w.last] for T in (drive.estimate, drive.truth))
-    np.testing.assert_allclose(w.motions, D, atol=1e-12)
-    np.testing.assert_allclose(w.errors, log(inverse(D) @ M), atol=1e-10)
+    assert_allclose(w.motions, D, atol=1e-12)
+    assert_allclose(w.errors, log(inverse(D) @ M), atol=1e-10)
     assert (w.first[1:] == w.last[:-1]).all()
 
 
-def test_pieces_of_other_spans_have_the_same_size(rng: np.random.Generator) -> None:
+def test_pieces_of_other_spans_have_the_same_size(rng):
     w = cut_windows(drives(rng, 1, length=200.0), span_of("10m"))
     for size, pieces in ((10.0, 20), (20.0, 40), (2.5, 5), (0.1, 1)):
         found = w.over(size)
@@ -79,21 +77,21 @@ def test_pieces_of_other_spans_have_the_same_size(rng: np.random.Generator) -> N
     assert w.over(500.0) is None
 
 
-def test_a_jump_is_cut_and_counted(rng: np.random.Generator) -> None:
+def test_a_jump_is_cut_and_counted(rng):
     clean, jumpy = (cut_windows(drives(np.random.default_rng(7), 1, World(jumps=n)), span_of("10m")) for n in (0, 2))
     assert clean.jumps == 0
     assert jumpy.jumps in (1, 2)
     assert np.abs(jumpy.errors[:, :2]).max() < 0.7
 
 
-def test_jumps_are_those_of_their_own_drive() -> None:
+def test_jumps_are_those_of_their_own_drive():
     """A drive that errs a hundred times as much has none."""
     rng = np.random.default_rng(1)
     rough = drives(rng, 1, World(times=1e4))[0]
     assert cut_windows([*drives(rng, 4), rough], span_of("10m")).jumps == 0
 
 
-def test_windows_without_motion_are_left_out(rng: np.random.Generator) -> None:
+def test_windows_without_motion_are_left_out(rng):
     drive = drives(rng, 1)[0]
     T = np.concatenate([drive.estimate[:1000], np.repeat(drive.estimate[999:1000], 400, 0)])
     M = np.concatenate([drive.truth[:1000], np.repeat(drive.truth[999:1000], 400, 0)])
@@ -103,7 +101,7 @@ def test_windows_without_motion_are_left_out(rng: np.random.Generator) -> None:
     assert w.long == 0
 
 
-def test_gaps_are_left_out_and_counted(rng: np.random.Generator) -> None:
+def test_gaps_are_left_out_and_counted(rng):
     drive = drives(rng, 1)[0]
     keep = np.r_[0:500, 700:1200]
     part = Drive("a", drive.t[keep], drive.row[keep], drive.estimate[keep], drive.truth[keep])
@@ -111,18 +109,18 @@ def test_gaps_are_left_out_and_counted(rng: np.random.Generator) -> None:
         assert cut_windows([part], span_of(span)).long == 1
 
 
-def test_spans_are_refused() -> None:
+def test_spans_are_refused():
     for bad in ("0m", "-1m", "1km", "m", "", "1.5"):
         with pytest.raises(InputError, match="--span"):
             span_of(bad)
 
 
-def test_planar_part_of_motions_in_space(rng: np.random.Generator) -> None:
+def test_planar_part_of_motions_in_space(rng):
     """Poses on a plane give the same windows in either form, whatever the world frame is."""
     drive = drives(rng, 1)[0]
     tilt = Rotation.from_euler("xyz", [0.3, -0.2, 1.0])
 
-    def raised(T: Array) -> Array:
+    def raised(T):
         pose = np.zeros((len(T), 7))
         pose[:, :3] = tilt.apply(np.column_stack([T[:, :2, 2], np.zeros(len(T))]))
         yaw = Rotation.from_rotvec(np.arctan2(T[:, 1, 0], T[:, 0, 0])[:, None] * [0, 0, 1])
@@ -131,7 +129,7 @@ def test_planar_part_of_motions_in_space(rng: np.random.Generator) -> None:
 
     space = drive_of("a", raised(drive.estimate), raised(drive.truth), drive.t)
     flat, cut = cut_windows([drive], span_of("10m")), cut_windows([space], span_of("10m"), planar=True)
-    np.testing.assert_allclose(cut.errors, flat.errors, atol=1e-9)
+    assert_allclose(cut.errors, flat.errors, atol=1e-9)
     assert in_plane(space.estimate).shape == (len(drive.t), 3, 3)
 
 
@@ -139,7 +137,7 @@ def test_planar_part_of_motions_in_space(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_an_error_of_a_piece_is_carried_to_the_end(group: str, rng: np.random.Generator) -> None:
+def test_an_error_of_a_piece_is_carried_to_the_end(group, rng):
     w = cut(group, rng)
     A, n = carriers(w.pieces), len(w.axes)
     perfect = replace(w, true=w.motions)
@@ -151,11 +149,11 @@ def test_an_error_of_a_piece_is_carried_to_the_end(group: str, rng: np.random.Ge
             before = before @ rest[:, j]
         after = inverse(before) @ w.motions
         moved = replace(perfect, true=before @ spatial.exp(e) @ after)
-        np.testing.assert_allclose(moved.errors, np.einsum("wij,wj->wi", A[:, k], e), atol=1e-10)
+        assert_allclose(moved.errors, np.einsum("wij,wj->wi", A[:, k], e), atol=1e-10)
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_derivatives_of_the_mean(group: str, rng: np.random.Generator) -> None:
+def test_derivatives_of_the_mean(group, rng):
     w = cut(group, rng)
     w = replace(w, true=w.motions)
     X, step = jacobian_of_mean(w.pieces), 1e-6
@@ -166,13 +164,13 @@ def test_derivatives_of_the_mean(group: str, rng: np.random.Generator) -> None:
             values[p] = sign * step
             mean = Mean(1 + values[0], 1 + values[1], tuple(values[2:]))
             ends.append(mean.applied(w).errors)
-        np.testing.assert_allclose(
+        assert_allclose(
             -(ends[0] - ends[1]) / (2 * step), X[..., p], atol=1e-7 if group == "SE(2)" else 0.02 * np.abs(X).max()
         )
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_a_mean_alone_is_found(group: str, rng: np.random.Generator) -> None:
+def test_a_mean_alone_is_found(group, rng):
     w = cut(group, rng)
     drift = (0.01,) if group == "SE(2)" else (0.01, -0.02, 0.005)
     known = Mean(0.95, 1.04, drift)
@@ -181,14 +179,14 @@ def test_a_mean_alone_is_found(group: str, rng: np.random.Generator) -> None:
     assert (found.way, found.turn, *found.drift) == pytest.approx((0.95, 1.04, *drift), abs=2e-4)
     again = estimate(w, found, normal_equations(w, found, None, [FORWARD])[FORWARD]).mean
     assert (again.way, again.turn, *again.drift) == pytest.approx((0.95, 1.04, *drift), abs=1e-6)
-    np.testing.assert_allclose(again.applied(w).errors, 0.0, atol=1e-5)
+    assert_allclose(again.applied(w).errors, 0.0, atol=1e-5)
 
 
 # --- likelihood ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_terms_are_sums_over_pieces(group: str, rng: np.random.Generator) -> None:
+def test_terms_are_sums_over_pieces(group, rng):
     w = cut(group, rng)
     F, A, n = terms_of(w.pieces), carriers(w.pieces), len(w.axes)
     d = w.d
@@ -199,12 +197,12 @@ def test_terms_are_sums_over_pieces(group: str, rng: np.random.Generator) -> Non
             turn = np.arctan2(T[1, 0], T[0, 0]) if d == 2 else Rotation.from_matrix(T[:3, :3]).magnitude()
             for size, out in zip((np.linalg.norm(T[:d, d]), abs(turn)), by_hand, strict=True):
                 out += 0.5 * size * sum(np.outer(A[k, j][:, axis], A[k, j][:, axis]) for j in (piece, piece + 1))
-        np.testing.assert_allclose(F[k, axis], by_hand[0], atol=1e-12)
-        np.testing.assert_allclose(F[k, n + axis], by_hand[1], atol=1e-12)
+        assert_allclose(F[k, axis], by_hand[0], atol=1e-12)
+        assert_allclose(F[k, n + axis], by_hand[1], atol=1e-12)
 
 
 @pytest.mark.parametrize("least", [(1e-9,) * 3, (4e-3, 1e-4, 1e-8)], ids=["hardly any floor", "as large as the noise"])
-def test_fitted_variances_are_a_fixed_point_and_the_best(least: tuple[float, ...], rng: np.random.Generator) -> None:
+def test_fitted_variances_are_a_fixed_point_and_the_best(least, rng):
     """theta = theta (sum u'Fu / sum tr C^-1 F)^.5 where it is positive, and no neighbour is likelier."""
     made = drives(rng, 3, World(offset=float(np.sqrt(least[0] / 2))))
     w = cut_windows(made, span_of("10m"))
@@ -215,10 +213,10 @@ def test_fitted_variances_are_a_fixed_point_and_the_best(least: tuple[float, ...
     up = np.einsum("wi,wpij,wj->p", u, F, u)
     down = np.einsum("wij,wpji->p", np.linalg.inv(C), F)
     positive = theta > 1e-3 * theta.max()
-    np.testing.assert_allclose((up / down)[positive], 1.0, atol=2e-3)  # 2e-4 at most in 60 draws
+    assert_allclose((up / down)[positive], 1.0, atol=2e-3)  # 2e-4 at most in 60 draws
     assert (up[~positive] <= 1.002 * down[~positive]).all()
 
-    def value(t: Array) -> float:
+    def value(t):
         P = np.diag(floor) + np.tensordot(t, F, (0, 1))
         return float(-0.5 * (np.linalg.slogdet(P)[1].sum() + nees_of(e, P).sum()))
 
@@ -229,16 +227,16 @@ def test_fitted_variances_are_a_fixed_point_and_the_best(least: tuple[float, ...
             assert value(other) <= value(theta) + 1e-3
 
 
-def test_known_noise_is_recovered(rng: np.random.Generator) -> None:
+def test_known_noise_is_recovered(rng):
     """6 drives, 600 windows: the terms a metre, which make up most of their axes, within 40 % (6 sigma)."""
     model = cs.fit_covariance(drives(rng, 6), "10m")
-    np.testing.assert_allclose(model.noise.per_m, world.PER_M, rtol=0.4)
+    assert_allclose(model.noise.per_m, world.PER_M, rtol=0.4)
     assert all(each.low < each.value < each.high for each in model.per_m)
     assert abs(np.log(model.ratio.value)) < 0.25
     assert model.counts == {"windows": len(model.windows.drive), "long": 0, "still": 0, "jumps": 0}  # type: ignore[union-attr]
 
 
-def test_intervals_of_the_jackknife() -> None:
+def test_intervals_of_the_jackknife():
     assert interval_of(8.0, [8.0] * 5).low == 0.0
     assert np.isnan(interval_of(0.0, [0.0] * 5).high)
     some = interval_of(8.0, [7.0, 8.0, 9.0, 8.5, 7.5])
@@ -247,7 +245,7 @@ def test_intervals_of_the_jackknife() -> None:
     assert [len(b) for b in blocks_of(np.zeros(40, int))] == [2] * 20
 
 
-def test_jitter_of_both_ends_is_the_floor(rng: np.random.Generator) -> None:
+def test_jitter_of_both_ends_is_the_floor(rng):
     quiet, shaky = (drives(rng, 3, World(offset=offset)) for offset in (0.0, 0.05))
     for made, low, high in ((quiet, 0.0, 1e-3), (shaky, 2.5e-3, 1e-2)):
         w = cut_windows(made, span_of("10m"))
@@ -257,7 +255,7 @@ def test_jitter_of_both_ends_is_the_floor(rng: np.random.Generator) -> None:
 # --- folds and ratios -----------------------------------------------------------------------------------------
 
 
-def test_what_is_judged_chose_nothing(rng: np.random.Generator) -> None:
+def test_what_is_judged_chose_nothing(rng):
     """Another content of the judged drive, or half, changes no fit that judges it."""
     made, others = drives(rng, 3), drives(rng, 3)
     mixed = [*made[:2], replace(others[2], name=made[2].name)]
@@ -276,7 +274,7 @@ def test_what_is_judged_chose_nothing(rng: np.random.Generator) -> None:
     assert np.array_equal(folds_of(late, "half", fit_noise)[1][0].noise.per_m, fold.noise.per_m)
 
 
-def test_ratio_over_drives() -> None:
+def test_ratio_over_drives():
     values = np.exp([0.1, -0.2, 0.3, 0.0, 0.2])
     r = ratio_of(values, np.repeat(values, 10))
     logs = np.log(values)
@@ -292,7 +290,7 @@ def test_ratio_over_drives() -> None:
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "drives_", "windows", "general", "status"),
+    "low, high, drives_, windows, general, status",
     [
         (0.8, 1.3, 5, 20, True, "consistent"), (0.8, 1.3, 2, 60, True, "consistent"),
         (0.8, 1.3, 4, 49, True, "undecided"), (0.8, 1.3, 5, 500, False, "undecided"),
@@ -302,11 +300,11 @@ def test_ratio_over_drives() -> None:
         (1.1, 1.6, 1, 500, False, "overconfident"),
     ],
 )  # fmt: skip
-def test_status_of_a_ratio(low: float, high: float, drives_: int, windows: int, general: bool, status: str) -> None:
+def test_status_of_a_ratio(low, high, drives_, windows, general, status):
     assert Ratio(1.0, low, high, 0.1, drives_, windows, general).status == status
 
 
-def test_halves_and_unknown_drives(rng: np.random.Generator) -> None:
+def test_halves_and_unknown_drives(rng):
     made = drives(rng, 2, length=300.0)
     model = cs.fit_covariance(made, "10m", held_out="half")
     assert model.status in ("undecided", "overconfident", "conservative")
@@ -316,13 +314,13 @@ def test_halves_and_unknown_drives(rng: np.random.Generator) -> None:
             cs.fit_covariance(made, "10m", held_out=bad)
 
 
-def test_cautious_raises_all_covariances(rng: np.random.Generator) -> None:
+def test_cautious_raises_all_covariances(rng):
     made = drives(rng, 5, World(spread=0.5), 500.0)
     plain, raised = (cs.fit_covariance(made, "10m", cautious=p) for p in (None, 0.9))
     factor = raised.noise.factor
     assert factor > 1.2
     assert raised.ratio.value == pytest.approx(plain.ratio.value / factor)
-    np.testing.assert_allclose(raised.covariance([10.0, 0, 0]), factor * plain.covariance([10.0, 0, 0]))
+    assert_allclose(raised.covariance([10.0, 0, 0]), factor * plain.covariance([10.0, 0, 0]))
     with pytest.raises(InputError, match="--cautious"):
         caution(replace(plain.ratio, drives=4), 0.9)
     with pytest.raises(InputError, match="between"):
@@ -332,17 +330,17 @@ def test_cautious_raises_all_covariances(rng: np.random.Generator) -> None:
 # --- the model ---------------------------------------------------------------------------------------------------
 
 
-def test_covariance_of_a_motion_is_that_of_its_steps(rng: np.random.Generator) -> None:
+def test_covariance_of_a_motion_is_that_of_its_steps(rng):
     model = cs.fit_covariance(drives(rng, 2, length=400.0), "10m")
     step = np.array([0.5, 0.0, 0.04])
     whole = composed(np.repeat(world.matrices_of(step[None]), 20, 0))[-1]
     motion = [whole[0, 2], whole[1, 2], np.arctan2(whole[1, 0], whole[0, 0])]
     C = model.covariance(np.repeat(step[None], 20, 0))
-    np.testing.assert_allclose(model.covariance(motion), C, rtol=1e-9)
+    assert_allclose(model.covariance(motion), C, rtol=1e-9)
     n = model.noise
     assert C[2, 2] == pytest.approx(10 * n.per_m[2] + 0.8 * n.per_rad[2] + n.floor[2])
     still = model.covariance([0.0, 0.0, 0.0])
-    np.testing.assert_allclose(still, np.diag(n.floor))
+    assert_allclose(still, np.diag(n.floor))
     assert (n.floor > 0).all()
     corrected = model.correct([[1.0, 0.0, 0.1]])[0]
     assert corrected[0, 2] == pytest.approx(n.mean.way)
@@ -351,11 +349,11 @@ def test_covariance_of_a_motion_is_that_of_its_steps(rng: np.random.Generator) -
             model.covariance(bad)
 
 
-def test_in_space_and_an_axis_that_never_moved(rng: np.random.Generator) -> None:
+def test_in_space_and_an_axis_that_never_moved(rng):
     """z, roll and pitch of planar poses have no error, and yet a variance."""
     flat = [drive_in("SE(2)", rng, 600, name) for name in "ab"]
 
-    def raised(T: Array) -> Array:
+    def raised(T):
         yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
         zero = np.zeros(len(T))
         return np.column_stack([T[:, :2, 2], zero, zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)])
@@ -366,7 +364,7 @@ def test_in_space_and_an_axis_that_never_moved(rng: np.random.Generator) -> None
     assert planar.noise.axes == ("x", "y", "yaw")
     C = model.covariance([3.0, 0, 0, 0, 0, 0, 1])
     assert np.linalg.eigvalsh(C)[0] > 0
-    np.testing.assert_allclose(planar.noise.per_m, cs.fit_covariance(flat, "3m").noise.per_m, rtol=1e-6)
+    assert_allclose(planar.noise.per_m, cs.fit_covariance(flat, "3m").noise.per_m, rtol=1e-6)
     with pytest.raises(InputError, match="--axes 6"):
         cs.fit_covariance(flat, "3m", axes=6)
     with pytest.raises(InputError, match="--axes 4"):
@@ -381,7 +379,7 @@ RIGHT = Ratio(1.0, 0.8, 1.25, 0.1, 6, 600)
 
 
 @pytest.mark.parametrize(
-    ("world", "words"),
+    "world, words",
     [
         (World(closed=True), ("loops are closed", "record the live odometry")),
         (World(metric=2.2), ("2.2 times", "not metric", "scale state")),
@@ -391,19 +389,19 @@ RIGHT = Ratio(1.0, 0.8, 1.25, 0.1, 6, 600)
         (World(jumps=8), ("have a jump", "more than 5 %")),
     ],
 )
-def test_a_drive_that_is_refused(world: World, words: tuple[str, ...], rng: np.random.Generator) -> None:
+def test_a_drive_that_is_refused(world, words, rng):
     with pytest.raises(InputError) as error:
         cs.fit_covariance(drives(rng, 2, world), SPAN)
     assert all(word in str(error.value) for word in words), str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_scale_is_the_users_matter_without_correction(rng: np.random.Generator) -> None:
+def test_scale_is_the_users_matter_without_correction(rng):
     model = cs.fit_covariance(drives(rng, 2, World(metric=2.2), 400.0), SPAN, correct=False)
     assert (model.noise.mean.way, model.noise.mean.turn, model.noise.mean.drift) == (1.0, 1.0, (0.0,))
 
 
-def test_too_few_windows(rng: np.random.Generator) -> None:
+def test_too_few_windows(rng):
     short = drives(rng, 1, length=40.0)
     with pytest.raises(InputError, match=r"too few to fit|fewer than|5 drives"):
         cs.fit_covariance(short, SPAN)
@@ -415,16 +413,16 @@ def test_too_few_windows(rng: np.random.Generator) -> None:
         cs.fit_covariance(["wheels"], SPAN)  # type: ignore[list-item]
 
 
-def test_estimate_and_truth_are_the_same(rng: np.random.Generator) -> None:
+def test_estimate_and_truth_are_the_same(rng):
     drive = drives(rng, 1)[0]
     with pytest.raises(InputError, match="same positions"):
         fit_noise(cut_windows([replace(drive, estimate=drive.truth)], span_of(SPAN)))
 
 
-def test_a_loop_that_is_closed_has_small_errors_between_passes(rng: np.random.Generator) -> None:
+def test_a_loop_that_is_closed_has_small_errors_between_passes(rng):
     """Circles of 250 m: white noise adds up between passes; a heading that is corrected at each pass does not."""
 
-    def circles(closed: bool) -> list[Drive]:
+    def circles(closed):
         found = []
         for i in range(4):
             n = 4000
@@ -451,7 +449,7 @@ def test_a_loop_that_is_closed_has_small_errors_between_passes(rng: np.random.Ge
     assert np.isnan(revisits(cut_windows(made, span_of("5s")))[0])
 
 
-def test_growth_of_white_noise_and_of_a_persistent_drift(rng: np.random.Generator) -> None:
+def test_growth_of_white_noise_and_of_a_persistent_drift(rng):
     """Power 1 within 4 standard errors of 0.1; nearly 2 where the drift of a drive outweighs its noise."""
     for drift, low, high in ((World(), 0.6, 1.4), (World(memory=2000.0, coloured=3e-3), 1.6, 2.1)):
         made = drives(rng, 5, drift)
@@ -467,7 +465,7 @@ def test_growth_of_white_noise_and_of_a_persistent_drift(rng: np.random.Generato
     assert np.isnan(rotation_growth(w, fit_noise(w).mean).power)
 
 
-def test_growth_needs_its_standard_errors() -> None:
+def test_growth_needs_its_standard_errors():
     assert RotationGrowth(0.3, 0.1).shrinks
     assert not RotationGrowth(0.3, 0.3).shrinks
     assert not RotationGrowth(0.6, 0.01).shrinks
@@ -476,10 +474,10 @@ def test_growth_needs_its_standard_errors() -> None:
 
 
 @pytest.mark.parametrize(
-    ("world", "word"),
+    "world, word",
     [(World(scale=0.02), "the scale of the way"), (World(memory=5000.0, coloured=3e-3), "drift of the heading")],
 )
-def test_terms_that_persist_are_named_from_five_drives_on(world: World, word: str, rng: np.random.Generator) -> None:
+def test_terms_that_persist_are_named_from_five_drives_on(world, word, rng):
     made = drives(rng, 6, world)
     few = cs.fit_covariance(made[:4], SPAN)
     assert not any("differs between drives" in each for each in few.warnings)
@@ -501,7 +499,7 @@ def test_terms_that_persist_are_named_from_five_drives_on(world: World, word: st
     assert replace(model, spans=(replace(model.spans[0], whole=wrong), *model.spans[1:])).status == "overconfident"
 
 
-def test_variance_between_drives() -> None:
+def test_variance_between_drives():
     """Five values with a variance of 0.1 each have Q = 100 with 4 degrees of freedom; weights sum to 50."""
     values, variances = 7.0 + np.arange(5.0), np.full(5, 0.1)
     assert variance_between(values, variances, 0.01) == pytest.approx((100 - 4) / (50 - 10))
@@ -511,32 +509,32 @@ def test_variance_between_drives() -> None:
     assert variance_between(values[:4], variances[:4], 0.01) == 0.0
 
 
-def test_a_second_estimator_with_the_same_errors(rng: np.random.Generator) -> None:
+def test_a_second_estimator_with_the_same_errors(rng):
     """Errors of the truth are in both; of another odometry they are not."""
     made = drives(rng, 5, length=500.0)
     same = cs.fit_covariance(made, SPAN, second=made)
-    np.testing.assert_allclose(same.second.correlation, 1.0, atol=0.05)
-    np.testing.assert_allclose(same.second.size, 1.0, atol=0.05)
+    assert_allclose(same.second.correlation, 1.0, atol=0.05)
+    assert_allclose(same.second.size, 1.0, atol=0.05)
     assert same.status != "consistent"
     assert "correlate" in repr(same)
 
-    def steps(T: Array) -> Array:
+    def steps(T):
         return inverse(T[:-1]) @ T[1:]
 
-    def twin(drive: Drive, error: Array) -> Drive:
+    def twin(drive, error):
         """Another estimate of the same truth, with errors (N - 1, 3) of its steps."""
         T = np.concatenate([drive.truth[:1], steps(drive.truth) @ matrices_of(error)])
         return replace(drive, estimate=composed(T))
 
-    def own(times: float) -> list[Drive]:
+    def own(times):
         """With noise of its own: in x and y ``times`` as large."""
         sigma = np.sqrt(0.5 * np.array(PER_M)) * [times, times, 1.0]
         return [twin(drive, sigma * rng.normal(size=(len(drive.t) - 1, 3))) for drive in made]
 
     larger = [twin(d, 3 * vectors(inverse(steps(d.truth)) @ steps(d.estimate))) for d in made]
     found = cs.fit_covariance(made, SPAN, second=larger).second
-    np.testing.assert_allclose(found.correlation, 1.0, atol=0.1)
-    np.testing.assert_allclose(found.size, 3.0, rtol=0.1)
+    assert_allclose(found.correlation, 1.0, atol=0.1)
+    assert_allclose(found.size, 3.0, rtol=0.1)
     other, rough = (cs.fit_covariance(made, SPAN, second=own(times)) for times in (1.0, 5.0))
     assert np.abs(other.second.correlation).max() < 0.4
     assert other.second.is_rough.tolist() == [False] * 3
@@ -547,13 +545,13 @@ def test_a_second_estimator_with_the_same_errors(rng: np.random.Generator) -> No
         cs.fit_covariance(made, SPAN, second=[replace(each, name="else") for each in made])
 
 
-def test_a_second_estimator_in_space_beside_three_axes(rng: np.random.Generator) -> None:
+def test_a_second_estimator_in_space_beside_three_axes(rng):
     made = drives(rng, 2, World(per_m=(1e-3,) * 3 + (1e-5,) * 3, per_rad=(1e-9,) * 6), 400.0)
     model = cs.fit_covariance(made, SPAN, axes=3, second=made)
     assert (model.second.correlation > 0.8).all()
 
 
-def test_the_turn_of_a_straight_drive_is_the_least(rng: np.random.Generator) -> None:
+def test_the_turn_of_a_straight_drive_is_the_least(rng):
     """A camera that looks 3 degrees to the side on a straight road, which tells nothing of a roll."""
     world = World(per_m=(1e-5,) * 3 + (1e-7,) * 3, per_rad=(1e-9,) * 6)
     made = drives(rng, 1, world, 400.0)[0]

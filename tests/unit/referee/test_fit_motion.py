@@ -1,14 +1,12 @@
 """Means that depend on the motion, clocks that differ, and inputs that are not poses, on drives with known errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import relative_poses as spatial
 from fit_covariance import OWN_CONSTANTS, World, drives, matrices_of
+from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
 from consistency.referee.errors import InputError
@@ -40,8 +38,7 @@ from consistency.referee.fit_covariance.writing import toml
 from consistency.referee.geometry.groups import composed, inverse, vectors
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.truth_matching import Manifold, Poses, unstated
-from consistency.referee.types import Array
+from consistency.referee.readers.truth_matching import Poses, unstated
 
 SPAN = "10m"
 RIGHT = Ratio(1.0, 0.8, 1.25, 0.1, 10, 250)
@@ -49,7 +46,7 @@ OPEN = replace(RIGHT, low=0.56, high=1.95)
 SPACE = ((4e-4, 2e-4, 3e-4, 2e-6, 3e-6, 4e-6), (4e-4, 1e-4, 2e-4, 1e-5, 1e-5, 2e-5))
 
 
-def paced(rng: np.random.Generator, noise: float, number: int = 5) -> list[Drive]:
+def paced(rng, noise, number=5):
     """Drives that go by 0.2 or 1 m a step, for 20 steps each, with noise (sd, m) of the way of each step."""
     found = []
     for i in range(number):
@@ -66,18 +63,18 @@ def paced(rng: np.random.Generator, noise: float, number: int = 5) -> list[Drive
 
 
 @pytest.mark.parametrize("world", [World(), World(*SPACE)], ids=["plane", "space"])
-def test_effect_of_a_slip_is_its_derivative(world: World, rng: np.random.Generator) -> None:
+def test_effect_of_a_slip_is_its_derivative(world, rng):
     w = cut_windows(drives(rng, 1, world, 300.0), span_of(SPAN))
     w = replace(w, true=w.motions)
     less, more = (replace(w, pieces=lengthened(w.pieces, slip)).errors for slip in (-1e-6, 1e-6))
-    np.testing.assert_allclose((less - more) / 2e-6, jacobian(w.pieces)[..., -1], atol=1e-6)
+    assert_allclose((less - more) / 2e-6, jacobian(w.pieces)[..., -1], atol=1e-6)
     longer = lengthened(w.pieces, 0.1)
-    np.testing.assert_allclose(ways(longer), ways(w.pieces) + 0.1 * np.linalg.norm(rotation_vectors(w.pieces), axis=-1))
-    np.testing.assert_allclose(rotation_vectors(longer), rotation_vectors(w.pieces))
+    assert_allclose(ways(longer), ways(w.pieces) + 0.1 * np.linalg.norm(rotation_vectors(w.pieces), axis=-1))
+    assert_allclose(rotation_vectors(longer), rotation_vectors(w.pieces))
     assert ways(lengthened(w.pieces, -1e3)).min() == 0.0
 
 
-def test_a_known_slip_is_recovered_and_corrected(rng: np.random.Generator) -> None:
+def test_a_known_slip_is_recovered_and_corrected(rng):
     """With hardly any noise: the corrected motion is the true one."""
     quiet = World((1e-10, 1e-10, 1e-12), (1e-12,) * 3, slip=-0.1)
     w = cut_windows(drives(rng, 2, quiet, 400.0), span_of(SPAN))
@@ -94,25 +91,25 @@ def test_a_known_slip_is_recovered_and_corrected(rng: np.random.Generator) -> No
     assert rotation_vectors(corrected)[0, 0, 0] == pytest.approx(0.9 * -0.5 + 0.1 * 0.9)
 
 
-def test_a_slip_keeps_the_floor_and_the_evidence(rng: np.random.Generator) -> None:
+def test_a_slip_keeps_the_floor_and_the_evidence(rng):
     w = cut_windows(drives(rng, 2, World(slip=-0.2), 300.0), span_of(SPAN))
     noise = fit_noise(w, by_turn=True, jitter=np.array([1.0, 2.0, 3.0]))
     assert noise.floor.tolist() == [1.0, 2.0, 3.0]
     alone = fit_noise(w.lengthened(noise.mean.slip), jitter=noise.floor)
     assert noise.mean_fit is not None
     assert alone.mean_fit is not None
-    np.testing.assert_array_equal(noise.mean_fit.low, alone.mean_fit.low)
+    assert_array_equal(noise.mean_fit.low, alone.mean_fit.low)
     assert replace(noise.mean, slip=0.0) == alone.mean
 
 
-def test_a_straight_drive_tells_no_slip(rng: np.random.Generator) -> None:
+def test_a_straight_drive_tells_no_slip(rng):
     steps = np.tile([0.5, 0.0, 0.0], (1200, 1))
     noisy = steps + rng.normal(size=steps.shape) * [0.02, 0.0, 0.0]
     T, M = (composed(matrices_of(each)) for each in (noisy, steps))
     assert fit_slip(cut_windows([Drive("a", np.arange(1200.0), np.arange(1200), T, M)], span_of(SPAN))) == 0.0
 
 
-def test_slip_that_helps_nothing_gains_nothing(rng: np.random.Generator) -> None:
+def test_slip_that_helps_nothing_gains_nothing(rng):
     w = cut_windows(drives(rng, 5, length=300.0), span_of(SPAN))
     assert held_out_gain(w, blocks_of(w.drive)) < 0.05
     quiet = World((1e-10, 1e-10, 1e-12), (1e-12,) * 3, slip=0.1)
@@ -121,7 +118,7 @@ def test_slip_that_helps_nothing_gains_nothing(rng: np.random.Generator) -> None
     assert held_out_gain(w, [np.flatnonzero(w.drive == i) for i in range(2)]) < 0.0
 
 
-def test_a_way_by_turn_is_found_named_and_corrected(rng: np.random.Generator) -> None:
+def test_a_way_by_turn_is_found_named_and_corrected(rng):
     """The right value is -0.2 m a radian; its standard error over 200 windows is about 0.01."""
     made = drives(rng, 5, World(slip=-0.2, **OWN_CONSTANTS | {"scale": 0.0}), 400.0)
     before, after = cs.fit_covariance(made, SPAN), cs.fit_covariance(made, SPAN, by_turn=True)
@@ -157,7 +154,7 @@ def test_a_way_by_turn_is_found_named_and_corrected(rng: np.random.Generator) ->
 
 
 @pytest.mark.parametrize("scale", [0, 1])
-def test_a_scale_that_depends_on_the_turn_has_its_values(scale: int, rng: np.random.Generator) -> None:
+def test_a_scale_that_depends_on_the_turn_has_its_values(scale, rng):
     """Planted in thirds of the windows: x1, x1.1 and x1.2 of either scale."""
     made = drives(rng, 4, World((1e-6, 1e-6, 1e-8), (1e-9,) * 3), 500.0)
     w = cut_windows(made, span_of(SPAN))
@@ -168,24 +165,24 @@ def test_a_scale_that_depends_on_the_turn_has_its_values(scale: int, rng: np.ran
     found = mean_by_motion(noise, replace(w, true=w.motions @ spatial.exp(e)))
     assert (found.scale, found.by) == (SCALES[scale], "turn")
     assert found.is_found
-    np.testing.assert_allclose(found.values, (1.0, 1.1, 1.2), atol=0.015)  # a straight third tells no scale of turns
-    np.testing.assert_allclose(found.edges, np.quantile(size, [1 / 3, 2 / 3]), rtol=0.3)
+    assert_allclose(found.values, (1.0, 1.1, 1.2), atol=0.015)  # a straight third tells no scale of turns
+    assert_allclose(found.edges, np.quantile(size, [1 / 3, 2 / 3]), rtol=0.3)
 
 
-def test_a_scale_of_all_windows_that_is_not_corrected_is_no_spread(rng: np.random.Generator) -> None:
+def test_a_scale_of_all_windows_that_is_not_corrected_is_no_spread(rng):
     """A tenth of the way is 15 sigma, which would be a share of 200; noise alone makes 0.02 of it on average."""
     w = cut_windows(drives(rng, 5, World(), 400.0), span_of(SPAN))
     noise, thirds = replace(fit_noise(w), mean=Mean()), np.arange(len(w.drive)) % 3
     w = replace(w, true=w.motions @ spatial.exp(w.errors + 0.1 * jacobian_of_mean(w.pieces)[:, :, 0]))
     values, error = values_by_bin(w, thirds, 0)
-    np.testing.assert_allclose(values, 0.1, atol=0.01)  # 10 standard errors
+    assert_allclose(values, 0.1, atol=0.01)  # 10 standard errors
     assert np.abs(error).max() < 0.1
     found = mean_by_motion(noise, w)
     assert found.share < 0.2
     assert found.p_value > 0.01  # fails in 1 %
 
 
-def test_a_scale_that_depends_on_the_way(rng: np.random.Generator) -> None:
+def test_a_scale_that_depends_on_the_way(rng):
     """Over seconds, with three speeds: x1 at the lowest and x1.1 at the highest."""
     made = paced(rng, 0.01)
     w = cut_windows(made, span_of("20s"))
@@ -197,7 +194,7 @@ def test_a_scale_that_depends_on_the_way(rng: np.random.Generator) -> None:
     assert found.values[-1] == pytest.approx(1.1, abs=0.02)
 
 
-def test_noise_of_the_way_by_which_windows_are_divided_is_not_a_dependence(rng: np.random.Generator) -> None:
+def test_noise_of_the_way_by_which_windows_are_divided_is_not_a_dependence(rng):
     """By the estimated way, a window that errs forward is a longer one; by the true way it is not."""
     made = paced(rng, 1.0)
     w = cut_windows(made, span_of("20s"))
@@ -209,7 +206,7 @@ def test_noise_of_the_way_by_which_windows_are_divided_is_not_a_dependence(rng: 
     assert mean_by_motion(noise, w).p_value > 0.01  # fails in 1 %
 
 
-def test_constants_of_each_drive_are_no_dependence() -> None:
+def test_constants_of_each_drive_are_no_dependence():
     """Each is found with a chance of 1 % at most: 3 of 10 are with one of 1e-4."""
     found = 0
     for seed in range(10):
@@ -219,16 +216,16 @@ def test_constants_of_each_drive_are_no_dependence() -> None:
     assert found < 3
 
 
-def test_pieces_of_the_true_motion(rng: np.random.Generator) -> None:
+def test_pieces_of_the_true_motion(rng):
     made = drives(rng, 2, length=200.0)
     w = cut_windows(made, span_of(SPAN)).of(np.arange(0, 38, 3))
-    np.testing.assert_allclose(replace(w, pieces=w.true_pieces).errors, 0.0, atol=1e-9)
+    assert_allclose(replace(w, pieces=w.true_pieces).errors, 0.0, atol=1e-9)
 
 
 # --- statuses ---------------------------------------------------------------------------------------------------------
 
 
-def test_an_undecided_axis_makes_it_undecided_and_is_named(rng: np.random.Generator) -> None:
+def test_an_undecided_axis_makes_it_undecided_and_is_named(rng):
     axes = (RIGHT, RIGHT, OPEN)
     assert OPEN.status == "undecided"
     judged = JudgedSpan(SPAN, RIGHT, axes, np.ones((1, 4)))
@@ -248,14 +245,14 @@ def test_an_undecided_axis_makes_it_undecided_and_is_named(rng: np.random.Genera
     assert "undecided" not in sentence(replace(shown, spans=(without_error, *model.spans[1:])))
 
 
-def test_what_decides_beside_the_ratio() -> None:
+def test_what_decides_beside_the_ratio():
     assert decided("consistent", False, False) == "consistent"
     assert decided("consistent", True, False) == "undecided"
     assert decided("consistent", True, True) == "inconsistent"
     assert decided("conservative", True, True) == "conservative"
 
 
-def test_the_mean_of_logarithms_of_few_degrees_of_freedom(rng: np.random.Generator) -> None:
+def test_the_mean_of_logarithms_of_few_degrees_of_freedom(rng):
     """-psi(k / 2) + log(k / 2) is 0.0405 for 25, and right on average: 4 standard errors of 4,000 ratios are 0.006."""
     values = np.array([1.0, 1.1, 0.9])
     few = ratio_of(values, np.ones(3), True, np.array([25.0, 25.0, 25.0]))
@@ -268,13 +265,13 @@ def test_the_mean_of_logarithms_of_few_degrees_of_freedom(rng: np.random.Generat
 # --- clocks ---------------------------------------------------------------------------------------------
 
 
-def bare(t: Array, estimate: Array, true_t: Array, truth: Array, manifold: Manifold, max_dt: float) -> Poses:
+def bare(t, estimate, true_t, truth, manifold, max_dt):
     """Poses without covariances."""
     place, P = Places("row {}".format, np.arange(len(t))), unstated(len(t), 3 if manifold == "planar" else 6)
     return Poses(place, t, estimate, *P, true_t, truth, manifold, "left", max_dt)
 
 
-def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> list[tuple[Poses, Array]]:
+def uneven(rng, late, world, number):
     """Poses whose timestamps are ``late`` s early, in a world of their own, of a vehicle that does not move evenly."""
     found = []
     for drive in drives(rng, number, world, 150.0):
@@ -286,31 +283,29 @@ def uneven(rng: np.random.Generator, late: float, world: World, number: int) -> 
     return found
 
 
-@pytest.mark.parametrize(("late", "number"), [(0.2, 3), (-0.35, 1)])
+@pytest.mark.parametrize("late, number", [(0.2, 3), (-0.35, 1)])
 @pytest.mark.parametrize("world", [World(jumps=2), World(*SPACE)], ids=["plane", "space"])
-def test_an_offset_of_clocks_is_found_from_motions(
-    late: float, number: int, world: World, rng: np.random.Generator
-) -> None:
+def test_an_offset_of_clocks_is_found_from_motions(late, number, world, rng):
     made = uneven(rng, late, world, number)
     wide = [(replace(poses, max_dt=0.5), T) for poses, T in made]
     assert clock_offset(wide) == pytest.approx(late, abs=0.02)
 
 
-def test_an_offset_that_nothing_tells_is_refused() -> None:
+def test_an_offset_that_nothing_tells_is_refused():
     M = np.column_stack([np.arange(300.0), np.zeros((300, 2))])
     poses = bare(np.arange(300.0), M, np.arange(300.0), M, "planar", 0.5)
     with pytest.raises(InputError, match="--time-offset estimate: the motions do not tell it"):
         clock_offset([(poses, matrices_of(M))])
 
 
-def test_drives_whose_clocks_differ_are_refused(rng: np.random.Generator) -> None:
+def test_drives_whose_clocks_differ_are_refused(rng):
     made = [*uneven(rng, 0.2, World(), 1), *uneven(rng, -0.8, World(), 1)]
     wide = [(replace(poses, max_dt=1.0), T) for poses, T in made]
     with pytest.raises(InputError, match="--time-offset estimate: the motions do not tell it"):
         clock_offset(wide)
 
 
-def test_the_command_reads_an_offset_that_is_estimated(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_the_command_reads_an_offset_that_is_estimated(tmp_path, rng):
     for name in ("est", "truth"):
         (tmp_path / name).mkdir()
     for i, (poses, _) in enumerate(uneven(rng, 0.2, World(), 3)):
@@ -321,8 +316,8 @@ def test_the_command_reads_an_offset_that_is_estimated(tmp_path: Path, rng: np.r
     found = cs.read_drives(tmp_path / "est", reading=given)
     assert found[0].shift == pytest.approx(0.2, abs=0.02)
     fixed = cs.read_drives(tmp_path / "est", reading=replace(given, time_offset=found[0].shift))
-    np.testing.assert_array_equal(found[2].t, fixed[2].t)
-    np.testing.assert_array_equal(found[2].truth, fixed[2].truth)
+    assert_array_equal(found[2].t, fixed[2].t)
+    assert_array_equal(found[2].truth, fixed[2].truth)
     assert fixed[0].shift == 0.0
     model = cs.fit_covariance(found, SPAN)
     assert f"clocks: {found[0].shift:.3g} s are added to the timestamps" in "\n".join(noise_lines(model))
@@ -333,7 +328,7 @@ def test_the_command_reads_an_offset_that_is_estimated(tmp_path: Path, rng: np.r
     assert whole[0] == whole[1]
 
 
-def test_jumps_name_the_offset_of_clocks(rng: np.random.Generator) -> None:
+def test_jumps_name_the_offset_of_clocks(rng):
     with pytest.raises(InputError, match=r"have a jump.*clocks of estimates and truth differ.*--time-offset"):
         cs.fit_covariance(drives(rng, 2, World(jumps=8)), SPAN)
 
@@ -341,18 +336,18 @@ def test_jumps_name_the_offset_of_clocks(rng: np.random.Generator) -> None:
 # --- no poses ---------------------------------------------------------------------------------------------------------
 
 
-def increments(T: Array) -> Array:
+def increments(T):
     return np.concatenate([np.eye(T.shape[-1])[None], inverse(T[:-1]) @ T[1:]])
 
 
-def unturned(T: Array) -> Array:
+def unturned(T):
     out = np.array(T)
     out[:, :-1, :-1] = np.eye(T.shape[-1] - 1)
     return out
 
 
 @pytest.mark.parametrize("world", [World(), World(*SPACE)], ids=["plane", "space"])
-def test_increments_and_placeholders_are_named(world: World, rng: np.random.Generator) -> None:
+def test_increments_and_placeholders_are_named(world, rng):
     drive = drives(rng, 1, world, 300.0)[0]
     require_poses([drive])
     cases = (
@@ -366,7 +361,7 @@ def test_increments_and_placeholders_are_named(world: World, rng: np.random.Gene
             cs.fit_covariance([drive, replace(drive, **parts)], SPAN)
 
 
-def test_what_moves_without_turning_is_no_placeholder(rng: np.random.Generator) -> None:
+def test_what_moves_without_turning_is_no_placeholder(rng):
     """A straight road with estimates that drift by a radian, and a vehicle that moves sideways as it likes."""
     steps = np.tile([0.5, 0.0, 0.0], (600, 1))
     drifting = steps + np.array([0.0, 0.0, 1e-3])
@@ -377,19 +372,19 @@ def test_what_moves_without_turning_is_no_placeholder(rng: np.random.Generator) 
         require_poses([Drive("a", np.arange(600.0), np.arange(600), T, M)])
 
 
-def test_a_scale_that_is_not_metric_is_not_taken_for_increments(rng: np.random.Generator) -> None:
+def test_a_scale_that_is_not_metric_is_not_taken_for_increments(rng):
     with pytest.raises(InputError, match="not metric"):
         cs.fit_covariance(drives(rng, 2, World(metric=2.2)), SPAN)
 
 
 @pytest.mark.parametrize("side", ["estimates", "truth"])
 @pytest.mark.parametrize("kind", ["npz", "csv", "folder"])
-def test_headings_in_degrees_are_refused(kind: str, side: str, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_headings_in_degrees_are_refused(kind, side, tmp_path, rng):
     """Those of unwrapped radians are read, though they are beyond a turn."""
     drive = drives(rng, 1, length=300.0)[0]
     rows = {"estimates": vectors(drive.estimate), "truth": vectors(drive.truth)}
 
-    def read() -> list[Drive]:
+    def read():
         if kind == "npz":
             np.savez(tmp_path / "a.npz", t=drive.t, **rows)
             return cs.read_drives(tmp_path / "a.npz")
@@ -410,7 +405,7 @@ def test_headings_in_degrees_are_refused(kind: str, side: str, tmp_path: Path, r
 
 
 @pytest.mark.parametrize("size", [1e-12, 1e-9, 1e-5])
-def test_rotations_equal_to_rounding_are_no_closed_loops(size: float, rng: np.random.Generator) -> None:
+def test_rotations_equal_to_rounding_are_no_closed_loops(size, rng):
     """Headings of the truth, rounded to a step of ``size``; positions err as they did."""
     made = []
     for drive in drives(rng, 3, length=500.0):
@@ -423,7 +418,7 @@ def test_rotations_equal_to_rounding_are_no_closed_loops(size: float, rng: np.ra
     assert size < ROUNDED
 
 
-def test_timestamps_in_messages_are_not_rounded(tmp_path: Path) -> None:
+def test_timestamps_in_messages_are_not_rounded(tmp_path):
     path = tmp_path / "a.tum"
     path.write_text("".join(f"1326030980.{k} {k} 0 0 0 0 0 1\n" for k in (51, 53, 53, 55)))
     with pytest.raises(InputError, match=r"line 3: timestamp 1326030980\.53 is duplicated"):

@@ -1,7 +1,5 @@
 """fit-covariance --second on a real drive: the wheels of five robots beside their sightings of landmarks."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -9,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import consistency
+from numpy.testing import assert_allclose
 
 from consistency.bench.runs.findings import sibling
-from consistency.referee.types import Array
 
 ROOT = Path(__file__).parents[3]
 DATA = Path(os.environ.get("CONSISTENCY_DATA", ROOT.parent / "shared" / "data"))
@@ -22,7 +20,7 @@ SIGMA = (0.17, 0.02)  # m, rad: of range and bearing
 GATE = 25.0  # NIS of a wrong barcode
 
 
-def by_sight(t: Array, place: Array, z: Array, start: Array) -> Array:
+def by_sight(t, place, z, start):
     """Rows t, x, y, heading of an EKF that knows the places (M, 2) of what it sees, and nothing of the wheels."""
     x, P, out = np.concatenate([start, [0.0, 0.0]]), np.diag([0.01, 0.01, 0.01, 0.1, 0.1]), {}
     for now, dt, landmark, seen in zip(t, np.diff(t, prepend=t[0]), place, z, strict=True):
@@ -45,7 +43,7 @@ def by_sight(t: Array, place: Array, z: Array, start: Array) -> Array:
     return np.column_stack([list(out), list(out.values())])
 
 
-def test_wheels_and_sightings_of_five_robots_share_no_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wheels_and_sightings_of_five_robots_share_no_error(tmp_path, capsys):
     """Both share the truth alone: in yaw it is not behind the errors of the wheels, in x and y nothing tells."""
     folder = DATA / "mrclam" / "MRCLAM_Dataset6"
     if not folder.is_dir():
@@ -70,5 +68,5 @@ def test_wheels_and_sightings_of_five_robots_share_no_error(tmp_path: Path, caps
     assert err == ""
     said = json.loads(out)
     assert said["status"] == "inconsistent"
-    np.testing.assert_allclose(said["second_correlation"], [-0.03, -0.47, 0.28], atol=0.05)
-    np.testing.assert_allclose(said["second_size"], [3.1, 5.2, 0.83], rtol=0.1)
+    assert_allclose(said["second_correlation"], [-0.03, -0.47, 0.28], atol=0.05)
+    assert_allclose(said["second_size"], [3.1, 5.2, 0.83], rtol=0.1)

@@ -158,7 +158,7 @@ BESIDE = ["quaternions", "blocks", "gtsam", "turned world", "information", "head
 
 
 @pytest.mark.parametrize(
-    ("name", "scale"), [*((name, 1.0) for name in MIXED), *((name, scale) for name in BESIDE for scale in (0.25, 4.0))]
+    "name, scale", [*((name, 1.0) for name in MIXED), *((name, scale) for name in BESIDE for scale in (0.25, 4.0))]
 )
 def test_a_mix_up_is_named_also_beside_a_wrong_scale(name, scale, rng):
     make, mess, words = MIXED[name]
@@ -192,7 +192,7 @@ def test_a_filter_that_is_wrong_by_itself_gets_no_hint(ratio, rng):
         assert hints("est", axes, runs) == []
 
 
-@pytest.mark.parametrize(("name", "factor"), [(name, case[4][-1]) for name, case in world.MIXED.items()])
+@pytest.mark.parametrize("name, factor", [(name, case[4][-1]) for name, case in world.MIXED.items()])
 def test_a_mix_up_of_less_than_a_decade_is_named(name, factor, rng):
     """Far above the smallest factor in the table of the benchmark, so that chance misses none but once in 1e5."""
     kind, convention, sigma, mess, _, words = world.MIXED[name]
@@ -541,7 +541,7 @@ def wheels(rng, steps=2000):
 
 
 @pytest.mark.parametrize(
-    ("key", "mess", "said"),
+    "key, mess, said",
     [
         ("covariances", lambda P: P, None),
         ("covariances", lambda P: P * np.outer(ANGLES, ANGLES), "its angles are in degrees"),
@@ -583,7 +583,7 @@ def test_mix_ups_of_poses_with_cross_covariances_are_named(rng):
 
 
 @pytest.mark.parametrize(
-    ("root", "said"),
+    "root, said",
     [
         (lambda P: np.linalg.cholesky(P), "it holds the lower root L of the covariance; write L L'"),
         (lambda P: np.linalg.cholesky(np.linalg.inv(P)), "it holds the upper root U of an information matrix U'U"),
@@ -617,7 +617,7 @@ def gated(nis):
 
 @pytest.mark.parametrize("optimal", [True, False])
 @pytest.mark.parametrize(
-    ("nis_of", "said"),
+    "nis_of, said",
     [
         (lambda v: np.square(v[..., :2]).sum(axis=-1), None),
         (lambda v: np.square(v).sum(axis=-1), "like chi-square with 3 degrees of freedom, not 2 as stated"),
@@ -761,7 +761,7 @@ def write_steps(path, pose, P):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    "change, said",
     [
         (lambda pose, P: (pose, P), None),
         (

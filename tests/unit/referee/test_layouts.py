@@ -16,7 +16,8 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.referee.readers.clock_units import unit_apart
-from consistency.referee.readers.formats.named_columns import fields_of, require_units
+from consistency.referee.readers.formats.file_head import fields_of
+from consistency.referee.readers.formats.named_columns import require_units
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.types import Array
 
@@ -206,7 +207,7 @@ def test_the_first_rows_of_euroc_judge_themselves(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "count"),
+    "name, count",
     [
         ("ece276a_stereo_tracks/kitti07_gt.txt", 1101),
         ("gtsam_stereo_factors/VO_camera_poses_large.txt", 26),
@@ -621,7 +622,7 @@ def millimetres(d):
 
 
 @pytest.mark.parametrize(
-    ("write", "mend"),
+    "write, mend",
     [
         (turned_quaternions, "the quaternions of the estimates are w x y z; write them x y z w"),
         (millimetres, "the positions of the truth are in millimetres; divide them by 1000"),
@@ -641,7 +642,7 @@ P = np.array([[0.04, 0.01, 0.005], [0.01, 0.09, -0.01], [0.005, -0.01, 0.01]])
 
 
 @pytest.mark.parametrize(
-    ("unit", "name"), [(10**3, "milliseconds"), (10**6, "microseconds"), (10**9, "nanoseconds"), (1, "")]
+    "unit, name", [(10**3, "milliseconds"), (10**6, "microseconds"), (10**9, "nanoseconds"), (1, "")]
 )
 def test_the_unit_that_makes_times_overlap_is_named(unit, name):
     for longer in (T, np.arange(600.0)):  # a truth may begin earlier and end later
@@ -664,7 +665,7 @@ def test_a_lower_triangle_is_a_covariance(heading, inside):
 
 
 @pytest.mark.parametrize(
-    ("name", "header", "rows", "said"),
+    "name, header, rows, said",
     [
         (
             "o.csv",
@@ -681,6 +682,12 @@ def test_a_lower_triangle_is_a_covariance(heading, inside):
         ),
         ("o.txt.gz", "", "", r"o\.txt\.gz: unknown kind of file; .*; unpack it$"),
         ("f.ulg", "", "", r"f\.ulg: unknown kind of file; .*; flight logs are for 'consistency monitor'$"),
+        (
+            "d/0.csv",
+            "t,x,y,heading",
+            "0,1,2,3\n",
+            r"0\.csv: column 'P_xx' is missing; .*; --columns P_xx=NAME says what it is called",
+        ),
     ],
 )
 def test_a_refusal_names_the_remedy(name, header, rows, said, inside):

@@ -174,7 +174,7 @@ def test_an_alarm_is_raised_at_the_inverse_of_the_rate():
 
 
 @pytest.mark.parametrize("tolerance", [1.0, 1.2])
-@pytest.mark.parametrize(("ratio", "direction"), [(3.0, "overconfident"), (0.2, "conservative")])
+@pytest.mark.parametrize("ratio, direction", [(3.0, "overconfident"), (0.2, "conservative")])
 def test_a_change_is_found_with_its_step_direction_and_scale(ratio, direction, tolerance):
     monitor = cs.Monitor(tolerance=tolerance)
     assert not fed(monitor, [3.0] * 200, 3)  # exactly the expected value
@@ -188,7 +188,7 @@ def test_a_change_is_found_with_its_step_direction_and_scale(ratio, direction, t
     assert monitor.evidence > alarm.evidence  # still counted
 
 
-@pytest.mark.parametrize(("ratio", "direction"), [(1.07, "overconfident"), (0.93, "conservative")])
+@pytest.mark.parametrize("ratio, direction", [(1.07, "overconfident"), (0.93, "conservative")])
 def test_the_direction_of_a_small_fault(ratio, direction):
     """The alternatives nearest to 1 on either side are the best there."""
     alarm = fed(cs.Monitor(tolerance=1.0), [300.0 * ratio] * 200, 300)[0]
@@ -253,7 +253,7 @@ def test_numbers_of_numpy_will_do():
 # --- the gate ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("gate", "rest"), [(0.99, 2), (0.999, 2), (0.95, 5), (0.98, 5)])
+@pytest.mark.parametrize("gate, rest", [(0.99, 2), (0.999, 2), (0.95, 5), (0.98, 5)])
 @pytest.mark.parametrize("rejected", [1e6, None, math.nan])
 def test_a_rejection_is_no_evidence_and_the_next_innovations_are_not_judged(rejected, gate, rest):
     monitor = cs.Monitor(gate=gate)
@@ -345,7 +345,7 @@ def test_reset_starts_anew():
 
 
 @pytest.mark.parametrize(
-    ("nis", "dof", "said"),
+    "nis, dof, said",
     [
         (-0.1, 3, "nis must be 0 or more and finite, got -0.1"),
         (math.inf, 3, "nis must be 0 or more and finite, got inf"),
@@ -366,7 +366,7 @@ def test_refused_values_leave_everything_as_it_was(nis, dof, said):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    "options, said",
     [
         ({"false_alarm": 0.0}, "false_alarm must lie between 0 and 1"),
         ({"false_alarm": 1.0}, "false_alarm must lie between 0 and 1"),

@@ -1,35 +1,26 @@
 """What is said of long work where standard error is no terminal."""
 
-from __future__ import annotations
-
-import io
-
 import pytest
 
 from consistency.referee.system import progress as module
 from consistency.referee.system.progress import announce, each, progress, quiet, say
 
 
-def test_what_is_announced_is_said_where_all_else_is_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_announced_is_said_where_all_else_is_quiet(capsys):
     with quiet():
         say("one of many")
         announce("compiling the kernel of ekf-uvd")
     assert capsys.readouterr().err == "compiling the kernel of ekf-uvd\n"
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_runs_are_said_when_some_are_done(capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_are_said_when_some_are_done(capsys):
     with progress("runs", 2) as advance:
         assert capsys.readouterr().err == ""
         advance(2)
         assert capsys.readouterr().err.startswith("runs: 2 of 2 runs")
 
 
-def test_work_on_each_is_quiet_and_the_whole_is_not(capsys: pytest.CaptureFixture[str]) -> None:
+def test_work_on_each_is_quiet_and_the_whole_is_not(capsys):
     done = []
     for item in each("abc", 3, "worlds", "worlds"):
         say(f"inside {item}")
@@ -45,8 +36,8 @@ def test_work_on_each_is_quiet_and_the_whole_is_not(capsys: pytest.CaptureFixtur
     assert capsys.readouterr().err == "outside\n"
 
 
-def test_an_item_that_breaks_leaves_nobody_quiet(capsys: pytest.CaptureFixture[str]) -> None:
-    def breaks() -> None:
+def test_an_item_that_breaks_leaves_nobody_quiet(capsys):
+    def breaks():
         for _ in each("abc", 3, "worlds", "worlds"):
             raise ValueError
 
@@ -56,9 +47,7 @@ def test_an_item_that_breaks_leaves_nobody_quiet(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().err == "again\n"
 
 
-def test_brief_work_is_said_when_it_takes_long(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_brief_work_is_said_when_it_takes_long(capsys, monkeypatch):
     with progress("report", 2, "parts", brief=True) as advance:
         advance(2)
     assert capsys.readouterr().err == ""

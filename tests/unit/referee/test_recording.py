@@ -1,12 +1,8 @@
 """Files of other estimators: errors against independent maths, verdicts of filterpy's filter, and every refusal."""
 
-from __future__ import annotations
-
 import json
 import runpy
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,6 +12,7 @@ from document_inputs import planar
 from documents import blocks
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from recorded import read_recordings
 from scipy import stats
 from scipy.linalg import expm, logm
@@ -28,7 +25,6 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import planar_error, se2_log
 from consistency.referee.geometry.groups import se3_log, spatial_error
 from consistency.referee.readers.truth_matching import associate, common_times
-from consistency.referee.types import Array
 from consistency.referee.verdicts.sources import judge_all
 
 ROOT = Path(__file__).parents[3]
@@ -41,7 +37,7 @@ few = settings(max_examples=25)  # logm is slow
 # --- the conventions, against matrix logarithms --------------------------------------------------
 
 
-def hat(twist: Array) -> Array:
+def hat(twist):
     """Matrix of the Lie algebra: (x, y, heading) -> (3, 3), (x, y, z, rotation vector) -> (4, 4)."""
     n = 2 if len(twist) == 3 else 3
     out = np.zeros((n + 1, n + 1))
@@ -54,13 +50,13 @@ def hat(twist: Array) -> Array:
     return out
 
 
-def vee(matrix: Array) -> Array:
+def vee(matrix):
     if len(matrix) == 3:
         return np.array([matrix[0, 2], matrix[1, 2], matrix[1, 0]])
     return np.array([*matrix[:3, 3], matrix[2, 1], matrix[0, 2], matrix[1, 0]])
 
 
-def matrix(pose: Array) -> Array:
+def matrix(pose):
     """Homogeneous matrix of (x, y, heading) or of (x, y, z, qx, qy, qz, qw)."""
     if len(pose) == 3:
         c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -70,7 +66,7 @@ def matrix(pose: Array) -> Array:
     return out
 
 
-def spatial(position: Array, turn: Array) -> Array:
+def spatial(position, turn):
     return np.concatenate([position, Rotation.from_rotvec(turn).as_quat()])
 
 
@@ -80,66 +76,66 @@ turn3 = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(lambda values: np.round(value
 
 @few
 @given(x=coordinate, y=coordinate, heading=angle)
-def test_se2_log_is_the_matrix_logarithm(x: float, y: float, heading: float) -> None:
+def test_se2_log_is_the_matrix_logarithm(x, y, heading):
     pose = np.array([x, y, heading])
-    np.testing.assert_allclose(se2_log(pose), vee(np.real(logm(matrix(pose)))), atol=1e-9)
+    assert_allclose(se2_log(pose), vee(np.real(logm(matrix(pose)))), atol=1e-9)
 
 
 @few
 @given(position=vector3, turn=turn3)
-def test_se3_log_is_the_matrix_logarithm(position: Array, turn: Array) -> None:
+def test_se3_log_is_the_matrix_logarithm(position, turn):
     pose = spatial(position, turn)
-    np.testing.assert_allclose(se3_log(pose), vee(np.real(logm(matrix(pose)))), atol=1e-8)
+    assert_allclose(se3_log(pose), vee(np.real(logm(matrix(pose)))), atol=1e-8)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.00999, 0.01001, 0.1, 1.0, 3.0, 3.14159, np.pi - 1e-9])
-def test_log_undoes_the_exponential_at_every_angle(size: float) -> None:
+def test_log_undoes_the_exponential_at_every_angle(size):
     """Also across the switch to the series, and near pi, where eq. 146 as printed divides zero by zero."""
     twist = np.array([3.0, -4.0, 5.0, *(size * np.array([2.0, -1.0, 2.0]) / 3.0)])
     exponential = expm(hat(twist))
     pose = np.concatenate([exponential[:3, 3], Rotation.from_matrix(exponential[:3, :3]).as_quat()])
-    np.testing.assert_allclose(se3_log(pose), twist, rtol=1e-6, atol=1e-12)
+    assert_allclose(se3_log(pose), twist, rtol=1e-6, atol=1e-12)
     planar = np.array([3.0, -4.0, size])
     T = expm(hat(planar))
-    np.testing.assert_allclose(se2_log(np.array([T[0, 2], T[1, 2], size])), planar, rtol=1e-9, atol=1e-12)
+    assert_allclose(se2_log(np.array([T[0, 2], T[1, 2], size])), planar, rtol=1e-9, atol=1e-12)
 
 
 @few
 @given(true=vector3, true_turn=turn3, estimate=vector3, turn=turn3)
-def test_spatial_errors_by_matrices(true: Array, true_turn: Array, estimate: Array, turn: Array) -> None:
+def test_spatial_errors_by_matrices(true, true_turn, estimate, turn):
     one, two = spatial(true, true_turn), spatial(estimate, turn)
     X, Y = matrix(one), matrix(two)
     if np.linalg.norm(se3_log(spatial(np.zeros(3), Rotation.from_matrix(X[:3, :3] @ Y[:3, :3].T).as_rotvec()))) > 3.1:
         return  # at pi the logarithm has two branches
     left, right = np.linalg.inv(Y) @ X, X @ np.linalg.inv(Y)
-    np.testing.assert_allclose(spatial_error(one, two, "left"), vee(np.real(logm(left))), atol=1e-7)
-    np.testing.assert_allclose(spatial_error(one, two, "right"), vee(np.real(logm(right))), atol=1e-7)
+    assert_allclose(spatial_error(one, two, "left"), vee(np.real(logm(left))), atol=1e-7)
+    assert_allclose(spatial_error(one, two, "right"), vee(np.real(logm(right))), atol=1e-7)
     for convention, turned in (("so3", right), ("so3-body", left)):
         error = spatial_error(one, two, convention)
-        np.testing.assert_allclose(error[:3], true - estimate)
-        np.testing.assert_allclose(error[3:], vee(np.real(logm(turned)))[3:], atol=1e-7)
+        assert_allclose(error[:3], true - estimate)
+        assert_allclose(error[3:], vee(np.real(logm(turned)))[3:], atol=1e-7)
 
 
 @few
 @given(true=st.tuples(coordinate, coordinate, angle), estimate=st.tuples(coordinate, coordinate, angle))
-def test_planar_errors_by_matrices(true: tuple[float, ...], estimate: tuple[float, ...]) -> None:
+def test_planar_errors_by_matrices(true, estimate):
     one, two = np.array(true), np.array(estimate)
     X, Y = matrix(one), matrix(two)
     if abs(planar_error(one, two, "so2")[2]) > 3.1:
         return
-    np.testing.assert_allclose(planar_error(one, two, "left"), vee(np.real(logm(np.linalg.inv(Y) @ X))), atol=1e-8)
-    np.testing.assert_allclose(planar_error(one, two, "right"), vee(np.real(logm(X @ np.linalg.inv(Y)))), atol=1e-8)
+    assert_allclose(planar_error(one, two, "left"), vee(np.real(logm(np.linalg.inv(Y) @ X))), atol=1e-8)
+    assert_allclose(planar_error(one, two, "right"), vee(np.real(logm(X @ np.linalg.inv(Y)))), atol=1e-8)
 
 
-def test_headings_are_wrapped_except_in_a_vector() -> None:
+def test_headings_are_wrapped_except_in_a_vector():
     true, estimate = np.array([0.0, 0.0, np.pi - 0.1]), np.array([0.0, 0.0, 0.1 - np.pi])
-    np.testing.assert_allclose(planar_error(true, estimate, "so2")[2], -0.2)
-    np.testing.assert_allclose(planar_error(true, estimate, "vector")[2], 2 * np.pi - 0.2)
+    assert_allclose(planar_error(true, estimate, "so2")[2], -0.2)
+    assert_allclose(planar_error(true, estimate, "vector")[2], 2 * np.pi - 0.2)
 
 
 # --- trajectories whose errors have the stated covariance ------------------------------------------
 
-DRAW: dict[str, Callable[[Array, Array, Array], tuple[Array, Array]]] = {
+DRAW = {
     # estimate T (4, 4), error xi (6,), its exponential (4, 4) -> true position and rotation
     "left": lambda T, xi, E: ((T @ E)[:3, 3], (T @ E)[:3, :3]),
     "right": lambda T, xi, E: ((E @ T)[:3, 3], (E @ T)[:3, :3]),
@@ -149,7 +145,7 @@ DRAW: dict[str, Callable[[Array, Array, Array], tuple[Array, Array]]] = {
 RUNS, STEPS = 5, 80
 
 
-def covariance6(rng: np.random.Generator) -> Array:
+def covariance6(rng):
     """One with every correlation, and very different along its axes."""
     sigma = np.array([0.1, 0.5, 0.02, 0.02, 0.005, 0.1])
     root = np.tril(rng.normal(0, 0.4, (6, 6)), -1) + np.eye(6)
@@ -158,7 +154,7 @@ def covariance6(rng: np.random.Generator) -> Array:
     return sigma[:, None] * (C / np.outer(d, d)) * sigma
 
 
-def write_trajectories(at: Path, convention: str, order: str = "translation-rotation", triangle: bool = False) -> None:
+def write_trajectories(at, convention, order="translation-rotation", triangle=False):
     """Folders est, truth, P with a file for each run."""
     rng = np.random.default_rng(20180)
     for folder in ("est", "truth", "P"):
@@ -181,7 +177,7 @@ def write_trajectories(at: Path, convention: str, order: str = "translation-rota
             np.savetxt(at / folder / f"run{run}.txt", rows, fmt="%.17g", header="made")
 
 
-def mean_nees(at: Path, convention: str | None, order: str | None = None) -> float:
+def mean_nees(at, convention, order=None):
     [recording] = read_recordings(at / "est", at / "truth", at / "P", convention, covariance_order=order)
     assert recording.error.shape == (RUNS, STEPS, 6)
     return float(nees(recording.error, recording.covariance).mean())
@@ -191,7 +187,7 @@ BAND = stats.chi2.ppf([0.5e-4, 1 - 0.5e-4], 6 * RUNS * STEPS) / (RUNS * STEPS)
 
 
 @pytest.mark.parametrize("convention", DRAW)
-def test_nees_of_a_trajectory_in_each_convention(convention: str, tmp_path: Path) -> None:
+def test_nees_of_a_trajectory_in_each_convention(convention, tmp_path):
     """False-alarm rate 1e-4 for each convention; declared as any other it is far outside (negative control)."""
     write_trajectories(tmp_path, convention)
     assert BAND[0] < mean_nees(tmp_path, convention) < BAND[1]
@@ -199,14 +195,14 @@ def test_nees_of_a_trajectory_in_each_convention(convention: str, tmp_path: Path
         assert mean_nees(tmp_path, wrong) > 2 * BAND[1]
 
 
-def test_order_of_the_covariance_and_its_triangle(tmp_path: Path) -> None:
+def test_order_of_the_covariance_and_its_triangle(tmp_path):
     """False-alarm rate 1e-4. The default convention is so3."""
     write_trajectories(tmp_path, "so3", "rotation-translation", triangle=True)
     assert BAND[0] < mean_nees(tmp_path, None, "rotation-translation") < BAND[1]
     assert not BAND[0] < mean_nees(tmp_path, None) < BAND[1]
 
 
-def test_layouts_of_one_line(tmp_path: Path) -> None:
+def test_layouts_of_one_line(tmp_path):
     """Covariance behind the pose: 44 or 29 columns; 20 are two recordings that equal the blocks."""
     write_trajectories(tmp_path, "so3-body")
     est, P = (np.loadtxt(tmp_path / folder / "run0.txt") for folder in ("est", "P"))
@@ -223,17 +219,17 @@ def test_layouts_of_one_line(tmp_path: Path) -> None:
         np.savetxt(tmp_path / name, rows, fmt="%.17g")
     for name in ("44.txt", "29.txt"):
         [one] = read_recordings(tmp_path / name, truth, None, "so3-body")
-        np.testing.assert_allclose(one.error, whole.error)
-        np.testing.assert_allclose(one.covariance, whole.covariance, rtol=1e-12)
+        assert_allclose(one.error, whole.error)
+        assert_allclose(one.covariance, whole.covariance, rtol=1e-12)
     position, rotation = read_recordings(tmp_path / "20.txt", truth)
     assert (position.axes, rotation.axes) == (("x", "y", "z"), ("roll", "pitch", "yaw"))
     assert (position.name, rotation.name) == ("20 position", "20 rotation")
-    np.testing.assert_allclose(position.error, whole.error[..., :3])
-    np.testing.assert_allclose(rotation.error, whole.error[..., 3:])
-    np.testing.assert_allclose(rotation.covariance, whole.covariance[..., 3:, 3:], rtol=1e-12)
+    assert_allclose(position.error, whole.error[..., :3])
+    assert_allclose(rotation.error, whole.error[..., 3:])
+    assert_allclose(rotation.covariance, whole.covariance[..., 3:, 3:], rtol=1e-12)
 
 
-def test_runs_of_different_lengths_and_gaps(tmp_path: Path) -> None:
+def test_runs_of_different_lengths_and_gaps(tmp_path):
     write_trajectories(tmp_path, "so3")
     shorten(tmp_path / "est/run1.txt", slice(0, 50))
     shorten(tmp_path / "truth/run2.txt", slice(20, None))
@@ -247,11 +243,11 @@ def test_runs_of_different_lengths_and_gaps(tmp_path: Path) -> None:
     assert r.failures == ()
 
 
-def shorten(path: Path, keep: slice) -> None:
+def shorten(path, keep):
     np.savetxt(path, np.loadtxt(path)[keep], fmt="%.17g")
 
 
-def test_clocks_of_different_days_are_counted_from_the_start() -> None:
+def test_clocks_of_different_days_are_counted_from_the_start():
     columns, t = common_times([np.array([0.0, 0.1, 0.2]), np.array([50.0, 50.1])])
     assert [column.tolist() for column in columns] == [[0, 1, 2], [0, 1]]
     assert np.isnan(t).all()
@@ -260,7 +256,7 @@ def test_clocks_of_different_days_are_counted_from_the_start() -> None:
     assert t.tolist() == [0.0, 0.1, 0.2]
 
 
-def test_a_failing_trajectory_and_warnings(tmp_path: Path) -> None:
+def test_a_failing_trajectory_and_warnings(tmp_path):
     write_trajectories(tmp_path, "so3")
     path = tmp_path / "est/run3.txt"
     rows = np.loadtxt(path)
@@ -280,9 +276,9 @@ def test_a_failing_trajectory_and_warnings(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spatial_kind", "planar_kind"), [("so3", "so2"), ("so3-body", "so2"), ("left", "left"), ("right", "right")]
+    "spatial_kind, planar_kind", [("so3", "so2"), ("so3-body", "so2"), ("left", "left"), ("right", "right")]
 )
-def test_a_planar_robot_in_messages_of_six(spatial_kind: str, planar_kind: str, tmp_path: Path) -> None:
+def test_a_planar_robot_in_messages_of_six(spatial_kind, planar_kind, tmp_path):
     """Zeros for z, roll and pitch: with three axes the errors are those of the planar poses."""
     rng = np.random.default_rng()
     t, n = 0.1 * np.arange(40), 40
@@ -301,8 +297,8 @@ def test_a_planar_robot_in_messages_of_six(spatial_kind: str, planar_kind: str, 
     files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
     [r] = read_recordings(*files, spatial_kind, axes=["x", "y", "yaw"])
     assert r.axes == ("x", "y", "yaw")
-    np.testing.assert_allclose(r.error[0], planar_error(true, own, planar_kind), atol=1e-12)
-    np.testing.assert_allclose(r.covariance[0], P3, rtol=1e-12)
+    assert_allclose(r.error[0], planar_error(true, own, planar_kind), atol=1e-12)
+    assert_allclose(r.covariance[0], P3, rtol=1e-12)
     hint = r"variance zero: z, roll, pitch\); judge only what the filter estimates: --axes x,y,yaw for a trajectory"
     with pytest.raises(InputError, match=hint):
         read_recordings(*files)
@@ -317,7 +313,7 @@ def test_a_planar_robot_in_messages_of_six(spatial_kind: str, planar_kind: str, 
     st.lists(st.integers(0, 10**6).map(lambda value: value / 1e5), min_size=1, max_size=20, unique=True),
     st.integers(0, 10**6),
 )
-def test_association_by_brute_force(reference: list[float], seed: int) -> None:
+def test_association_by_brute_force(reference, seed):
     rng = np.random.default_rng(seed)
     ref, times = np.sort(reference), np.sort(rng.uniform(-1, 11, 15))
     own, match = associate(times, ref, 0.5)
@@ -334,7 +330,7 @@ def test_association_by_brute_force(reference: list[float], seed: int) -> None:
         )
 
 
-def test_the_tolerance_of_times_is_inside() -> None:
+def test_the_tolerance_of_times_is_inside():
     """Also of seconds since 1970, which a double holds to a quarter of a microsecond."""
     for start in (0.0, 1.7e9):
         own, match = associate(start + np.array([0.5, 2.6]), start + np.array([0.0, 2.0]), 0.5)
@@ -346,7 +342,7 @@ def test_the_tolerance_of_times_is_inside() -> None:
 # --- tables: poses ---------------------------------------------------------------------------------
 
 
-def poses(runs: int = 3, steps: int = 5) -> tuple[pd.DataFrame, pd.DataFrame]:
+def poses(runs=3, steps=5):
     """Estimates and truth of a pose with a known, full covariance."""
     rng = np.random.default_rng(3)
     P = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]])
@@ -359,28 +355,25 @@ def poses(runs: int = 3, steps: int = 5) -> tuple[pd.DataFrame, pd.DataFrame]:
     return est, true
 
 
-Edit = Callable[[pd.DataFrame], Any]
-
-
-def write(at: Path, edit: Edit | None = None, edit_truth: Edit | None = None) -> tuple[Path, Path]:
+def write(at, edit=None, edit_truth=None):
     for name, table, change in zip(("est.csv", "truth.csv"), poses(), (edit, edit_truth), strict=True):
         changed = change(table) if change else None
         (table if changed is None else changed).to_csv(at / name, index=False)
     return at / "est.csv", at / "truth.csv"
 
 
-def one(estimates: Path, truth: Path | None, **options: Any) -> Any:
+def one(estimates, truth, **options):
     [recording] = read_recordings(estimates, truth, **options)
     return recording
 
 
-def test_a_table_is_read_back_to_the_last_digit(tmp_path: Path) -> None:
+def test_a_table_is_read_back_to_the_last_digit(tmp_path):
     est, true = poses()
     r = one(*write(tmp_path))
     expected = true[["x", "y", "heading"]].to_numpy() - est[["x", "y", "heading"]].to_numpy()
-    np.testing.assert_allclose(r.error, expected.reshape(3, 5, 3), rtol=0, atol=1e-15)  # wrapping rounds once more
+    assert_allclose(r.error, expected.reshape(3, 5, 3), rtol=0, atol=1e-15)  # wrapping rounds once more
     assert (r.name, r.axes, r.convention, r.runs.tolist()) == ("est", ("x", "y", "heading"), "so2", [0, 1, 2])
-    np.testing.assert_allclose(r.t, [0.1, 0.2, 0.3, 0.4, 0.5])
+    assert_allclose(r.t, [0.1, 0.2, 0.3, 0.4, 0.5])
     assert r.covariance[2, 4].tolist() == [[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]]
     for suffix in ("parquet", "csv"):  # Parquet, shuffled rows, and semicolons: the same
         shuffled = est.sample(frac=1, random_state=1)
@@ -389,11 +382,11 @@ def test_a_table_is_read_back_to_the_last_digit(tmp_path: Path) -> None:
         else:
             shuffled.to_parquet(tmp_path / "again.parquet")
         again = one(tmp_path / f"again.{suffix}", tmp_path / "truth.csv")
-        np.testing.assert_array_equal(again.error, r.error)
-        np.testing.assert_array_equal(again.covariance, r.covariance)
+        assert_array_equal(again.error, r.error)
+        assert_array_equal(again.covariance, r.covariance)
 
 
-def test_without_run_and_step(tmp_path: Path) -> None:
+def test_without_run_and_step(tmp_path):
     """One run, matched by time; a truth without runs serves all."""
     est, truth = write(tmp_path, lambda e: e[e["run"] == 0].drop(columns=["run", "step"]), lambda t: t[t["run"] == 0])
     alone = one(est, truth)
@@ -405,7 +398,7 @@ def test_without_run_and_step(tmp_path: Path) -> None:
     assert several.convention == "so2"
 
 
-def test_filters_are_recordings(tmp_path: Path) -> None:
+def test_filters_are_recordings(tmp_path):
     est, truth = write(tmp_path, lambda e: pd.concat([e.assign(filter="a"), e.assign(filter="b", x=e["x"] + 9)]))
     assert [r.name for r in read_recordings(est, truth)] == ["a", "b"]
     assert list(judge_all(read_recordings(est, truth), ["b"])) == ["b"]
@@ -413,8 +406,8 @@ def test_filters_are_recordings(tmp_path: Path) -> None:
         judge_all(read_recordings(est, truth), ["c"])
 
 
-def set_cell(row: int, column: str, value: float) -> Edit:
-    def edit(table: pd.DataFrame) -> None:
+def set_cell(row, column, value):
+    def edit(table):
         table[column] = table[column].astype(float)
         table.loc[row, column] = value
 
@@ -422,7 +415,7 @@ def set_cell(row: int, column: str, value: float) -> Edit:
 
 
 @pytest.mark.parametrize(
-    ("row", "column", "value", "reason"),
+    "row, column, value, reason",
     [
         (7, "x", np.nan, "estimate is not finite"),
         (7, "heading", np.inf, "estimate is not finite"),
@@ -433,7 +426,7 @@ def set_cell(row: int, column: str, value: float) -> Edit:
         (5, "P_xx", -1.0, "covariance is not positive definite"),
     ],
 )
-def test_a_broken_row_is_a_failed_run(row: int, column: str, value: float, reason: str, tmp_path: Path) -> None:
+def test_a_broken_row_is_a_failed_run(row, column, value, reason, tmp_path):
     est, truth = write(tmp_path, set_cell(row, column, value))
     r = one(est, truth)
     step = row - 5
@@ -448,8 +441,8 @@ def test_a_broken_row_is_a_failed_run(row: int, column: str, value: float, reaso
     assert verdict.statistics["failures"] == [[1, step + 1, r.failures[0].reason]]
 
 
-def test_a_start_known_exactly_is_left_out(tmp_path: Path) -> None:
-    def singular(table: pd.DataFrame) -> None:
+def test_a_start_known_exactly_is_left_out(tmp_path):
+    def singular(table):
         table.loc[table["step"] == 1, POSE_COLUMNS] = 0.0
         table.loc[table["step"] == 2, POSE_COLUMNS] = [1.0, 1.0, 0.0, 1.0, 0.0, 1.0]  # rank 2
 
@@ -457,30 +450,30 @@ def test_a_start_known_exactly_is_left_out(tmp_path: Path) -> None:
     assert r.failures == ()
     assert np.isnan(r.nees[:, :2]).all()
     assert np.isnan(r.covariance[:, :2]).all()
-    np.testing.assert_allclose(r.nees[:, 2:], nees(r.error[:, 2:], r.covariance[:, 2:]))
+    assert_allclose(r.nees[:, 2:], nees(r.error[:, 2:], r.covariance[:, 2:]))
     assert np.isfinite(r.error).all()
     assert any("6 estimates before the covariance has full rank" in note for note in r.notes)
     assert judge_all([r])["est"].statistics["left_out_steps"] == [1, 2]
 
 
-def test_step_0_is_the_start_only_where_nothing_is_uncertain(tmp_path: Path) -> None:
-    def shift(table: pd.DataFrame) -> None:
+def test_step_0_is_the_start_only_where_nothing_is_uncertain(tmp_path):
+    def shift(table):
         table["step"] -= 1
 
     kept = one(*write(tmp_path, shift, shift))
     assert kept.error.shape == (3, 5, 3)
     assert any("which has 0 to 4" in note for note in kept.notes)
 
-    def exact(table: pd.DataFrame) -> None:
+    def exact(table):
         shift(table)
         table.loc[table["step"] == 0, POSE_COLUMNS] = 0.0
 
     start = one(*write(tmp_path, exact, shift))
     assert start.error.shape == (3, 4, 3)
-    np.testing.assert_array_equal(start.error, kept.error[:, 1:])
+    assert_array_equal(start.error, kept.error[:, 1:])
 
 
-def test_short_and_missing_runs_are_told(tmp_path: Path) -> None:
+def test_short_and_missing_runs_are_told(tmp_path):
     r = one(*write(tmp_path, lambda e: e[(e["run"] != 1) & ((e["run"] != 2) | (e["step"] < 4))]))
     assert r.runs.tolist() == [0, 2]
     assert np.isnan(r.error[1, 3:]).all()
@@ -488,7 +481,7 @@ def test_short_and_missing_runs_are_told(tmp_path: Path) -> None:
     assert any("1 run of 2 (2) end before step 5" in note for note in r.notes)
 
 
-def test_nis_alone(tmp_path: Path) -> None:
+def test_nis_alone(tmp_path):
     rng = np.random.default_rng(4)
     table = pd.DataFrame({"run": np.repeat(range(20), 50), "step": np.tile(np.arange(1, 51), 20)})
     table["nis"], table["nis_dof"] = 4 * rng.chisquare(2, 1000), 2
@@ -503,31 +496,31 @@ def test_nis_alone(tmp_path: Path) -> None:
     assert judge_all([r], optimal_gain=True)["nis"].status == "overconfident"
 
 
-def test_our_own_files_get_our_own_verdict(uvd: cs.Scenario, tmp_path: Path) -> None:
+def test_our_own_files_get_our_own_verdict(uvd, tmp_path):
     results = cs.run_trials(uvd, ["ekf-uvd"], runs=3, jobs=1)
     results.write(tmp_path / "out")
     r = one(tmp_path / "out/estimates.parquet", tmp_path / "out/truth.parquet")
     ours, theirs = cs.analyse(results)["ekf-uvd"], judge_all([r])["ekf-uvd"]
     assert (theirs.status, theirs.statistics["left_out_steps"]) == (ours.status, ours.statistics["left_out_steps"])
-    np.testing.assert_allclose(theirs.statistics["anees"], ours.statistics["anees"], rtol=1e-9)
+    assert_allclose(theirs.statistics["anees"], ours.statistics["anees"], rtol=1e-9)
 
 
 # --- archives --------------------------------------------------------------------------------------
 
 
-def archive(at: Path, **arrays: Any) -> Path:
+def archive(at, **arrays):
     np.savez(at / "a.npz", **arrays)
     return at / "a.npz"
 
 
-def gaussian(scale: float = 1.0) -> dict[str, Any]:
+def gaussian(scale=1.0):
     rng = np.random.default_rng(5)
     P = np.array([[0.04, 0.01], [0.01, 0.09]])
     errors = rng.multivariate_normal([0, 0], scale * P, (40, 30))
     return {"errors": errors, "covariances": np.broadcast_to(P, (40, 30, 2, 2))}
 
 
-def test_three_kinds_of_archives_agree(tmp_path: Path) -> None:
+def test_three_kinds_of_archives_agree(tmp_path):
     """Consistent errors: false-alarm rate 0.05 of the verdict, so it is asked at 1 - 1e-4."""
     arrays = gaussian()
     by_error = one(archive(tmp_path, **arrays, axes=["px", "py"]), None)
@@ -535,19 +528,19 @@ def test_three_kinds_of_archives_agree(tmp_path: Path) -> None:
     truth = np.random.default_rng(6).normal(size=(40, 30, 2))
     estimates = {"estimates": truth - arrays["errors"], "truth": truth, "covariances": arrays["covariances"]}
     by_truth = one(archive(tmp_path, **estimates), None)
-    np.testing.assert_allclose(by_truth.error, by_error.error, atol=1e-12)
+    assert_allclose(by_truth.error, by_error.error, atol=1e-12)
     values = nees(error=arrays["errors"], covariance=arrays["covariances"])
     by_nees = one(archive(tmp_path, nees=values, dof=2), None)
     assert by_nees.error is None
     for r in (by_error, by_truth, by_nees):
         verdict = judge_all([r], settings=Settings(false_alarm=1e-4))["a"]
         assert verdict.status == "consistent"
-        np.testing.assert_allclose(verdict.statistics["mean_anees"], values.mean())
+        assert_allclose(verdict.statistics["mean_anees"], values.mean())
     for bad in (gaussian(2.0), {"nees": 2 * values, "dof": 2}):
         assert judge_all([one(archive(tmp_path, **bad), None)])["a"].status == "overconfident"
 
 
-def test_lengths_failures_and_starts_of_archives(tmp_path: Path) -> None:
+def test_lengths_failures_and_starts_of_archives(tmp_path):
     arrays = gaussian()
     errors = arrays["errors"].copy()
     errors[3, 20:] = np.nan
@@ -563,12 +556,12 @@ def test_lengths_failures_and_starts_of_archives(tmp_path: Path) -> None:
     assert np.isnan(r.nees[1]).tolist() == [False, False, False, True, True]
 
 
-def test_poses_in_an_archive_take_a_convention(tmp_path: Path) -> None:
+def test_poses_in_an_archive_take_a_convention(tmp_path):
     est, true = poses()
     estimates, truth = (table[["x", "y", "heading"]].to_numpy().reshape(3, 5, 3) for table in (est, true))
     path = archive(tmp_path, estimates=estimates, truth=truth, covariances=np.tile(np.eye(3), (3, 5, 1, 1)))
-    np.testing.assert_allclose(one(path, None, error="left").error, planar_error(truth, estimates, "left"))
-    np.testing.assert_allclose(one(path, None).error, truth - estimates)
+    assert_allclose(one(path, None, error="left").error, planar_error(truth, estimates, "left"))
+    assert_allclose(one(path, None).error, truth - estimates)
 
 
 # --- the commands of the manual ----------------------------------------------------------------------
@@ -578,7 +571,7 @@ FILTERPY = (ROOT / "docs/examples/filterpy_csv.py").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
-    ("change", "status"),
+    "change, status",
     [
         (None, "consistent"),
         (("believed = 1.0", "believed = 0.5"), "overconfident"),
@@ -587,9 +580,9 @@ FILTERPY = (ROOT / "docs/examples/filterpy_csv.py").read_text(encoding="utf-8")
     ],
 )
 def test_the_filterpy_filter_of_the_manual(
-    change: tuple[str, str] | None, status: str, inside: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    change, status, inside,
+    capsys,
+):  # fmt: skip
     """The manual's seed, so no false alarm of its own; the three wrong filters are the negative control."""
     text = FILTERPY
     if change:
@@ -606,7 +599,7 @@ def test_the_filterpy_filter_of_the_manual(
     assert "error convention vector" in err
 
 
-def test_the_notebook_of_the_manual(inside: Path) -> None:
+def test_the_notebook_of_the_manual(inside):
     (block,) = (block.text for block in blocks("docs/files.md", "python") if "record.plot(" in block.text)
     (inside / "notebook.py").write_text(block)
     planar(inside)

@@ -7,7 +7,6 @@ would be missed: together under 1 false failure in 1,000 runs of this file.
 
 import re
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import pytest
@@ -59,7 +58,7 @@ def within(count, total, rate, sigmas=5.0):
 # --- planning ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("ratio", "runs"), [(1.2, 260), (1.5, 53), (2.0, 18)])
+@pytest.mark.parametrize("ratio, runs", [(1.2, 260), (1.5, 53), (2.0, 18)])
 def test_required_runs_are_the_planned_ones(ratio, runs):
     """Worked out outside this project: 3 degrees of freedom, two-sided 5 %, power 0.95."""
     assert required_runs(3, ratio) == runs
@@ -400,8 +399,6 @@ def test_noncredibility_by_hand(fresh):
 
 
 # --- whole verdicts: clean -----------------------------------------------------------------------------
-
-Case = dict[str, Any]
 
 
 def clean(rng, runs=RUNS, coefficient=0.9):

@@ -1,7 +1,5 @@
 """Relative poses over windows: groups, covariances by finite differences, windows, frames, files and refusals."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import replace
@@ -13,16 +11,15 @@ import pytest
 import relative_poses as world
 from command import consistency, refused
 from documents import ROOT
+from numpy.testing import assert_allclose
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
-from consistency.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.geometry.groups import composed, matrices, propagated, to_left
-from consistency.referee.readers.pipeline.relative_motions import Stretch, windows_of
+from consistency.referee.readers.pipeline.relative_motions import windows_of
 from consistency.referee.readers.windows import Relative
-from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline
 from consistency.referee.verdicts.compare_sources import compare_with
 from consistency.referee.verdicts.sources import judge_all
@@ -35,15 +32,15 @@ DATA = Path(os.environ.get("CONSISTENCY_DATA", Path(__file__).parents[4] / "shar
 # --- frames ------------------------------------------------------------------------------------------
 
 
-def statistics(stretches: list[Stretch], size: str, motions: bool) -> dict[str, object]:
+def statistics(stretches, size, motions):
     return dict(plain(verdict_of(stretches, size, motions).statistics))
 
 
-def verdict_of(stretches: list[Stretch], size: str, motions: bool) -> Verdict:
+def verdict_of(stretches, size, motions):
     return judge_all([recorded(stretches, size, motions)])["log"]
 
 
-def same(a: object, b: object) -> None:
+def same(a, b):
     assert type(a) is type(b)
     if isinstance(a, dict):
         assert isinstance(b, dict)
@@ -63,9 +60,7 @@ def same(a: object, b: object) -> None:
 
 @pytest.mark.parametrize("size", ["5", "1s", "2m"])
 @pytest.mark.parametrize("group", GROUPS)
-def test_another_world_of_the_truth_changes_no_number_of_motions(
-    group: str, size: str, rng: np.random.Generator
-) -> None:
+def test_another_world_of_the_truth_changes_no_number_of_motions(group, size, rng):
     stretch = motion_stretch(drive(rng, group, 200))
     G = exp(3.0 * rng.normal(size=(1, len(AXES[group]))))
     turned = replace(stretch, truth=vectors(G @ matrices(stretch.truth)))
@@ -73,7 +68,7 @@ def test_another_world_of_the_truth_changes_no_number_of_motions(
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_another_world_of_either_changes_no_number_of_poses(group: str, rng: np.random.Generator) -> None:
+def test_another_world_of_either_changes_no_number_of_poses(group, rng):
     runs = [pose_stretch(rng, group, 8, 5, 1.0, run) for run in range(21)]
     kind, n = DECLARED[group], len(AXES[group])
     turned = []
@@ -97,7 +92,7 @@ def test_another_world_of_either_changes_no_number_of_poses(group: str, rng: np.
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_right_motions_are_consistent_and_wrong_ones_are_found(group: str, rng: np.random.Generator) -> None:
+def test_right_motions_are_consistent_and_wrong_ones_are_found(group, rng):
     """One of the two fails by chance in fewer than 1e-5 of all draws: 100 windows, and a ratio of 4."""
     for ratio, status in ((1.0, "consistent"), (4.0, "overconfident"), (0.2, "conservative")):
         record = recorded([motion_stretch(drive(rng, group, 500, ratio))], "5", True)
@@ -107,22 +102,22 @@ def test_right_motions_are_consistent_and_wrong_ones_are_found(group: str, rng: 
         assert "windows" in verdict.reasons[0] or status != "consistent"
 
 
-def test_windows_that_may_depend_are_steps_of_their_run(rng: np.random.Generator) -> None:
+def test_windows_that_may_depend_are_steps_of_their_run(rng):
     runs = [pose_stretch(rng, "SE(2)", 11, 5, 1.0, run) for run in range(25)]
     verdict = verdict_of(runs, "1", False)
     assert (verdict.runs, verdict.steps, verdict.unit) == (25, 10, "run")
 
 
-def test_declared_windows_are_runs(rng: np.random.Generator) -> None:
+def test_declared_windows_are_runs(rng):
     runs = [pose_stretch(rng, "SE(2)", 11, 5, 1.0, run) for run in range(3)]
     relative = replace(Relative(1, "step"), independent=True)
     record = world.relative_recording("log", "log", runs, AXES["SE(2)"], range(3), relative)
     verdict = judge_all([record])["log"]
     assert (verdict.runs, verdict.steps, verdict.unit) == (30, 1, "window")
-    np.testing.assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
+    assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
 
 
-def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Record:
+def declared(rng, windows, steps=10):
     """Independent windows of poses, by declaration only; true errors are 3 times what is stated."""
     runs = [pose_stretch(rng, "SE(2)", steps + 1, 5, 9.0, run) for run in range(windows // steps)]
     return world.relative_recording(
@@ -130,7 +125,7 @@ def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Record:
     )
 
 
-def test_few_windows_do_not_show_independence(rng: np.random.Generator) -> None:
+def test_few_windows_do_not_show_independence(rng):
     """Errors x9: found by 150 windows, and neither a fault nor an all-clear is said with 140."""
     few = judge_all([declared(rng, ENOUGH - 10)])["log"]
     assert few.status == "undecided"
@@ -148,7 +143,7 @@ def test_few_windows_do_not_show_independence(rng: np.random.Generator) -> None:
         compare_with(base, base, [])
 
 
-def test_a_failed_window_stays_failed(rng: np.random.Generator) -> None:
+def test_a_failed_window_stays_failed(rng):
     stretch = pose_stretch(rng, "SE(2)", 30, 5, 1.0, 0)
     stretch.estimate[20] = np.nan
     relative = replace(Relative(1, "step"), independent=True)
@@ -159,32 +154,32 @@ def test_a_failed_window_stays_failed(rng: np.random.Generator) -> None:
 # --- files -----------------------------------------------------------------------------------------------
 
 
-def lines(path: Path, *columns: Array) -> Path:
+def lines(path, *columns):
     np.savetxt(path, np.column_stack(columns), fmt="%.17g")
     return path
 
 
 @pytest.fixture
-def motion_file(tmp_path: Path, rng: np.random.Generator) -> Path:
+def motion_file(tmp_path, rng):
     """motions.tum with truth.tum beside it, 120 motions."""
     s = motion_stretch(drive(rng, "SE(3)", 120))
     lines(tmp_path / "truth.tum", s.t, s.truth)
     return lines(tmp_path / "motions.tum", s.t, s.estimate, s.covariance.reshape(-1, 36))
 
 
-def test_motions_as_tum(motion_file: Path) -> None:
+def test_motions_as_tum(motion_file):
     record = cs.read(motion_file, motion_file.parent / "truth.tum", relative="1s", motions=True)
     assert record.window == "1 s"
     assert record.error.shape == (1, 12, 6)
-    np.testing.assert_allclose(record.t, np.arange(1, 13), atol=1e-9)
+    assert_allclose(record.t, np.arange(1, 13), atol=1e-9)
     planar = cs.read(
         motion_file, motion_file.parent / "truth.tum", relative=10, motions=True, axes=["x", "y", "yaw"]
     )  # fmt: skip
     assert planar.axes == ("x", "y", "yaw")
-    np.testing.assert_allclose(planar.error, record.error[:, :, [0, 1, 5]], atol=1e-12)
+    assert_allclose(planar.error, record.error[:, :, [0, 1, 5]], atol=1e-12)
 
 
-def test_poses_with_cross_covariances_as_tum(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_poses_with_cross_covariances_as_tum(tmp_path, rng):
     s = pose_stretch(rng, "SE(3)", 9, 5, 1.0, 0)
     lines(tmp_path / "est.tum", s.t, s.estimate)
     lines(tmp_path / "truth.tum", s.t, s.truth)
@@ -192,8 +187,8 @@ def test_poses_with_cross_covariances_as_tum(tmp_path: Path, rng: np.random.Gene
     P = lines(tmp_path / "P.txt", s.t, s.covariance.reshape(-1, 36), cross)
     record = cs.read(tmp_path / "est.tum", tmp_path / "truth.tum", P, relative=1)
     found = windows_of(s, Relative(1, "step"))
-    np.testing.assert_allclose(record.covariance[0], found.covariance, rtol=1e-9)
-    np.testing.assert_allclose(record.error[0], found.error, atol=1e-12)
+    assert_allclose(record.covariance[0], found.covariance, rtol=1e-9)
+    assert_allclose(record.error[0], found.error, atol=1e-12)
     with pytest.raises(cs.InputError, match="line 3: --relative 2: the window spans 2 rows"):
         cs.read(tmp_path / "est.tum", tmp_path / "truth.tum", P, relative=2)
     keep = np.arange(9) != 4
@@ -202,7 +197,7 @@ def test_poses_with_cross_covariances_as_tum(tmp_path: Path, rng: np.random.Gene
         cs.read(tmp_path / "some.tum", tmp_path / "truth.tum", P, relative=1)
 
 
-def table(path: Path, s: Stretch, cross: bool) -> Path:
+def table(path, s, cross):
     columns = {"step": np.arange(len(s.t)), "t": s.t} | dict(zip(("x", "y", "heading"), s.estimate.T, strict=True))
     for i, a in enumerate("xyh"):
         for j, b in enumerate("xyh"):
@@ -214,25 +209,25 @@ def table(path: Path, s: Stretch, cross: bool) -> Path:
     return path
 
 
-def test_tables_and_archives_of_motions(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_tables_and_archives_of_motions(tmp_path, rng):
     s = motion_stretch(drive(rng, "SE(2)", 40))
     expected = recorded([s], "5", True)
     record = cs.read(table(tmp_path / "m.csv", s, False), tmp_path / "truth.csv", relative="0.5s", motions=True)
-    np.testing.assert_allclose(record.nees, expected.nees, rtol=1e-9)
+    assert_allclose(record.nees, expected.nees, rtol=1e-9)
     np.savez(tmp_path / "m.npz", estimates=s.estimate, truth=s.truth, covariances=s.covariance)
-    np.testing.assert_allclose(cs.read(tmp_path / "m.npz", relative=5, motions=True).nees, expected.nees, rtol=1e-9)
+    assert_allclose(cs.read(tmp_path / "m.npz", relative=5, motions=True).nees, expected.nees, rtol=1e-9)
     with pytest.raises(cs.InputError, match="--relative 1s needs a column t"):
         cs.read(tmp_path / "m.npz", relative="1s", motions=True)
 
 
-def test_tables_and_archives_of_poses_with_cross_covariances(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_tables_and_archives_of_poses_with_cross_covariances(tmp_path, rng):
     s = pose_stretch(rng, "SE(2)", 9, 5, 1.0, 0)
     expected = recorded([s], "1", False)
     record = cs.read(table(tmp_path / "p.csv", s, True), tmp_path / "truth.csv", relative=1)
-    np.testing.assert_allclose(record.nees, expected.nees, rtol=1e-9)
+    assert_allclose(record.nees, expected.nees, rtol=1e-9)
     arrays = {"estimates": s.estimate, "truth": s.truth, "covariances": s.covariance, "cross_covariances": s.cross}
     np.savez(tmp_path / "p.npz", **arrays)
-    np.testing.assert_allclose(cs.read(tmp_path / "p.npz", relative=1).nees, expected.nees, rtol=1e-9)
+    assert_allclose(cs.read(tmp_path / "p.npz", relative=1).nees, expected.nees, rtol=1e-9)
     declared = cs.read(tmp_path / "p.npz", relative=1, windows="independent")
     assert cs.judge(declared).runs == 8
     np.savez(tmp_path / "q.npz", **arrays | {"cross_covariances": s.cross[:4]})
@@ -247,9 +242,7 @@ def test_tables_and_archives_of_poses_with_cross_covariances(tmp_path: Path, rng
 # --- refusals and commands -------------------------------------------------------------------------------
 
 
-def test_marginal_covariances_are_refused_with_the_remedy(
-    motion_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_marginal_covariances_are_refused_with_the_remedy(motion_file, capsys):
     files = [str(motion_file), "--truth", str(motion_file.parent / "truth.tum")]
     cases = {
         ("--relative", "10"): "covariances of two poses do not tell that of the motion between them; give their cross",
@@ -265,7 +258,7 @@ def test_marginal_covariances_are_refused_with_the_remedy(
         assert text in refused(capsys, "analyse", *files, *options)
 
 
-def test_what_has_no_poses_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_what_has_no_poses_is_refused(tmp_path, rng):
     s = motion_stretch(drive(rng, "SE(2)", 10))
     path = table(tmp_path / "m.csv", s, False)
     with pytest.raises(cs.InputError, match="--relative needs poses x, y, heading"):
@@ -277,7 +270,7 @@ def test_what_has_no_poses_is_refused(tmp_path: Path, rng: np.random.Generator) 
         cs.read(tmp_path / "e.npz", relative=1)
 
 
-def test_the_command_and_its_report(motion_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_and_its_report(motion_file, capsys):
     out = motion_file.parent / "look"
     files = [str(motion_file), "--truth", str(motion_file.parent / "truth.tum"), "--motions", "--relative", "0.5s"]
     shown, notes = consistency(capsys, "analyse", *files, "--report", out)
@@ -296,7 +289,7 @@ def test_the_command_and_its_report(motion_file: Path, capsys: pytest.CaptureFix
 # --- the front-end -----------------------------------------------------------------------------------------
 
 
-def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[object], Array]:
+def simulated_motions(rng, number):
     """Motions of a front-end, and true poses (number + 1, 4, 4); errors are of roll, pitch, yaw."""
     from consistency.referee.geometry import rotation
     from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
@@ -320,7 +313,7 @@ def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[objec
     return found, composed(np.array(steps))
 
 
-def test_motions_of_the_front_end_are_read_and_right(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_motions_of_the_front_end_are_read_and_right(tmp_path, rng):
     """Without images: 400 motions with large turns; x1.5 is found in all but 1e-5 of all draws."""
     from consistency.stereo.frontend.images_to_log import motions_text
     from consistency.stereo.visual_odometry.odometry import motion_covariances
@@ -340,13 +333,11 @@ def test_motions_of_the_front_end_are_read_and_right(tmp_path: Path, rng: np.ran
 
 
 @pytest.mark.parametrize(
-    ("name", "truth", "size", "count"),
+    "name, truth, size, count",
     [("kitti06_f0-50", "poses.txt", "0.5s", 10), ("euroc_static", "groundtruth_first97.csv", "1", 5)],
 )
 @pytest.mark.slow
-def test_a_real_sequence_from_images_to_windows(
-    tmp_path: Path, name: str, truth: str, size: str, count: int, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_real_sequence_from_images_to_windows(tmp_path, name, truth, size, count, capsys):
     """Images, motions, windows: the verdict of docs/front-end.md, where the covariance is of pixel noise alone."""
     pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
     if not (DATA / name).is_dir():
@@ -358,9 +349,9 @@ def test_a_real_sequence_from_images_to_windows(
     assert (verdict.runs, verdict.status) == (count, "overconfident")
 
 
-def test_the_example_of_the_manual(inside: Path) -> None:
+def test_the_example_of_the_manual(inside):
     example = (ROOT / "docs/examples/wheel_odometry.py").read_text(encoding="utf-8")
-    names: dict[str, Record] = {}
+    names = {}
     exec(example, names)
     verdict = cs.judge(names["record"])
     assert (verdict.runs, verdict.unit, verdict.status) == (60, "window", "consistent")

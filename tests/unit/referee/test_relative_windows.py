@@ -45,7 +45,7 @@ def test_matrices_inverse_log_and_adjoint(group, rng):
 
 
 @pytest.mark.parametrize(
-    ("group", "convention"), [("SE(2)", c) for c in PLANAR if c != "vector"] + [("SE(3)", c) for c in SPATIAL]
+    "group, convention", [("SE(2)", c) for c in PLANAR if c != "vector"] + [("SE(3)", c) for c in SPATIAL]
 )
 def test_every_convention_becomes_the_left_error(group, convention, rng):
     T = random_poses(rng, group, 10)
@@ -146,9 +146,7 @@ def test_sizes_that_are_none(text):
         relative_of(text)
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"), [("100", "100 steps"), ("1", "1 step"), ("10s", "10 s"), ("0.5 m", "0.5 m")]
-)
+@pytest.mark.parametrize("text, shown", [("100", "100 steps"), ("1", "1 step"), ("10s", "10 s"), ("0.5 m", "0.5 m")])
 def test_sizes_as_they_are_shown(text, shown):
     relative = relative_of(text)
     assert relative.text == shown

@@ -232,26 +232,36 @@ def test_one_command_writes_page_paper_and_numbers(archive, capsys):
     assert json.loads((out / "verdict.json").read_text())["mine"]["reasons"] == list(verdict.reasons)
     assert verdict.reasons[0].split(",")[0] in (out / "report.html").read_text()
     assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
-    shown, err = consistency(capsys, "analyse", archive, "--report", out, status=2)  # below the verdict
-    assert shown == printed.split(str(out))[0]
-    assert err.endswith("exists already; choose another folder or add --overwrite\n")
-    shown, _ = consistency(capsys, "analyse", archive, "--report", out, "--json", status=2)
-    assert set(json.loads(shown)) == {"mine"}
-    consistency(capsys, "analyse", archive, "--report", out, "--overwrite")
+    (out / "report.pdf").unlink()
+    shown, _ = consistency(capsys, "analyse", archive, "--report", out)  # it replaces what it has written itself
+    assert shown == printed
+    assert (out / "report.pdf").exists()
+    (out / "mine.txt").write_text("mine")
+    assert "exists already" in refused(capsys, "analyse", archive, "--report", out)
 
 
-def test_a_verdict_that_fails_counts_before_a_report_that_is_refused(tmp_path, capsys):
-    errors = np.random.default_rng(5).normal(0.0, 3.0, (60, 1, 2))
-    np.savez(tmp_path / "bad.npz", errors=errors, covariances=np.broadcast_to(np.eye(2), (60, 1, 2, 2)))
+def test_a_report_that_is_not_replaced_is_refused_before_the_work(archive, tmp_path, capsys):
     taken = tmp_path / "taken"
     taken.mkdir()
-    command = ["analyse", tmp_path / "bad.npz", "--report", taken]
-    for more, status in (([], 2), (["--fail-on", "inconsistent"], 1), (["--fail-on", "inconsistent", "--json"], 1)):
-        out, err = consistency(capsys, *command, *more, status=status)
-        assert "overconfident" in out
-        assert f"consistency: --report {taken}: exists already" in err
-        assert "--json" not in more or json.loads(out)["bad"]["status"] == "overconfident"
-    assert not list(taken.iterdir())
+    (taken / "mine.txt").write_text("mine")
+    why = f"--report {taken}: exists already; choose another folder or add --overwrite"
+    assert why in refused(capsys, "analyse", archive, "--report", taken)
+    other = tmp_path / "junit.xml"
+    other.write_text("<testsuites></testsuites>\n")
+    why = f"{other}: exists already; name another file or add --overwrite"
+    assert why in refused(capsys, "analyse", tmp_path / "not-there.npz", "--report", other)
+    assert (taken / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["r.xml", "r.md"])
+def test_a_file_that_analyse_has_written_is_replaced(name, archive, tmp_path, capsys):
+    consistency(capsys, "analyse", archive, "--report", tmp_path / name)
+    first = (tmp_path / name).read_text()
+    consistency(capsys, "analyse", archive, "--report", tmp_path / name)
+    assert (tmp_path / name).read_text() == first
+    (tmp_path / name).write_text(f"{first}more")
+    assert "exists already" in refused(capsys, "analyse", archive, "--report", tmp_path / name)
+    consistency(capsys, "analyse", archive, "--report", tmp_path / name, "--overwrite")
 
 
 def test_what_a_report_is_not_for(archive, tmp_path, capsys):

@@ -271,7 +271,7 @@ def test_the_rows_of_the_calibration(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         ({"split": "x"}, "--split x: must be a number of pieces, or 'auto'"),
         ({"split": "0"}, "--split 0: must be a number of pieces, or 'auto'"),
@@ -328,7 +328,7 @@ def test_independent_pieces_are_doubted_at_the_stated_rate(count, rng):
     assert doubted <= stats.binom.isf(SURE, 400, 0.005)
 
 
-@pytest.mark.parametrize(("memory", "count"), [(0.5, 400), (0.8, 150), (0.95, 150)])
+@pytest.mark.parametrize("memory, count", [(0.5, 400), (0.8, 150), (0.95, 150)])
 def test_sizes_that_go_on_are_doubted(memory, count, rng):
     """Missed in fewer than 1e-5: signs are independent, sizes AR."""
     found = independence(calibration_windows.windows_of(rng, count, memory))

@@ -221,7 +221,7 @@ WRONG = {
     "empty folder": (
         lambda at: (at / "d").mkdir(),
         ("d", "--truth", "d"),
-        "d: holds no .txt or .tum file and no manifest.json",
+        "d: holds no .txt or .tum file, no table and no manifest.json",
     ),
     "folder of nothing": (lambda at: (at / "d").mkdir(), ("d",), "holds no results of"),
     "truth of another run": (

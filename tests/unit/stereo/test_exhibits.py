@@ -1,5 +1,7 @@
 """Exhibits of the experiments on the sensor: every finding has one, with its rule, its tables and its figures."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -8,9 +10,10 @@ from painted import by_title, legend_of, lines, panels, titles
 from scripts import experiment, figures
 
 import consistency as cs
+from consistency.bench.pages import build
 from consistency.bench.pages.build import build_report
 from consistency.bench.pages.sections.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, shown
-from consistency.referee.document.blocks import Column, Heading, Stack, Status, Table
+from consistency.referee.document.blocks import Column, Heading, Stack, Status, Table, Text
 
 images, sensor_issues = figures("images"), figures("sensor_issues")
 SECTIONS = (sensor_issues, images)
@@ -60,6 +63,19 @@ def test_an_exhibit_has_its_own_findings_and_none_without_a_table(tmp_path):
     assert rows_of(table) == (("1.2",),)
     (folder / "first.parquet").unlink()
     assert shown(build_report(folder), exhibits) == ()
+
+
+def test_chapters_of_scripts_stand_on_paper_as_they_say(tmp_path, monkeypatch):
+    def script(name, on_paper):
+        return SimpleNamespace(CHAPTER=(name, name.title(), "Entry"), ON_PAPER=on_paper, blocks=lambda _: (Text("x"),))
+
+    scripts = {"first": script("first", True), "second": script("second", False)}
+    monkeypatch.setattr(build, "figure_scripts", lambda: scripts)
+    report = build_report(written(tmp_path / "out", {}, ("a",)))
+    first, second = build._of_experiments(report, brief=True)
+    assert (first.anchor, first.title, first.link, first.on_paper) == ("first", "First", "Entry", None)
+    assert second.on_paper == ()
+    assert [chapter.on_paper for chapter in build._of_experiments(report, brief=False)] == [None, None]
 
 
 def test_a_listing_writes_text_numbers_and_verdicts():

@@ -104,7 +104,7 @@ def test_unusable_images(wall, rng):
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    "settings, said",
     [({"estimator": "icp"}, "one of reprojection"), ({"ratio": 0.0}, "ratio: 0.0"), ({"features": 1}, "at least 8")],
 )
 def test_unusable_settings(settings, said):
@@ -237,7 +237,7 @@ def data(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "truth", "metres", "degrees"),
+    "name, truth, metres, degrees",
     [("kitti06_f0-50", "poses.txt", 0.020, 0.03), ("euroc_static", "groundtruth_first97.csv", 0.001, 0.1)],
 )
 def test_real_images(name, truth, metres, degrees, rng):

@@ -1,9 +1,6 @@
 """Every example of the page of sensor effects works in herath2007-stereo, and it has every effect and scenario."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import pytest
 from documents import blocks, read
@@ -17,7 +14,7 @@ TABLES = [block.text for block in blocks("docs/reference/sensor-effects.md", "to
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: re.findall(r'kind = "(.*)"|sensor\.(\w+)', table)[0])
-def test_a_table_switches_something_on(tmp_path: Path, table: str) -> None:
+def test_a_table_switches_something_on(tmp_path, table):
     text = (data_folder("scenarios") / "herath2007-stereo.toml").read_text(encoding="utf-8")
     (tmp_path / "mine.toml").write_text(f"{text}\n{table}", encoding="utf-8")
     plain, mine = cs.load_scenario("herath2007-stereo"), cs.load_scenario(tmp_path / "mine.toml")
@@ -26,14 +23,14 @@ def test_a_table_switches_something_on(tmp_path: Path, table: str) -> None:
     assert (a.z.shape == b.z.shape and (a.z == b.z).all()) == ("[belief" in table)
 
 
-def test_code_runs() -> None:
+def test_code_runs():
     pieces = blocks("docs/reference/sensor-effects.md", "python")
     assert len(pieces) == 2
     for piece in pieces:
         exec(piece.text, {})
 
 
-def test_every_effect_and_scenario_is_there() -> None:
+def test_every_effect_and_scenario_is_there():
     shown = set(re.findall(r'^kind = "(.*)"', PAGE, flags=re.MULTILINE))
     assert shown == set(EFFECTS)
     for kind, effect in EFFECTS.items():

@@ -78,7 +78,7 @@ def test_gimbal_lock_is_named(rng):
 
 
 @pytest.mark.parametrize(
-    ("R", "t", "message"),
+    "R, t, message",
     [
         (np.eye(2), np.zeros(3), "R: shape"),
         (np.eye(3), np.zeros(2), "t: shape"),

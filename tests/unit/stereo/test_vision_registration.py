@@ -74,7 +74,7 @@ DEGENERATE = {
 }
 
 
-@pytest.mark.parametrize(("points", "message"), DEGENERATE.values(), ids=DEGENERATE.keys())
+@pytest.mark.parametrize("points, message", DEGENERATE.values(), ids=DEGENERATE.keys())
 def test_points_that_fix_no_motion(points, message, rng):
     moved = MOTION.apply(points)
     calls = [

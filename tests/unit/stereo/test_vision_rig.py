@@ -43,7 +43,7 @@ def test_no_points_are_no_error():
 
 
 @pytest.mark.parametrize(
-    ("uv", "why"),
+    "uv, why",
     [
         ([400.0, 240.0, 400.0, 240.0], "zero disparity: at infinity"),
         ([380.0, 240.0, 400.0, 240.0], "negative disparity: behind"),
@@ -104,7 +104,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), BAD)
+@pytest.mark.parametrize("change, message", BAD)
 def test_a_rig_that_is_none(change, message):
     good = {"K_left": K, "K_right": K, "R": TURN, "t": BASE, "image_size": SIZE}
     with pytest.raises(InputError, match=message):
@@ -119,7 +119,7 @@ def test_a_rig_cannot_be_changed():
 
 
 @pytest.mark.parametrize(
-    ("S", "message"),
+    "S, message",
     [
         (np.eye(3), r"S_uv: shape \(3, 3\)"),
         (np.diag([1.0, 1.0, 1.0, -0.1]), "not positive semidefinite"),

@@ -266,7 +266,7 @@ def screen_known(
 ) -> tuple[int, int, bool]:
     """First by the track, then by what the filter expects of the landmarks that it knows."""
     m = _screen_tracks(guard, state.offset, data, k, m, work, watch)
-    withhold(slam.covariance, state, data, k, watch.rejected, watch.anew, local)
+    withhold(slam.covariance, state, data, k, watch.rejected, watch.again, local)
     if m == 0:
         return 0, 0, False
     code, _ = predict_innovation(slam.update, slam, state, data, k, m, local, work)
@@ -279,13 +279,13 @@ def screen_known(
         row, label, kept = work.known[i], work.label[i], watch.kept[i]
         watch.rejected[row] = not kept
         watch.misses[label] = 0 if kept else watch.misses[label] + 1
-        watch.anew[row] = not kept and watch.begun[label] >= 0
+        watch.again[row] = not kept and watch.begun[label] >= 0
         if kept:
             watch.begun[label] = -1
     left = _without_rejected(m, work, watch)
     if left < m:
-        withhold(slam.covariance, state, data, k, watch.rejected, watch.anew, local)
-        _begin_anew(data, k, watch)
+        withhold(slam.covariance, state, data, k, watch.rejected, watch.again, local)
+        _restart(data, k, watch)
     return 0, left, left == m
 
 
@@ -319,10 +319,10 @@ def _screen_tracks(
 
 
 @inner
-def _begin_anew(data: Data, k: int, watch: Watch) -> None:
+def _restart(data: Data, k: int, watch: Watch) -> None:
     """What a landmark began with is rejected, where it restarts with the first that disagrees."""
     for i in range(data.first[k], data.first[k + 1]):
-        if watch.anew[i]:
+        if watch.again[i]:
             label = data.landmark[i]
             watch.rejected[watch.begun[label]], watch.rejected[i] = True, False
             watch.begun[label] = i
@@ -340,7 +340,7 @@ def _without_rejected(m: int, work: Work[NamedTuple], watch: Watch) -> int:
 
 @implement(may_enter, Guard)
 def enters_unless_rejected(guard: Guard, row: int, is_known: bool, watch: Watch) -> bool:
-    return watch.anew[row] if is_known else not watch.rejected[row]
+    return watch.again[row] if is_known else not watch.rejected[row]
 
 
 @implement(rejected_rows, Guard)

@@ -46,8 +46,8 @@ from consistency.bench.filters.kernel.part_functions import (
     to_error,
     world_point,
 )
+from consistency.bench.filters.kernel.unicycle import robot_frame
 from consistency.bench.filters.kernel.update_steps import NOT_FINITE, POSE, Work, make_work
-from consistency.bench.filters.parts.unicycle import robot_frame
 from consistency.referee.types import Array, Indices
 
 

@@ -16,7 +16,7 @@ from consistency.bench.filters.compiler.dispatch import generic, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.arrays import copy_matrix, fill_matrix, filled, integers, matrix, vector
 from consistency.bench.filters.kernel.blas import add_transposed_times
-from consistency.bench.filters.parts.unicycle import Frame, add_motion_noise, move, move_about, propagate_covariance
+from consistency.bench.filters.kernel.unicycle import Frame, add_motion_noise, move, move_about, propagate_covariance
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array, Indices
 

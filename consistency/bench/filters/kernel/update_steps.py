@@ -46,7 +46,7 @@ from consistency.bench.filters.kernel.part_functions import (
     to_error,
     wrap_residual,
 )
-from consistency.bench.filters.parts.unicycle import Frame, robot_frame
+from consistency.bench.filters.kernel.unicycle import Frame, robot_frame
 from consistency.bench.models import point
 from consistency.referee.types import Array, Indices
 

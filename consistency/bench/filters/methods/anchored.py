@@ -20,8 +20,8 @@ from consistency.bench.filters.kernel.part_functions import (
     to_body_jacobian,
     world_point,
 )
+from consistency.bench.filters.kernel.unicycle import Frame
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.parts.unicycle import Frame
 from consistency.bench.filters.textbook.anchored import AnchoredKalman
 from consistency.bench.models.point import Mounting, turned_to_robot
 from consistency.referee.types import Array

@@ -20,6 +20,7 @@ from consistency.bench.filters.kernel.part_functions import (
     predict_innovation,
     stands_apart,
 )
+from consistency.bench.filters.kernel.unicycle import Unicycle
 from consistency.bench.filters.kernel.update_steps import (
     Work,
     add_noise,
@@ -31,7 +32,6 @@ from consistency.bench.filters.kernel.update_steps import (
     place_observed,
 )
 from consistency.bench.filters.parts.sensors import RangeBearing, RelativeXy, Uvd, Xyz
-from consistency.bench.filters.parts.unicycle import Unicycle
 from consistency.bench.filters.parts.world_point import PlanarPoint, WorldPoint
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.protocols import Problem

@@ -39,6 +39,7 @@ from consistency.bench.filters.kernel.part_functions import (
     to_error,
     world_point,
 )
+from consistency.bench.filters.kernel.unicycle import Frame, move, noise_columns, robot_frame
 from consistency.bench.filters.kernel.update_steps import (
     Work,
     add_noise,
@@ -52,7 +53,6 @@ from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.parts.invariant_pose import move_pose, shifted_covariance
 from consistency.bench.filters.parts.inverse_range import inward, outward
 from consistency.bench.filters.parts.sensors import Uvd
-from consistency.bench.filters.parts.unicycle import Frame, move, noise_columns, robot_frame
 from consistency.bench.filters.parts.world_point import combine_world_point
 from consistency.bench.filters.textbook.equivariant import EquivariantKalman
 from consistency.bench.models import point

@@ -18,10 +18,10 @@ from consistency.bench.filters.kernel.part_functions import (
     place,
     propagate_covariance_at,
 )
+from consistency.bench.filters.kernel.unicycle import propagate_covariance_by
 from consistency.bench.filters.kernel.update_steps import Work, place_observed
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.kf import invert_at, landmark_at_known, motion_at_known, observation_at_known
-from consistency.bench.filters.parts.unicycle import propagate_covariance_by
 from consistency.bench.filters.textbook.ideal import IdealKalman, truth_of
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array

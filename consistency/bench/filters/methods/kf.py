@@ -25,9 +25,9 @@ from consistency.bench.filters.kernel.part_functions import (
     place,
     propagate_covariance_at,
 )
+from consistency.bench.filters.kernel.unicycle import propagate_covariance, robot_frame
 from consistency.bench.filters.kernel.update_steps import Work, linearise_at
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.parts.unicycle import propagate_covariance, robot_frame
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.kf import LinearKalman
 from consistency.bench.models.motion import dead_reckoning

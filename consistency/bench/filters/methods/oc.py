@@ -44,9 +44,9 @@ from consistency.bench.filters.kernel.part_functions import (
     place,
     propagate_covariance_at,
 )
+from consistency.bench.filters.kernel.unicycle import move, propagate_covariance_by
 from consistency.bench.filters.kernel.update_steps import Work, place_observed
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.parts.unicycle import move, propagate_covariance_by
 from consistency.bench.filters.textbook.oc import ConstrainedKalman
 from consistency.referee.types import Array, Indices
 

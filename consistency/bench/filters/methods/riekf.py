@@ -20,10 +20,10 @@ from consistency.bench.filters.kernel.part_functions import (
     retract,
     to_error,
 )
+from consistency.bench.filters.kernel.unicycle import move, noise_columns
 from consistency.bench.filters.kernel.update_steps import Work
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.parts.invariant_pose import exponential, shifted_covariance
-from consistency.bench.filters.parts.unicycle import move, noise_columns
 from consistency.bench.filters.textbook.riekf import RightInvariantKalman
 from consistency.referee.types import Array
 

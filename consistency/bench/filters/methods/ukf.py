@@ -40,6 +40,7 @@ from consistency.bench.filters.kernel.part_functions import (
     predict_innovation,
     wrap_residual,
 )
+from consistency.bench.filters.kernel.unicycle import add_motion_noise, move, propagate_covariance_root, robot_frame
 from consistency.bench.filters.kernel.update_steps import (
     POSE,
     Work,
@@ -50,7 +51,6 @@ from consistency.bench.filters.kernel.update_steps import (
     observe,
 )
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.parts.unicycle import add_motion_noise, move, propagate_covariance_root, robot_frame
 from consistency.bench.filters.textbook.ukf import CUBATURE, UnscentedKalman
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array

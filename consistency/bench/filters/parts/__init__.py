@@ -1,1 +1,1 @@
-"""Parts that the kernels of several methods are made of: motion, sensors, landmarks, covariance updates."""
+"""Parts that the kernels of several methods are made of: sensors, landmarks, covariance updates."""

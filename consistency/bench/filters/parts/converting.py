@@ -28,6 +28,7 @@ from consistency.bench.filters.kernel.arrays import (
 )
 from consistency.bench.filters.kernel.covariance import add_gram_to_state, multiply_columns, multiply_rows, replace_rows
 from consistency.bench.filters.kernel.part_functions import Slam, State, Triple, make_room, place, predict
+from consistency.bench.filters.kernel.unicycle import Frame, move, noise_columns
 from consistency.bench.filters.kernel.update_steps import Work
 from consistency.bench.filters.parts.invariant_pose import exponential, left_jacobian, move_pose
 from consistency.bench.filters.parts.inverse_range import (
@@ -39,7 +40,6 @@ from consistency.bench.filters.parts.inverse_range import (
     subtract_bias,
 )
 from consistency.bench.filters.parts.parking import Clones
-from consistency.bench.filters.parts.unicycle import Frame, move, noise_columns
 from consistency.referee.types import Array, Indices
 
 

@@ -10,6 +10,7 @@ from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
 from consistency.bench.filters.kernel.covariance import add_gram_to_state, gather_all_rows, replace_rows, state_index
 from consistency.bench.filters.kernel.part_functions import Data, Slam, State, correct, predict_innovation
+from consistency.bench.filters.kernel.unicycle import Frame, robot_frame
 from consistency.bench.filters.kernel.update_steps import Work, apply_beyond, divide_by_root
 from consistency.bench.filters.parts.converting import (
     Converting,
@@ -24,7 +25,6 @@ from consistency.bench.filters.parts.converting import (
 from consistency.bench.filters.parts.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.parts.inverse_range import carried, observe_range
 from consistency.bench.filters.parts.parking import Clones, is_in_doubt, is_new, recentre, unpark
-from consistency.bench.filters.parts.unicycle import Frame, robot_frame
 from consistency.referee.types import Array, Indices
 
 SETTLED = 1e-3  # change in standard deviations that ends an iteration

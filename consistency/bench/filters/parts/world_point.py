@@ -15,7 +15,7 @@ from consistency.bench.filters.kernel.part_functions import (
     to_body_jacobian,
     world_point,
 )
-from consistency.bench.filters.parts.unicycle import Frame
+from consistency.bench.filters.kernel.unicycle import Frame
 from consistency.bench.models import point
 from consistency.bench.models.point import Mounting
 from consistency.referee.types import Array

@@ -10,7 +10,7 @@ import numpy as np
 from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.node_tables import BiasMap
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Finite
+from consistency.bench.scenario.tables.toml_tables import Finite
 from consistency.referee.types import Array
 
 Coefficients = tuple[Finite, Finite]

@@ -10,7 +10,7 @@ from pydantic import Field, ModelWrapValidatorHandler, TypeAdapter, model_valida
 from pydantic_core import PydanticCustomError
 
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Table
+from consistency.bench.scenario.tables.toml_tables import Table
 
 E = TypeVar("E", bound="ListedEffect")
 

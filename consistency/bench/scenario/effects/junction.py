@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from consistency.bench.models import point, stereo
 from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Count, Positive, Rate
+from consistency.bench.scenario.tables.toml_tables import Count, Positive, Rate
 from consistency.referee.types import Array
 
 

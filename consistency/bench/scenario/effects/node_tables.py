@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Finite, Positive, Table
+from consistency.bench.scenario.tables.toml_tables import Finite, Positive, Table
 from consistency.referee.types import Array
 
 Nodes = Annotated[tuple[Finite, ...], Field(min_length=1)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.bench.models import planar, point, stereo
-from consistency.bench.scenario.sensor_view import SeeingSensor
+from consistency.bench.scenario.tables.sensor_view import SeeingSensor
 from consistency.referee.types import Array, Indices
 
 NO_LANDMARK = -1  # source of an observation that is of no landmark

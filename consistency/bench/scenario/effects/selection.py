@@ -9,7 +9,7 @@ from pydantic import Field
 
 from consistency.bench.scenario.effects.effect import UvdEffect, register_effect
 from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.toml_tables import Count, NonNegative, Positive
+from consistency.bench.scenario.tables.toml_tables import Count, NonNegative, Positive
 from consistency.referee.types import Array, Indices
 
 

@@ -143,6 +143,8 @@ def findings_of(
         innovations=innovations,
         landmarks=record.landmarks,
         joint=None if joint is None else joint.score,
+        times=record.t if record.files and len(record.t) == steps else None,
+        files=record.files if len({*record.files.values()}) > 1 else {},
         unit=record.unit,
         lost=lost,
         ends=ends,
@@ -226,7 +228,9 @@ def _equivalence(
     if truth is not None:
         return truth.equivalence(sample, settings, factor)
     low_is_fault = not record.reduced
-    return equivalence(sample.means(), sample.dof, sample.longest, settings, factor, low_is_fault, record.unseen)
+    return equivalence(
+        sample.means(), sample.dof, sample.longest, settings, factor, low_is_fault, record.unseen, is_whole=True
+    )
 
 
 def _early_ends(sample: Sample) -> EarlyEnds | None:

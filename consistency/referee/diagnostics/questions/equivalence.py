@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +16,9 @@ from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settin
 from consistency.referee.diagnostics.verdict.parts import Equivalence
 from consistency.referee.types import Array
 
+FARTHEST = 15.0  # log of a ratio, beyond which an interval has no end
+HALVINGS = 16  # of an interval in which an end is looked for
+
 
 def equivalence(
     means: Array,
@@ -27,6 +30,7 @@ def equivalence(
     unseen: float = 0.0,
     share: float = 0.0,
     weights: Array | None = None,
+    is_whole: bool = False,
 ) -> Equivalence:
     """Two one-sided tests that the ratio of true to stated covariance lies in [1 / factor, factor].
 
@@ -46,16 +50,61 @@ def equivalence(
     unseen : share of the NEES that ``means`` may lack; the ratio is then as much larger on its upper side
     share : of errors of the truth in the covariances of ``means``; the ratio is of the others
     weights : (runs,), of the runs in the mean; None where they are equal
+    is_whole : the interval of the two tests is worked out, too
     """
     factor = settings.factor if factor is None else factor
     top, bottom = (share + (1.0 - share) * factor) * (1.0 - unseen), share + (1.0 - share) / factor
-    below = scale_test(means / top, dof, steps, False, weights).below if top > 0 else 1.0
-    above = scale_test(means / bottom, dof, steps, False, weights).above
+
+    def p_below(ratio: float) -> float:
+        size = (share + (1.0 - share) * ratio) * (1.0 - unseen)
+        return scale_test(means / size, dof, steps, False, weights).below if size > 0 else 1.0
+
+    def p_above(ratio: float) -> float:
+        return scale_test(means / (share + (1.0 - share) * ratio), dof, steps, False, weights).above
+
+    below, above = p_below(factor), p_above(1.0 / factor)
+    interval = None
+    if is_whole and len(means) and not share:
+        interval = interval_of_tests(p_below, p_above, float(np.average(means, weights=weights)), 1.0 - settings.power)
     runs = None
     if top > 1.0:
         nearer = min(top, 1.0 / bottom) if share and not settings.one_sided else top
         runs = deciding_runs(scale_test(means, dof, steps, False, weights), nearer, settings, low_is_fault)
-    return equivalent(below, above, factor, settings, runs)
+    return replace(equivalent(below, above, factor, settings, runs), interval=interval)
+
+
+def interval_of_tests(
+    below: Callable[[float], float], above: Callable[[float], float], ratio: float, level: float
+) -> tuple[float, float] | None:
+    """Ratios that are excluded by neither of two one-sided tests, whose p values are ``below`` and ``above``.
+
+    It lies inside [1 / factor, factor] where :func:`equivalence` is shown. None where it holds no ``ratio``.
+
+    Parameters
+    ----------
+    below, above : p values of the ratio being as large as a number, or as small
+    ratio : that is estimated
+    """
+    if not (ratio > 0 and np.isfinite(ratio)):
+        return None
+    return _end(above, ratio, -1.0, level), _end(below, ratio, 1.0, level)
+
+
+def _end(p_value: Callable[[float], float], ratio: float, sign: float, level: float) -> float:
+    """The ratio from which on, upwards or downwards, a test excludes all."""
+    inside, step = 0.0, 0.1
+    while p_value(ratio * float(np.exp(sign * step))) > level:
+        inside, step = step, 2.0 * step
+        if step > FARTHEST:
+            return float("inf") if sign > 0 else 0.0
+    outside = step
+    for _ in range(HALVINGS):
+        middle = 0.5 * (inside + outside)
+        if p_value(ratio * float(np.exp(sign * middle))) > level:
+            inside = middle
+        else:
+            outside = middle
+    return ratio * float(np.exp(sign * outside))
 
 
 def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equivalence:

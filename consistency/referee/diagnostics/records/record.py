@@ -104,6 +104,7 @@ class Record:
     # origin
     t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
     times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
+    files: Mapping[int, str] = field(default_factory=dict)  # of each run by its number, where files hold them
     convention: str = ""  # of the error
     notes: tuple[str, ...] = ()  # notes for the reader: the convention, left-out steps
     causes: tuple[str, ...] = ()  # probable mix-ups, which the verdict names; they stand in the notes, too

@@ -61,6 +61,7 @@ class Equivalence:
     level: float  # at which it is shown
     runs: int | None  # that would probably decide, shown or found at fault; None where it is not known
     one_sided: bool = False  # only that the ratio is below ``factor``
+    interval: tuple[float, float] | None = None  # ratios that neither test excludes at ``level``; None where not known
 
     @property
     def shown(self) -> bool:

@@ -34,7 +34,7 @@ from consistency.referee.diagnostics.verdict.parts import (
     TruthShare,
 )
 from consistency.referee.errors import InputError
-from consistency.referee.types import Failure, Indices
+from consistency.referee.types import Array, Failure, Indices
 
 UNKNOWN_ENDS = (float("nan"), float("nan"))
 
@@ -63,6 +63,8 @@ class Findings:
     by_group: ByGroup | None = None  # where the record has groups
     landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
     joint: JointScore | None = None  # of the verdict on a map
+    times: Array | None = None  # (steps,), s, NaN where a step has none; None where no file has them
+    files: Mapping[int, str] = field(default_factory=dict)  # of each run by its number, where each has one of its own
     unit: str = "run"  # what a run is called, as in :class:`~consistency.diagnostics.Record`
     lost: Lost | None = None  # where there is a NEES
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
@@ -75,10 +77,18 @@ class Findings:
         return self.status == "consistent"
 
     def place(self, step: int) -> str:
-        """Name of step 1..T: "step 3", or "landmark 17" where landmarks stand in the place of steps."""
-        if self.landmarks is None:
+        """Name of step 1..T: "step 3 (0.3 s)", or "landmark 17" where landmarks stand in the place of steps."""
+        if self.landmarks is not None:
+            return f"landmark {self.landmarks[step - 1]}"
+        if self.times is None or not np.isfinite(self.times[step - 1]):
             return f"step {step}"
-        return f"landmark {self.landmarks[step - 1]}"
+        return f"step {step} ({self.times[step - 1]:.12g} s)"
+
+    def run_name(self, run: int) -> str:
+        """Name of a run: "run 3 (est/3.csv)", or "window 3"."""
+        if run in self.files:
+            return f"{self.unit} {run} ({self.files[run]})"
+        return f"{self.unit} {run}"
 
     @property
     def places(self) -> str:
@@ -203,6 +213,7 @@ class Verdict(Findings):
     """
 
     reasons: tuple[str, ...] = ()  # the first is a sentence to act on
+    details: tuple[str, ...] = ()  # of the reasons, those that only --verbose shows on a terminal
     axis: tuple[str, Interval] | None = None  # that decides the status, with its ratio; None where the whole does
     convention: str | None = None  # of the error that is judged, where files or the filter declare one
     notes: tuple[str, ...] = ()  # of whoever read the files

@@ -11,7 +11,7 @@ from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAI
 from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Answer, Innovations, Interval, JointScore
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import (
-    UNCERTAIN,
+    is_uncertain,
     off_by,
     off_by_factor,
     plural,
@@ -51,9 +51,7 @@ def scale_text(v: Findings, faults: Faults) -> str:
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
-    text = _size_text(v, inflation, about)
-    if v.location.subset:
-        text += f", mainly {v.location.subset}"
+    text = _size_text(v, inflation, about) + _where(v)
     text += _first_visible(v)
     if not about and v.status == "overconfident" and AXIS in faults and not v.settings.one_sided:
         text += _contrary_axis(v)
@@ -62,13 +60,35 @@ def scale_text(v: Findings, faults: Faults) -> str:
 
 def _size_text(v: Findings, inflation: Interval, about: str) -> str:
     """The size of the fault, and since when."""
-    if v.runs > 1 and inflation.value > TINY and not inflation.high < UNCERTAIN * inflation.low:
+    if v.runs > 1 and inflation.value > TINY and is_uncertain(inflation):
         off = off_by_factor(inflation.value)
+        if inflation.low > 1.0:
+            off = off_by(inflation)
         return f"covariance{about} {off}{_since(v)} in the mean, which a few {v.unit}s make"
     text = f"covariance{about} {off_by(inflation)}"
     if inflation.holds(1.0) and v.runs > 1:
         return f"{text}{_since(v)}, an interval that holds 1: the {v.unit}s differ more than Gaussian errors would"
     return f"{text}{_since(v)}"
+
+
+def _where(v: Findings) -> str:
+    """The axes that carry the fault; a combination of two, where none of these is wrong by itself."""
+    assert v.location is not None
+    subset = v.location.subset
+    if not subset:
+        return ""
+    of_axes = v.axes.inflation if v.axes is not None else {}
+    if all(of_axes[axis].holds(1.0) for axis in subset.split(", ") if axis in of_axes):
+        return f", {combination_text(v)}"
+    return f", mainly {subset}"
+
+
+def combination_text(v: Findings) -> str:
+    """The two components whose correlation is least as stated, where no component is shown to be wrong by itself."""
+    if v.shape is None or v.shape.pair is None or v.axes is None:
+        return "in a combination of axes"
+    a, b = (v.axes.names[i] for i in v.shape.pair)
+    return f"in a combination of {a} and {b} (correlation {v.shape.actual:+.2f}, stated {v.shape.stated:+.2f})"
 
 
 def _first_visible(v: Findings) -> str:
@@ -79,7 +99,7 @@ def _first_visible(v: Findings) -> str:
         return ""
     if where.first_step <= int(np.argmax(v.scale.alive > 0)) + 1:
         return ""
-    return f", first visible in step {where.first_step}"
+    return f", first visible in {v.place(where.first_step)}"
 
 
 def _contrary_axis(v: Findings) -> str:
@@ -93,7 +113,7 @@ def _contrary_axis(v: Findings) -> str:
 def _since(v: Findings) -> str:
     if v.location is None or v.location.since is None:
         return ""
-    return f" since step {v.location.since}"
+    return f" since {v.place(v.location.since)}"
 
 
 def _side(sign: float) -> str:
@@ -255,7 +275,7 @@ def tails_text(v: Findings, faults: Faults) -> str:
     if "outliers" not in faults:
         return f"heavy tails: the {v.unit}s differ more than Gaussian errors would"
     assert v.tails is not None
-    where = f"{v.unit} {v.tails.run}"
+    where = v.run_name(v.tails.run)
     if v.steps > 1:
         where += f", {v.place(v.tails.step)}"
     return f"heavy tails: {short(v.tails.distance)} sigma from the other {v.unit}s in {where}"
@@ -273,7 +293,7 @@ def innovations_text(v: Findings, i: Innovations, they: str = "innovations") -> 
         are = "is an outlier,"
     where = v.place(far.step)
     if v.runs > 1:
-        where = f"{v.unit} {far.run}, {where}"
+        where = f"{v.run_name(far.run)}, {where}"
     return (
         f"{far.count} of {plural(far.of, 'innovation')} {are} in {where} (NIS {short(far.nis)}, {far.dof} expected); "
         f"NIS per degree of freedom of the rest {far.rest.ratio:.3f}"

@@ -24,6 +24,8 @@ def short(value: float) -> str:
 def off_by(interval: Interval) -> str:
     """Too small by x1.6 [1.4, 1.9]; of a covariance too large the inverse, and the ratio as tables have it."""
     ratio, low, high = interval
+    if is_uncertain(interval) and low > 1.0:
+        return f"too small by at least x{short(low)}"
     if ratio >= 1.0:
         return f"too small by x{ratio_text(interval)}"
     if ratio < TINY:
@@ -43,9 +45,16 @@ def ratio_text(interval: Interval) -> str:
     """1.02 [0.87, 1.19]: a ratio that may lie on either side of 1."""
     if interval.value < TINY:
         return f"below {TINY:g}"
-    if not interval.high < UNCERTAIN * interval.low:
+    if is_uncertain(interval) and interval.low > 1.0:
+        return f"at least {short(interval.low)}"
+    if is_uncertain(interval):
         return f"{short(interval.value)} (known to no better than a factor of {UNCERTAIN:g})"
     return f"{short(interval.value)} [{short(interval.low)}, {short(interval.high)}]"
+
+
+def is_uncertain(interval: Interval) -> bool:
+    """Whether an interval is so wide that it says nothing, or only that a ratio is above its lower end."""
+    return not interval.high < UNCERTAIN * interval.low
 
 
 def p_text(p: float) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from consistency.referee.diagnostics.judging.status import smaller
+from consistency.referee.diagnostics.judging.status import clear, smaller
 from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
@@ -17,6 +17,7 @@ from consistency.referee.diagnostics.words.faults import (
     MOST,
     Faults,
     bias_text,
+    combination_text,
     innovations_text,
     joint_text,
     opposite,
@@ -25,7 +26,15 @@ from consistency.referee.diagnostics.words.faults import (
     tails_text,
 )
 from consistency.referee.diagnostics.words.groups import groups_text, lines_of_groups, right_groups
-from consistency.referee.diagnostics.words.numbers import is_or_are, p_text, percent, plural, ratio_text, short
+from consistency.referee.diagnostics.words.numbers import (
+    SMALLEST_P,
+    is_or_are,
+    p_text,
+    percent,
+    plural,
+    ratio_text,
+    short,
+)
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
 MUCH = 100_000  # runs; more are not advice
@@ -47,14 +56,25 @@ def reasons(v: Findings, first: str = "") -> list[str]:
         lines = [sentence, *_failures(v), *figures]
     if v.innovations is not None:
         lines.append(_nis(v.innovations))
-    if v.answers:
-        lines.append(_questions(v, faults))
-    lines += _first_steps(v)
+    lines += [*details(v), *_first_steps(v)]
     if not first:
         first = lines[0]
         if v.skipped is not None:
             first += f"; without {v.skipped.skip.text} of each {_whole(v)}"
     return [f"{v.status}: {first}", *lines[1:]]
+
+
+def details(v: Findings) -> list[str]:
+    """Figures that a first reading leaves out: credibility indices, and p values of the questions."""
+    faults = {answer.question: answer for answer in v.answers if answer.found and not answer.tolerated}
+    lines = []
+    if v.accuracy is not None and np.isfinite(v.accuracy.nci):
+        lines.append(
+            f"noncredibility index {v.accuracy.nci:.1f} dB, inclination {v.accuracy.inclination:+.1f} dB (0 if right)"
+        )
+    if v.answers:
+        lines.append(_questions(v, faults))
+    return lines
 
 
 def _sentence_and_figures(v: Findings, faults: Faults) -> tuple[str, list[str]]:
@@ -81,7 +101,7 @@ def _failures(v: Findings) -> list[str]:
         first, count = v.failures[0], len({failure.run for failure in v.failures})
         where = f"{v.unit} {first.run}"
         if v.unit == "run":
-            where += f" in step {first.step}"
+            where += f" in step {first.step}" if v.landmarks is not None else f" in {v.place(first.step)}"
         lines.append(f"{count} of {v.runs} {v.unit}s failed, first {where}: {first.reason}")
     if v.impossible:
         row, step = v.impossible[0]
@@ -90,7 +110,7 @@ def _failures(v: Findings) -> list[str]:
             have = "has"
         lines.append(
             f"{count} of {v.runs} {v.unit}s {have} an infinite error or a covariance with a "
-            f"negative variance, first {v.unit} {row} in {v.place(step)}; those {v.places} are left out"
+            f"negative variance, first {v.run_name(row)} in {v.place(step)}; those {v.places} are left out"
         )
     if v.joint is not None and v.joint.not_definite:
         lines.append(
@@ -135,24 +155,24 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
     """The sentence where a question found a fault."""
     if v.parts:
         return _faults_of_parts(v)
-    parts = []
     of_scale, of_bias = _any_of(SCALE, faults), _any_of(BIAS, faults)
     is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
+    found: list[tuple[str, Collection[str]]] = []  # sentences, with the questions that they answer
+    contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in faults
+    if v.status == "heavy-tailed" or "outliers" in faults or (contrary and not opposite(v, faults)):
+        found.append((tails_text(v, faults), ["outliers"]))
     if of_bias:
-        parts.append(bias_text(v, "bias" not in faults))
+        found.append((bias_text(v, "bias" not in faults), BIAS))
+    if of_scale and v.status not in ("biased", "heavy-tailed"):
+        found.append((scale_text(v, faults), SCALE))
+    if _any_of(SHAPE, faults) and v.status not in ("biased", "heavy-tailed"):
+        found.append((shape_text(v, faults), SHAPE))
+    if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
+        found.append((joint_text(v, v.joint), [JOINT]))
+    found.sort(key=lambda one: _rank(v, faults, one[1]))
+    parts = [text for text, _ in found]
     if v.status == "heavy-tailed":
-        parts.insert(0, tails_text(v, faults))
         parts.append(f"in the mean the covariance ratio is {ratio_text(s.inflation)}")
-    else:
-        if of_scale and v.status != "biased":
-            parts.append(scale_text(v, faults))
-        if _any_of(SHAPE, faults) and v.status != "biased":
-            parts.append(shape_text(v, faults))
-        contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in faults
-        if "outliers" in faults or (contrary and not opposite(v, faults)):
-            parts.append(tails_text(v, faults))
-        if JOINT in faults and v.joint is not None:
-            parts.append(joint_text(v, v.joint))
     if v.by_group is not None:
         parts.append(groups_text(v.by_group, GROUP in faults))
     if len(faults) == 1:
@@ -164,6 +184,14 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
     if (of_scale or GROUP in faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
+
+
+def _rank(v: Findings, faults: Faults, questions: Collection[str]) -> tuple[bool, float, int]:
+    """Order of a fault in the sentence: what the status says, then by p value, the size before what else is wrong."""
+    named = {"biased": BIAS, "heavy-tailed": ["outliers"]}.get(v.status, ())
+    p = min((faults[question].adjusted for question in questions if question in faults), default=1.0)
+    order = (SCALE, BIAS, SHAPE)
+    return questions is not named and questions != named, max(p, SMALLEST_P), [*order, questions].index(questions)
 
 
 def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
@@ -184,14 +212,14 @@ def _faults_of_parts(v: Findings) -> str:
 def _no_fault(v: Findings, s: Scale) -> str:
     """Whether the ratio is shown to be right, with that of the worst axis; and what share of lost runs stays open."""
     shown, runs = s.equivalence, plural(v.runs, v.unit)
-    none, size, axis = "no fault found", f"covariance ratio {ratio_text(s.inflation)}", ""
+    none, size, axis = "no fault found", f"covariance ratio {_ratio_of_test(s)}", ""
     if any(answer.tolerated for answer in v.answers):
         none = "no fault beyond the tolerance"
     if v.parts:
         size = "covariance ratio of every part"
-    if v.worst_axis is not None:
-        name, ratio = v.worst_axis
-        axis = f" (worst axis: {name}, {ratio_text(ratio)})"
+    worst = clear(v.worst_axis)
+    if worst is not None:
+        axis = f" (worst axis: {worst[0]}, {ratio_text(worst[1])})"
     axis += right_groups(v)
     if shown.shown:
         return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
@@ -199,6 +227,19 @@ def _no_fault(v: Findings, s: Scale) -> str:
     if v.runs == 1:
         do = "does"
     return f"{none}, but {runs} {do} not show the {size} to be {_between(shown)}{axis}{_advice(v, shown)}"
+
+
+def _ratio_of_test(s: Scale) -> str:
+    """The ratio, with the interval of the two tests that show where it is."""
+    shown = s.equivalence
+    if shown.interval is None:
+        return ratio_text(s.inflation)
+    low, high = shown.interval
+    if np.isinf(high):
+        return f"{short(s.inflation.value)} (known to be above {short(low)} only)"
+    if shown.one_sided:
+        return f"{short(s.inflation.value)} (below {short(high)} at a confidence of {percent(1.0 - shown.level)})"
+    return f"{short(s.inflation.value)} ({percent(1.0 - 2.0 * shown.level)} interval {short(low)} to {short(high)})"
 
 
 def _advice(v: Findings, shown: Equivalence) -> str:
@@ -213,7 +254,7 @@ def _advice(v: Findings, shown: Equivalence) -> str:
 
 def _lost(v: Findings) -> str:
     """Lost runs, and the share of them that is shown or not excluded."""
-    if v.lost is None:
+    if v.lost is None or not _has_lost(v):
         return ""
     lost, asked, unit, some = v.lost, v.settings.lost, v.unit, ""
     if lost.count:
@@ -236,6 +277,11 @@ def _lost(v: Findings) -> str:
     if lost.needed is not None:
         text += f"; {lost.needed} {unit}s would, if no further one is lost"
     return text
+
+
+def _has_lost(v: Findings) -> bool:
+    """Whether lost runs are worth a word: an estimate of one step cannot get lost, unless a share is asked for."""
+    return v.steps > 1 or v.unit != "run" or v.settings.lost is not None or bool(v.failures)
 
 
 def _between(shown: Equivalence) -> str:
@@ -274,13 +320,14 @@ def _levels(v: Findings, s: Scale) -> list[str]:
         )
     elif v.location is not None:
         lines.append(_level(v, s, v.location))
-    if v.faults and v.worst_axis is not None:
-        axis, ratio_of_axis = v.worst_axis
-        of_all = ratio_text(s.inflation)
-        lines.append(f"covariance ratio of the worst axis: {axis}, {ratio_text(ratio_of_axis)}; of all {of_all}")
+    worst, of_all = clear(v.worst_axis), ratio_text(s.inflation)
+    if v.faults and worst is not None:
+        lines.append(f"covariance ratio of the worst axis: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
+    elif _any_of(SCALE, v.faults) and v.worst_axis is not None:
+        lines.append(f"no axis is shown to be wrong by itself, only errors {combination_text(v)}; of all {of_all}")
     if v.by_group is not None:
         lines += lines_of_groups(v.by_group, v.unit)
-    if v.lost is not None and (v.lost.count or v.settings.lost is not None):
+    if v.lost is not None and _has_lost(v) and (v.lost.count or v.settings.lost is not None):
         lines.append(
             f"lost {v.unit}s: {v.lost.count} of {v.lost.runs} failed or have a mean NEES above {short(v.lost.bound)}; "
             f"at most {percent(v.lost.upper)} of all at a confidence of {v.lost.level:g}"
@@ -372,10 +419,7 @@ def _coverage(v: Findings) -> list[str]:
             known.append(f"{axis} {100 * share:.1f} %")
     if not known:
         return []
-    text = f"2-sigma coverage {', '.join(known)} ({100 * TWO_SIGMA:.1f} % expected)"
-    if np.isfinite(v.accuracy.nci):
-        text += f"; noncredibility index {v.accuracy.nci:.1f} dB, inclination {v.accuracy.inclination:+.1f} dB"
-    return [text]
+    return [f"2-sigma coverage {', '.join(known)} ({100 * TWO_SIGMA:.1f} % expected)"]
 
 
 def _without_truth(v: Findings, i: Innovations, faults: Faults) -> str:

@@ -7,19 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.named_columns import (
-    beginning,
-    begins_with_numbers,
-    clock_of,
-    head_of,
-    places_of,
-    roles_of,
-)
+from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.file_head import beginning, begins_with_numbers, head_of
+from consistency.referee.readers.formats.named_columns import clock_of, places_of, roles_of
 
 TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
 ARCHIVES = (".npz", ".mat")
 TRAJECTORIES = (".txt", ".tum")
 BAGS = (".bag", ".mcap", ".db3")
+HELD_OUT, CORRECTED, CORRECTION = "held-out", "corrected", "correction.toml"  # of a folder of 'correct'
 SPEEDS = ("v", "speed", "velocity", "forward_velocity", "linear_velocity", "linear_x", "vx", "v_x")
 TURNS = ("omega", "w", "yaw_rate", "yawrate", "turn_rate", "angular_velocity", "angular_z", "wz", "w_z")
 HEADINGS = ("heading", "theta", "yaw", "orientation", "psi")
@@ -46,38 +42,53 @@ def is_solution(path: Path) -> bool:
     return path.suffix.lower() == ".pos" and path.is_file()
 
 
-def is_spatial(path: Path) -> bool:
+def is_spatial(path: Path, columns: Columns | None = None) -> bool:
     """Whether a table is of poses in space."""
-    return path.suffix.lower() == ".csv" and path.is_file() and is_poses(path)
+    return path.suffix.lower() == ".csv" and path.is_file() and is_poses(path, columns)
 
 
-def is_poses(path: Path) -> bool:
+def is_poses(path: Path, columns: Columns | None = None) -> bool:
     """Whether a text file is of poses in space: by the names of its columns, or without names."""
-    head = head_of(path)
+    head = head_of(path, columns)
     if head is None:
         return begins_with_numbers(path)
     roles = roles_of(head.names, path)
     return "heading" not in head.names and roles is not None and bool(roles.quaternion)
 
 
-def is_plane(path: Path) -> bool:
+def is_plane(path: Path, columns: Columns | None = None) -> bool:
     """Whether a file has columns of planar poses, or of speeds and turn rates, under names of their own."""
-    head = head_of(path)
-    if head is None or clock_of(head.names) is None or is_poses(path):
+    head = head_of(path, columns)
+    if head is None or clock_of(head.names) is None or is_poses(path, columns):
         return False
     return any(places_of(head.names, each) is not None for each in (PLACES, (SPEEDS, TURNS)))
 
 
-def trajectory_files(folder: Path) -> list[Path]:
+def trajectory_files(folder: Path, columns: Columns | None = None) -> list[Path]:
     """Files of a folder that may be trajectories, by name."""
-    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    files = _files(folder)
     named = [p for p in files if p.suffix.lower() in TRAJECTORIES]
-    return named or [p for p in files if is_spatial(p) or is_solution(p)]
+    return named or [p for p in files if is_spatial(p, columns) or is_solution(p)]
 
 
 def table_files(folder: Path) -> list[Path]:
-    """Tables in a folder, by name."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in TABLES and p.is_file() and p.name[0] != ".")
+    """Tables of a folder, by name."""
+    return [path for path in _files(folder) if path.suffix.lower() in TABLES]
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+
+
+def fitted_note(path: Path) -> str:
+    """A note on files whose covariances were fitted to their own errors; "" of others."""
+    for at in (path, path.parent):
+        if at.name == CORRECTED and (at.parent / CORRECTION).is_file():
+            return (
+                f"{path}: its covariances are corrected by factors fitted to these runs, so that their verdict shows "
+                f"nothing; {at.parent / HELD_OUT} has each run by the factors of others"
+            )
+    return ""
 
 
 SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages

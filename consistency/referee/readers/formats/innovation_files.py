@@ -128,7 +128,7 @@ def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRow
 
 
 def _of_archive(path: Path, run: int | None) -> NisLog:
-    arrays = load_arrays(path, "nis and nis_dof")
+    arrays = _with_nis(path, load_arrays(path, "nis and nis_dof"))
     _require_columns(str(path), list(arrays))
     for key in NEEDED:
         if arrays[key].dtype.kind not in "fiu":
@@ -143,6 +143,27 @@ def _of_archive(path: Path, run: int | None) -> NisLog:
     own = nis[row, :steps]
     dof = checked_dof(own, dof[row, :steps], lambda k: f"{path}, run {row}, step {k + 1}")
     return NisLog(path.stem, np.arange(1.0, steps + 1), t, own, dof)
+
+
+def _with_nis(path: Path, arrays: dict[str, Array]) -> dict[str, Array]:
+    """The arrays with the NIS of innovations and their covariances, where they hold these in its place."""
+    keys = ("innovations", "innovation_covariances")
+    if "nis" in arrays or not set(keys) <= set(arrays):
+        return arrays
+    from consistency.referee.diagnostics.questions.innovations import nis_of
+
+    v, S = (arrays[key] for key in keys)
+    if v.dtype.kind not in "fiu" or S.dtype.kind not in "fiu" or v.ndim < 2 or S.shape != (*v.shape, v.shape[-1]):
+        raise InputError(
+            f"{path}: keys 'innovations' {v.shape} and 'innovation_covariances' {S.shape} must be numbers of shape "
+            "(steps, m) and (steps, m, m), with runs before them where there are several"
+        )
+    known = np.isfinite(v).all(axis=-1)
+    nis, dof = nis_of(np.asarray(v, float), np.asarray(S, float))
+    place = "runs and steps, from 0" if v.ndim > 2 else "step, from 0"
+    if bad := np.argwhere(known & np.isnan(nis)).tolist():
+        raise InputError(f"{path}: key 'innovation_covariances' is not positive definite at {bad[0]} ({place})")
+    return arrays | {"nis": nis, "nis_dof": dof}
 
 
 def stream_nis(lines: Iterable[str], name: str) -> Iterator[tuple[str, float, float]]:

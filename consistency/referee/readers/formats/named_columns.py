@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import re
-import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import is_file
-from consistency.referee.readers.formats.text_blocks import opened
 
-PEEKED = 2**16  # bytes of a file that hold its header and its first row
 POSITIONS = ("p_rs_r_{}", "p_{}", "p{}", "t_{}", "t{}", "pos_{}", "position_{}", "translation_{}", "{}")
 QUATERNIONS = ("q_rs_{}", "q_{}", "q{}", "quat_{}", "orientation_{}", "rotation_{}")
 MOVING = (
@@ -45,15 +38,6 @@ NUMBERED = re.compile(r"(.*?)(?:covariance|cov)_?(\d+)(?:_(\d+))?")
 BY_INDEX = re.compile(r"(.*?)p_?(\d+)(?:_(\d+))?")  # P11, ..., P66
 
 
-class Head(NamedTuple):
-    """Names of the columns of a text file, as they stand in it."""
-
-    names: list[str]
-    line: int  # of the names, from 1
-    comment: bool  # it begins with #
-    spaced: bool  # by white space
-
-
 @dataclass(frozen=True)
 class Roles:
     """Which columns are what, by their places."""
@@ -73,72 +57,6 @@ class Roles:
         return self.time + self.position + self.quaternion == tuple(range(8)) and self.unit in (None, 1)
 
 
-def head_of(path: Path) -> Head | None:
-    """The names of columns above the first row of numbers; None where the file has none."""
-    lines, row = _beginning(path)
-    if row is None or not lines:
-        return None
-    number, line = lines[-1]
-    comment = line.lstrip().startswith("#")
-    if not comment and len([text for _, text in lines if not text.lstrip().startswith("#")]) > 1:
-        return None
-    text, width = line, len(fields_of(row))
-    if comment:
-        text = line.strip().lstrip("#")
-    names = fields_of(text)
-    if len(names) != width and comment:
-        names = re.split(r"\s{2,}", text.strip())
-    if len(names) != width:
-        return None
-    return Head(names, number, comment, not any(mark in line for mark in ",;\t"))
-
-
-def begins_with_numbers(path: Path) -> bool:
-    """Whether the first line that is not a comment is of numbers alone."""
-    lines, row = _beginning(path)
-    return (
-        row is not None and all(map(_is_number, fields_of(row))) and all(text.lstrip()[0] == "#" for _, text in lines)
-    )
-
-
-def beginning(path: Path) -> bytes:
-    """The first bytes of a file; none of what is not a file or cannot be read."""
-    if not is_file(path):  # a pipe would be waited for
-        return b""
-    try:
-        with opened(path) as file:
-            return file.read(PEEKED)
-    except (OSError, EOFError, zlib.error):
-        return b""
-
-
-def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
-    """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none."""
-    text = beginning(path).decode("utf-8-sig", "ignore")
-    lines: list[tuple[int, str]] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.strip() and _is_row(line):
-            return lines, line
-        if line.strip():
-            lines.append((number, line))
-    return lines, None
-
-
-def _is_row(line: str) -> bool:
-    """Whether at least half of the fields of a line are numbers or empty, and one is a number."""
-    fields = fields_of(line)
-    numbers = sum(map(_is_number, fields))
-    return not line.lstrip().startswith("#") and numbers > 0 and 2 * (numbers + fields.count("")) >= len(fields)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 # --- names -------------------------------------------------------------------------------------------
 
 
@@ -152,9 +70,9 @@ def roles_of(names: Sequence[str], where: Path) -> Roles | None:
     InputError
         Several columns would do.
     """
-    true = [_stem_of(name, TRUE) for name in names]
+    true = [stem_of(name, TRUE) for name in names]
     if any(true):
-        own = [OTHER if word else _stem_of(name, OWN[1:]) or name for name, word in zip(names, true, strict=True)]
+        own = [OTHER if word else stem_of(name, OWN[1:]) or name for name, word in zip(names, true, strict=True)]
         if (roles := _roles(own, where)) is not None:
             return roles
     return _roles(names, where)
@@ -170,11 +88,11 @@ def true_roles_of(names: Sequence[str], where: Path) -> Roles | None:
     """
     clock = clock_of(names)
     times = () if clock is None else clock[0]
-    words = [_stem_of(name, TRUE) or (name if i in times else OTHER) for i, name in enumerate(names)]
+    words = [stem_of(name, TRUE) or (name if i in times else OTHER) for i, name in enumerate(names)]
     return _roles(words, where)
 
 
-def _stem_of(name: str, spellings: Sequence[str]) -> str:
+def stem_of(name: str, spellings: Sequence[str]) -> str:
     """What a name has in the place of ``{}`` of a spelling; "" of other names."""
     plain = plain_name(name)
     for spelling in spellings:
@@ -207,6 +125,11 @@ def _roles(names: Sequence[str], where: Path) -> Roles | None:
     return Roles(*clock, position, quaternion or (), covariance, kind, rest, squared)
 
 
+def naming(name: str) -> str:
+    """What a refusal says of a column whose name is not known."""
+    return f"--columns {name}=NAME says what it is called, in a truth --truth-columns"
+
+
 def plain_name(name: str) -> str:
     """A name in lower case without its unit, words joined by one underscore."""
     name = re.sub(r"[\[(]([^\]\d)][^\])]*)?[\])]", "", name.lower())
@@ -227,7 +150,8 @@ def _family(plain: list[str], spellings: Sequence[str], parts: str, where: Path)
         if many := next((places for places in found if len(places) > 1), []):
             name = spelling.format(parts[found.index(many)])
             raise InputError(
-                f"{where}: {len(many)} columns are '{name}'; leave one pose in the file, or rename the others"
+                f"{where}: {len(many)} columns are '{name}'; leave one pose in the file, or choose by name: "
+                f"{naming(parts[found.index(many)])}"
             )
         return tuple(places[0] for places in found)
     return None
@@ -244,11 +168,11 @@ def clock_of(names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
     for clock in CLOCKS:
         for i, name in enumerate(bare):
             if name == clock or (clock == "header_stamp" and name.endswith(clock)):
-                return (i,), _unit_in(names[i])
+                return (i,), unit_in(names[i])
     return None
 
 
-def _unit_in(name: str) -> int | None:
+def unit_in(name: str) -> int | None:
     """How many of the units that the name of a time states are a second; None where it states none."""
     if stated := re.search(r"[\[(_ ]\s*(s|sec|ms|us|ns|nsec)\s*[\])]?$", name.lower()):
         return UNITS[stated[1]]
@@ -357,12 +281,3 @@ def require_units(names: Sequence[str], path: Path) -> None:
             raise InputError(
                 f"{path}: column '{name}' is in {found[1].strip()}; units are SI and radians: convert and rename it"
             )
-
-
-def fields_of(line: str) -> list[str]:
-    """Fields of a line, apart by commas, semicolons or tabs, or by white space where it has none of them."""
-    separator = max(",;\t", key=line.count)
-    if '"' in line and separator in line:
-        with suppress(csv.Error):  # of a line with a null character
-            return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
-    return [field.strip().strip('"') for field in (line.split(separator) if separator in line else line.split())]

@@ -11,8 +11,10 @@ from consistency.referee.column_names import COVARIANCE, POSE
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.clock_units import UNIT_NAMES
+from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.file_head import head_of
 from consistency.referee.readers.formats.file_kinds import PLACES, SPEEDS, TURNS, is_poses
-from consistency.referee.readers.formats.named_columns import TRUE, clock_of, head_of, places_of
+from consistency.referee.readers.formats.named_columns import TRUE, clock_of, places_of
 from consistency.referee.readers.formats.other_names import covariance_places, state_places
 from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
 from consistency.referee.readers.formats.sheet import TableRows, increasing
@@ -20,7 +22,7 @@ from consistency.referee.readers.formats.table_columns import LOWER_NAMES
 from consistency.referee.types import Array
 
 
-def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
+def read_plane(path: Path, motions: bool = False, columns: Columns | None = None) -> tuple[TableRows, str]:
     """Planar poses t, x, y, heading of a file, and what it was read as.
 
     Speeds and turn rates are integrated, each held from its row to the next: to the motion since the row before, in
@@ -32,11 +34,11 @@ def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
     InputError
         The file holds none of these, or its timestamps do not increase.
     """
-    if is_poses(path):
-        lines = read_poses(path, true=True)
+    if is_poses(path, columns):
+        lines = read_poses(path, true=True, columns=columns)
         of = lines.note or f"{path}: read as poses in space"
         return on_plane(lines, "line"), f"{of}, of which the heading is that of the x axis"
-    head = head_of(path)
+    head = head_of(path, columns)
     clock = None if head is None else clock_of(head.names)
     if head is None or clock is None:
         raise InputError(f"{path}: needs names of columns, t with x, y, heading, or t with v, omega")
@@ -48,16 +50,17 @@ def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
     others = covariance_places(head.names, POSE) | state_places(head.names, POSE, TRUE)
     known = (*COVARIANCE, *LOWER_NAMES.values(), *(head.names[place] for place in others.values()))
     stated = [name for name in dict.fromkeys(known) if name in head.names]
-    lines, columns = read_named(path, head, (*clock[0], *places, *(head.names.index(name) for name in stated)))
+    wanted = (*clock[0], *places, *(head.names.index(name) for name in stated))
+    lines, values = read_named(path, head, wanted, columns)
     first = len(clock[0])
-    t, unit = times_of(lines, clock[0], columns[:first], clock[1])
-    pose = np.column_stack(columns[first : first + len(places)])
+    t, unit = times_of(lines, clock[0], values[:first], clock[1])
+    pose = np.column_stack(values[first : first + len(places)])
     of = "planar poses"
     if rates:
         of = f"speed and turn rate, each held until the next, integrated to {'motions' if motions else 'poses'}"
         pose = motions_of(t, pose[:, 0], pose[:, 1])
         pose = pose if motions else poses_of(pose)
-    rows = increasing(replace(lines, values=np.column_stack([t, pose, *columns[first + len(places) :]])))
+    rows = increasing(replace(lines, values=np.column_stack([t, pose, *values[first + len(places) :]])))
     note = f"{path}: read as {of}, {len(head.names)} columns, {UNIT_NAMES[unit]}"
     data = dict(zip(["t", *POSE, *stated], rows.values.T, strict=True))
     return TableRows(path, data, rows.line, "line", rows.open_line, rows.cut), note

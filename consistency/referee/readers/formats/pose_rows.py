@@ -15,17 +15,11 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.readers.clock_units import UNIT_NAMES, unit_of
+from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.file_head import Head, fields_of, head_of
 from consistency.referee.readers.formats.file_kinds import is_solution
 from consistency.referee.readers.formats.geodetic import read_solution
-from consistency.referee.readers.formats.named_columns import (  # fmt: skip
-    Head,
-    Roles,
-    fields_of,
-    head_of,
-    require_units,
-    roles_of,
-    true_roles_of,
-)
+from consistency.referee.readers.formats.named_columns import Roles, naming, require_units, roles_of, true_roles_of
 from consistency.referee.readers.formats.sheet import (
     Lines,
     TableRows,
@@ -51,8 +45,12 @@ ROTATION = 1e-3  # largest entry of R R' - I
 LAYOUT = f"t tx ty tz qx qy qz qw ({', '.join(map(str, TUM))} columns)"
 
 
-def read_poses(path: Path, true: bool = False) -> Lines:
+def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -> Lines:
     """Lines (N, 8, or more with a covariance) as in a TUM trajectory, whatever layout they have in the file.
+
+    Parameters
+    ----------
+    columns : names of columns in place of the file's own
 
     Raises
     ------
@@ -61,12 +59,14 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     """
     if is_solution(path):
         return read_solution(path)
-    head = head_of(path)
+    head = head_of(path, columns)
     roles = None if head is None else roles_of(head.names, path)
     if head is not None and roles is not None and not (head.comment and roles.is_tum and len(head.names) in TUM):
         if not (roles.quaternion or true):
-            raise InputError(f"{path}: holds no quaternion; a table of a state is read with --state x,y,z")
-        return _named(path, head, roles, true)
+            raise InputError(
+                f"{path}: holds no quaternion; a table of a state is read with --state x,y,z; {naming('qx')}"
+            )
+        return _named(path, head, roles, true, columns)
     widths = [matrix + stated for matrix in MATRICES for stated in STATED]
     lines = read_rows(path, (*(POINT,) * true, *TUM, DEVIATED, *widths, *STATES), LAYOUT)
     width = lines.values.shape[1]
@@ -88,15 +88,15 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     return states
 
 
-def read_beside(path: Path) -> Lines | None:
+def read_beside(path: Path, columns: Columns | None = None) -> Lines | None:
     """The truth in columns beside the estimates of a file with names, in rows that have one; None without any."""
-    head = head_of(path)
+    head = head_of(path, columns)
     if head is None:
         return None
     roles = true_roles_of(head.names, path)
     if roles is None or not roles.quaternion:
         return None
-    lines = _named(path, head, roles, true=True)
+    lines = _named(path, head, roles, True, columns)
     known = np.isfinite(lines.values).all(axis=1)
     note = f"{path}: the truth stands in columns beside the estimates"
     return replace(lines, values=lines.values[known], line=lines.line[known], rest=None, note=note)
@@ -120,14 +120,14 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
     return TableRows(lines.path, columns, lines.line, unit, lines.open_line, lines.cut)
 
 
-def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
+def _named(path: Path, head: Head, roles: Roles, true: bool, columns: Columns | None) -> Lines:
     """Rows under the names of their columns."""
     pose = (*roles.time, *roles.position, *roles.quaternion, *roles.covariance)
-    lines, columns = read_named(path, head, (*pose, *roles.rest))
-    t, unit = times_of(lines, roles.time, columns[: len(roles.time)], roles.unit)
+    lines, values = read_named(path, head, (*pose, *roles.rest), columns)
+    t, unit = times_of(lines, roles.time, values[: len(roles.time)], roles.unit)
     if roles.squared:
         first = len(roles.time) + len(roles.position) + len(roles.quaternion)
-        columns[first : len(pose)] = [np.sign(each) * np.sqrt(np.abs(each)) for each in columns[first : len(pose)]]
+        values[first : len(pose)] = [np.sign(each) * np.sqrt(np.abs(each)) for each in values[first : len(pose)]]
     of, clock = roles.kind, UNIT_NAMES[unit]
     if not true:
         of = of.replace(" truth", " poses")
@@ -146,19 +146,21 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
         elif len(roles.covariance) in DEVIATIONS:
             stated = "standard deviations"
         note += f", {stated} in {len(roles.covariance)} columns"
-    values = np.column_stack([t, *columns[len(roles.time) : len(pose)]])
-    rest = np.column_stack(columns[len(pose) :]) if roles.rest else None
-    return increasing(replace(lines, values=values, note=note, rest=rest))
+    rest = np.column_stack(values[len(pose) :]) if roles.rest else None
+    rows = np.column_stack([t, *values[len(roles.time) : len(pose)]])
+    return increasing(replace(lines, values=rows, note=note, rest=rest))
 
 
-def read_named(path: Path, head: Head, places: Sequence[int]) -> tuple[Lines, list[Array]]:
+def read_named(
+    path: Path, head: Head, places: Sequence[int], columns: Columns | None = None
+) -> tuple[Lines, list[Array]]:
     """Some columns of a file with names, and lines that hold none of them yet."""
     require_units([head.names[i] for i in places], path)
     if head.comment or head.spaced:
         layout = f"{len(head.names)} columns as named"
         lines = read_rows(path, [len(head.names)], layout, 0 if head.comment else head.line)
         return replace(lines, values=lines.values[:, :0]), [lines.values[:, i] for i in places]
-    sheet = read_sheet(path)
+    sheet = read_sheet(path, columns)
     names = list(sheet.data)
     if "run" in names or "filter" in names:
         raise InputError(f"{path}: column 'run' or 'filter': write such poses to a file for each run and estimator")

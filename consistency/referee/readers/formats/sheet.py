@@ -16,6 +16,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
+from consistency.referee.readers.formats.column_renaming import Columns, renamed
 from consistency.referee.readers.formats.text_blocks import Block, blocks
 from consistency.referee.readers.places import cut_note, exact, listed, refuse
 from consistency.referee.types import Array, Indices
@@ -99,6 +100,11 @@ class TableRows:
     def rows(self, keep: Array) -> TableRows:
         return replace(self, data={name: cells[keep] for name, cells in self.data.items()}, line=self.line[keep])
 
+    def renamed(self, columns: Columns | None) -> TableRows:
+        """The table with names of ``columns`` in place of its own."""
+        names = renamed(list(self.data), columns, self.path)
+        return replace(self, data=dict(zip(names, self.data.values(), strict=True)))
+
     def open_end(self, row: int) -> str:
         """What to note of a row if it is cut short; "" where its line has an end."""
         return cut_note(self.path, self.open_line) if self.line[row] == self.open_line else ""
@@ -162,25 +168,26 @@ def are_dof(values: Array) -> Array:
     return np.asarray((values >= 0) & (values < MOST_DOF) & (values == np.round(values)))
 
 
-def read_sheet(path: Path) -> TableRows:
-    """A CSV file (comma, semicolon or tab; # comments) or a Parquet file."""
+def read_sheet(path: Path, columns: Columns | None = None) -> TableRows:
+    """A CSV file (comma, semicolon or tab; # comments) or a Parquet file, with names of ``columns`` for its own."""
     if path.suffix.lower() in (".parquet", ".pq"):
         if not is_file(path):
             raise InputError(f"{path}: no such file")
         require(f"{path}: Parquet", "parquet")
         from consistency.referee.readers.formats.parquet_file import read_columns
 
-        columns, rows = read_columns(path, "cannot be read as Parquet")
-        sheet = TableRows(path, columns, np.arange(rows), "row")
+        data, rows = read_columns(path, "cannot be read as Parquet")
+        sheet = TableRows(path, data, np.arange(rows), "row")
     elif path.suffix.lower() in (".jsonl", ".ndjson"):
         from consistency.referee.readers.formats.json_lines import read_json_lines
 
-        columns, line, open_line, cut = read_json_lines(path)
-        sheet = TableRows(path, columns, line, "line", open_line, cut)
+        data, line, open_line, cut = read_json_lines(path)
+        sheet = TableRows(path, data, line, "line", open_line, cut)
     else:
         sheet = _read_csv(path)
     if not len(sheet):
         raise InputError(f"{path}: holds no row")
+    sheet = sheet.renamed(columns)
     if "filter" in sheet:
         refuse(sheet.empty("filter"), sheet.place, "column 'filter' is empty")
         for name in dict.fromkeys(sheet.texts("filter")):

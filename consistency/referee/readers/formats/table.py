@@ -12,8 +12,10 @@ from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
+from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
-from consistency.referee.readers.formats.named_columns import begins_with_numbers, head_of
+from consistency.referee.readers.formats.named_columns import naming
 from consistency.referee.readers.formats.other_names import true_columns, with_clock, with_known_names
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.table_columns import (
@@ -70,10 +72,10 @@ def _both(
     estimates: Path | TableRows, axes: tuple[str, ...], r: Reading
 ) -> tuple[TableRows, TableRows | None, list[str]]:
     """Estimates and truth, which may stand beside them, with times where steps do not number both, and notes."""
-    sheet, note = _sheet(estimates, axes, bool(r.motions))
+    sheet, note = _sheet(estimates, axes, r.columns, bool(r.motions))
     other, notes = None, [sheet.cut, note]
     if r.truth is not None:
-        other, note = _sheet(r.truth, axes, body=r.body)
+        other, note = _sheet(r.truth, axes, r.truth_columns, body=r.body)
         notes = [sheet.cut, other.cut, *notes[1:], note]
     timed = r.time_offset is not None or r.max_dt is not None
     if timed or not ("step" in sheet and (other is None or "step" in other)):
@@ -84,33 +86,38 @@ def _both(
 
 
 def _sheet(
-    table: Path | TableRows, axes: tuple[str, ...], motions: bool = False, body: str | None = None
+    table: Path | TableRows,
+    axes: tuple[str, ...],
+    columns: Columns | None = None,
+    motions: bool = False,
+    body: str | None = None,
 ) -> tuple[TableRows, str]:
     """Rows of a file or a drive, or those in memory, under the names of docs/files.md, and what they were read as."""
     note = ""
     if isinstance(table, TableRows):
-        sheet = table
+        sheet = table.renamed(columns)
     elif is_drive(table):
         from consistency.referee.readers.formats.kitti_files import drive_sheet
 
         sheet = drive_sheet(table, body)
     elif axes == POSE:
-        sheet, note = planar_sheet(table, motions)
+        sheet, note = planar_sheet(table, motions, columns)
     else:
-        sheet = read_sheet(table)
+        sheet = read_sheet(table, columns)
     sheet, taken = with_known_names(sheet, axes)
     return sheet, "; ".join(filter(None, (note, taken)))
 
 
-def planar_sheet(path: Path, motions: bool = False) -> tuple[TableRows, str]:
+def planar_sheet(path: Path, motions: bool = False, columns: Columns | None = None) -> tuple[TableRows, str]:
     """A table of planar poses, and what it was read as where it has no columns x, y, heading."""
-    head = None if path.suffix.lower() in (".parquet", ".pq") or not path.is_file() else head_of(path)
+    head = None if path.suffix.lower() in (".parquet", ".pq") or not path.is_file() else head_of(path, columns)
     named = head is not None and not head.comment and set(POSE) <= set(head.names)
-    if (head is None and not begins_with_numbers(path)) or named or not (is_poses(path) or is_plane(path)):
-        return read_sheet(path), ""
+    unnamed = head is None and not begins_with_numbers(path)
+    if unnamed or named or not (is_poses(path, columns) or is_plane(path, columns)):
+        return read_sheet(path, columns), ""
     from consistency.referee.readers.formats.planar_columns import read_plane
 
-    return read_plane(path, motions)
+    return read_plane(path, motions, columns)
 
 
 # --- what goes together ------------------------------------------------------------------------------
@@ -166,7 +173,8 @@ def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
     hint = ""
     if len(sheet.data) == 1 and " " in sheet.columns:
         hint = "; separate columns by commas, semicolons or tabs"
-    raise InputError(f"{sheet.path}: column 'step' or 't' is missing; there are: {sheet.columns}{hint}")
+    missing = f"{sheet.path}: column 'step' or 't' is missing; there are: {sheet.columns}{hint}"
+    raise InputError(f"{missing}; {naming('t')}")
 
 
 # --- poses -------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.named_columns import DEVIATIONS
+from consistency.referee.readers.formats.named_columns import DEVIATIONS, naming
 from consistency.referee.readers.formats.sheet import TableRows, are_dof
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
@@ -114,7 +114,7 @@ def stated_covariance(sheet: TableRows, axes: tuple[str, ...], own: bool = False
                 wanted = upper[-1]
                 raise InputError(
                     f"{sheet.path}: column '{wanted}' is missing; the covariance of {', '.join(axes)} needs its "
-                    "upper triangle, zeros included; --state a,b judges fewer components"
+                    f"upper triangle, zeros included; {naming(wanted)}; --state a,b judges fewer components"
                 )
             out[:, i, j], out[:, j, i] = sheet.numbers(there[0]), sheet.numbers(there[-1])
     return symmetric(out, sheet.place)
@@ -124,8 +124,12 @@ def require_columns(sheet: TableRows, axes: tuple[str, ...]) -> None:
     """Refuse a table that lacks a column of the state."""
     missing = [axis for axis in axes if axis not in sheet]
     if missing:
-        hint = "; name other states with --state a,b,c" if axes == POSE else ""
-        raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}{hint}")
+        hint = ""
+        if axes == POSE:
+            hint = " (poses in space have x, y, z, qx, qy, qz, qw); name other states with --state a,b,c"
+        raise InputError(
+            f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}; {naming(missing[0])}{hint}"
+        )
 
 
 def own_column(sheet: TableRows, r: Reading) -> Array | None:

@@ -14,10 +14,12 @@ from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
 from consistency.referee.readers.clock_units import nothing_near
-from consistency.referee.readers.formats.file_kinds import is_drive, trajectory_files
+from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.file_head import head_of
+from consistency.referee.readers.formats.file_kinds import is_drive, table_files, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
-from consistency.referee.readers.formats.named_columns import head_of, numbered
+from consistency.referee.readers.formats.named_columns import numbered
 from consistency.referee.readers.formats.pose_rows import (
     DEVIATIONS,
     DEVIATIONS_LAYOUT,
@@ -40,7 +42,7 @@ from consistency.referee.readers.formats.position_truth import (
 )
 from consistency.referee.readers.formats.sheet import Lines, read_numbers
 from consistency.referee.readers.options import COLUMNS, Reading
-from consistency.referee.readers.places import Places, refuse
+from consistency.referee.readers.places import Places, one_of_each_kind, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import (
     ALONE,
@@ -90,8 +92,8 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     if r.error not in (None, *INERTIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
     truth_of = _truths(estimates, r)
-    files = _runs(estimates, r.truth, None if poses_alone else r.covariance)
-    runs = (SpaceRun(read_trajectory(own), truth_of(true), (own, true), P) for own, true, P in files)
+    files = files_of_runs(estimates, r, None if poses_alone else r.covariance)
+    runs = (SpaceRun(read_trajectory(own, columns=r.columns), truth_of(true), (own, true), P) for own, true, P in files)
     if poses_alone:
         return [poses_of(estimates, runs, r)]
     return [space_estimator(estimates, runs, r)]
@@ -114,7 +116,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
         notes += [own.cut, true.cut, own.note, true.note, world, _unused(true, r), *run.notes]
         if layout is None:
             layout = _layout_of(own, run.files, r)
-            notes += _order_note(run.files[0], _width(own), r.covariance_order)
+            notes += _order_note(run.files[0], _width(own), r)
         elif _stated(own) != layout.stated:
             what = f"{run.files[0]}: has {own.values.shape[1]} columns, {layout.files[0]} another layout"
             raise InputError(mixed or what)
@@ -149,7 +151,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     return Estimator(
         path.stem, path, poses, STATE[: poses[0].covariance.shape[-1]], kind,
         f"{INERTIAL.get(kind) or PLANAR[kind]}{why}", layout.stated, path.name, r.covariance,
-        tuple(dict.fromkeys(note for note in notes if note)), in_space=True, position=3,
+        one_of_each_kind(notes), in_space=True, position=3,
     )  # fmt: skip
 
 
@@ -208,8 +210,8 @@ def _truths(estimates: Path, r: Reading) -> Callable[[Path], Lines]:
     @lru_cache(maxsize=1)
     def read(path: Path) -> Lines:
         if r.truth is not None:
-            return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, true=True)
-        beside = read_beside(path)
+            return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, True, r.truth_columns)
+        beside = read_beside(path, r.columns)
         if beside is None:
             raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
         return _checked(beside)
@@ -244,16 +246,17 @@ def _origin(stated: Stated) -> str:
     return "written by OpenVINS"
 
 
-def _runs(estimates: Path, truth: Path | None, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
+def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
     """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
+    truth = r.truth
     if not estimates.is_dir():
         for option, path in (("--truth", truth), ("--covariance", covariance)):
             if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
                 raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
         return [(estimates, truth or estimates, covariance)]
-    files = trajectory_files(estimates)
+    files = trajectory_files(estimates, r.columns)
     if not files:
-        raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json")
+        raise InputError(f"{estimates}: holds no .txt or .tum file, no table and no manifest.json")
     stems = [path.stem for path in files]
     if twice := next((path for path in files if stems.count(path.stem) > 1), None):
         raise InputError(f"{estimates}: holds the run '{twice.stem}' twice, as .txt and .tum; keep one of them")
@@ -272,9 +275,9 @@ def _runs(estimates: Path, truth: Path | None, covariance: Path | None) -> list[
 def _same_stem(folder: Path, path: Path, option: str) -> Path:
     if is_drive(folder / path.stem):
         return folder / path.stem
-    matches = [other for other in trajectory_files(folder) if other.stem == path.stem]
+    matches = [other for other in (*trajectory_files(folder), *table_files(folder)) if other.stem == path.stem]
     if not matches:
-        raise InputError(f"{option} {folder}: holds no file '{path.stem}' with .txt or .tum for {path}")
+        raise InputError(f"{option} {folder}: holds no file '{path.stem}' with .txt or .tum, or table, for {path}")
     return matches[0]
 
 
@@ -302,7 +305,7 @@ def _poses(
         if source.values.shape[1] == 1 + BOTH:
             cross = _cross(own, source, rows, picked, order)
     if covariance is None:
-        of = f"lines of t and {FULL} numbers"
+        of = f"lines of t and {FULL} numbers, or name its columns: --columns 'P*=NAME*'"
         if isinstance(own, States):
             of = f"the standard deviations of {DEVIATIONS_LAYOUT}"
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
@@ -407,9 +410,9 @@ def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indic
 # --- files ---------------------------------------------------------------------------------------
 
 
-def read_trajectory(path: Path, true: bool = False) -> Lines:
+def read_trajectory(path: Path, true: bool = False, columns: Columns | None = None) -> Lines:
     """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
-    return _checked(read_poses(path, true), true)
+    return _checked(read_poses(path, true, columns), true)
 
 
 def _checked(lines: Lines, true: bool = True) -> Lines:
@@ -445,7 +448,7 @@ def _inline(own: Lines, order: str) -> Array | None:
     if not numbers.shape[1]:
         return None
     if numbers.shape[1] in DEVIATIONS:
-        return diagonal(numbers[:, _turned(numbers.shape[1], order)])
+        return diagonal(numbers[:, covariance_order(numbers.shape[1], order)])
     if own.values.shape[1] == SPLIT:  # rotation, then position
         rotation, position = _triangle(numbers[:, :6], 3), _triangle(numbers[:, 6:], 3)
         out = np.zeros((len(numbers), 6, 6))
@@ -459,11 +462,11 @@ def _matrices(numbers: Array, order: str) -> Array:
     n = next(n for n in DEVIATIONS if numbers.shape[1] in (n * n, n * (n + 1) // 2))
     P = numbers.reshape(-1, n, n) if numbers.shape[1] == n * n else _triangle(numbers, n)
     if order != ORDERS[0]:
-        P = P[:, _turned(n, order)][:, :, _turned(n, order)]
+        P = P[:, covariance_order(n, order)][:, :, covariance_order(n, order)]
     return np.asarray(P)
 
 
-def _turned(n: int, order: str) -> list[int]:
+def covariance_order(n: int, order: str) -> list[int]:
     """Places of x, y, z, the rotation and n - 6 more among components in an order."""
     there = BLOCKS_OF_STATE[: n // 3]
     blocks = [block for block in blocks_in(n, order) if block in there]
@@ -476,15 +479,16 @@ def blocks_in(n: int, order: str) -> list[str]:
     return [*names, *(block for block in BLOCKS_OF_STATE[: n // 3] if block not in names)]
 
 
-def _order_note(path: Path | str, n: int, order: str | None) -> list[str]:
+def _order_note(path: Path | str, n: int, r: Reading) -> list[str]:
     """The order of the blocks: where it is declared, or where no names of columns tell that of three or more."""
+    order = r.covariance_order
     blocks, there = blocks_in(n, order or ORDERS[0]), BLOCKS_OF_STATE[: n // 3]
     if sorted(blocks) != sorted(there):
         has = (
             f"the blocks {','.join(there)} of {path} (p position, R rotation, v velocity, bg, ba biases), as they stand"
         )
         raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {has}")
-    head = None if n == 6 or order else head_of(Path(path))
+    head = None if n == 6 or order else head_of(Path(path), r.columns)
     if order is None and (n == 6 or (head is not None and not any(map(numbered, head.names)))):
         return []
     return [f"{path}: the covariance is read in the order {', '.join(blocks)}; --covariance-order declares another one"]

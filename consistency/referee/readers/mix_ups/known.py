@@ -227,9 +227,13 @@ def _ned(convention: str) -> Iterator[Guess]:
         return replace(p, covariance=T @ p.covariance @ T)
 
     worlds = "one file is in a world of x north, y east, z down, the other in one of x east, y north, z up"
-    remedy = "write both in one (swap x and y, turn z over)"
-    yield Guess(f"{worlds}; {remedy}", lambda p: moved(p, north), fine=False)
-    yield Guess(f"{worlds}, and their bodies have z down and z up; {remedy}", with_body, fine=False)
+    words = f"{worlds}; add --world ned if that is the estimates, --truth-world ned if it is the truth"
+    yield Guess(words, lambda p: moved(p, north), fine=False)
+    words = (
+        f"{worlds}, and their bodies have z down and z up; add --world ned --body-axes frd if that is the estimates, "
+        "--truth-world ned --truth-body-axes frd if it is the truth"
+    )
+    yield Guess(words, with_body, fine=False)
 
 
 def _mirrored(convention: str) -> Guess:
@@ -243,7 +247,8 @@ def _mirrored(convention: str) -> Guess:
         return replace(p, estimate=own, covariance=A @ p.covariance @ A.T)
 
     words = "one file is in a plane of x north, y east, the other in one of x east, y north"
-    return Guess(f"{words}; write both in one (swap x and y, heading = pi/2 - heading)", change, fine=False)
+    remedy = "add --world ned if that is the estimates, --truth-world ned if it is the truth"
+    return Guess(f"{words}; {remedy}", change, fine=False)
 
 
 def _orders(convention: str) -> Iterator[Guess]:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, read_json, require_name
+from consistency.referee.readers.declared_axes import OPTIONS
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
@@ -30,6 +31,8 @@ from consistency.referee.readers.truth_matching import Estimator
 
 OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
 OF_BAGS = ("topic", "truth_topic")
+OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # bags have these in messages
+OF_NAMES = ("columns", "truth_columns")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
 Found = Sequence[Estimator | Record]
 PROGRAM_RUNS = "monte-carlo"  # kind of the manifest of a folder with runs of a program
@@ -89,7 +92,7 @@ def _table_folder(path: Path, r: Reading, poses_alone: bool) -> Found:
 
 
 def _is_table_folder(path: Path, r: Reading) -> bool:
-    return path.is_dir() and bool(table_files(path)) and (r.state is not None or not trajectory_files(path))
+    return path.is_dir() and bool(table_files(path)) and (r.state is not None or not trajectory_files(path, r.columns))
 
 
 def _is_archive(path: Path, r: Reading) -> bool:
@@ -97,8 +100,8 @@ def _is_archive(path: Path, r: Reading) -> bool:
 
 
 def _is_table(path: Path, r: Reading) -> bool:
-    named = path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path))
-    return named or is_plane(path)
+    named = path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path, r.columns))
+    return named or is_plane(path, r.columns)
 
 
 def _is_trajectory(path: Path, r: Reading) -> bool:
@@ -107,8 +110,8 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 KINDS = (  # a file is of the first that knows it
     Kind(lambda path, r: is_program_runs(path), (), _program_runs),
-    Kind(lambda path, r: is_bag(path), ("state", "covariance", "covariance_order", "truth", "lever_arm"), _bags),
-    Kind(_is_archive, (*OF_BAGS, "state", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
+    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES), _bags),
+    Kind(_is_archive, (*OF_NAMES, *OPTIONS, *OF_BAGS, "state", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
     Kind(_is_trajectory, (*OF_BAGS, "state"), _trajectories),

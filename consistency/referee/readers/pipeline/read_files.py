@@ -14,10 +14,13 @@ from typing import Any, cast
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
+from consistency.referee.readers.declared_axes import in_axes_of_estimates
 from consistency.referee.readers.formats.file_kinds import (
     TRAJECTORIES,
+    fitted_note,
     is_bag,
     is_drive,
+    table_files,
     trajectory_files,
 )
 from consistency.referee.readers.options import Reading, flag_of
@@ -56,9 +59,9 @@ def is_recording(path: Path, reading: Reading) -> bool:
     if is_program_runs(path):
         return True
     if path.is_dir() and not (path / "manifest.json").exists():
-        recording = bool(trajectory_files(path)) or is_bag(path) or bool(given)
+        recording = bool(trajectory_files(path) or table_files(path)) or is_bag(path) or bool(given)
         if not recording:
-            known = f"trajectories ({', '.join(TRAJECTORIES)}) or ROS bags"
+            known = f"trajectories ({', '.join(TRAJECTORIES)}), tables or ROS bags"
             raise InputError(f"{path}: holds no results of 'consistency run', and no {known}")
     else:
         recording = not path.is_dir() and (path.exists() or path.suffix != "")
@@ -165,7 +168,8 @@ def _records(found: Found, r: Reading) -> list[Record]:
     for one in found:
         if isinstance(one, Estimator):
             records += [
-                replace(with_failed_runs(record, one.failed), trials=one.trials) for record in records_of(one, r)
+                replace(with_failed_runs(record, one.failed), trials=one.trials)
+                for record in records_of(in_axes_of_estimates(one, r), r)
             ]
         else:
             records.append(grouped(*of_record(one, r), r))
@@ -174,6 +178,9 @@ def _records(found: Found, r: Reading) -> list[Record]:
 
 def _by_kind(estimates: Path, r: Reading) -> list[Record]:
     records = _records(found_in(estimates, r), r)
+    for path in filter(None, (estimates, r.covariance)):
+        if note := fitted_note(path):
+            records = [replace(records[0], notes=(note, *records[0].notes)), *records[1:]]
     if r.truth is None or not is_drive(r.truth):
         return records
     of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"

@@ -99,7 +99,8 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
             continue
         some, axes = [track.part(part) for track in tracks], tuple(e.axes[i] for i in part)
         record = assemble(f"{e.name}{ending}", some, t, axes, str(e.covariances or e.path), e.convention, notes)
-        record = replace(moved.on(record), causes=tuple(causes))
+        files = {p.run: str(p.files[0]) for p in runs}
+        record = replace(moved.on(record), causes=tuple(causes), files=files)
         if e.stated.alone:
             record = each_alone(record)
         records.append(grouped(record, column, r))

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, one_line, read_toml, reading
@@ -21,6 +22,7 @@ UNITS = {
     **dict.fromkeys(("x", "y", "z", "position", "range", "B", "centre", "rings"), "_m"),
     "dt": "_s",
 }
+SHOWN = 4  # complaints in a message
 LIST_OF_KINDS = "effects"  # a list of tables, each of the kind that its key 'kind' names
 SIGMA_UNITS = {"uvd": "_px", "xyz": "_m", "linear": "_m", "relative-xy": "_m", "range-bearing": ""}  # m and rad
 
@@ -83,11 +85,17 @@ def read_table(path: Path, model: type[T], **extra: Any) -> T:
 
 
 def explain(error: ValueError, model: type[Table]) -> str:
-    """One complaint of pydantic in one line: key, what is wrong, what is allowed; unknown keys first."""
+    """Complaints of pydantic in one line: key, what is wrong, what is allowed; unknown keys first."""
     if not isinstance(error, ValidationError):
         return str(error)
     complaints = sorted(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
-    first, more = complaints[0], len(complaints) - 1
+    texts = list(dict.fromkeys(_complaint(complaint, model) for complaint in complaints))
+    more = f" (and {len(texts) - SHOWN} more)" if len(texts) > SHOWN else ""
+    return "; ".join(texts[:SHOWN]) + more
+
+
+def _complaint(first: ErrorDetails, model: type[Table]) -> str:
+    """One complaint."""
     keys = [one_line(key, 60) for key in _keys(first["loc"])]
     if first["type"].startswith("union_tag"):
         keys.append(first["ctx"]["discriminator"].strip("'"))
@@ -103,7 +111,7 @@ def explain(error: ValueError, model: type[Table]) -> str:
         text = first["msg"].removeprefix("Value error, ")
         if first["type"] != "value_error":
             text += f" (got {shown(first['input'])})"
-    return where + text + (f" (and {more} more)" if more > 0 else "")
+    return where + text
 
 
 def shown(value: Any) -> str:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import SerializerFunctionWrapHandler, ValidationInfo, field_validator, model_serializer, model_validator
 
 from consistency.bench.models.point import Mounting
-from consistency.bench.scenario.toml_tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
+from consistency.bench.scenario.tables.toml_tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 from consistency.referee.geometry import rotation
 
 PLANAR_SENSORS = ("relative-xy", "range-bearing")  # of landmarks in the plane, with two values each

@@ -1,0 +1,365 @@
+"""A stated covariance corrected by factors and floors, and judged on runs that chose nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import special
+
+from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
+from consistency.referee.diagnostics.records.whitening import squared_length, whiten
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named
+from consistency.referee.fit_covariance.factors import Block, Factors, Fit, blocks_of, mean_over_runs
+from consistency.referee.fit_covariance.floors import fit_runs
+from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
+from consistency.referee.types import Array, Indices
+from consistency.referee.verdicts.sources import judge_all
+
+LEVELS = (0.68, 0.95, 0.99)
+ByGroup = tuple[Factors, ...]  # of each group, and last of all steps
+FEW = 30  # runs; with fewer what the uncertainty of the factors adds to a ratio is printed
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of judged runs beside a covariance."""
+
+    record: Record = field(repr=False)
+    verdict: Verdict = field(repr=False)  # what ``analyse`` says of it
+    ratio: Interval  # of true to stated covariance
+    scores: Array  # log density of a step, mean of each run that has one
+
+    @property
+    def ratios(self) -> Array:
+        """Ratio of true to stated covariance of each run, (R,); NaN of one without a step."""
+        assert self.record.nees is not None
+        means, counts = run_means(self.record.nees)
+        return np.where(counts > 0, means, np.nan) / self.record.dof
+
+    def covered(self, levels: Sequence[float] | Array) -> Array:
+        """Share of the errors inside the ellipsoid of each probability, mean over runs."""
+        nees = self.record.nees
+        assert nees is not None
+        counted = np.isfinite(nees)
+        bounds = special.chdtri(self.record.dof, 1.0 - np.asarray(levels))
+        return np.array([average(np.where(counted, nees <= bound, np.nan)) for bound in bounds])
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Factors and floors for a stated covariance, with the verdict on errors that chose nothing."""
+
+    name: str
+    blocks: tuple[Block, ...]
+    fits: Mapping[str, Fit] = field(repr=False)  # by group; the last one, "", is of all steps
+    held_out: str  # "in turn", "half" or names
+    runs: tuple[str, ...]  # names of all runs
+    fitted: tuple[str, ...]
+    judged: tuple[str, ...]
+    used: tuple[ByGroup, ...]  # of each judged run, from other runs
+    before: HeldOut  # the judged runs as they are stated
+    after: HeldOut  # corrected, as the files of held-out/ have them
+    verdict: Verdict = field(repr=False)  # with the uncertainty of the factors taken in
+    excess: float  # what that uncertainty adds to the ratio of held-out runs
+    gain: Interval  # of the log score, a step
+
+    @property
+    def fit(self) -> Fit:
+        """That of all steps, whatever their group."""
+        return self.fits[""]
+
+    @property
+    def shown(self) -> dict[str, Fit]:
+        """Fits by group; without groups the one of all steps, by the name ""."""
+        return {group: fit for group, fit in self.fits.items() if group or len(self.fits) == 1}
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the components of the error."""
+        return tuple(self.before.record.axes) or numbered_axes(self.before.record.dof)
+
+    @property
+    def unit(self) -> str:
+        """What a run is called."""
+        return self.before.record.unit
+
+    @property
+    def needed(self) -> int | None:
+        """Runs that would probably decide; None where that is not known."""
+        shown = self.verdict.equivalence
+        return None if shown is None else shown.runs
+
+    @property
+    def status(self) -> str:
+        """consistent, undecided, or inconsistent where no factor mends what is wrong."""
+        status = self.verdict.status
+        return status if status in ("consistent", "undecided") else "inconsistent"
+
+    def covariance(self, stated: ArrayLike, group: str = "") -> Array:
+        """Corrected covariances of stated ones, (..., n, n), in a group where factors go by group."""
+        return self.fits[group].factors.applied(np.asarray(stated, float))
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Ratios of held-out runs, factors with intervals, and coverage; needs ``[plot]``.
+
+        Parameters
+        ----------
+        path : .png, .pdf or .svg to write as well; one that is there is replaced
+        """
+        from consistency.referee.fit_covariance.page import plot_correction  # draws
+
+        return plot_correction(self, path)
+
+    def __repr__(self) -> str:
+        from consistency.referee.fit_covariance.correction_text import sentence  # of this class
+
+        return f"<Correction {self.name}: {sentence(self)}>"
+
+
+def correct(
+    record: Record | ArrayLike,
+    covariances: ArrayLike | None = None,
+    *,
+    axes: Sequence[str] | None = None,
+    held_out: str | None = None,
+    per_axis: bool = False,
+    names: Sequence[str] | None = None,
+) -> Correction:
+    """Fit factors to the covariances that an estimator states, and judge them on runs that chose nothing.
+
+    Parameters
+    ----------
+    record : of :func:`consistency.read`; or errors (runs, steps, n), truth minus estimate
+    covariances : (runs, steps, n, n), beside errors
+    axes : (n,), names of the components of errors: x, y, z; roll, pitch, yaw or heading; vx, vy, vz make up blocks
+    held_out : names of runs that are judged and not fitted, with commas; "half": the second half of the runs; None:
+        each run is judged by the factors of all others
+    per_axis : a factor for each component, in place of one for position, attitude and velocity
+    names : of the runs, for messages and ``held_out``; their numbers where None
+
+    Raises
+    ------
+    InputError
+        There is one run, or none with errors and covariances; or a name is not there.
+    """
+    if not isinstance(record, Record):
+        if covariances is None:
+            raise InputError("covariances: needed beside errors, (runs, steps, n, n)")
+        record = record_of_arrays({"errors": record, "covariances": covariances}, axes, "estimator", False)
+    require_runs(record)
+    assert record.nees is not None
+    labels = tuple(map(str, record.run_numbers if names is None else names))
+    counted = np.asarray(np.isfinite(record.nees).any(axis=1))
+    fitted, judged = fitted_and_judged(labels, counted, held_out)
+    blocks = blocks_of(record.axes, record.dof, per_axis)
+    fits = fit_groups(record.of_runs(fitted), blocks)
+    place = {run: row for row, run in enumerate(fitted)}
+    used = tuple(by_group(fits, place.get(run)) for run in judged)
+    some = replace(record, map=None, rejections=None, world=None).of_runs(judged)
+    before = held_out_by(some)
+    after = held_out_by(with_factors(some, used))
+    dof = np.array([fit.dof for fit in fits.values()])
+    return Correction(
+        name=record.name,
+        blocks=blocks,
+        fits=fits,
+        held_out=held_out or IN_TURN,
+        runs=labels,
+        fitted=tuple(labels[i] for i in fitted),
+        judged=tuple(labels[i] for i in judged),
+        used=used,
+        before=before,
+        after=after,
+        verdict=verdict_of(with_uncertainty(after.record, blocks, dof)),
+        excess=excess_of(after.record, blocks, dof),
+        gain=mean_over_runs(after.scores - before.scores),
+    )
+
+
+def the_record(records: Sequence[Record], name: str | None = None) -> Record:
+    """The record of the one estimator, or of that named.
+
+    Raises
+    ------
+    InputError
+        There are several, or none of this name.
+    """
+    named_so = [record for record in records if name in (None, record.name)]
+    if len(named_so) == 1:
+        return named_so[0]
+    there = ", ".join(record.name for record in records)
+    what = (
+        f"--filter {name}: is not in these files"
+        if name
+        else "these files hold several estimators: name one by --filter"
+    )
+    raise InputError(f"{what}; there are: {there}")
+
+
+def require_runs(record: Record) -> None:
+    """Refuse a record that has no covariances, or one run alone."""
+    if record.error is None or record.covariance is None or record.nees is None:
+        raise InputError(f"{record.name}: needs errors and covariances, of files with a truth")
+    if record.groups is not None and record.groups.outcome:
+        raise InputError(
+            f"--by {record.groups.column}: {record.groups.outcome}, which selects on the outcome: by it a right "
+            "covariance has other ratios, too, so that factors would be wrong"
+        )
+    if record.guesses:
+        raise InputError("--error guess: a correction is of one error; declare the one that the covariance is of")
+    runs = int(np.isfinite(record.nees).any(axis=1).sum())
+    if runs == 1:
+        from consistency.referee.diagnostics.planning.single_log import FEWEST
+
+        raise InputError(
+            f"{record.name}: one log has no other to judge its factors by; give several runs, or cut it with --split "
+            f"auto, which takes {FEWEST} pieces or more that do not depend on each other"
+        )
+    if runs == 0:
+        raise InputError(f"{record.name}: no run has a step with an error and a covariance of full rank")
+
+
+def fitted_and_judged(labels: Sequence[str], counted: Array, held_out: str | None) -> tuple[Indices, Indices]:
+    """Rows of the runs that are fitted, and of those that are judged, among them runs that failed from the start.
+
+    Parameters
+    ----------
+    counted : (runs,) of bool, runs with a step that can be fitted
+    """
+    every = np.arange(len(labels))
+    if held_out is None:
+        return every[counted], every
+    judged = every[len(every) // 2 :]
+    if held_out != HALF:
+        judged = named(labels, held_out, "run")
+    fitted = np.setdiff1d(every[counted], judged)
+    if len(fitted) < 2 or not counted[judged].any():
+        raise InputError(f"--held-out {held_out}: leaves {len(fitted)} runs to fit; it takes 2, and 1 to judge")
+    return fitted, judged
+
+
+def fit_groups(record: Record, blocks: tuple[Block, ...]) -> dict[str, Fit]:
+    """Fits to the steps of each group, by its name, and last, by the name "", that of all steps.
+
+    A group that fewer than two runs pass through has the fit of all steps.
+    """
+    assert record.nees is not None
+    fits = {}
+    names = record.groups.names if record.groups is not None else ()
+    whole = fit_runs(record, blocks)
+    for number, name in enumerate(names):
+        nees = np.where(group_index(record) == number, record.nees, np.nan)
+        some = replace(record, nees=nees, groups=None)
+        there = np.isfinite(nees).any(axis=1)
+        if there.sum() < 2:
+            fits[name] = replace(whole, notes=(f"{name}: fewer than two runs; the factors are those of all steps",))
+            continue
+        fit = fit_runs(some.of_runs(np.flatnonzero(there)), blocks)
+        rows = np.where(there, np.cumsum(there) - 1, -1)
+        left_out = tuple(fit.left_out[row] if row >= 0 else fit.factors for row in rows)
+        fits[name] = replace(fit, left_out=left_out, notes=tuple(f"{name}: {note}" for note in fit.notes))
+    return fits | {"": whole}
+
+
+def group_index(record: Record) -> Indices:
+    """The group of each step, (runs, steps), -1 where it is in none: the place of a fit among those of the groups."""
+    assert record.nees is not None
+    return np.full(record.nees.shape, -1) if record.groups is None else record.groups.index
+
+
+def by_group(fits: Mapping[str, Fit], without: int | None = None) -> ByGroup:
+    """Factors of each group, and last those of all steps; ``without`` one of the fitted runs."""
+    if without is None:
+        return tuple(fit.factors for fit in fits.values())
+    return tuple(fit.left_out[without] for fit in fits.values())
+
+
+def with_factors(record: Record, used: Sequence[ByGroup]) -> Record:
+    """The record with the covariances of each run corrected by its factors."""
+    assert record.covariance is not None
+    P = record.covariance.copy()
+    for run, index in enumerate(group_index(record)):
+        for number in np.unique(index):
+            steps = index == number
+            P[run, steps] = used[run][number].applied(P[run, steps])
+    return with_covariance(record, record.error, P)
+
+
+def excess_of(record: Record, blocks: Sequence[Block], dof: Array) -> float:
+    """What the uncertainty of factors known with dof (groups, B) adds to a ratio, on average over runs."""
+    assert record.nees is not None
+    sizes = np.array([len(block) for block in blocks])
+    of_blocks = np.where(dof > 2.0, dof / np.maximum(dof - 2.0, 1e-9), np.inf)
+    of_groups = (sizes * of_blocks).sum(axis=1) / sizes.sum()
+    steps = np.where(np.isfinite(record.nees), of_groups[group_index(record)], np.nan)
+    return average(steps)
+
+
+def with_covariance(record: Record, error: Array | None, P: Array) -> Record:
+    """The record with other errors and covariances where it had some that count."""
+    assert error is not None
+    assert record.nees is not None
+    nees = np.where(np.isfinite(record.nees), squared_length(whiten(error, P)), np.nan)
+    return replace(record, error=error, covariance=P, nees=nees)
+
+
+def with_uncertainty(record: Record, blocks: Sequence[Block], dof: Array) -> Record:
+    """Corrected errors, less what the uncertainty of their factors adds.
+
+    By a factor that is known with nu degrees of freedom the NEES of a block of n components is n times F(n, nu), not
+    chi-square(n). Errors of the block are made shorter so that their NEES is the quantile of the chi-square at the same
+    probability.
+
+    Parameters
+    ----------
+    dof : (groups, B), nu of each block in each group
+    """
+    assert record.error is not None
+    assert record.covariance is not None
+    error = record.error.copy()
+    for block, of_groups in zip(blocks, dof.T, strict=True):
+        nu = of_groups[group_index(record)]
+        places, n = list(block.places), len(block)
+        P = record.covariance[:, :, places][..., places]
+        squares = squared_length(whiten(error[..., places], P))
+        known = special.chdtri(n, special.fdtrc(n, nu, squares / n))
+        shorter = np.sqrt(known / np.where(squares > 0, squares, 1.0))
+        error[..., places] *= np.where(np.isfinite(shorter) & (squares > 0), shorter, 1.0)[..., None]
+    return with_covariance(record, error, record.covariance)
+
+
+def verdict_of(record: Record) -> Verdict:
+    """What ``analyse`` says of a record."""
+    return judge_all([record])[record.name]
+
+
+def held_out_by(record: Record) -> HeldOut:
+    """Figures of runs beside the covariance of their record."""
+    assert record.nees is not None
+    assert record.covariance is not None
+    verdict = verdict_of(record)
+    if verdict.scale is not None:
+        ratio = verdict.scale.inflation
+    else:
+        means, counts = run_means(record.nees)
+        ratio = ratio_interval(means[counts > 0] / record.dof, record.dof)
+    counted = np.isfinite(record.nees)
+    P = np.where(counted[..., None, None], record.covariance, np.eye(record.dof))
+    density = -0.5 * (record.nees + np.linalg.slogdet(2.0 * np.pi * P)[1])
+    scores, counts = run_means(density)
+    return HeldOut(record, verdict, ratio, scores[counts > 0])
+
+
+def average(values: Array) -> float:
+    """Mean over runs of the mean over the steps of each, (runs, steps), NaN where there is none."""
+    means, counts = run_means(values)
+    return float(means[counts > 0].mean())

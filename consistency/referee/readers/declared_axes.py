@@ -1,0 +1,139 @@
+"""Axes of worlds and bodies, declared by a letter each, as ned and frd; the truth is carried to those of the estimates.
+
+Covariances of the estimates stay as they are, so that each error keeps its meaning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import wrap
+from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.truth_matching import Estimator, Poses
+from consistency.referee.types import Array
+
+X, Y, Z = np.eye(3)
+WORLD = {"e": X, "w": -X, "n": Y, "s": -Y, "u": Z, "d": -Z}  # of axes, in east, north, up
+BODY = {"f": X, "b": -X, "l": Y, "r": -Y, "u": Z, "d": -Z}  # in forward, left, up
+ENU, FLU = "enu", "flu"
+OPTIONS = ("world", "body_axes", "truth_world", "truth_body_axes")
+
+
+class Axes(NamedTuple):
+    """Axes of a file."""
+
+    world: str  # as "ned"
+    body: str  # as "frd"
+
+
+class Change(NamedTuple):
+    """Matrices from the axes of the truth to those of the estimates, whose entries are 0, 1 and -1."""
+
+    world: Array  # (3, 3)
+    body: Array  # (3, 3)
+
+
+def in_axes_of_estimates(e: Estimator, r: Reading) -> Estimator:
+    """An estimator whose truth is given in the axes of its estimates.
+
+    Raises
+    ------
+    InputError
+        Axes are none, or left-handed; the estimates have no poses; or axes of the plane do not lie in one.
+    """
+    given = r.given(OPTIONS)
+    if not given:
+        return e
+    if e.innovations_alone or not (e.in_space or tuple(e.axes) == ("x", "y", "heading")):
+        raise InputError(f"{flag_of(given[0])}: needs poses or positions with a truth; {e.path} has none")
+    own, true = axes_of_files(r, e.in_space)
+    change = Change(
+        _matrix("--world", own.world, WORLD).T @ _matrix("--truth-world", true.world, WORLD),
+        _matrix("--body-axes", own.body, BODY).T @ _matrix("--truth-body-axes", true.body, BODY),
+    )
+    if all(np.array_equal(matrix, np.eye(3)) for matrix in change):
+        return e
+    if not e.in_space and abs(change.world[2, 2] + change.body[2, 2]) != 2.0:
+        raise InputError(
+            f"{flag_of(given[0])}: in the plane, as in {e.path}, the third axes of world and body must be both up "
+            f"or both down; the estimates are in {own.world} and {own.body}, the truth in {true.world} and {true.body}"
+        )
+    runs = [_with_truth(p, change, e.in_space) for p in e.runs]
+    what = (
+        f"the truth, in {true.world} and {true.body}, is read in the axes of the estimates, {own.world} and {own.body}"
+    )
+    return replace(e, runs=runs, notes=(*e.notes, f"{e.said}: {what} (world, body)"))
+
+
+def axes_of_files(r: Reading, in_space: bool) -> tuple[Axes, Axes]:
+    """Axes of estimates and truth, which are enu and flu where nothing is declared.
+
+    A truth beside the estimates in their file has their axes. The body of a pose in the plane, unless declared, has its
+    third axis where its world has it.
+    """
+    beside = r.truth is None and r.truth_topic is None
+    world = r.world or ENU
+    own = Axes(world, r.body_axes or _body_of(world, in_space))
+    if beside:
+        return own, Axes(r.truth_world or own.world, r.truth_body_axes or own.body)
+    true_world = r.truth_world or ENU
+    return own, Axes(true_world, r.truth_body_axes or _body_of(true_world, in_space))
+
+
+def _body_of(world: str, in_space: bool) -> str:
+    return "frd" if world.endswith("d") and not in_space else FLU
+
+
+def _matrix(option: str, letters: str, directions: Mapping[str, Array]) -> Array:
+    """Matrix (3, 3) whose columns are the axes, in east, north, up or in forward, left, up."""
+    example = "ned, enu" if directions is WORLD else "frd, flu"
+    if len(letters) != 3 or not set(letters) <= set(directions):
+        known = ", ".join(directions)
+        raise InputError(f"{option} {letters}: must be three letters of {known}, such as {example}")
+    out = np.column_stack([directions[letter] for letter in letters])
+    if np.linalg.det(out) < 0.5:
+        raise InputError(f"{option} {letters}: is not right-handed; such as {example} are")
+    return out
+
+
+def _with_truth(p: Poses, change: Change, in_space: bool) -> Poses:
+    """A run with its truth in other axes, and the covariance of that truth."""
+    A, C = change
+    truth, P = p.truth.copy(), p.true_covariance
+    if not in_space:
+        truth[:, :2] = truth[:, :2] @ A[:2, :2].T
+        start = A @ C.T
+        truth[:, 2] = A[2, 2] * truth[:, 2] + np.arctan2(start[1, 0], start[0, 0])
+        if p.manifold == "planar":
+            truth[:, 2] = wrap(truth[:, 2])
+    else:
+        truth[:, :3] = truth[:, :3] @ A.T
+        if p.manifold == "spatial" and len(truth):
+            R = Rotation.from_matrix(A) * Rotation.from_quat(truth[:, 3:7]) * Rotation.from_matrix(C.T)
+            truth[:, 3:7] = R.as_quat()
+        for first, axes in ((7, A), (10, C), (13, C)):  # velocity, biases of gyroscope and accelerometer
+            if first < truth.shape[1]:
+                truth[:, first : first + 3] = truth[:, first : first + 3] @ axes.T
+    if P is not None:
+        P = _carried(P, p.convention, change, in_space)
+    return replace(p, truth=truth, true_covariance=P)
+
+
+def _carried(P: Array, convention: str, change: Change, in_space: bool) -> Array:
+    """Covariances (M, n, n) of errors of the truth in other axes; of positions or planar poses n is 3, of poses 6."""
+    A, C = change
+    blocks = {"so3-body": (A, C), "left": (C, C)}.get(convention, (A, A))
+    if convention == "additive":
+        raise InputError("--truth-covariance: goes with no other axes of the truth where the error is 'additive'")
+    T = np.zeros((6, 6))
+    T[:3, :3], T[3:, 3:] = blocks
+    if P.shape[-1] == 3:
+        part = [0, 1, 2] if in_space else [0, 1, 5]
+        T = T[np.ix_(part, part)]
+    return np.asarray(T @ P @ T.T)

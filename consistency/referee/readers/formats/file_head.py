@@ -1,0 +1,103 @@
+"""The first lines of a text file: names of columns, and the first row of numbers."""
+
+from __future__ import annotations
+
+import csv
+import re
+import zlib
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from consistency.referee.parsing import is_file
+from consistency.referee.readers.formats.column_renaming import Columns, renamed
+from consistency.referee.readers.formats.text_blocks import opened
+
+PEEKED = 2**16  # bytes of a file that hold its header and its first row
+
+
+class Head(NamedTuple):
+    """Names of the columns of a text file, as they stand in it."""
+
+    names: list[str]
+    line: int  # of the names, from 1
+    comment: bool  # it begins with #
+    spaced: bool  # by white space
+
+
+def head_of(path: Path, columns: Columns | None = None) -> Head | None:
+    """The names of columns above the first row of numbers, those of ``columns`` in place of the file's own.
+
+    None where the file has none.
+    """
+    lines, row = _beginning(path)
+    if row is None or not lines:
+        return None
+    number, line = lines[-1]
+    comment = line.lstrip().startswith("#")
+    if not comment and len([text for _, text in lines if not text.lstrip().startswith("#")]) > 1:
+        return None
+    text, width = line, len(fields_of(row))
+    if comment:
+        text = line.strip().lstrip("#")
+    names = fields_of(text)
+    if len(names) != width and comment:
+        names = re.split(r"\s{2,}", text.strip())
+    if len(names) != width:
+        return None
+    return Head(renamed(names, columns, path), number, comment, not any(mark in line for mark in ",;\t"))
+
+
+def begins_with_numbers(path: Path) -> bool:
+    """Whether the first line that is not a comment is of numbers alone."""
+    lines, row = _beginning(path)
+    return (
+        row is not None and all(map(_is_number, fields_of(row))) and all(text.lstrip()[0] == "#" for _, text in lines)
+    )
+
+
+def beginning(path: Path) -> bytes:
+    """The first bytes of a file; none of what is not a file or cannot be read."""
+    if not is_file(path):  # a pipe would be waited for
+        return b""
+    try:
+        with opened(path) as file:
+            return file.read(PEEKED)
+    except (OSError, EOFError, zlib.error):
+        return b""
+
+
+def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
+    """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none."""
+    text = beginning(path).decode("utf-8-sig", "ignore")
+    lines: list[tuple[int, str]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.strip() and _is_row(line):
+            return lines, line
+        if line.strip():
+            lines.append((number, line))
+    return lines, None
+
+
+def _is_row(line: str) -> bool:
+    """Whether at least half of the fields of a line are numbers or empty, and one is a number."""
+    fields = fields_of(line)
+    numbers = sum(map(_is_number, fields))
+    return not line.lstrip().startswith("#") and numbers > 0 and 2 * (numbers + fields.count("")) >= len(fields)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def fields_of(line: str) -> list[str]:
+    """Fields of a line, apart by commas, semicolons or tabs, or by white space where it has none of them."""
+    separator = max(",;\t", key=line.count)
+    if '"' in line and separator in line:
+        with suppress(csv.Error):  # of a line with a null character
+            return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+    return [field.strip().strip('"') for field in (line.split(separator) if separator in line else line.split())]

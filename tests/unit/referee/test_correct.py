@@ -1,0 +1,387 @@
+"""Factors and floors for a stated covariance: the fit, runs as the unit, what is held out, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+import consistency as cs
+from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.statistics.nees import nees
+from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.correct import correct, fit_groups, held_out_by, with_uncertainty
+from consistency.referee.fit_covariance.factors import Block, Factors, blocks_of, fit_alone, fit_factors, run_moments
+from consistency.referee.fit_covariance.floors import fit_runs, floor_interval, likeness, scores
+from consistency.referee.fit_covariance.white_noise import interval_of_ratio
+from consistency.referee.types import Array, Failure
+
+POSE = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def covariances(rng: np.random.Generator, runs: int, steps: int, n: int, spread: float = 1.0) -> Array:
+    """One shape of a covariance whose size varies from step to step, (runs, steps, n, n)."""
+    A = rng.normal(size=(n, n))
+    return np.asarray(np.exp(spread * rng.normal(size=(runs, steps, 1, 1))) * (A @ A.T + np.eye(n)))
+
+
+def drawn(rng: np.random.Generator, C: Array, rho: float = 0.0) -> Array:
+    """Errors with covariances C (runs, steps, n, n), whose whitened values depend on those of the step before."""
+    runs, steps, n, _ = C.shape
+    w = rng.normal(size=(runs, steps, n))
+    for k in range(1, steps):
+        w[:, k] = rho * w[:, k - 1] + np.sqrt(1.0 - rho**2) * w[:, k]
+    return np.asarray((np.linalg.cholesky(C) @ w[..., None])[..., 0])
+
+
+def record_of(error: Array, P: Array, axes: tuple[str, ...] = ()) -> Record:
+    n = error.shape[-1]
+    return Record("est", error, P, nees(error, P), n, axes=axes or POSE[:n], runs=np.arange(len(error)))
+
+
+def wrong(
+    rng: np.random.Generator, runs: int = 24, steps: int = 40, factor: float = 9.0, turn: float = 0.5, rho: float = 0.5
+) -> Record:
+    """A pose in space whose position is off by one factor and its rotation by another."""
+    P = covariances(rng, runs, steps, 6)
+    return record_of(
+        drawn(rng, Factors(blocks_of(POSE, 6, False), np.array([factor, turn]), np.zeros(2)).applied(P), rho), P
+    )
+
+
+# --- blocks and factors -----------------------------------------------------------------------------------------------
+
+
+def test_blocks_go_by_names() -> None:
+    names = (*POSE, "vx", "vy", "vz")
+    assert [(b.name, b.places) for b in blocks_of(names, 9, False)] == [
+        ("position", (0, 1, 2)),
+        ("attitude", (3, 4, 5)),
+        ("velocity", (6, 7, 8)),
+    ]
+    assert [b.name for b in blocks_of(("x", "y", "heading"), 3, True)] == ["x", "y", "heading"]
+    assert [b.name for b in blocks_of(("tank", "x", "pump"), 3, False)] == ["tank", "position", "pump"]
+    assert [b.places for b in blocks_of((), 3, False)] == [(0, 1, 2)]
+
+
+def test_one_factor_is_the_mean_nees_of_runs(rng: np.random.Generator) -> None:
+    P = covariances(rng, 5, 7, 3)
+    error = rng.normal(size=(5, 7, 3))
+    error[1, 4:] = np.nan
+    P[1, 4:] = np.nan
+    values = np.full((5, 7), np.nan)
+    values[np.isfinite(error[..., 0])] = nees(error[np.isfinite(error[..., 0])], P[np.isfinite(error[..., 0])])
+    record = replace(
+        record_of(np.ones((5, 7, 3)), np.broadcast_to(np.eye(3), (5, 7, 3, 3)).copy()),
+        error=error,
+        covariance=P,
+        nees=values,
+    )
+    fit = fit_alone(record, blocks_of(record.axes, 3, False))
+    runs = np.nanmean(values, axis=1) / 3
+    assert fit.factors.factor == pytest.approx([runs.mean()])
+    assert fit.left_out[2].factor == pytest.approx([np.delete(runs, 2).mean()])
+
+
+def test_factors_are_the_most_likely_ones(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=4)
+    blocks = blocks_of(POSE, 6, False)
+    assert record.covariance is not None
+    assert record.error is not None
+    P, e = record.covariance, record.error
+
+    def loss(logs: Array) -> float:
+        C = Factors(blocks, np.exp(logs), np.zeros(2)).applied(P)
+        return float(nees(e, C).mean() + np.linalg.slogdet(C)[1].mean())
+
+    found = optimize.minimize(loss, np.zeros(2), tol=1e-12).x
+    Q = run_moments(record, blocks)
+    assert np.log(fit_factors(Q.mean(axis=0), np.array([3.0, 3.0]))) == pytest.approx(found, abs=1e-4)
+
+
+def test_factors_of_any_size_are_found(rng: np.random.Generator) -> None:
+    A = rng.normal(size=(50, 4, 4)) * 10.0 ** rng.uniform(-6, 6, (50, 4, 1))
+    Q, sizes = A @ np.swapaxes(A, 1, 2), np.array([3.0, 3.0, 3.0, 1.0])
+    x = fit_factors(Q, sizes) ** -0.5
+    assert (Q @ x[..., None])[..., 0] * x == pytest.approx(np.broadcast_to(sizes, x.shape), abs=1e-6)
+
+
+def test_runs_are_the_unit(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=6, steps=10)
+    assert record.error is not None
+    assert record.covariance is not None
+    twice = record_of(np.repeat(record.error, 3, axis=1), np.repeat(record.covariance, 3, axis=1))
+    once, again = (fit_runs(each, blocks_of(POSE, 6, False)) for each in (record, twice))
+    for one, other in zip(once.factor, again.factor, strict=True):
+        assert tuple(one) == pytest.approx(tuple(other), rel=1e-6)
+
+
+def test_a_covariance_is_scaled_by_blocks() -> None:
+    P = np.array([[4.0, 1.0, 0.2], [1.0, 5.0, 0.3], [0.2, 0.3, 0.1]])
+    factors = Factors((Block("position", (0, 1)), Block("attitude", (2,))), np.array([9.0, 4.0]), np.array([0.5, 0.0]))
+    expected = [[36.5, 9.0, 1.2], [9.0, 45.5, 1.8], [1.2, 1.8, 0.4]]
+    assert factors.applied(P) == pytest.approx(np.array(expected))
+
+
+# --- what is held out -------------------------------------------------------------------------------------------------
+
+
+def test_a_run_has_no_say_in_its_own_factors(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=6)
+    assert record.error is not None
+    assert record.covariance is not None
+    error = record.error.copy()
+    error[3] *= 20.0
+    one, other = (correct(each) for each in (record, record_of(error, record.covariance)))
+    assert other.used[3][0].factor == pytest.approx(one.used[3][0].factor, rel=1e-9)
+    assert (other.used[2][0].factor > 2 * one.used[2][0].factor).all()
+
+
+def test_known_factors_are_found_and_judged_right() -> None:
+    """Fails by chance in fewer than 1 in 1e5: bounds are 5 standard errors or more of some 960 steps x 3."""
+    found = correct(wrong(np.random.default_rng(), rho=0.0))
+    position, attitude = found.fit.factor
+    assert position.value == pytest.approx(9.0, rel=0.15)
+    assert attitude.value == pytest.approx(0.5, rel=0.15)
+    assert found.before.ratio.low > 2.0
+    assert found.after.ratio.value == pytest.approx(1.0, abs=0.02)
+    assert found.after.covered((0.68, 0.95, 0.99)) == pytest.approx((0.68, 0.95, 0.99), abs=0.08)
+    assert found.gain.low > 0.0
+    assert not found.after.ratio.holds(1.2)
+
+
+def test_the_gain_is_of_log_densities(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=3, steps=5)
+    assert record.error is not None
+    assert record.covariance is not None
+    scores_of = held_out_by(record).scores
+    for run in range(3):
+        density = [
+            stats.multivariate_normal.logpdf(e, np.zeros(6), P)
+            for e, P in zip(record.error[run], record.covariance[run], strict=True)
+        ]
+        assert scores_of[run] == pytest.approx(np.mean(density))
+
+
+def test_named_runs_and_half_are_judged_by_the_others(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=6)
+    by_name = correct(record, held_out="1, 4", names=["0", "1", "2", "3", "4", "5"])
+    assert by_name.judged == ("1", "4")
+    assert by_name.fitted == ("0", "2", "3", "5")
+    rest = fit_runs(record.of_runs(np.array([0, 2, 3, 5])), by_name.blocks)
+    assert by_name.used[0][0].factor == pytest.approx(rest.factors.factor)
+    assert correct(record, held_out="half").judged == ("3", "4", "5")
+
+
+def test_uncertain_factors_lengthen_no_tails() -> None:
+    """A block whose NEES is a quantile of n F(n, nu) has that of the chi-square afterwards."""
+    p = np.array([0.01, 0.5, 0.99, 0.9999])
+    squares = 3 * stats.f.ppf(p, 3, 8.0)
+    error = np.zeros((1, 4, 3))
+    error[0, :, 1] = np.sqrt(squares)
+    record = record_of(error, np.broadcast_to(np.eye(3), (1, 4, 3, 3)).copy())
+    blocks = blocks_of(record.axes, 3, False)
+    found = with_uncertainty(record, blocks, np.array([[8.0]]))
+    assert found.nees is not None
+    assert found.nees[0] == pytest.approx(stats.chi2.ppf(p, 3), rel=1e-6)
+
+
+def test_what_few_runs_add_is_what_a_ratio_has_more() -> None:
+    rng = np.random.default_rng(0)
+    constant = np.repeat(rng.normal(size=(10, 1, 3)), 5, axis=1)
+    P = np.broadcast_to(np.eye(3), (10, 5, 3, 3)).copy()
+    found = correct(constant, P, axes=("x", "y", "z"))
+    nu = found.fit.dof[0]
+    assert nu >= 27.0
+    assert found.excess == pytest.approx(nu / (nu - 2.0))
+
+
+# --- the three ends ---------------------------------------------------------------------------------------------------
+
+
+def test_many_runs_off_by_a_factor_are_consistent_after() -> None:
+    """Fails by chance where the referee finds a fault in a right covariance, 5 %; so the best of five tries counts."""
+    tries = (correct(wrong(np.random.default_rng(), runs=40, rho=0.3)).status for _ in range(5))
+    assert "consistent" in tries
+
+
+def test_few_runs_are_undecided_after_and_say_how_many_would_decide() -> None:
+    found = correct(wrong(np.random.default_rng(3), runs=6))
+    assert found.status == "undecided"
+    assert found.needed is not None
+    assert found.needed > 6
+    assert f"about {found.needed} runs would decide" in repr(found)
+
+
+def test_what_no_factor_mends_is_named(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=40, rho=0.0)
+    assert record.error is not None
+    assert record.covariance is not None
+    heavy = record.error * np.sqrt(2.0 / rng.chisquare(2.0, (40, 40, 1)))
+    biased = record.error + 3.0 * np.sqrt(np.diagonal(record.covariance, axis1=2, axis2=3))
+    for error, word in ((heavy, "heavy"), (biased, "mean error")):
+        found = correct(record_of(error, record.covariance))
+        assert found.status == "inconsistent"
+        assert word in found.verdict.reasons[0]
+        assert "no factor mends this" in repr(found)
+
+
+def test_a_run_that_failed_from_the_start_counts(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=8)
+    assert record.error is not None
+    assert record.nees is not None
+    error, values = record.error.copy(), record.nees.copy()
+    error[2], values[2] = np.nan, np.nan
+    broken = replace(record, error=error, nees=values, failures=(Failure("est", 2, 1, "estimate is not finite"),))
+    found = correct(broken)
+    assert found.status == "inconsistent"
+    assert found.verdict.status == "failed"
+    assert found.after.verdict.runs == 8
+    assert found.fitted == ("0", "1", "3", "4", "5", "6", "7")
+    assert found.used[2][0] == found.fit.factors
+    assert found.used[3][0] == found.fit.left_out[2]
+    assert np.isfinite(found.after.covered((0.5,))).all()
+    assert np.isfinite(found.gain).all()
+
+
+def test_a_correlation_of_the_wrong_sign_is_not_mended(rng: np.random.Generator) -> None:
+    right = np.array([[1.0, 0.9], [0.9, 1.0]])
+    C = np.broadcast_to(right, (40, 30, 2, 2)).copy()
+    P = C * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    assert correct(record_of(drawn(rng, C), P)).status == "inconsistent"
+
+
+def test_one_run_is_refused_with_what_it_takes(rng: np.random.Generator) -> None:
+    with pytest.raises(InputError, match="--split auto, which takes 20 pieces"):
+        correct(wrong(rng, runs=1))
+    with pytest.raises(InputError, match="no run '9'; there are 0, 1, 2"):
+        correct(wrong(rng, runs=3), held_out="9")
+    with pytest.raises(InputError, match="leaves 1 runs to fit"):
+        correct(wrong(rng, runs=3), held_out="0,1")
+    P = np.broadcast_to(np.eye(2), (3, 4, 2, 2)).copy()
+    with pytest.raises(InputError, match="no error in any step"):
+        correct(record_of(np.zeros((3, 4, 2)), P))
+
+
+# --- floors -----------------------------------------------------------------------------------------------------------
+
+
+def with_floor(rng: np.random.Generator, factor: float, floor: float, spread: float = 1.0, runs: int = 24) -> Record:
+    P = covariances(rng, runs, 40, 3, spread)
+    return record_of(drawn(rng, factor * P + floor * np.eye(3)), P)
+
+
+def test_a_floor_is_found_where_it_is() -> None:
+    """Fails by chance in fewer than 1 in 1e4: 5 standard errors."""
+    rng = np.random.default_rng()
+    record = with_floor(rng, 2.0, 20.0)
+    fit = fit_runs(record, blocks_of(record.axes, 3, False))
+    for value, interval, true in (
+        (fit.factors.factor[0], fit.factor[0], 2.0),
+        (fit.factors.floor[0], fit.floor[0], 20.0),
+    ):
+        half = 0.5 * (interval.high - interval.low)
+        assert abs(value - true) < 2.5 * half + 0.02 * true
+    assert "gains" in fit.notes[0]
+
+
+def test_no_floor_is_kept_that_data_do_not_ask_for() -> None:
+    rng = np.random.default_rng(5)
+    record = with_floor(rng, 2.0, 0.0)
+    fit = fit_runs(record, blocks_of(record.axes, 3, False))
+    assert fit.factors.floor.tolist() == [0.0]
+    assert fit.floor[0].low == 0.0
+    assert fit.floor[0].high > 0.0
+    assert "floors are 0" in fit.notes[0]
+
+
+def test_a_factor_of_0_beside_a_floor_has_a_one_sided_interval() -> None:
+    rng = np.random.default_rng(2)
+    P = covariances(rng, 20, 40, 3)
+    record = record_of(drawn(rng, np.broadcast_to(50.0 * np.eye(3), P.shape).copy()), P)
+    fit = fit_runs(record, blocks_of(record.axes, 3, False))
+    assert fit.factors.floor[0] == pytest.approx(50.0, rel=0.2)
+    assert fit.factor[0].low == 0.0
+    assert 0.0 < fit.factor[0].high < 2.0
+
+
+def test_a_floor_is_not_told_from_a_covariance_of_its_shape(rng: np.random.Generator) -> None:
+    P = np.broadcast_to(2.0 * np.eye(3), (6, 20, 3, 3)).copy()
+    record = record_of(drawn(rng, 3.0 * P), P)
+    blocks = blocks_of(record.axes, 3, False)
+    assert likeness(record, blocks[0]) == pytest.approx(1.0)
+    fit = fit_runs(record, blocks)
+    assert fit.factors.floor.tolist() == [0.0]
+    assert "cannot be told apart" in fit.notes[0]
+
+
+def test_gradients_and_information_are_those_of_the_likelihood(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=3, steps=30)
+    blocks, free = blocks_of(POSE, 6, False), np.array([0, 1])
+    theta = np.array([4.0, 0.7, 0.8, 0.3])
+    _, gradient, information = scores(record, blocks, free, theta)
+    h = 1e-5
+    for i in range(4):
+        step = h * np.eye(4)[i]
+        above, below = (scores(record, blocks, free, theta + sign * step) for sign in (1.0, -1.0))
+        assert (above[0] - below[0]) / (2 * h) == pytest.approx(gradient[:, i], rel=1e-4, abs=1e-6)
+    assert (np.linalg.eigvalsh(information) > 0).all()
+
+
+def test_the_interval_of_a_factor_is_that_of_the_jackknife() -> None:
+    left_out = np.array([8.0, 9.0, 9.5, 10.0])
+    error = np.sqrt(3 / 4 * np.square(np.log(left_out) - np.log(left_out).mean()).sum())
+    reach = np.exp(stats.t.ppf(0.975, 3) * error)
+    assert tuple(interval_of_ratio(9.0, left_out)) == pytest.approx((9.0, 9.0 / reach, 9.0 * reach))
+
+
+def test_a_floor_at_zero_has_a_one_sided_interval() -> None:
+    left_out = np.array([-0.3, -0.2, 0.1, 0.05, -0.1])
+    error = 2.0 * left_out.std()
+    found = floor_interval(0.0, -0.1, left_out)
+    assert tuple(found) == pytest.approx((0.0, 0.0, stats.t.isf(0.05, 4) * error))
+    inside = floor_interval(0.1, 0.1, left_out)
+    assert inside.high == pytest.approx(0.1 + stats.t.isf(0.025, 4) * error)
+
+
+def test_groups_have_factors_of_their_own_runs(rng: np.random.Generator) -> None:
+    record = wrong(rng, runs=6)
+    index = rng.integers(-1, 2, (6, 40))
+    index[:5][index[:5] == 1] = 0
+    groups = Groups("speed", ("slow", "fast"), index, (1.0,))
+    fits = fit_groups(replace(record, groups=groups), blocks_of(POSE, 6, False))
+    assert list(fits) == ["slow", "fast", ""]
+    assert record.nees is not None
+    slow = replace(record, nees=np.where(index == 0, record.nees, np.nan))
+    assert fits["slow"].factors.factor == pytest.approx(fit_runs(slow, fits[""].factors.blocks).factors.factor)
+    assert fits["fast"].factors == fits[""].factors
+    assert "fewer than two runs" in fits["fast"].notes[0]
+    found = correct(replace(record, groups=groups))
+    assert record.covariance is not None
+    assert found.after.record.covariance is not None
+    run, step = (int(each[0]) for each in np.nonzero(index == -1))
+    expected = fits[""].left_out[run].applied(record.covariance[run, step])
+    assert found.after.record.covariance[run, step] == pytest.approx(expected)
+
+
+def test_arrays_are_corrected_in_python(rng: np.random.Generator) -> None:
+    P = covariances(rng, 8, 20, 3)
+    found = cs.correct(drawn(rng, 4.0 * P), P, axes=("x", "y", "heading"), per_axis=True)
+    assert [block.name for block in found.blocks] == ["x", "y", "heading"]
+    d = np.sqrt(found.fit.factors.factor)
+    assert found.covariance(P[0, 0]) == pytest.approx(P[0, 0] * np.outer(d, d) + np.diag(found.fit.factors.floor))
+
+
+def test_pictures_are_drawn(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    found = correct(wrong(np.random.default_rng(1), runs=5))
+    figure = found.plot(tmp_path / "c.png")
+    assert (tmp_path / "c.png").stat().st_size > 1000
+    runs, factors, coverage = figure.axes
+    assert [len(line.get_xdata()) for line in runs.lines if line.get_marker() == "s"] == [5]
+    assert factors.get_xlabel() == "factor on variances"
+    assert {line.get_label() for line in coverage.lines} >= {"stated", "corrected"}

@@ -148,7 +148,7 @@ def correct_command(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
 ) -> None:
-    """Find factors for a covariance that is stated, and judge them on runs that chose nothing."""
+    """Find factors for a stated covariance. Judge them on runs that chose nothing."""
     from consistency.referee.fit_covariance.correct import correct, the_record
     from consistency.referee.fit_covariance.correction_text import correction_document
     from consistency.referee.readers.formats.restated import text_files

@@ -87,9 +87,7 @@ def analyse_command(
     fail_on: Annotated[
         str | None, typer.Option("--fail-on", help="'inconsistent': exit with status 1 unless all are consistent.")
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Overwrite files that are not a report of this.")
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite files other than reports, too.")] = False,
 ) -> None:
     """Check whether stated covariances match the errors. Explain the verdict."""
     from consistency.referee.document.judged_filters import document

@@ -109,7 +109,7 @@ def require_report(report: Path, overwrite: bool) -> bool:
     Raises
     ------
     InputError
-        Something is there that is not a report of a verdict, without ``overwrite``; or the system refuses.
+        Something other than a report of a verdict is there, without ``overwrite``; or the system refuses.
     """
     from consistency.referee.system.folders import require_free
 

@@ -7,9 +7,7 @@ of the noise the gap is a tenth.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,13 +33,9 @@ from consistency.bench.filters.methods.ideal import AtTruth
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState, view
-from consistency.bench.protocols import Problem
-from consistency.bench.types import Control, Gaussian, Info, Observation, Trial
-from consistency.referee.types import Array
 
 pytestmark = pytest.mark.usefixtures("dense")  # test_local_updating.py compares it with local updating
 
-Small = Callable[..., cs.Scenario]
 NAMES = [name for name in usable_names() if isinstance(cs.get_filter(name), Compiled)]
 WORLDS = {
     "linear": "linear-gaussian", "xyz": "herath2007-xyz", "uvd": "herath2007-wide-baseline", "relative-xy": "esde-xy",
@@ -53,12 +47,12 @@ STEP = 1e-6  # of finite differences
 CONVERTING = ("robocentric-ekf-uvd", "parked-ekf-uvd")  # have no h whose Jacobian is taken: see test_robocentric.py
 
 
-def world_of(name: str) -> str:
+def world_of(name):
     """Where the filter works on what the sensor gives."""
     return WORLDS[cs.get_filter(name).sensors[0]]
 
 
-def mounted(name: str, tilted: dict[str, Any]) -> dict[str, Any]:
+def mounted(name, tilted):
     """A mount with as many numbers different from zero as the sensor of the filter may have."""
     if name.endswith(("-xy", "-rb")):
         return {"position": [*tilted["position"][:2], 0.0], "rotation": [0.0, 0.0, tilted["rotation"][2]]}
@@ -71,7 +65,7 @@ def mounted(name: str, tilted: dict[str, Any]) -> dict[str, Any]:
 class Bench:
     """The kernels of a filter at a state with two landmarks, and one more to come."""
 
-    def __init__(self, name: str, scenario: cs.Scenario) -> None:
+    def __init__(self, name, scenario):
         trial = cs.simulate(scenario, run=1)
         filter_ = cs.get_filter(name)
         problem = problem_for(filter_, trial, scenario.belief)
@@ -86,10 +80,10 @@ class Bench:
         for i in range(2):
             self.place(self.x, 3 + i * self.w, i, self.z[i] * (1.01, 0.98, 1.02)[: self.s])
 
-    def state(self, x: Array, n: int, P: Array | None = None) -> State:
+    def state(self, x, n, P=None):
         return State(x, np.zeros((len(x), len(x))) if P is None else P, n, 0, np.zeros(200, int))
 
-    def place(self, x: Array, n: int, i: int, z: Array) -> None:
+    def place(self, x, n, i, z):
         slam, label = self.slam, int(self.labels[i])
         self.stand(x, x)
         place(slam.point, slam, self.state(x, n), 0, label, z, self.work)
@@ -97,36 +91,36 @@ class Bench:
             slam.point.landmarks[label] = x[n : n + self.w]
             place(slam.point, slam, self.state(x, n), 0, label, z, self.work)
 
-    def stand(self, before: Array, after: Array) -> None:
+    def stand(self, before, after):
         """A point that is not the estimate is put there, so that finite differences are the Jacobians at it."""
         if stands_apart(self.slam.point):
             path = self.slam.point.path if isinstance(self.slam.point, AtTruth) else self.work.notes.path
             path[0], path[1] = before[: path.shape[1]], after[: path.shape[1]]
 
-    def moved(self, x: Array, n: int, error: Array) -> Array:
+    def moved(self, x, n, error):
         """x with an error of its first n variables."""
         x = x.copy()
         retract(self.slam.error, self.slam, self.state(x, n), error[None, :n].copy(), np.ones(1), self.work)
         return x
 
-    def along_errors(self, function: Callable[[Array], Array], n: int) -> Array:
+    def along_errors(self, function, n):
         """Derivative (k, n) of a function of the state by the error of its first n variables."""
         steps = STEP * np.eye(n)
         ahead, behind = ([function(self.moved(self.x, n, sign * e)) for e in steps] for sign in (1.0, -1.0))
         return (np.array(ahead) - np.array(behind)).T / (2.0 * STEP)
 
-    def additive_from_own(self, x: Array, n: int) -> Array:
+    def additive_from_own(self, x, n):
         """T (n, n): what an error does to the variables at x."""
         here, self.x = self.x, x
         T = self.along_errors(lambda moved: moved[:n], n)
         self.x = here
         return T
 
-    def expected(self, x: Array) -> Array:
+    def expected(self, x):
         linearise_seen(self.slam, self.state(x, self.n), 0, 2, self.work)
         return self.work.zhat[: 2 * self.s].copy()
 
-    def predicted(self, x: Array, u: Array, P: Array | None = None) -> Array:
+    def predicted(self, x, u, P=None):
         x, after = x.copy(), x.copy()
         move(x[:3], u, after[:3])
         self.stand(x, after)
@@ -135,17 +129,17 @@ class Bench:
 
 
 @pytest.fixture(scope="module", params=[name for name in NAMES if name not in CONVERTING])
-def bench(request: pytest.FixtureRequest, small: Small, tilted: dict[str, Any]) -> Bench:
+def bench(request, small, tilted):
     name = request.param
     mount = mounted(name, tilted)
     return Bench(name, small(world_of(name), truth__sensor__mount=mount, belief__sensor__mount=mount))
 
 
-def close(a: Array, b: Array, tolerance: float = 1e-6) -> bool:
+def close(a, b, tolerance=1e-6):
     return bool(np.abs(a - b).max() <= tolerance * max(1.0, np.abs(b).max()))
 
 
-def test_observation_jacobians_are_those_of_the_retraction(bench: Bench) -> None:
+def test_observation_jacobians_are_those_of_the_retraction(bench):
     exact = bench.along_errors(bench.expected, bench.n)
     bench.expected(bench.x)
     s = bench.s
@@ -157,7 +151,7 @@ def test_observation_jacobians_are_those_of_the_retraction(bench: Bench) -> None
     assert not close(1.001 * H, exact)  # negative control
 
 
-def test_motion_moves_the_covariance_of_the_error(bench: Bench, rng: np.random.Generator) -> None:
+def test_motion_moves_the_covariance_of_the_error(bench, rng):
     n, sigmas = bench.n, bench.slam.motion
     assert isinstance(sigmas, Unicycle)
     after = bench.predicted(bench.x, bench.u)
@@ -179,10 +173,10 @@ def test_motion_moves_the_covariance_of_the_error(bench: Bench, rng: np.random.G
     assert not close((A @ A.T + G @ G.T)[upper], expected[upper]) or close(F, np.eye(n))
 
 
-def test_a_new_landmark_has_the_jacobians_of_its_error(bench: Bench) -> None:
+def test_a_new_landmark_has_the_jacobians_of_its_error(bench):
     n, w, z = bench.n, bench.w, bench.z[2].copy()
 
-    def augmented(x: Array, z: Array) -> Array:
+    def augmented(x, z):
         x = x.copy()
         bench.place(x, n, 2, z)
         return x
@@ -215,15 +209,15 @@ class TrueKalman:
 
     name = "at-truth"
 
-    def __init__(self, trial: Trial, uvd: bool) -> None:
+    def __init__(self, trial, uvd):
         assert trial.truth is not None
         assert trial.landmarks is not None
         self.path, self.landmarks, self.uvd = trial.truth, trial.landmarks, uvd
 
-    def init(self, problem: Problem) -> TrueState:
+    def init(self, problem):
         return TrueState(basics.start(problem), 0)
 
-    def predict(self, state: TrueState, control: Control) -> TrueState:
+    def predict(self, state, control):
         before, x, P = self.path[state.step], state.slam.x.copy(), state.slam.P.copy()
         F, G = basics.motion_jacobians(before, control)
         x[:3] = basics.move(before, control) + F @ (x[:3] - before)
@@ -232,17 +226,17 @@ class TrueKalman:
         P[:3, :3] += basics.process_noise(G, state.slam.problem.belief)
         return TrueState(replace(state.slam, x=x, P=P), state.step + 1)
 
-    def update(self, state: TrueState, observation: Observation) -> tuple[TrueState, Info]:
+    def update(self, state, observation):
         pose, sensor = self.path[state.step], view(state.slam.problem.belief.sensor, self.uvd)
         landmarks = self.landmarks[:, : sensor.width]
 
-        def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        def correct(slam, seen, z, R):
             known = np.concatenate([pose, *(landmarks[label] for label in slam.landmarks)])
             zhat, H = basics.expect(replace(slam, x=known), seen, self.uvd)
             innovation = basics.innovation_of(slam, z, zhat, self.uvd) - H @ (slam.x - known)
             return basics.corrected(slam, H, innovation, R)
 
-        def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+        def locate(slam, label, z):
             Hp, Hl = sensor.jacobians(pose, landmarks[label])
             Jz = np.linalg.inv(Hl)
             error = sensor.less(z, sensor.measure(pose, landmarks[label])) - Hp @ (slam.x[:3] - pose)
@@ -251,21 +245,21 @@ class TrueKalman:
         slam, info = basics.update_jointly(state.slam, observation, self.uvd, correct, locate)
         return TrueState(slam, state.step), info
 
-    def pose(self, state: TrueState) -> Gaussian:
+    def pose(self, state):
         return basics.pose_of(state.slam)
 
 
-def scaled(scenario: cs.Scenario, scale: float) -> cs.Scenario:
+def scaled(scenario, scale):
     """The world with all noise, true and believed, multiplied."""
     sigma = tuple(scale * s for s in scenario.belief.sensor.sigma)
     motion = scenario.belief.motion
-    changes: dict[str, Any] = {"motion__sigma_v": scale * motion.sigma_v, "sensor__sigma": sigma}
+    changes = {"motion__sigma_v": scale * motion.sigma_v, "sensor__sigma": sigma}
     changes["motion__sigma_omega"] = scale * motion.sigma_omega
     both = {f"{table}__{key}": value for table in ("truth", "belief") for key, value in changes.items()}
     return scenario.variant("scaled", **both)
 
 
-def gap(name: str, scenario: cs.Scenario) -> float:
+def gap(name, scenario):
     """Largest distance of a filter's pose from that of the Kalman filter at the truth, in standard deviations."""
     trial, filter_ = cs.simulate(scenario, run=1), cs.get_filter(name)
     exact = step_through(TrueKalman(trial, filter_.uvd), trial, scenario.belief)
@@ -277,7 +271,7 @@ def gap(name: str, scenario: cs.Scenario) -> float:
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "kf"])
-def test_the_gap_to_the_kalman_filter_at_the_truth_shrinks_with_the_noise(small: Small, name: str) -> None:
+def test_the_gap_to_the_kalman_filter_at_the_truth_shrinks_with_the_noise(small, name):
     full, tenth, hundredth = (gap(name, scaled(small(world_of(name)), scale)) for scale in (1.0, 0.1, 0.01))
     assert tenth < 0.5 * full
     assert 0.8 < np.log10(tenth / hundredth) < 1.2
@@ -288,7 +282,7 @@ def test_the_gap_to_the_kalman_filter_at_the_truth_shrinks_with_the_noise(small:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_kernel_equals_its_twin_over_a_trial(small: Small, name: str, tilted: dict[str, Any]) -> None:
+def test_kernel_equals_its_twin_over_a_trial(small, name, tilted):
     mount = mounted(name, tilted)
     scenario = small(world_of(name), truth__steps=200, truth__sensor__mount=mount, belief__sensor__mount=mount)
     trial, filter_ = cs.simulate(scenario, run=2), cs.get_filter(name)
@@ -299,7 +293,7 @@ def test_kernel_equals_its_twin_over_a_trial(small: Small, name: str, tilted: di
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_map_is_that_of_the_twin(small: Small, name: str) -> None:
+def test_the_map_is_that_of_the_twin(small, name):
     scenario = small(world_of(name))
     trial, filter_ = cs.simulate(scenario, run=2), cs.get_filter(name)
     state = filter_.init(problem_for(filter_, trial, scenario.belief))

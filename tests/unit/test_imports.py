@@ -1,12 +1,9 @@
 """Imports flow one way, as import-linter reads in pyproject.toml; what is loaded is seen in a new process."""
 
-from __future__ import annotations
-
 import ast
 import runpy
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Set
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -27,7 +24,7 @@ OTHERS = {
 }
 
 
-def imported(source: str) -> Iterator[str]:
+def imported(source):
     """Dotted names that a source imports, wherever in it."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -36,7 +33,7 @@ def imported(source: str) -> Iterator[str]:
             yield str(node.module)
 
 
-def acyclic(graph: Mapping[str, Set[str]]) -> bool:
+def acyclic(graph):
     try:
         TopologicalSorter(graph).prepare()
     except CycleError:
@@ -44,20 +41,20 @@ def acyclic(graph: Mapping[str, Set[str]]) -> bool:
     return True
 
 
-def linted(settings: Path) -> subprocess.CompletedProcess[str]:
+def linted(settings):
     """What import-linter says of the package by these settings."""
     code = "from importlinter.cli import lint_imports_command; lint_imports_command()"
     command = [sys.executable, "-c", code, str(settings), "--no-cache"]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=PACKAGE.parent)
 
 
-def test_directions_between_roots_folders_and_layers() -> None:
+def test_directions_between_roots_folders_and_layers():
     done = linted(SETTINGS)
     assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize(
-    ("above", "below"),
+    "above, below",
     [
         ("consistency.referee", "consistency.bench"),
         ("consistency.referee.diagnostics", "consistency.referee.readers"),
@@ -66,7 +63,7 @@ def test_directions_between_roots_folders_and_layers() -> None:
         ("consistency.bench.simulation", "consistency.bench.runs"),
     ],
 )
-def test_a_direction_that_is_turned_is_reported(above: str, below: str, tmp_path: Path) -> None:
+def test_a_direction_that_is_turned_is_reported(above, below, tmp_path):
     """Negative control: in truth the second imports the first."""
     contract = f'name = "turned"\ntype = "layers"\nlayers = ["{above}", "{below}"]'
     settings = tmp_path / "pyproject.toml"
@@ -78,7 +75,7 @@ def test_a_direction_that_is_turned_is_reported(above: str, below: str, tmp_path
     assert "turned BROKEN" in done.stdout
 
 
-def test_no_two_modules_import_each_other() -> None:
+def test_no_two_modules_import_each_other():
     """Wherever in them, for the type checker too; but a fit shows itself by the modules that show it."""
     modules = grimp.build_graph("consistency", cache_dir=None)
     graph = {name: modules.find_modules_directly_imported_by(name) for name in modules.modules}
@@ -92,7 +89,7 @@ def test_no_two_modules_import_each_other() -> None:
     )  # negative control
 
 
-def test_the_page_of_the_house_has_its_table() -> None:
+def test_the_page_of_the_house_has_its_table():
     """``make house-write`` writes it."""
     house = runpy.run_path(str(PACKAGE.parent / "docs/house.py"))
     table = house["table"](exact=False)
@@ -104,21 +101,21 @@ def test_the_page_of_the_house_has_its_table() -> None:
 # --- experiments and benchmarks ----------------------------------------------------------------
 
 
-def siblings(path: Path) -> set[str]:
+def siblings(path):
     return {other.stem for other in path.parent.glob("*.py")}
 
 
-def strangers(source: str, known: Set[str] = frozenset()) -> set[str]:
+def strangers(source, known=frozenset()):
     """What a script imports beside the package, arrays, tables, the standard library and its ``known`` siblings."""
     return {name.split(".")[0] for name in imported(source)} - IN_EXPERIMENTS - known - set(sys.stdlib_module_names)
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
-def test_a_script_only_uses_the_package(path: Path) -> None:
+def test_a_script_only_uses_the_package(path):
     assert strangers(path.read_text(encoding="utf-8"), siblings(path)) == OTHERS.get(path.stem, set())
 
 
-def mentioned(path: Path) -> set[str]:
+def mentioned(path):
     """Siblings that a script imports, by a statement or, where a part is loaded later, by its name as text."""
     source = path.read_text(encoding="utf-8")
     texts = {str(node.value) for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Constant)}
@@ -126,14 +123,14 @@ def mentioned(path: Path) -> set[str]:
     return siblings(path) & ({*imported(source)} | parts) - {path.stem}
 
 
-def test_scripts_do_not_import_each_other_in_a_circle() -> None:
+def test_scripts_do_not_import_each_other_in_a_circle():
     graph = {path.stem: mentioned(path) for path in SCRIPTS}
     assert {"bench_models", "bench_stonesoup"} <= graph["bench_peers"]
     assert acyclic(graph)
     assert not acyclic(graph | {"bench_models": {"bench_stonesoup"}})  # negative control
 
 
-def test_a_stranger_in_an_experiment_is_caught() -> None:
+def test_a_stranger_in_an_experiment_is_caught():
     source = "import consistency as cs\nimport os\nfrom matplotlib import pyplot\nimport numba"
     assert strangers(source) == {"matplotlib", "numba"}
 
@@ -141,37 +138,37 @@ def test_a_stranger_in_an_experiment_is_caught() -> None:
 # --- what is loaded ----------------------------------------------------------------------------
 
 
-def loaded(statement: str) -> set[str]:
+def loaded(statement):
     """Top-level modules in a new process after ``statement``."""
     code = f"import sys\n{statement}\nprint(*{{name.split('.')[0] for name in sys.modules}})"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     return set(out.stdout.split())
 
 
-def test_diagnostics_load_arrays_and_distributions_only() -> None:
+def test_diagnostics_load_arrays_and_distributions_only():
     names = "import consistency.diagnostics as d\n_ = [getattr(d, name) for name in d.__all__]"
     modules_ = loaded(names)
     assert {"numpy", "scipy"} <= modules_
     assert not modules_ & {"pandas", "matplotlib", "numba", "pydantic", "joblib"}
 
 
-def test_gates_need_arrays_only() -> None:
+def test_gates_need_arrays_only():
     modules_ = loaded("import consistency.testing")
     assert {"numpy", "scipy"} <= modules_
     assert not modules_ & {"pytest", "_pytest", "pandas", "matplotlib", "numba", "pydantic", "joblib", "rich"}
 
 
-def test_the_pytest_plugin_loads_nothing_heavy() -> None:
+def test_the_pytest_plugin_loads_nothing_heavy():
     assert not loaded("import consistency.pytest_plugin") & {"numpy", "scipy", "pandas", "numba", "pydantic", "rich"}
 
 
-def test_the_package_itself_loads_nothing_heavy() -> None:
+def test_the_package_itself_loads_nothing_heavy():
     heavy = {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "typer"}
     assert not loaded("import consistency") & heavy
     assert "numba" in loaded("import consistency; consistency.get_filter('ekf-uvd')")  # negative control
 
 
-def test_engines_of_clusters_are_loaded_when_they_are_chosen() -> None:
+def test_engines_of_clusters_are_loaded_when_they_are_chosen():
     engines = {"dask", "distributed", "submitit"}
     choose = "import consistency.bench.runs.montecarlo\n"
     choose += "from consistency.bench.runs.backends.choosing import executor_for\n"
@@ -181,7 +178,7 @@ def test_engines_of_clusters_are_loaded_when_they_are_chosen() -> None:
     assert loaded(choose.format("slurm")) & engines == {"submitit"}
 
 
-def test_a_new_session_lists_the_public_names() -> None:
+def test_a_new_session_lists_the_public_names():
     """``dir``, and so tab completion, without loading what the names stand for."""
     code = "import sys, consistency; print(*dir(consistency)); print(*sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
@@ -190,17 +187,17 @@ def test_a_new_session_lists_the_public_names() -> None:
     assert "numpy" not in modules_
 
 
-def test_vision_needs_opencv_for_images_alone() -> None:
+def test_vision_needs_opencv_for_images_alone():
     assert not loaded("import consistency.vision") & {"cv2", "numba", "pandas", "matplotlib"}
 
 
-def test_the_help_loads_nothing_heavy() -> None:
+def test_the_help_loads_nothing_heavy():
     modules_ = loaded("from consistency.commands.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
     assert "typer" in modules_
     assert not modules_ & {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib"}
 
 
-def test_every_public_name_is_there() -> None:
+def test_every_public_name_is_there():
     for name in consistency.__all__:
         assert getattr(consistency, name) is not None
     with pytest.raises(AttributeError, match="consistency attribute nonsense"):

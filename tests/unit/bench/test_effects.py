@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import pandas as pd
@@ -15,17 +13,15 @@ import consistency as cs
 from consistency.bench.filters.stepping import step_through
 from consistency.bench.models import point, stereo
 from consistency.bench.runs.montecarlo import run_log, simulate_log
-from consistency.bench.scenario.effects import EFFECTS, Context, FieldOfView, ListedEffect, Observations
+from consistency.bench.scenario.effects import EFFECTS, FieldOfView, ListedEffect, Observations
 from consistency.bench.scenario.tables.toml_tables import Count, Positive, Triple
 from consistency.bench.simulation import World, draw_landmarks, planned_controls
 from consistency.bench.simulation.world import purpose_of
 from consistency.bench.store.log import read_log
 from consistency.bench.store.trial_rows import observations_table
-from consistency.referee.types import Array
 
-Small = Callable[..., cs.Scenario]
-CALLS: list[str] = []  # labels of effects in the order in which they were applied
-DRAWN: dict[str, Array] = {}  # first numbers of each effect, by label
+CALLS = []  # labels of effects in the order in which they were applied
+DRAWN = {}  # first numbers of each effect, by label
 FIRST = {"kind": "draw", "name": "first"}
 SECOND = {"kind": "draw", "name": "second"}
 
@@ -38,7 +34,7 @@ class Shift(ListedEffect):
     kind: Literal["shift"] = "shift"
     by: Triple
 
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+    def apply(self, observations, rng, context):
         CALLS.append(self.label)
         return observations.with_z(observations.z + np.array(self.by))
 
@@ -51,7 +47,7 @@ class Scale(ListedEffect):
     kind: Literal["scale"] = "scale"
     factor: Positive
 
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+    def apply(self, observations, rng, context):
         CALLS.append(self.label)
         return observations.with_z(observations.z * self.factor)
 
@@ -61,7 +57,7 @@ class Draw(ListedEffect):
 
     kind: Literal["draw"] = "draw"
 
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+    def apply(self, observations, rng, context):
         CALLS.append(self.label)
         DRAWN[self.label] = rng.standard_normal(5)
         return observations
@@ -75,7 +71,7 @@ class Ghosts(ListedEffect):
     count: Count
     length: Count
 
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+    def apply(self, observations, rng, context):
         start = rng.integers(1, context.steps - self.length + 2, self.count)
         pixel = rng.uniform([-50.0, -40.0, 5.0], [50.0, 40.0, 15.0], (self.count, 3))
         thing = np.repeat(np.arange(self.count), self.length)
@@ -88,7 +84,7 @@ class Mistaken(ListedEffect):
 
     kind: Literal["mistaken"] = "mistaken"
 
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+    def apply(self, observations, rng, context):
         step = observations.step
         row = np.flatnonzero((step[:-2] == step[1:-1]) & (step[:-2] % 10 == 0) & (np.diff(step, prepend=0)[:-2] > 0))
         z, source = observations.z.copy(), observations.sources.copy()
@@ -102,9 +98,9 @@ class Broken(ListedEffect):
     kind: Literal["broken"] = "broken"
     mistake: str
 
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+    def apply(self, observations, rng, context):
         o, one = observations, np.ones(1, int)
-        made: dict[str, Callable[[], Observations]] = {
+        made = {
             "shape": lambda: o.with_z(o.z[:, :2]),
             "NaN": lambda: o.with_z(np.where(o.landmark[:, None] == o.landmark[0], np.nan, o.z)),
             "step zero": lambda: o.add(0 * one, 0 * one, o.z[:1]),
@@ -122,28 +118,26 @@ class Silent(ListedEffect):
     draws: ClassVar[bool] = False
     kind: Literal["silent"] = "silent"
 
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+    def apply(self, observations, rng, context):
         return observations.with_z(observations.z + rng.standard_normal(3))
 
 
 @pytest.fixture(autouse=True)
-def kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+def kinds(monkeypatch):
     for effect in (Shift, Scale, Draw, Ghosts, Mistaken, Broken, Silent):
         monkeypatch.setitem(EFFECTS, effect.model_fields["kind"].default, effect)
     CALLS.clear()
     DRAWN.clear()
 
 
-def with_effects(
-    small: Small, *effects: dict[str, Any], name: str = "herath2007-stereo", **changes: Any
-) -> cs.Scenario:
+def with_effects(small, *effects, name="herath2007-stereo", **changes):
     return small(name, truth__sensor__effects=effects, **changes)
 
 
 # --- the first three ------------------------------------------------------------------------------
 
 
-def plainly(scenario: cs.Scenario, run: int, seed: int) -> tuple[Array, Array, Array]:
+def plainly(scenario, run, seed):
     """Steps, landmarks and z of a trial without any effects as parts: one loop over steps, noise at the end."""
     truth, sensor = scenario.truth, scenario.truth.sensor
     streams = [np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run, purpose))) for purpose in (0, 1)]
@@ -175,10 +169,8 @@ def plainly(scenario: cs.Scenario, run: int, seed: int) -> tuple[Array, Array, A
 
 @pytest.mark.parametrize("noise_on", ["odometry", "motion"])
 @pytest.mark.parametrize("name", ["herath2007-stereo", "herath2007-xyz"])
-def test_field_of_view_noise_and_search_range_are_a_plain_sensor(
-    small: Small, tilted: dict[str, list[float]], name: str, noise_on: str
-) -> None:
-    changes: dict[str, Any] = {"truth__sensor__disparity": (4.0, 9.0)} if name == "herath2007-stereo" else {}
+def test_field_of_view_noise_and_search_range_are_a_plain_sensor(small, tilted, name, noise_on):
+    changes = {"truth__sensor__disparity": (4.0, 9.0)} if name == "herath2007-stereo" else {}
     scenario = small(name, truth__motion__noise_on=noise_on, truth__sensor__mount=tilted, **changes)
     trial = cs.simulate(scenario, run=2, seed=3)
     step, landmark, z = plainly(scenario, 2, 3)
@@ -189,18 +181,18 @@ def test_field_of_view_noise_and_search_range_are_a_plain_sensor(
 
 
 @pytest.mark.parametrize("name", ["linear-gaussian", "herath2007-xyz"])
-def test_a_linear_sensor_looks_from_the_planned_path(small: Small, name: str) -> None:
+def test_a_linear_sensor_looks_from_the_planned_path(small, name):
     world, rng = World(small(name).truth), np.random.default_rng(0)
     aside = world.reference + np.array([0.0, 0.0, 0.5])
 
-    def seen(path: Array) -> Array:
+    def seen(path):
         context = world.context(path)
         return FieldOfView().apply(context.ideal(), rng, context).landmark
 
     assert np.array_equal(seen(aside), seen(world.reference)) == (name == "linear-gaussian")
 
 
-def test_an_empty_list_is_no_list(small: Small) -> None:
+def test_an_empty_list_is_no_list(small):
     base = cs.load_scenario("herath2007-stereo")
     empty = base.variant("empty", truth__sensor__effects=[])
     assert empty.hash == base.hash
@@ -217,7 +209,7 @@ def test_an_empty_list_is_no_list(small: Small) -> None:
 # --- order ------------------------------------------------------------------------------------------
 
 
-def test_effects_are_applied_in_order_and_before_the_search_range(small: Small) -> None:
+def test_effects_are_applied_in_order_and_before_the_search_range(small):
     wide = {"truth__sensor__disparity": (1e-6, 1e6)}
     plain = cs.simulate(with_effects(small, **wide))
     shift, scale = {"kind": "shift", "by": (0.0, 0.0, 5.0)}, {"kind": "scale", "factor": 2.0}
@@ -232,8 +224,8 @@ def test_effects_are_applied_in_order_and_before_the_search_range(small: Small) 
     assert np.array_equal(found.landmark, plain.landmark[(expected >= 10.0) & (expected <= 20.0)])
 
 
-@pytest.mark.parametrize(("noise_on", "times"), [("odometry", 0), ("motion", 3)])
-def test_what_is_the_same_in_every_run_is_done_once(small: Small, noise_on: str, times: int) -> None:
+@pytest.mark.parametrize("noise_on, times", [("odometry", 0), ("motion", 3)])
+def test_what_is_the_same_in_every_run_is_done_once(small, noise_on, times):
     scale = {"kind": "scale", "factor": 2.0}
     world = World(with_effects(small, scale, truth__motion__noise_on=noise_on).truth)
     alone = World(with_effects(small, scale, truth__motion__noise_on=noise_on).truth)
@@ -247,15 +239,15 @@ def test_what_is_the_same_in_every_run_is_done_once(small: Small, noise_on: str,
 # --- random numbers -----------------------------------------------------------------------------------
 
 
-def test_the_purpose_of_a_name_never_changes() -> None:
+def test_the_purpose_of_a_name_never_changes():
     """Results that are kept depend on it."""
     assert purpose_of("noise") == 1
     assert purpose_of("bias") == 18034705287583516686  # the first 8 bytes of its SHA-256
     assert len({purpose_of(name) for name in ("bias", "first", "second", "ghosts")}) == 4
 
 
-def test_random_numbers_of_an_effect_depend_on_its_name_alone(small: Small) -> None:
-    def drawn(*effects: dict[str, Any], run: int = 0, seed: int = 0) -> dict[str, Array]:
+def test_random_numbers_of_an_effect_depend_on_its_name_alone(small):
+    def drawn(*effects, run=0, seed=0):
         DRAWN.clear()
         cs.simulate(with_effects(small, *effects), run, seed)
         return dict(DRAWN)
@@ -270,7 +262,7 @@ def test_random_numbers_of_an_effect_depend_on_its_name_alone(small: Small) -> N
     assert all(not np.array_equal(other, both["first"]) for other in others)
 
 
-def test_an_effect_that_says_it_draws_nothing_gets_nothing(small: Small) -> None:
+def test_an_effect_that_says_it_draws_nothing_gets_nothing(small):
     with pytest.raises(TypeError, match="'silent' says draws = False and asks for random numbers"):
         cs.simulate(with_effects(small, {"kind": "silent"}))
 
@@ -280,7 +272,7 @@ def test_an_effect_that_says_it_draws_nothing_gets_nothing(small: Small) -> None
 GHOSTS = {"kind": "ghosts", "count": 4, "length": 12}
 
 
-def test_things_have_ids_of_their_own_and_labels(small: Small) -> None:
+def test_things_have_ids_of_their_own_and_labels(small):
     plain, trial = cs.simulate(with_effects(small), 1), cs.simulate(with_effects(small, GHOSTS), 1)
     N = len(plain.landmarks)
     assert plain.source is None
@@ -303,14 +295,14 @@ def test_things_have_ids_of_their_own_and_labels(small: Small) -> None:
         trial.source[0] = 0
 
 
-def test_two_effects_do_not_share_ids(small: Small) -> None:
+def test_two_effects_do_not_share_ids(small):
     trial = cs.simulate(with_effects(small, GHOSTS, {**GHOSTS, "name": "more", "count": 2}))
     assert trial.n_landmarks == len(trial.landmarks) + 6
     assert len(trial.things) == 6
     assert np.all(np.bincount(trial.landmark)[trial.things] == 12)
 
 
-def test_a_mismatch_keeps_its_id_and_says_what_it_is_of(small: Small) -> None:
+def test_a_mismatch_keeps_its_id_and_says_what_it_is_of(small):
     plain, trial = cs.simulate(with_effects(small)), cs.simulate(with_effects(small, {"kind": "mistaken"}))
     row = np.flatnonzero(trial.spurious)
     assert len(row) > 3
@@ -320,14 +312,14 @@ def test_a_mismatch_keeps_its_id_and_says_what_it_is_of(small: Small) -> None:
     assert trial.n_landmarks == plain.n_landmarks
 
 
-def test_things_that_are_never_found_leave_no_label(small: Small) -> None:
+def test_things_that_are_never_found_leave_no_label(small):
     trial = cs.simulate(with_effects(small, GHOSTS, truth__sensor__disparity=(20.0, 32.0)))
     assert trial.source is None
     assert "source" not in observations_table([trial])
 
 
 @pytest.mark.parametrize("name", ["ekf-uvd", "ekf-xyz"])
-def test_a_filter_takes_a_thing_for_a_landmark(small: Small, name: str) -> None:
+def test_a_filter_takes_a_thing_for_a_landmark(small, name):
     scenario = with_effects(small, GHOSTS, truth__steps=80)
     trial, filter_ = cs.simulate(scenario, run=1), cs.get_filter(name)
     kernel, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
@@ -345,7 +337,7 @@ def test_a_filter_takes_a_thing_for_a_landmark(small: Small, name: str) -> None:
 
 
 @pytest.mark.parametrize("effect", [GHOSTS, {"kind": "mistaken"}])
-def test_labels_go_through_a_log(small: Small, tmp_path: Path, effect: dict[str, Any]) -> None:
+def test_labels_go_through_a_log(small, tmp_path, effect):
     scenario = with_effects(small, effect)
     simulate_log(scenario, runs=2, seed=5, out=tmp_path / "log")
     table = pd.read_parquet(tmp_path / "log" / "observations.parquet")
@@ -364,7 +356,7 @@ def test_labels_go_through_a_log(small: Small, tmp_path: Path, effect: dict[str,
     pd.testing.assert_frame_equal(logged.estimates, direct.estimates, check_exact=True)
 
 
-def test_a_run_without_spurious_rows_is_labelled_with_the_others(small: Small) -> None:
+def test_a_run_without_spurious_rows_is_labelled_with_the_others(small):
     """Runs of one table: where one has labels, those of the others are the landmarks themselves."""
     trials = [cs.simulate(with_effects(small)), cs.simulate(with_effects(small, GHOSTS), 1)]
     table = observations_table(trials)
@@ -372,17 +364,17 @@ def test_a_run_without_spurious_rows_is_labelled_with_the_others(small: Small) -
 
 
 @pytest.fixture
-def labelled(small: Small, tmp_path: Path) -> Path:
+def labelled(small, tmp_path):
     simulate_log(with_effects(small, GHOSTS), runs=1, seed=0, out=tmp_path / "log")
     return tmp_path / "log"
 
 
-def change(folder: Path, **columns: Callable[[pd.DataFrame], Any]) -> None:
+def change(folder, **columns):
     path = folder / "observations.parquet"
     pd.read_parquet(path).assign(**columns).to_parquet(path)
 
 
-def test_a_log_without_positions_knows_landmarks_by_their_labels(labelled: Path) -> None:
+def test_a_log_without_positions_knows_landmarks_by_their_labels(labelled):
     with_positions = read_log(labelled).trials[0]
     (labelled / "landmarks.parquet").unlink()
     trial = read_log(labelled).trials[0]
@@ -391,7 +383,7 @@ def test_a_log_without_positions_knows_landmarks_by_their_labels(labelled: Path)
     assert np.array_equal(trial.things, with_positions.things)
 
 
-def test_things_of_a_log_may_have_any_number(labelled: Path) -> None:
+def test_things_of_a_log_may_have_any_number(labelled):
     """Also one that lies between those of landmarks: ids of things come last all the same."""
     before = read_log(labelled).trials[0]
     table = pd.read_parquet(labelled / "observations.parquet")
@@ -405,7 +397,7 @@ def test_things_of_a_log_may_have_any_number(labelled: Path) -> None:
     assert np.array_equal(before.landmarks, after.landmarks)
 
 
-BAD_LABELS: dict[str, tuple[dict[str, Any], str]] = {
+BAD_LABELS = {
     "below -1": ({"source": lambda t: t["source"].where(t.index != 3, -2)}, r"row 3: .* a source is one of them or -1"),
     "negative landmark": ({"landmark": lambda t: t["landmark"].where(t.index != 4, -7)}, r"row 4: .*numbered from 0"),
     "half": ({"source": lambda t: t["source"].astype(float).where(t.index != 2, 0.5)}, r"'source', row 2: not a whole"),
@@ -414,14 +406,14 @@ BAD_LABELS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_LABELS)
-def test_bad_labels_are_refused(labelled: Path, case: str) -> None:
+def test_bad_labels_are_refused(labelled, case):
     columns, complaint = BAD_LABELS[case]
     change(labelled, **columns)
     with pytest.raises(cs.InputError, match=complaint):
         read_log(labelled)
 
 
-def test_a_linear_log_holds_landmarks_only(linear: cs.Scenario, tmp_path: Path) -> None:
+def test_a_linear_log_holds_landmarks_only(linear, tmp_path):
     simulate_log(linear, runs=1, seed=0, out=tmp_path / "log")
     change(
         tmp_path / "log",
@@ -437,7 +429,7 @@ def test_a_linear_log_holds_landmarks_only(linear: cs.Scenario, tmp_path: Path) 
 SHIFT = {"kind": "shift", "by_px": [0.0, 0.0, 1.0]}
 OWN = {"broken", "draw", "ghosts", "mistaken", "scale", "shift", "silent"}
 ALL = ", ".join(f"'{kind}'" for kind in sorted(OWN | set(EFFECTS)))
-MISTAKES: dict[str, tuple[Any, str]] = {
+MISTAKES = {
     "unknown kind": ([{"kind": "blur"}], rf"\.effects\.0\.kind': 'blur' is not one of .*{ALL}"),
     "no kind": ([{"by_px": [0.0, 0.0, 1.0]}], r"\.effects\.0\.kind': missing; it must be given"),
     "kind is a list": ([{"kind": ["shift"]}], r"\.effects\.0\.kind': .* is not one of"),
@@ -466,14 +458,14 @@ MISTAKES: dict[str, tuple[Any, str]] = {
 
 
 @pytest.mark.parametrize("case", MISTAKES)
-def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str) -> None:
+def test_a_mistake_is_answered_with_file_and_key(tmp_path, case):
     effects, complaint = MISTAKES[case]
     with pytest.raises(cs.InputError, match=r"mine\.toml: key 'truth\.sensor" + complaint) as e:
         load(tmp_path, put("truth.sensor.effects", effects))
     assert "\n" not in str(e.value)
 
 
-def test_an_effect_is_read_with_units_and_name(tmp_path: Path) -> None:
+def test_an_effect_is_read_with_units_and_name(tmp_path):
     scenario = load(tmp_path, put("truth.sensor.effects", [SHIFT, SHIFT | {"name": "again"}]))
     assert scenario.truth.sensor.effects == (
         Shift(by=(0.0, 0.0, 1.0)),
@@ -481,7 +473,7 @@ def test_an_effect_is_read_with_units_and_name(tmp_path: Path) -> None:
     )
 
 
-def test_an_effect_of_another_sensor_is_refused(small: Small) -> None:
+def test_an_effect_of_another_sensor_is_refused(small):
     motion = {"truth__motion__noise_on": "motion"}
     with pytest.raises(ValueError, match="'ghosts' works on a sensor xyz or uvd, not 'linear'"):
         with_effects(small, GHOSTS, name="linear-gaussian", **motion)
@@ -498,18 +490,18 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("mistake", BROKEN)
-def test_an_effect_with_a_mistake_is_named(small: Small, mistake: str) -> None:
+def test_an_effect_with_a_mistake_is_named(small, mistake):
     with pytest.raises(ValueError, match=f"the effect 'broken' must give {BROKEN[mistake]}"):
         cs.simulate(with_effects(small, {"kind": "broken", "mistake": mistake}, name="herath2007-xyz"))
 
 
-def test_a_linear_world_has_no_room_for_things(small: Small) -> None:
+def test_a_linear_world_has_no_room_for_things(small):
     scenario = with_effects(small, {"kind": "broken", "mistake": "thing"}, name="linear-gaussian")
     with pytest.raises(cs.InputError, match=r"'broken' \(truth\.sensor\.effects\).* use the model 'xyz' or 'uvd'"):
         cs.simulate(scenario)
 
 
-def test_effects_may_bring_a_world_into_the_search_range(small: Small) -> None:
+def test_effects_may_bring_a_world_into_the_search_range(small):
     far = {"truth__sensor__disparity": (100.0, 132.0)}
     with pytest.raises(cs.InputError, match="no landmark comes into view"):
         cs.run_trials(with_effects(small, **far), ["ekf-uvd"], runs=1)

@@ -1,9 +1,5 @@
 """f, h and their inverses: Jacobians by complex step, signs, mounts, and the kernels composed from them."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +7,7 @@ from hypothesis import strategies as st
 
 from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.kernel import unicycle
-from consistency.bench.filters.kernel.part_functions import Slam, State
+from consistency.bench.filters.kernel.part_functions import State
 from consistency.bench.filters.kernel.update_steps import linearise, linearise_at, make_work, observe, place_observed
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.kf import Reference, place_about_reference
@@ -20,7 +16,6 @@ from consistency.bench.models import motion, point, stereo
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.types import Control
-from consistency.referee.types import Array
 
 F, B = 150.0, 0.09
 METRES = st.floats(-20.0, 20.0)
@@ -30,7 +25,7 @@ DISPARITY = st.floats(0.5, 60.0)
 ANGLE = st.floats(-7.0, 7.0)
 
 
-def complex_step(function: Callable[[Array], Array], at: Array) -> Array:
+def complex_step(function, at):
     """Jacobian by Im f(x + i h) / h, exact to rounding (Squire & Trapp 1998)."""
     columns = []
     for j in range(len(at)):
@@ -40,7 +35,7 @@ def complex_step(function: Callable[[Array], Array], at: Array) -> Array:
     return np.column_stack(columns)
 
 
-def close(a: Array, b: Array, tolerance: float = 1e-12) -> bool:
+def close(a, b, tolerance=1e-12):
     """Equal within ``tolerance`` of the largest entry."""
     return bool(np.abs(np.subtract(a, b)).max() <= tolerance * max(1.0, np.abs(b).max()))
 
@@ -49,7 +44,7 @@ def close(a: Array, b: Array, tolerance: float = 1e-12) -> bool:
 
 
 @given(METRES, METRES, ANGLE, st.floats(0.01, 1.0), st.floats(-3.0, 3.0), st.floats(-2.0, 2.0))
-def test_motion_jacobians(x: float, y: float, heading: float, dt: float, v: float, omega: float) -> None:
+def test_motion_jacobians(x, y, heading, dt, v, omega):
     exact = complex_step(lambda p: motion.unicycle(*p, dt, v, omega), np.array([x, y, heading]))
     assert close(np.array(motion.unicycle_jacobian(heading, dt, v)), exact[:2, 2])
     G = complex_step(lambda c: motion.unicycle(x, y, heading, dt, *c), np.array([v, omega]))
@@ -60,11 +55,11 @@ def test_motion_jacobians(x: float, y: float, heading: float, dt: float, v: floa
     assert close(np.array([[xx, xy, 0], [xy, yy, 0], [0, 0, hh]]), G @ np.diag([0.09, 0.04]) @ G.T)
 
 
-def test_robot_drives_along_its_heading_and_turns_counter_clockwise() -> None:
+def test_robot_drives_along_its_heading_and_turns_counter_clockwise():
     assert np.allclose(motion.unicycle(1.0, 2.0, np.pi / 2, 0.5, 2.0, 0.4), (1.0, 3.0, np.pi / 2 + 0.2))
 
 
-def test_dead_reckoning_repeats_single_steps(rng: np.random.Generator) -> None:
+def test_dead_reckoning_repeats_single_steps(rng):
     controls = np.column_stack([rng.uniform(0.05, 0.2, 40), rng.normal(size=(40, 2))])
     path = motion.dead_reckoning(np.array([1.0, -2.0, 0.7]), controls)
     pose = path[0]
@@ -77,30 +72,30 @@ def test_dead_reckoning_repeats_single_steps(rng: np.random.Generator) -> None:
 
 
 @given(AHEAD, METRES, METRES)
-def test_projection_jacobian(x: float, y: float, z: float) -> None:
+def test_projection_jacobian(x, y, z):
     exact = complex_step(lambda p: stereo.project(*p, F, B), np.array([x, y, z]))
     assert close(np.reshape(stereo.project_jacobian(x, y, z, F, B), (3, 3)), exact)
 
 
 @given(PIXELS, PIXELS, DISPARITY)
-def test_triangulation_jacobian(u: float, v: float, d: float) -> None:
+def test_triangulation_jacobian(u, v, d):
     exact = complex_step(lambda p: stereo.triangulate(*p, F, B), np.array([u, v, d]))
     assert close(np.reshape(stereo.triangulate_jacobian(u, v, d, F, B), (3, 3)), exact)
 
 
 @given(AHEAD, METRES, METRES)
-def test_triangulation_inverts_projection(x: float, y: float, z: float) -> None:
+def test_triangulation_inverts_projection(x, y, z):
     back = stereo.triangulate(*stereo.project(x, y, z, F, B), F, B)
     assert np.allclose(back, (x, y, z), rtol=1e-12, atol=1e-12)
 
 
-def test_signs_of_pixels() -> None:
+def test_signs_of_pixels():
     """Left of the axis u < 0, above it v < 0, and the disparity is f B / x."""
     u, v, d = stereo.project(2.0, 0.5, 0.25, F, B)
     assert (u, v, d) == (-37.5, -18.75, F * B / 2.0)
 
 
-def test_published_nominal_pixel() -> None:
+def test_published_nominal_pixel():
     """Herath et al. (2007) sec. 4.5: a point 10 m ahead and 1 m aside is seen at |u| = 15 px.
 
     The text prints d = 1.32 px; with its f = 150 px and B = 0.09 m, f B / x is 1.35 px.
@@ -114,19 +109,19 @@ def test_published_nominal_pixel() -> None:
 
 
 @given(METRES, METRES, ANGLE, METRES, METRES, METRES)
-def test_robot_frame_inverse(px: float, py: float, heading: float, lx: float, ly: float, lz: float) -> None:
+def test_robot_frame_inverse(px, py, heading, lx, ly, lz):
     back = point.to_world(px, py, heading, *point.to_robot(px, py, heading, lx, ly, lz))
     assert np.allclose(back, (lx, ly, lz), rtol=0, atol=1e-12 * 100)
 
 
-def test_robot_frame_signs() -> None:
+def test_robot_frame_signs():
     """A robot facing world +y: a point further along y is ahead, one at smaller x is to the right."""
     assert np.allclose(point.to_robot(1.0, 1.0, np.pi / 2, 1.0, 3.0, 0.5), (2.0, 0.0, 0.5))
     assert np.allclose(point.to_robot(1.0, 1.0, np.pi / 2, 2.0, 1.0, 0.0), (0.0, -1.0, 0.0))
 
 
 @given(METRES, METRES, METRES, ANGLE, st.floats(-1.5, 1.5), ANGLE)
-def test_mount_inverse(x: float, y: float, z: float, roll: float, pitch: float, heading: float) -> None:
+def test_mount_inverse(x, y, z, roll, pitch, heading):
     mount = Mount(position=(0.3, -0.2, 0.5), rotation=(roll, pitch, heading)).packed()
     there = point.to_sensor(x, y, z, mount)
     assert np.allclose(point.from_sensor(*there, mount), (x, y, z), rtol=0, atol=1e-11)
@@ -136,7 +131,7 @@ def test_mount_inverse(x: float, y: float, z: float, roll: float, pitch: float, 
 # --- sensors: textbook and kernels ---------------------------------------------------------------
 
 
-def _sensor(tilted: dict[str, list[float]]) -> BelievedSensor:
+def _sensor(tilted):
     return BelievedSensor(model="uvd", sigma=(1.0, 1.0, 0.5), f=F, B=B, mount=Mount.model_validate(tilted))
 
 
@@ -147,9 +142,9 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("pose", "landmark"), CASES)
+@pytest.mark.parametrize("pose, landmark", CASES)
 @pytest.mark.parametrize("uvd", [False, True])
-def test_textbook_sensor_jacobians(pose: Array, landmark: Array, uvd: bool, tilted: dict[str, list[float]]) -> None:
+def test_textbook_sensor_jacobians(pose, landmark, uvd, tilted):
     sensor = PointSensor(_sensor(tilted), uvd)
     Hp, Hl = sensor.jacobians(pose, landmark)
     assert close(Hp, complex_step(lambda p: sensor.measure(p, landmark), pose))
@@ -162,16 +157,14 @@ def test_textbook_sensor_jacobians(pose: Array, landmark: Array, uvd: bool, tilt
     assert close(Hp + Hl @ Jp, np.zeros((3, 3)), 1e-11)
 
 
-def _slam(sensor: BelievedSensor, uvd: bool) -> Slam:
+def _slam(sensor, uvd):
     belief = Belief(motion=BelievedMotion(sigma_v=0.1, sigma_omega=0.1), sensor=sensor)
     return ekf.parts(Problem(belief, np.zeros(3)), np.zeros((0, 3)), uvd)
 
 
-@pytest.mark.parametrize(("pose", "landmark"), CASES)
+@pytest.mark.parametrize("pose, landmark", CASES)
 @pytest.mark.parametrize("uvd", [False, True])
-def test_kernels_equal_the_textbook_sensor(
-    pose: Array, landmark: Array, uvd: bool, tilted: dict[str, list[float]]
-) -> None:
+def test_kernels_equal_the_textbook_sensor(pose, landmark, uvd, tilted):
     belief = _sensor(tilted)
     sensor, slam = PointSensor(belief, uvd), _slam(belief, uvd)
     frame, expected = unicycle.robot_frame(pose), sensor.measure(pose, landmark)
@@ -188,7 +181,7 @@ def test_kernels_equal_the_textbook_sensor(
         assert close(kernel, textbook)
 
 
-def test_linear_kernel_is_the_first_order_expansion(tilted: dict[str, list[float]]) -> None:
+def test_linear_kernel_is_the_first_order_expansion(tilted):
     belief = _sensor(tilted)
     sensor = PointSensor(belief, uvd=False)
     pose0, landmark0 = CASES[0]
@@ -210,7 +203,7 @@ def test_linear_kernel_is_the_first_order_expansion(tilted: dict[str, list[float
     assert not close(z, sensor.measure(pose0 + step, landmark0 + move), 1e-3)
 
 
-def test_converted_noise_is_propagated_to_first_order(rng: np.random.Generator) -> None:
+def test_converted_noise_is_propagated_to_first_order(rng):
     """R = J diag(sigma^2) J' with J the Jacobian of eq. 21 at the measurement."""
     sensor = BelievedSensor(model="uvd", sigma=(1.34, 1.53, 0.65), f=F, B=B)
     z = np.column_stack([rng.uniform(-100, 100, (6, 2)), rng.uniform(2, 20, 6)])

@@ -353,7 +353,7 @@ def test_innovations_with_their_covariances(tmp_path):
         read_innovations(tmp_path / "a.npz")
 
 
-def test_the_plot_is_over_time_where_there_is_one() -> None:
+def test_the_plot_is_over_time_where_there_is_one():
     watched = changed()
     _, below = drawn(partial(monitor_drawing, watched)).axes
     assert below.get_xlabel() == "t / s"
@@ -363,7 +363,7 @@ def test_the_plot_is_over_time_where_there_is_one() -> None:
     assert drawn(partial(monitor_drawing, unknown)).axes[1].get_xlabel() == "step"
 
 
-def test_no_alarm_says_what_analyse_asks() -> None:
+def test_no_alarm_says_what_analyse_asks():
     quiet = str(document_of(changed(1.0)).opening)
     assert "'consistency analyse --innovations optimal' tests whether it is right exactly" in quiet
     assert "analyse" not in str(document_of(changed(1.0, tolerance=1.0)).opening)

@@ -1,12 +1,8 @@
 """Runs are a function of (scenario, filter, seed, run) alone, and whatever a filter does is a result."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,9 +13,7 @@ import consistency as cs
 from consistency.bench.filters.stepping import run_filter
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.store.results import joined
-from consistency.bench.types import Control, Gaussian, Observation, Trial
-
-Small = Callable[..., cs.Scenario]
+from consistency.bench.types import Trial
 
 
 class Mine:
@@ -27,23 +21,23 @@ class Mine:
 
     name = "mine"
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.inner = cs.get_filter("ekf-xyz")
 
-    def init(self, problem: Any) -> Any:
+    def init(self, problem):
         return self.inner.init(problem)
 
-    def predict(self, state: Any, control: Control) -> Any:
+    def predict(self, state, control):
         return self.inner.predict(state, control)
 
-    def update(self, state: Any, observation: Observation) -> tuple[Any, Any]:
+    def update(self, state, observation):
         return self.inner.update(state, observation)
 
-    def pose(self, state: Any) -> Gaussian:
+    def pose(self, state):
         return self.inner.pose(state)
 
 
-def equal(a: cs.Results, b: cs.Results) -> bool:
+def equal(a, b):
     """Same tables to the bit."""
     for name in ("estimates", "failures", "truth", "landmarks"):
         pd.testing.assert_frame_equal(getattr(a, name), getattr(b, name), check_exact=True)
@@ -51,18 +45,18 @@ def equal(a: cs.Results, b: cs.Results) -> bool:
 
 
 @pytest.fixture(scope="module")
-def ten(uvd: cs.Scenario) -> cs.Results:
+def ten(uvd):
     return cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=1)
 
 
 # --- the same bits -------------------------------------------------------------------------------
 
 
-def test_number_of_workers_does_not_matter(uvd: cs.Scenario, ten: cs.Results) -> None:
+def test_number_of_workers_does_not_matter(uvd, ten):
     assert equal(ten, cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=2))
 
 
-def test_number_of_runs_does_not_matter(uvd: cs.Scenario, ten: cs.Results) -> None:
+def test_number_of_runs_does_not_matter(uvd, ten):
     more = cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=15, seed=3, jobs=2)
     for name in ("estimates", "truth"):
         table = getattr(more, name)
@@ -70,20 +64,20 @@ def test_number_of_runs_does_not_matter(uvd: cs.Scenario, ten: cs.Results) -> No
         pd.testing.assert_frame_equal(first, getattr(ten, name), check_exact=True)
 
 
-def test_filters_that_ran_apart_are_joined(uvd: cs.Scenario, ten: cs.Results) -> None:
+def test_filters_that_ran_apart_are_joined(uvd, ten):
     parts = [cs.run_trials(uvd, [name], runs=10, seed=3, jobs=1) for name in ("ekf-uvd", "ekf-xyz")]
     whole = joined(parts)
     assert equal(whole, ten)
     assert whole.filters == ten.filters
 
 
-def test_seed_matters(uvd: cs.Scenario, ten: cs.Results) -> None:
+def test_seed_matters(uvd, ten):
     """Negative control of the tests above."""
     other = cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=4, jobs=1)
     assert not np.array_equal(other.estimates["x"], ten.estimates["x"])
 
 
-def test_an_untouched_process_gives_the_same_bits(xyz: cs.Scenario) -> None:
+def test_an_untouched_process_gives_the_same_bits(xyz):
     """A filter of one's own is sent to processes; the built-in one beside it must not notice."""
     pooled = cs.run_trials(xyz, ["ekf-xyz", Mine()], runs=4, seed=1, jobs=2)
     alone = cs.run_trials(xyz, ["ekf-xyz", Mine()], runs=4, seed=1, jobs=1)
@@ -96,7 +90,7 @@ def test_an_untouched_process_gives_the_same_bits(xyz: cs.Scenario) -> None:
 # --- filters of the user's own -----------------------------------------------------------------------
 
 
-def test_own_filter_beside_a_name(xyz: cs.Scenario) -> None:
+def test_own_filter_beside_a_name(xyz):
     results = cs.run_trials(xyz, ["ekf-xyz", Mine()], runs=3, seed=1, jobs=1)
     assert results.filters == ["ekf-xyz", "mine"]
     ours, theirs = (results.estimates[results.estimates["filter"] == name] for name in results.filters)
@@ -106,18 +100,18 @@ def test_own_filter_beside_a_name(xyz: cs.Scenario) -> None:
     assert verdict.statistics["nis_dof"] > 0
 
 
-def test_a_filter_without_a_name_has_that_of_its_class(xyz: cs.Scenario) -> None:
+def test_a_filter_without_a_name_has_that_of_its_class(xyz):
     class Nameless(Mine):
         name = property()  # type: ignore[assignment]
 
     assert cs.run_trials(xyz, [Nameless()], runs=1, jobs=1).filters == ["Nameless"]
 
 
-def test_a_pose_that_is_no_gaussian_is_named(xyz: cs.Scenario) -> None:
+def test_a_pose_that_is_no_gaussian_is_named(xyz):
     class Tuple(Mine):
         name = "tuple"
 
-        def pose(self, state: Any) -> Any:
+        def pose(self, state):
             estimate = super().pose(state)
             return estimate.mean, estimate.covariance
 
@@ -126,14 +120,14 @@ def test_a_pose_that_is_no_gaussian_is_named(xyz: cs.Scenario) -> None:
     assert reason == "TypeError: pose must return cs.Gaussian(mean, covariance), not tuple"
 
 
-def test_a_filter_that_breaks_at_once(xyz: cs.Scenario) -> None:
+def test_a_filter_that_breaks_at_once(xyz):
     class Stillborn(Mine):
         name = "stillborn"
 
-        def init(self, problem: Any) -> Any:
+        def init(self, problem):
             return self.look_up(problem)
 
-        def look_up(self, problem: Any) -> Any:
+        def look_up(self, problem):
             raise KeyError("no such map")
 
     results = cs.run_trials(xyz, [Stillborn()], runs=3, jobs=1)
@@ -148,7 +142,7 @@ def test_a_filter_that_breaks_at_once(xyz: cs.Scenario) -> None:
     assert any("3 of 3 runs failed" in reason for reason in verdict.reasons)
 
 
-def test_a_compiled_filter_that_breaks(small: Small) -> None:
+def test_a_compiled_filter_that_breaks(small):
     """No motion noise believed: the pose covariance never gets any rank, and nothing is claimed of it."""
     scenario = small("herath2007-xyz", belief__motion__sigma_v=0.0, belief__motion__sigma_omega=0.0)
     results = cs.run_trials(scenario, ["ekf-xyz"], runs=2, jobs=1)
@@ -156,7 +150,7 @@ def test_a_compiled_filter_that_breaks(small: Small) -> None:
     assert cs.analyse(results)["ekf-xyz"].status == "failed"
 
 
-def test_a_compiled_filter_given_nonsense_says_in_which_step(uvd: cs.Scenario) -> None:
+def test_a_compiled_filter_given_nonsense_says_in_which_step(uvd):
     trial = cs.simulate(uvd)
     z = trial.z.copy()
     z[trial.first[20] :] = np.nan
@@ -178,7 +172,7 @@ class Same(Mine):
 
 
 @pytest.mark.parametrize(
-    ("options", "complaint"),
+    "options, complaint",
     [
         ({"filters": ["ekf-xyz", "ekf-xyz"]}, "a filter is given twice: ekf-xyz"),
         ({"filters": ["ekf-xyz", Same()]}, "given twice: ekf-xyz"),
@@ -192,7 +186,7 @@ class Same(Mine):
         ({"jobs": -2}, "jobs must be at least 1, or -1"),
     ],
 )
-def test_arguments_that_are_refused(xyz: cs.Scenario, options: dict[str, Any], complaint: str) -> None:
+def test_arguments_that_are_refused(xyz, options, complaint):
     with pytest.raises(cs.InputError, match=complaint):
         cs.run_trials(xyz, **{"filters": ["ekf-xyz"], "runs": 1, "jobs": 1, **options})
 
@@ -200,9 +194,7 @@ def test_arguments_that_are_refused(xyz: cs.Scenario, options: dict[str, Any], c
 # --- stopped and resumed -------------------------------------------------------------------------
 
 
-def test_stopped_and_resumed_gives_the_same_bits(
-    uvd: cs.Scenario, ten: cs.Results, stop_at: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Any
-) -> None:
+def test_stopped_and_resumed_gives_the_same_bits(uvd, ten, stop_at, monkeypatch, tmp_path):
     stop_at(4, KeyboardInterrupt())
     with pytest.raises(Interrupted) as stop:
         cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=1)
@@ -221,7 +213,7 @@ def test_stopped_and_resumed_gives_the_same_bits(
     assert "finished_runs" not in resumed.manifest
 
 
-def test_resuming_keeps_failed_runs(xyz: cs.Scenario, stop_at: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resuming_keeps_failed_runs(xyz, stop_at, monkeypatch):
     filters = [Still("breaks", raises(RuntimeError("out of ideas")), cs.simulate(xyz, 2, seed=1).control(1))]
     whole = cs.run_trials(xyz, filters, runs=6, seed=1, jobs=1)
     stop_at(4, KeyboardInterrupt())
@@ -233,7 +225,7 @@ def test_resuming_keeps_failed_runs(xyz: cs.Scenario, stop_at: Any, monkeypatch:
     assert equal(resumed, whole)
 
 
-def test_resuming_fills_gaps(uvd: cs.Scenario, ten: cs.Results) -> None:
+def test_resuming_fills_gaps(uvd, ten):
     """Workers do not finish in order: run 4 may be missing where run 7 is there."""
     kept = {
         name: table[~table["run"].isin([4, 8, 9])].reset_index(drop=True)
@@ -243,26 +235,22 @@ def test_resuming_fills_gaps(uvd: cs.Scenario, ten: cs.Results) -> None:
     assert equal(cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=2, previous=previous), ten)
 
 
-def test_resuming_what_is_complete_needs_no_compiler(
-    uvd: cs.Scenario, ten: cs.Results, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resuming_what_is_complete_needs_no_compiler(uvd, ten, monkeypatch):
     monkeypatch.setattr("consistency.bench.filters.compiled.Compiled.is_ready", lambda *_: False)
     assert equal(cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=1, previous=ten), ten)
 
 
-def test_resuming_with_fewer_runs_than_there_are_is_refused(uvd: cs.Scenario, ten: cs.Results) -> None:
+def test_resuming_with_fewer_runs_than_there_are_is_refused(uvd, ten):
     """A folder must not hold more runs than its manifest says."""
     with pytest.raises(cs.InputError, match="runs"):
         cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=5, seed=3, jobs=1, previous=ten)
 
 
 @pytest.mark.parametrize(
-    ("change", "key"),
+    "change, key",
     [({"seed": 4}, "seed"), ({"filters": ["ekf-uvd"]}, "filter"), ({"truth__steps": 61}, "scenario")],
 )
-def test_resuming_something_else_is_refused(
-    small: Small, ten: cs.Results, tmp_path: Any, change: dict[str, Any], key: str
-) -> None:
+def test_resuming_something_else_is_refused(small, ten, tmp_path, change, key):
     ten.write(tmp_path / "out")
     scenario = small("herath2007-stereo", **{k: v for k, v in change.items() if k.startswith("truth")})
     filters, seed = change.get("filters", ["ekf-uvd", "ekf-xyz"]), change.get("seed", 3)
@@ -273,11 +261,11 @@ def test_resuming_something_else_is_refused(
 class InPlace(Still):
     """Works on what it is given instead of on a copy."""
 
-    def init(self, problem: Any) -> Any:
+    def init(self, problem):
         problem.start += 1.0
 
 
-def test_a_filter_cannot_change_what_the_next_one_is_given(xyz: cs.Scenario) -> None:
+def test_a_filter_cannot_change_what_the_next_one_is_given(xyz):
     results = cs.run_trials(xyz, [InPlace("in-place"), "ekf-xyz"], runs=2, jobs=1)
     alone = cs.run_trials(xyz, ["ekf-xyz"], runs=2, jobs=1)
     both = results.estimates[results.estimates["filter"] == "ekf-xyz"].reset_index(drop=True)

@@ -1,9 +1,6 @@
 """Factors and floors for a stated covariance: the fit, runs as the unit, what is held out, and the verdict."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,18 +15,18 @@ from consistency.referee.fit_covariance.correct import correct, fit_groups, held
 from consistency.referee.fit_covariance.factors import Block, Factors, blocks_of, fit_alone, fit_factors, run_moments
 from consistency.referee.fit_covariance.floors import fit_runs, floor_interval, likeness, scores
 from consistency.referee.fit_covariance.white_noise import interval_of_ratio
-from consistency.referee.types import Array, Failure
+from consistency.referee.types import Failure
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
-def covariances(rng: np.random.Generator, runs: int, steps: int, n: int, spread: float = 1.0) -> Array:
+def covariances(rng, runs, steps, n, spread=1.0):
     """One shape of a covariance whose size varies from step to step, (runs, steps, n, n)."""
     A = rng.normal(size=(n, n))
     return np.asarray(np.exp(spread * rng.normal(size=(runs, steps, 1, 1))) * (A @ A.T + np.eye(n)))
 
 
-def drawn(rng: np.random.Generator, C: Array, rho: float = 0.0) -> Array:
+def drawn(rng, C, rho=0.0):
     """Errors with covariances C (runs, steps, n, n), whose whitened values depend on those of the step before."""
     runs, steps, n, _ = C.shape
     w = rng.normal(size=(runs, steps, n))
@@ -38,14 +35,12 @@ def drawn(rng: np.random.Generator, C: Array, rho: float = 0.0) -> Array:
     return np.asarray((np.linalg.cholesky(C) @ w[..., None])[..., 0])
 
 
-def record_of(error: Array, P: Array, axes: tuple[str, ...] = ()) -> Record:
+def record_of(error, P, axes=()):
     n = error.shape[-1]
     return Record("est", error, P, nees(error, P), n, axes=axes or POSE[:n], runs=np.arange(len(error)))
 
 
-def wrong(
-    rng: np.random.Generator, runs: int = 24, steps: int = 40, factor: float = 9.0, turn: float = 0.5, rho: float = 0.5
-) -> Record:
+def wrong(rng, runs=24, steps=40, factor=9.0, turn=0.5, rho=0.5):
     """A pose in space whose position is off by one factor and its rotation by another."""
     P = covariances(rng, runs, steps, 6)
     return record_of(
@@ -56,7 +51,7 @@ def wrong(
 # --- blocks and factors -----------------------------------------------------------------------------------------------
 
 
-def test_blocks_go_by_names() -> None:
+def test_blocks_go_by_names():
     names = (*POSE, "vx", "vy", "vz")
     assert [(b.name, b.places) for b in blocks_of(names, 9, False)] == [
         ("position", (0, 1, 2)),
@@ -68,7 +63,7 @@ def test_blocks_go_by_names() -> None:
     assert [b.places for b in blocks_of((), 3, False)] == [(0, 1, 2)]
 
 
-def test_one_factor_is_the_mean_nees_of_runs(rng: np.random.Generator) -> None:
+def test_one_factor_is_the_mean_nees_of_runs(rng):
     P = covariances(rng, 5, 7, 3)
     error = rng.normal(size=(5, 7, 3))
     error[1, 4:] = np.nan
@@ -87,14 +82,14 @@ def test_one_factor_is_the_mean_nees_of_runs(rng: np.random.Generator) -> None:
     assert fit.left_out[2].factor == pytest.approx([np.delete(runs, 2).mean()])
 
 
-def test_factors_are_the_most_likely_ones(rng: np.random.Generator) -> None:
+def test_factors_are_the_most_likely_ones(rng):
     record = wrong(rng, runs=4)
     blocks = blocks_of(POSE, 6, False)
     assert record.covariance is not None
     assert record.error is not None
     P, e = record.covariance, record.error
 
-    def loss(logs: Array) -> float:
+    def loss(logs):
         C = Factors(blocks, np.exp(logs), np.zeros(2)).applied(P)
         return float(nees(e, C).mean() + np.linalg.slogdet(C)[1].mean())
 
@@ -103,14 +98,14 @@ def test_factors_are_the_most_likely_ones(rng: np.random.Generator) -> None:
     assert np.log(fit_factors(Q.mean(axis=0), np.array([3.0, 3.0]))) == pytest.approx(found, abs=1e-4)
 
 
-def test_factors_of_any_size_are_found(rng: np.random.Generator) -> None:
+def test_factors_of_any_size_are_found(rng):
     A = rng.normal(size=(50, 4, 4)) * 10.0 ** rng.uniform(-6, 6, (50, 4, 1))
     Q, sizes = A @ np.swapaxes(A, 1, 2), np.array([3.0, 3.0, 3.0, 1.0])
     x = fit_factors(Q, sizes) ** -0.5
     assert (Q @ x[..., None])[..., 0] * x == pytest.approx(np.broadcast_to(sizes, x.shape), abs=1e-6)
 
 
-def test_runs_are_the_unit(rng: np.random.Generator) -> None:
+def test_runs_are_the_unit(rng):
     record = wrong(rng, runs=6, steps=10)
     assert record.error is not None
     assert record.covariance is not None
@@ -120,7 +115,7 @@ def test_runs_are_the_unit(rng: np.random.Generator) -> None:
         assert tuple(one) == pytest.approx(tuple(other), rel=1e-6)
 
 
-def test_a_covariance_is_scaled_by_blocks() -> None:
+def test_a_covariance_is_scaled_by_blocks():
     P = np.array([[4.0, 1.0, 0.2], [1.0, 5.0, 0.3], [0.2, 0.3, 0.1]])
     factors = Factors((Block("position", (0, 1)), Block("attitude", (2,))), np.array([9.0, 4.0]), np.array([0.5, 0.0]))
     expected = [[36.5, 9.0, 1.2], [9.0, 45.5, 1.8], [1.2, 1.8, 0.4]]
@@ -130,7 +125,7 @@ def test_a_covariance_is_scaled_by_blocks() -> None:
 # --- what is held out -------------------------------------------------------------------------------------------------
 
 
-def test_a_run_has_no_say_in_its_own_factors(rng: np.random.Generator) -> None:
+def test_a_run_has_no_say_in_its_own_factors(rng):
     record = wrong(rng, runs=6)
     assert record.error is not None
     assert record.covariance is not None
@@ -141,7 +136,7 @@ def test_a_run_has_no_say_in_its_own_factors(rng: np.random.Generator) -> None:
     assert (other.used[2][0].factor > 2 * one.used[2][0].factor).all()
 
 
-def test_known_factors_are_found_and_judged_right() -> None:
+def test_known_factors_are_found_and_judged_right():
     """Fails by chance in fewer than 1 in 1e5: bounds are 5 standard errors or more of some 960 steps x 3."""
     found = correct(wrong(np.random.default_rng(), rho=0.0))
     position, attitude = found.fit.factor
@@ -154,7 +149,7 @@ def test_known_factors_are_found_and_judged_right() -> None:
     assert not found.after.ratio.holds(1.2)
 
 
-def test_the_gain_is_of_log_densities(rng: np.random.Generator) -> None:
+def test_the_gain_is_of_log_densities(rng):
     record = wrong(rng, runs=3, steps=5)
     assert record.error is not None
     assert record.covariance is not None
@@ -167,7 +162,7 @@ def test_the_gain_is_of_log_densities(rng: np.random.Generator) -> None:
         assert scores_of[run] == pytest.approx(np.mean(density))
 
 
-def test_named_runs_and_half_are_judged_by_the_others(rng: np.random.Generator) -> None:
+def test_named_runs_and_half_are_judged_by_the_others(rng):
     record = wrong(rng, runs=6)
     by_name = correct(record, held_out="1, 4", names=["0", "1", "2", "3", "4", "5"])
     assert by_name.judged == ("1", "4")
@@ -177,7 +172,7 @@ def test_named_runs_and_half_are_judged_by_the_others(rng: np.random.Generator) 
     assert correct(record, held_out="half").judged == ("3", "4", "5")
 
 
-def test_uncertain_factors_lengthen_no_tails() -> None:
+def test_uncertain_factors_lengthen_no_tails():
     """A block whose NEES is a quantile of n F(n, nu) has that of the chi-square afterwards."""
     p = np.array([0.01, 0.5, 0.99, 0.9999])
     squares = 3 * stats.f.ppf(p, 3, 8.0)
@@ -190,7 +185,7 @@ def test_uncertain_factors_lengthen_no_tails() -> None:
     assert found.nees[0] == pytest.approx(stats.chi2.ppf(p, 3), rel=1e-6)
 
 
-def test_what_few_runs_add_is_what_a_ratio_has_more() -> None:
+def test_what_few_runs_add_is_what_a_ratio_has_more():
     rng = np.random.default_rng(0)
     constant = np.repeat(rng.normal(size=(10, 1, 3)), 5, axis=1)
     P = np.broadcast_to(np.eye(3), (10, 5, 3, 3)).copy()
@@ -203,13 +198,13 @@ def test_what_few_runs_add_is_what_a_ratio_has_more() -> None:
 # --- the three ends ---------------------------------------------------------------------------------------------------
 
 
-def test_many_runs_off_by_a_factor_are_consistent_after() -> None:
+def test_many_runs_off_by_a_factor_are_consistent_after():
     """Fails by chance where the referee finds a fault in a right covariance, 5 %; so the best of five tries counts."""
     tries = (correct(wrong(np.random.default_rng(), runs=40, rho=0.3)).status for _ in range(5))
     assert "consistent" in tries
 
 
-def test_few_runs_are_undecided_after_and_say_how_many_would_decide() -> None:
+def test_few_runs_are_undecided_after_and_say_how_many_would_decide():
     found = correct(wrong(np.random.default_rng(3), runs=6))
     assert found.status == "undecided"
     assert found.needed is not None
@@ -217,7 +212,7 @@ def test_few_runs_are_undecided_after_and_say_how_many_would_decide() -> None:
     assert f"about {found.needed} runs would decide" in repr(found)
 
 
-def test_what_no_factor_mends_is_named(rng: np.random.Generator) -> None:
+def test_what_no_factor_mends_is_named(rng):
     record = wrong(rng, runs=40, rho=0.0)
     assert record.error is not None
     assert record.covariance is not None
@@ -230,7 +225,7 @@ def test_what_no_factor_mends_is_named(rng: np.random.Generator) -> None:
         assert "no factor mends this" in repr(found)
 
 
-def test_a_run_that_failed_from_the_start_counts(rng: np.random.Generator) -> None:
+def test_a_run_that_failed_from_the_start_counts(rng):
     record = wrong(rng, runs=8)
     assert record.error is not None
     assert record.nees is not None
@@ -248,14 +243,14 @@ def test_a_run_that_failed_from_the_start_counts(rng: np.random.Generator) -> No
     assert np.isfinite(found.gain).all()
 
 
-def test_a_correlation_of_the_wrong_sign_is_not_mended(rng: np.random.Generator) -> None:
+def test_a_correlation_of_the_wrong_sign_is_not_mended(rng):
     right = np.array([[1.0, 0.9], [0.9, 1.0]])
     C = np.broadcast_to(right, (40, 30, 2, 2)).copy()
     P = C * np.array([[1.0, -1.0], [-1.0, 1.0]])
     assert correct(record_of(drawn(rng, C), P)).status == "inconsistent"
 
 
-def test_one_run_is_refused_with_what_it_takes(rng: np.random.Generator) -> None:
+def test_one_run_is_refused_with_what_it_takes(rng):
     with pytest.raises(InputError, match="--split auto, which takes 20 pieces"):
         correct(wrong(rng, runs=1))
     with pytest.raises(InputError, match="no run '9'; there are 0, 1, 2"):
@@ -270,12 +265,12 @@ def test_one_run_is_refused_with_what_it_takes(rng: np.random.Generator) -> None
 # --- floors -----------------------------------------------------------------------------------------------------------
 
 
-def with_floor(rng: np.random.Generator, factor: float, floor: float, spread: float = 1.0, runs: int = 24) -> Record:
+def with_floor(rng, factor, floor, spread=1.0, runs=24):
     P = covariances(rng, runs, 40, 3, spread)
     return record_of(drawn(rng, factor * P + floor * np.eye(3)), P)
 
 
-def test_a_floor_is_found_where_it_is() -> None:
+def test_a_floor_is_found_where_it_is():
     """Fails by chance in fewer than 1 in 1e4: 5 standard errors."""
     rng = np.random.default_rng()
     record = with_floor(rng, 2.0, 20.0)
@@ -289,7 +284,7 @@ def test_a_floor_is_found_where_it_is() -> None:
     assert "gains" in fit.notes[0]
 
 
-def test_no_floor_is_kept_that_data_do_not_ask_for() -> None:
+def test_no_floor_is_kept_that_data_do_not_ask_for():
     rng = np.random.default_rng(5)
     record = with_floor(rng, 2.0, 0.0)
     fit = fit_runs(record, blocks_of(record.axes, 3, False))
@@ -299,7 +294,7 @@ def test_no_floor_is_kept_that_data_do_not_ask_for() -> None:
     assert "floors are 0" in fit.notes[0]
 
 
-def test_a_factor_of_0_beside_a_floor_has_a_one_sided_interval() -> None:
+def test_a_factor_of_0_beside_a_floor_has_a_one_sided_interval():
     rng = np.random.default_rng(2)
     P = covariances(rng, 20, 40, 3)
     record = record_of(drawn(rng, np.broadcast_to(50.0 * np.eye(3), P.shape).copy()), P)
@@ -309,7 +304,7 @@ def test_a_factor_of_0_beside_a_floor_has_a_one_sided_interval() -> None:
     assert 0.0 < fit.factor[0].high < 2.0
 
 
-def test_a_floor_is_not_told_from_a_covariance_of_its_shape(rng: np.random.Generator) -> None:
+def test_a_floor_is_not_told_from_a_covariance_of_its_shape(rng):
     P = np.broadcast_to(2.0 * np.eye(3), (6, 20, 3, 3)).copy()
     record = record_of(drawn(rng, 3.0 * P), P)
     blocks = blocks_of(record.axes, 3, False)
@@ -319,7 +314,7 @@ def test_a_floor_is_not_told_from_a_covariance_of_its_shape(rng: np.random.Gener
     assert "cannot be told apart" in fit.notes[0]
 
 
-def test_gradients_and_information_are_those_of_the_likelihood(rng: np.random.Generator) -> None:
+def test_gradients_and_information_are_those_of_the_likelihood(rng):
     record = wrong(rng, runs=3, steps=30)
     blocks, free = blocks_of(POSE, 6, False), np.array([0, 1])
     theta = np.array([4.0, 0.7, 0.8, 0.3])
@@ -332,14 +327,14 @@ def test_gradients_and_information_are_those_of_the_likelihood(rng: np.random.Ge
     assert (np.linalg.eigvalsh(information) > 0).all()
 
 
-def test_the_interval_of_a_factor_is_that_of_the_jackknife() -> None:
+def test_the_interval_of_a_factor_is_that_of_the_jackknife():
     left_out = np.array([8.0, 9.0, 9.5, 10.0])
     error = np.sqrt(3 / 4 * np.square(np.log(left_out) - np.log(left_out).mean()).sum())
     reach = np.exp(stats.t.ppf(0.975, 3) * error)
     assert tuple(interval_of_ratio(9.0, left_out)) == pytest.approx((9.0, 9.0 / reach, 9.0 * reach))
 
 
-def test_a_floor_at_zero_has_a_one_sided_interval() -> None:
+def test_a_floor_at_zero_has_a_one_sided_interval():
     left_out = np.array([-0.3, -0.2, 0.1, 0.05, -0.1])
     error = 2.0 * left_out.std()
     found = floor_interval(0.0, -0.1, left_out)
@@ -348,7 +343,7 @@ def test_a_floor_at_zero_has_a_one_sided_interval() -> None:
     assert inside.high == pytest.approx(0.1 + stats.t.isf(0.025, 4) * error)
 
 
-def test_groups_have_factors_of_their_own_runs(rng: np.random.Generator) -> None:
+def test_groups_have_factors_of_their_own_runs(rng):
     record = wrong(rng, runs=6)
     index = rng.integers(-1, 2, (6, 40))
     index[:5][index[:5] == 1] = 0
@@ -368,7 +363,7 @@ def test_groups_have_factors_of_their_own_runs(rng: np.random.Generator) -> None
     assert found.after.record.covariance[run, step] == pytest.approx(expected)
 
 
-def test_arrays_are_corrected_in_python(rng: np.random.Generator) -> None:
+def test_arrays_are_corrected_in_python(rng):
     P = covariances(rng, 8, 20, 3)
     found = cs.correct(drawn(rng, 4.0 * P), P, axes=("x", "y", "heading"), per_axis=True)
     assert [block.name for block in found.blocks] == ["x", "y", "heading"]
@@ -376,7 +371,7 @@ def test_arrays_are_corrected_in_python(rng: np.random.Generator) -> None:
     assert found.covariance(P[0, 0]) == pytest.approx(P[0, 0] * np.outer(d, d) + np.diag(found.fit.factors.floor))
 
 
-def test_pictures_are_drawn(tmp_path: Path) -> None:
+def test_pictures_are_drawn(tmp_path):
     pytest.importorskip("matplotlib")
     found = correct(wrong(np.random.default_rng(1), runs=5))
     figure = found.plot(tmp_path / "c.png")

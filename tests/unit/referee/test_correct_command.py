@@ -1,10 +1,7 @@
 """consistency correct: files in and out in the kind that they came in, lines for other programs, bad input."""
 
-from __future__ import annotations
-
 import json
 import re
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -15,19 +12,16 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.fit_covariance.correction_files import place_in
-from consistency.referee.types import Array
 
 RUNS, DRIVES, STEPS = 24, 8, 20
 
 
-def shown_ratio(text: str) -> str:
+def shown_ratio(text):
     """Ratio and interval of a table of ``analyse``."""
     return re.findall(r"\d+\.\d+ \[[^\]]*\]", text)[0]
 
 
-def write_tables(
-    folder: Path, rng: np.random.Generator, runs: int = RUNS, factor: float = 9.0, rho: float = 0.3
-) -> tuple[Path, Path]:
+def write_tables(folder, rng, runs=RUNS, factor=9.0, rho=0.3):
     """A table of estimates whose positions err by ``factor`` more than stated, and the truth."""
     folder.mkdir(parents=True, exist_ok=True)
     own = ["run,step,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh,satellites"]
@@ -48,9 +42,7 @@ def write_tables(
     return paths
 
 
-def write_trajectories(
-    folder: Path, rng: np.random.Generator, columns: int = 36, apart: bool = False, turned: bool = False
-) -> Path:
+def write_trajectories(folder, rng, columns=36, apart=False, turned=False):
     """TUM trajectories whose positions err by 3 sigma of what is stated, in folders est, truth and, apart, P."""
     for name in ("est", "truth", "P"):
         (folder / name).mkdir(parents=True)
@@ -81,26 +73,26 @@ def write_trajectories(
     return folder / "est"
 
 
-def loaded(path: Path) -> ModuleType:
+def loaded(path):
     module = ModuleType(path.stem)
     exec(compile(path.read_text(), str(path), "exec"), module.__dict__)
     return module
 
 
 @pytest.fixture(scope="module")
-def tables(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def tables(tmp_path_factory):
     return write_tables(tmp_path_factory.mktemp("tables"), np.random.default_rng(1))
 
 
 @pytest.fixture
-def written(tables: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[Path, str]:
+def written(tables, tmp_path, capsys):
     """The folder of a correction, and what was printed."""
     estimates, truth = tables
     out, _ = consistency(capsys, "correct", estimates, "--truth", truth, "--out", tmp_path / "c")
     return tmp_path / "c", out
 
 
-def test_a_table_comes_back_with_other_covariances_alone(written: tuple[Path, str], tables: tuple[Path, Path]) -> None:
+def test_a_table_comes_back_with_other_covariances_alone(written, tables):
     folder, _ = written
     factors = {"P_xx": 9.0, "P_yy": 9.0, "P_hh": 1.0}
     for name in ("held-out", "corrected"):
@@ -116,9 +108,7 @@ def test_a_table_comes_back_with_other_covariances_alone(written: tuple[Path, st
                     assert new[column] == value
 
 
-def test_analyse_says_of_held_out_what_was_printed(
-    written: tuple[Path, str], tables: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_analyse_says_of_held_out_what_was_printed(written, tables, capsys):
     folder, printed = written
     out, _ = consistency(capsys, "analyse", folder / "held-out/est.csv", "--truth", tables[1])
     assert f"{shown_ratio(out)} after" in printed
@@ -127,20 +117,16 @@ def test_analyse_says_of_held_out_what_was_printed(
     assert "fitted to these runs" not in err
 
 
-def test_analyse_repeats_that_corrected_runs_were_fitted(
-    written: tuple[Path, str], tables: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_analyse_repeats_that_corrected_runs_were_fitted(written, tables, capsys):
     _, err = consistency(capsys, "analyse", written[0] / "corrected/est.csv", "--truth", tables[1])
     assert "fitted to these runs" in err
     assert str(written[0] / "held-out") in err
 
 
 @pytest.mark.parametrize(
-    ("columns", "apart", "turned"), [(36, False, False), (21, False, True), (36, True, True), (6, False, False)]
+    "columns, apart, turned", [(36, False, False), (21, False, True), (36, True, True), (6, False, False)]
 )
-def test_trajectories_come_back_as_trajectories(
-    columns: int, apart: bool, turned: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_trajectories_come_back_as_trajectories(columns, apart, turned, tmp_path, capsys):
     estimates = write_trajectories(tmp_path, np.random.default_rng(columns), columns, apart, turned)
     options = ["--truth", tmp_path / "truth", "--error", "so3"]
     if turned:
@@ -167,7 +153,7 @@ def test_trajectories_come_back_as_trajectories(
     assert after[0, place] / before[0, place] == pytest.approx(factors["position"] ** of_sigma, rel=1e-9)
 
 
-def matrix_of(folder: Path, P: Array) -> Array:
+def matrix_of(folder, P):
     """D P D + F by the numbers of a correction of x, y, heading."""
     blocks = {b["name"]: b for b in json.loads((folder / "verdict.json").read_text())["blocks"]}
     factor, floor = ([blocks["position"][key]] * 2 + [blocks["attitude"][key]] for key in ("factor", "floor"))
@@ -177,7 +163,7 @@ def matrix_of(folder: Path, P: Array) -> Array:
 P3 = np.array([[0.02, 0.001, 0.0002], [0.001, 0.03, 0.0001], [0.0002, 0.0001, 0.0004]])
 
 
-def test_plain_python_and_ros_have_the_same_matrix(written: tuple[Path, str]) -> None:
+def test_plain_python_and_ros_have_the_same_matrix(written):
     folder, _ = written
     pasted, expected = loaded(folder / "corrected_covariance.py"), matrix_of(folder, P3)
     assert np.array(pasted.corrected(P3.tolist())) == pytest.approx(expected)
@@ -189,7 +175,7 @@ def test_plain_python_and_ros_have_the_same_matrix(written: tuple[Path, str]) ->
     assert found[2:5, 2:5] == pytest.approx(full[2:5, 2:5])
 
 
-def test_a_message_of_ros_takes_the_numbers(written: tuple[Path, str]) -> None:
+def test_a_message_of_ros_takes_the_numbers(written):
     rosbags = pytest.importorskip("rosbags.typesys")
     types = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
     kind = "geometry_msgs/msg/PoseWithCovariance"
@@ -207,14 +193,14 @@ def test_a_message_of_ros_takes_the_numbers(written: tuple[Path, str]) -> None:
     assert found == pytest.approx(matrix_of(written[0], P3))
 
 
-def test_gtsam_takes_the_corrected_covariance(written: tuple[Path, str]) -> None:
+def test_gtsam_takes_the_corrected_covariance(written):
     gtsam = pytest.importorskip("gtsam")
     noise = loaded(written[0] / "corrected_covariance.py").gtsam_noise(P3)
     assert noise.covariance() == pytest.approx(matrix_of(written[0], P3))
     gtsam.PriorFactorPose2(0, gtsam.Pose2(), noise)
 
 
-def test_gtsam_has_the_rotation_first_in_space(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gtsam_has_the_rotation_first_in_space(tmp_path, capsys):
     estimates = write_trajectories(tmp_path, np.random.default_rng(3))
     consistency(capsys, "correct", estimates, "--truth", tmp_path / "truth", "--error", "so3", "--out", tmp_path / "c")
     pasted = loaded(tmp_path / "c/corrected_covariance.py")
@@ -223,7 +209,7 @@ def test_gtsam_has_the_rotation_first_in_space(tmp_path: Path, capsys: pytest.Ca
     assert variances == pytest.approx([blocks["attitude"]] * 3 + [blocks["position"]] * 3)
 
 
-def test_an_inconsistent_correction_is_written_only_anyway(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_inconsistent_correction_is_written_only_anyway(tmp_path, capsys):
     rng = np.random.default_rng(7)
     P = np.broadcast_to(np.eye(2), (40, 30, 2, 2)).copy()
     errors = rng.standard_t(2.1, size=(40, 30, 2))
@@ -239,7 +225,7 @@ def test_an_inconsistent_correction_is_written_only_anyway(tmp_path: Path, capsy
         assert archive["errors"] == pytest.approx(errors)
 
 
-def test_a_run_that_failed_is_written_as_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_failed_is_written_as_failed(tmp_path, capsys):
     errors = np.random.default_rng(8).normal(size=(24, 20, 2))
     errors[3, 7:] = np.nan
     P = np.broadcast_to(np.eye(2), (24, 20, 2, 2)).copy()
@@ -250,7 +236,7 @@ def test_a_run_that_failed_is_written_as_failed(tmp_path: Path, capsys: pytest.C
     assert [failure[:2] for failure in said["est"]["statistics"]["failures"]] == [[3, 8]]
 
 
-def test_an_undecided_correction_is_written_and_marked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_undecided_correction_is_written_and_marked(tmp_path, capsys):
     estimates, truth = write_tables(tmp_path, np.random.default_rng(2), runs=5)
     out, _ = consistency(capsys, "correct", estimates, "--truth", truth, "--out", tmp_path / "c")
     assert "undecided after" in out
@@ -260,9 +246,7 @@ def test_an_undecided_correction_is_written_and_marked(tmp_path: Path, capsys: p
     consistency(capsys, "correct", estimates, "--truth", truth, "--fail-on", "inconsistent", status=1)
 
 
-def test_named_runs_alone_are_held_out(
-    tables: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_named_runs_alone_are_held_out(tables, tmp_path, capsys):
     estimates, truth = tables
     consistency(capsys, "correct", estimates, "--truth", truth, "--held-out", "3,7", "--out", tmp_path / "c")
     lines = (tmp_path / "c/held-out/est.csv").read_text().splitlines()[1:]
@@ -271,7 +255,7 @@ def test_named_runs_alone_are_held_out(
     assert len({line.split(",")[0] for line in lines}) == RUNS
 
 
-def test_one_log_is_cut_into_pieces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_log_is_cut_into_pieces(tmp_path, capsys):
     rng = np.random.default_rng(4)
     errors = 2.0 * rng.normal(size=(1, 2000, 2))
     np.savez(tmp_path / "log.npz", errors=errors, covariances=np.broadcast_to(np.eye(2), (1, 2000, 2, 2)).copy())
@@ -284,9 +268,7 @@ def test_one_log_is_cut_into_pieces(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert f"{shown_ratio(said)} after" in out
 
 
-def test_bad_input_is_named_and_nothing_is_written(
-    tables: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_named_and_nothing_is_written(tables, tmp_path, capsys):
     estimates, truth = tables
     good = ("--truth", truth, "--out", tmp_path / "c")
     assert "--per must be 'axis'" in refused(capsys, "correct", estimates, *good, "--per", "block")
@@ -298,7 +280,7 @@ def test_bad_input_is_named_and_nothing_is_written(
     assert "exists already" in refused(capsys, "correct", estimates, *good)
 
 
-def test_a_folder_of_tables_comes_back_as_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_tables_comes_back_as_one(tmp_path, capsys):
     paths = write_tables(tmp_path, np.random.default_rng(6), runs=6)
     for path in paths:
         head, *lines = path.read_text().splitlines()
@@ -317,9 +299,7 @@ def test_a_folder_of_tables_comes_back_as_one(tmp_path: Path, capsys: pytest.Cap
     consistency(capsys, "correct", tmp_path / "est", *options, "--held-out", "drive2,drive5")
 
 
-def test_two_estimators_are_told_apart(
-    tables: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_estimators_are_told_apart(tables, tmp_path, capsys):
     lines = tables[0].read_text().splitlines()
     both = [f"filter,{lines[0]}", *(f"a,{line}" for line in lines[1:]), *(f"b,{line}" for line in lines[1:])]
     (tmp_path / "two.csv").write_text("\n".join(both) + "\n")
@@ -331,7 +311,7 @@ def test_two_estimators_are_told_apart(
     assert {row.split(",")[0] for row in rows} == {"b"}
 
 
-def write_grouped(folder: Path, rng: np.random.Generator, words: bool = False) -> tuple[Path, Path]:
+def write_grouped(folder, rng, words=False):
     """A table whose covariance is right in half of the steps of each run, and too small by 16 in the others."""
     own, true = ["run,step,a,b,P_a_a,P_a_b,P_b_b,seen"], ["run,step,a,b"]
     for run in range(RUNS):
@@ -350,7 +330,7 @@ def write_grouped(folder: Path, rng: np.random.Generator, words: bool = False) -
 
 
 @pytest.mark.parametrize("words", [False, True])
-def test_factors_go_by_group(words: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_factors_go_by_group(words, tmp_path, capsys):
     estimates, truth = write_grouped(tmp_path, np.random.default_rng(words), words)
     options = ["--truth", truth, "--state", "a,b", "--by", "seen", *([] if words else ["--bins", "5,"])]
     out, _ = consistency(capsys, "correct", estimates, *options, "--out", tmp_path / "c", "--anyway")
@@ -371,7 +351,7 @@ def test_factors_go_by_group(words: bool, tmp_path: Path, capsys: pytest.Capture
         assert module.corrected([[1.0, 0.0], [0.0, 1.0]], at[group])[0][0] == pytest.approx(factors[group, "a"])
 
 
-def test_a_value_on_an_edge_is_below_it() -> None:
+def test_a_value_on_an_edge_is_below_it():
     numbers = Groups("n", ("n <= 5", "5 < n <= 9", "n > 9"), np.zeros(1, int), (5.0, 9.0))
     assert [place_in(numbers, value) for value in ("5", "5.5", "9.0", "10", "", "nan")] == [0, 1, 1, 2, -1, -1]
     words = Groups("road", ("road is dry", "road is wet"), np.zeros(1, int), None)
@@ -379,14 +359,12 @@ def test_a_value_on_an_edge_is_below_it() -> None:
     assert place_in(None, "7") == -1
 
 
-def test_factors_by_what_selects_on_the_outcome_are_refused(
-    tables: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_factors_by_what_selects_on_the_outcome_are_refused(tables, tmp_path, capsys):
     words = ("correct", tables[0], "--truth", tables[1], "--by", "P_xx", "--out", tmp_path / "c")
     assert "selects on the outcome" in refused(capsys, *words)
 
 
-def test_standard_deviations_come_back_as_such(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_standard_deviations_come_back_as_such(tmp_path, rng):
     from consistency.referee.readers.formats.restated import text_files
     from consistency.referee.readers.options import Reading
 
@@ -398,9 +376,9 @@ def test_standard_deviations_come_back_as_such(tmp_path: Path, rng: np.random.Ge
     assert '"x; y"' in text
 
 
-def test_a_folder_is_read_in_python_as_by_the_command(tmp_path: Path) -> None:
+def test_a_folder_is_read_in_python_as_by_the_command(tmp_path):
     estimates = write_trajectories(tmp_path, np.random.default_rng(9))
     found = cs.correct(cs.read(estimates, truth=tmp_path / "truth", error="so3"))
     assert [block.name for block in found.blocks] == ["position", "attitude"]
-    values: Array = found.fit.factors.factor
+    values = found.fit.factors.factor
     assert values == pytest.approx([9.0, 1.0], rel=0.3)

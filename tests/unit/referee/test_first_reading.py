@@ -3,32 +3,28 @@
 The seed of ``rng`` is fixed and was not chosen; faults are so large that a verdict at a rate of 1e-5 finds them.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from draws import identities, independent
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, ratio_text, short
 from consistency.referee.document.blocks import Quantity
 from consistency.referee.document.judged_filters import TERMINAL, cells, document
 from consistency.referee.document.wording import PLAIN, written
-from consistency.referee.types import Array
 
 
-def judged(error: Array, **settings: object) -> Verdict:
+def judged(error, **settings):
     record = Record("f", error, identities(error), axes=("x", "y", "heading")[: error.shape[-1]])
     return judge(record, Settings(**{"false_alarm": 1e-5} | settings))  # type: ignore[arg-type]
 
 
-def test_the_interval_of_the_sentence_is_that_of_the_test(rng: np.random.Generator) -> None:
+def test_the_interval_of_the_sentence_is_that_of_the_test(rng):
     """Whatever the data, "shown" goes with an interval inside the ends, and "not shown" with one outside."""
     shown = set()
     for runs, scale in itertools.product((5, 20, 40, 80), (0.8, 1.0, 1.2, 1.35)):
@@ -47,7 +43,7 @@ def test_the_interval_of_the_sentence_is_that_of_the_test(rng: np.random.Generat
     assert shown == {True, False}
 
 
-def test_the_interval_of_a_one_sided_test_has_an_upper_end(rng: np.random.Generator) -> None:
+def test_the_interval_of_a_one_sided_test_has_an_upper_end(rng):
     verdict = judged(independent(rng, 60, 6, 3), allow="conservative")
     assert verdict.equivalence is not None
     assert verdict.equivalence.interval is not None
@@ -55,7 +51,7 @@ def test_the_interval_of_a_one_sided_test_has_an_upper_end(rng: np.random.Genera
     assert f"(below {short(high)} at a confidence of 95 %)" in verdict.reasons[0]
 
 
-def test_the_strongest_fault_comes_first(rng: np.random.Generator) -> None:
+def test_the_strongest_fault_comes_first(rng):
     """A factor of 2 in 400 runs is far surer than a mean of half a standard deviation in single steps."""
     error = np.sqrt(2.0) * independent(rng, 400, 6, 3)
     error[:, 3, 1] += 0.9
@@ -66,7 +62,7 @@ def test_the_strongest_fault_comes_first(rng: np.random.Generator) -> None:
     assert re.match(r"overconfident: covariance [a-z ]*too small by x[^;]*; mean error ", sentence)
 
 
-def test_credibility_and_p_values_are_details(rng: np.random.Generator) -> None:
+def test_credibility_and_p_values_are_details(rng):
     verdict = judged(2.0 * independent(rng, 40, 6, 3))
     assert [text.split(" ")[0] for text in verdict.details] == ["noncredibility", "9"]
     assert set(verdict.details) <= set(verdict.reasons)
@@ -76,7 +72,7 @@ def test_credibility_and_p_values_are_details(rng: np.random.Generator) -> None:
         assert "2-sigma coverage" in " ".join(entry.others)
 
 
-def test_a_fault_of_a_correlation_names_the_combination(rng: np.random.Generator) -> None:
+def test_a_fault_of_a_correlation_names_the_combination(rng):
     error = independent(rng, 100, 6, 3)
     covariance = np.eye(3)
     covariance[0, 1] = covariance[1, 0] = -0.9
@@ -91,7 +87,7 @@ def test_a_fault_of_a_correlation_names_the_combination(rng: np.random.Generator
     )
 
 
-def test_one_shot_estimates_do_not_get_lost(rng: np.random.Generator) -> None:
+def test_one_shot_estimates_do_not_get_lost(rng):
     error = independent(rng, 80, 1, 2)
     error[0] = 40.0
     for scale in (1.0, 3.0):
@@ -101,7 +97,7 @@ def test_one_shot_estimates_do_not_get_lost(rng: np.random.Generator) -> None:
     assert any("lost runs" in text for text in judged(independent(rng, 80, 2, 2)).reasons)
 
 
-def test_biased_shows_the_ratio_about_the_mean(rng: np.random.Generator) -> None:
+def test_biased_shows_the_ratio_about_the_mean(rng):
     verdict = judged(independent(rng, 60, 6, 3) + np.array([2.0, 0.0, 0.0]))
     assert verdict.status == "biased"
     assert verdict.bias is not None
@@ -110,21 +106,21 @@ def test_biased_shows_the_ratio_about_the_mean(rng: np.random.Generator) -> None
 
 
 @pytest.mark.parametrize(
-    ("interval", "text", "factor"),
+    "interval, text, factor",
     [
         (Interval(55.1, 6.76, 9.8e5), "at least 6.76", "too small by at least x6.76"),
         (Interval(2.0, 1.5, 2.5), "2.00 [1.50, 2.50]", "too small by x2.00 [1.50, 2.50]"),
         (Interval(2.0, 0.01, 9.0), "2.00 (known to no better than a factor of 100)", None),
     ],
 )
-def test_an_interval_without_an_upper_end(interval: Interval, text: str, factor: str | None) -> None:
+def test_an_interval_without_an_upper_end(interval, text, factor):
     assert ratio_text(interval) == text
     assert factor is None or off_by(interval) == factor
     cell = Quantity(interval.value, interval[1:], limit=UNCERTAIN)
     assert written(cell, PLAIN).startswith(text.replace("least ", "least x").split(" (")[0].split(" [")[0])
 
 
-def test_seconds_and_files_are_named(tmp_path: Path) -> None:
+def test_seconds_and_files_are_named(tmp_path):
     rng = np.random.default_rng()
     stated = np.eye(2)[np.triu_indices(2)]
     for run in range(30):

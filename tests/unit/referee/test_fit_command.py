@@ -1,12 +1,9 @@
 """consistency fit-covariance: files in and out, other programs' conventions, bad input."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -17,12 +14,12 @@ import pytest
 import relative_poses as spatial
 from command import consistency, refused
 from fit_covariance import drives
+from numpy.testing import assert_allclose, assert_array_less
 
 import consistency as cs
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.extras import is_installed
-from consistency.referee.fit_covariance.drives import Drive, drive_of
-from consistency.referee.fit_covariance.noise_model import NoiseModel
+from consistency.referee.fit_covariance.drives import drive_of
 from consistency.referee.fit_covariance.writing import (
     ceres,
     gtsam,
@@ -34,12 +31,11 @@ from consistency.referee.fit_covariance.writing import (
 )
 from consistency.referee.geometry.groups import composed, vectors
 from consistency.referee.readers.options import Reading
-from consistency.referee.types import Array
 
 SPAN = "10m"
 
 
-def write_tables(made: list[Drive], folder: Path) -> tuple[Path, Path]:
+def write_tables(made, folder):
     """Drives as two CSV files with a column run."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = folder / "wheels.csv", folder / "truth.csv"
@@ -52,7 +48,7 @@ def write_tables(made: list[Drive], folder: Path) -> tuple[Path, Path]:
     return paths
 
 
-def in_space(rng: np.random.Generator, number: int = 2, steps: int = 500) -> list[Drive]:
+def in_space(rng, number=2, steps=500):
     found = []
     for i in range(number):
         made = spatial.drive(rng, "SE(3)", steps)
@@ -62,16 +58,16 @@ def in_space(rng: np.random.Generator, number: int = 2, steps: int = 500) -> lis
 
 
 @pytest.fixture(scope="module")
-def planar() -> NoiseModel:
+def planar():
     return cs.fit_covariance(drives(np.random.default_rng(11), 5, length=400.0), SPAN, name="wheels")
 
 
 @pytest.fixture(scope="module")
-def full() -> NoiseModel:
+def full():
     return cs.fit_covariance(in_space(np.random.default_rng(12)), "3m", name="vio")
 
 
-def loaded(text: str, tmp_path: Path) -> ModuleType:
+def loaded(text, tmp_path):
     """A written snippet as a module."""
     module = ModuleType("snippet")
     exec(compile(text, str(tmp_path / "snippet.py"), "exec"), module.__dict__)
@@ -81,7 +77,7 @@ def loaded(text: str, tmp_path: Path) -> ModuleType:
 # --- motions --------------------------------------------------------------------------------------------
 
 
-def test_motions_read_back_have_the_same_verdict(planar: NoiseModel, full: NoiseModel, tmp_path: Path) -> None:
+def test_motions_read_back_have_the_same_verdict(planar, full, tmp_path):
     """To the last digit, in the plane and in space."""
     for model, motions, truth in ((planar, "motions.csv", "truth.csv"), (full, "motions", "truth")):
         out = tmp_path / model.name
@@ -96,7 +92,7 @@ def test_motions_read_back_have_the_same_verdict(planar: NoiseModel, full: Noise
         assert stored["status"] == model.status
 
 
-def test_a_window_that_is_left_out_begins_another_run(rng: np.random.Generator, tmp_path: Path) -> None:
+def test_a_window_that_is_left_out_begins_another_run(rng, tmp_path):
     made = drives(rng, 2, world.World(jumps=1), 600.0)
     model = cs.fit_covariance(made, SPAN)
     assert model.counts["jumps"] >= 1
@@ -109,7 +105,7 @@ def test_a_window_that_is_left_out_begins_another_run(rng: np.random.Generator, 
 # --- other programs --------------------------------------------------------------------------------------
 
 
-def integrated(twist: Callable[[float, float, float], list[float]], v: float, w: float, dt: float, n: int) -> Array:
+def integrated(twist, v, w, dt, n):
     """Covariance (x, y, yaw) in the last frame after n messages, each integrated with its twist covariance.
 
     A filter that predicts with a measured twist u moves by u dt, so that each step adds dt^2 times the covariance of u.
@@ -124,48 +120,48 @@ def integrated(twist: Callable[[float, float, float], list[float]], v: float, w:
 
 
 @pytest.mark.parametrize("w", [0.0, 0.15])
-def test_a_twist_integrates_to_the_covariance_of_the_model(planar: NoiseModel, w: float, tmp_path: Path) -> None:
+def test_a_twist_integrates_to_the_covariance_of_the_model(planar, w, tmp_path):
     twist = loaded(robot_localization(planar), tmp_path).twist_covariance
     dt, n, v = 0.005, 2000, 1.0
     motion = composed(np.repeat(world.matrices_of(np.array([[v * dt, 0.0, w * dt]])), n, 0))[-1]
     C = planar.covariance([motion[0, 2], motion[1, 2], np.arctan2(motion[1, 0], motion[0, 0])])
     got = integrated(twist, v, w, dt, n)
-    np.testing.assert_allclose(got, C, rtol=0.01, atol=1e-3 * np.sqrt(np.outer(np.diag(C), np.diag(C))).max())
+    assert_allclose(got, C, rtol=0.01, atol=1e-3 * np.sqrt(np.outer(np.diag(C), np.diag(C))).max())
 
 
-def test_a_twist_at_rest_reaches_the_floor_in_the_time_of_a_span(planar: NoiseModel, tmp_path: Path) -> None:
+def test_a_twist_at_rest_reaches_the_floor_in_the_time_of_a_span(planar, tmp_path):
     twist = loaded(robot_localization(planar), tmp_path).twist_covariance
     n = 100
     P = integrated(twist, 0.0, 0.0, seconds(planar) / n, n)
-    np.testing.assert_allclose(np.diag(P), planar.noise.floor)
+    assert_allclose(np.diag(P), planar.noise.floor)
     assert (np.array(twist(0.0, 0.0, 0.1))[[0, 7, 35]] > 0).all()
     assert seconds(planar) == pytest.approx(10.0)  # 1 m/s
 
 
-def test_gtsam_has_the_same_matrix(planar: NoiseModel, full: NoiseModel, tmp_path: Path) -> None:
+def test_gtsam_has_the_same_matrix(planar, full, tmp_path):
     """The rotation is first in Pose3; a motion at rest has the floor."""
     gtsam_ = pytest.importorskip("gtsam")
     snippet = loaded(gtsam(planar), tmp_path)
     for motion in ([9.0, 1.5, 0.4], [0.0, 0.0, 0.0]):
         got = snippet.noise(gtsam_.Pose2(*motion)).covariance()
-        np.testing.assert_allclose(got, planar.covariance(motion), rtol=1e-9, atol=1e-15)
+        assert_allclose(got, planar.covariance(motion), rtol=1e-9, atol=1e-15)
     snippet = loaded(gtsam(full), tmp_path)
     turn = spatial.exp(np.array([[2.5, 0.3, -0.2, 0.1, -0.2, 0.4]]))[0]
     order = [3, 4, 5, 0, 1, 2]
     for T in (turn, np.eye(4)):
         C = full.covariance(spatial.vectors(T[None])[0])
         got = snippet.noise(gtsam_.Pose3(T)).covariance()
-        np.testing.assert_allclose(got, C[np.ix_(order, order)], rtol=1e-8, atol=1e-15)
+        assert_allclose(got, C[np.ix_(order, order)], rtol=1e-8, atol=1e-15)
     # a factor of gtsam has the error in the frame at the end of the motion
     e = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.1])
     factor = gtsam_.BetweenFactorPose3(0, 1, gtsam_.Pose3(turn), gtsam_.noiseModel.Unit.Create(6))
     values = gtsam_.Values()
     values.insert(0, gtsam_.Pose3())
     values.insert(1, gtsam_.Pose3(turn).compose(gtsam_.Pose3.Expmap(e)))
-    np.testing.assert_allclose(factor.unwhitenedError(values), e, atol=1e-12)
+    assert_allclose(factor.unwhitenedError(values), e, atol=1e-12)
 
 
-def test_ceres_header_whitens(full: NoiseModel, tmp_path: Path) -> None:
+def test_ceres_header_whitens(full, tmp_path):
     """Compiled where there is a compiler, read as text otherwise: S^-1/2 S S^-1/2' = I."""
     (tmp_path / "ceres_noise.h").write_text(ceres(full))
     compiler = shutil.which("g++") or shutil.which("c++")
@@ -179,13 +175,13 @@ def test_ceres_header_whitens(full: NoiseModel, tmp_path: Path) -> None:
     else:
         numbers = ceres(full).split("{")[1].split("}")[0].replace(",", " ").split()
     L = np.array(numbers, float).reshape(6, 6)
-    np.testing.assert_allclose(L @ straight(full) @ L.T, np.eye(6), atol=1e-8)
+    assert_allclose(L @ straight(full) @ L.T, np.eye(6), atol=1e-8)
 
 
-def test_an_axis_that_never_moved_has_a_covariance_in_each_export(rng: np.random.Generator, tmp_path: Path) -> None:
+def test_an_axis_that_never_moved_has_a_covariance_in_each_export(rng, tmp_path):
     """z, roll and pitch of a drive on a plane, at rest and moving."""
 
-    def raised(T: Array) -> Array:
+    def raised(T):
         out = np.tile(np.eye(4), (len(T), 1, 1))
         out[:, :2, :2], out[:, :2, 3] = T[:, :2, :2], T[:, :2, 2]
         return out
@@ -196,14 +192,12 @@ def test_an_axis_that_never_moved_has_a_covariance_in_each_export(rng: np.random
     assert (n.per_m[2:5] < 1e-12).all()
     assert (n.floor > 0).all()
     C = model.covariance([0.0, 0, 0, 0, 0, 0, 1])
-    np.testing.assert_allclose(C, np.diag(n.floor))
+    assert_allclose(C, np.diag(n.floor))
     twist = loaded(robot_localization(model), tmp_path).twist_covariance
     for v in (0.0, 1.0):
-        np.testing.assert_array_less(
-            n.floor[2:5] / seconds(model) / 0.1 * (1 - 1e-9), np.array(twist(v, 0.0, 0.1))[[14, 21, 28]]
-        )
+        assert_array_less(n.floor[2:5] / seconds(model) / 0.1 * (1 - 1e-9), np.array(twist(v, 0.0, 0.1))[[14, 21, 28]])
     L = np.array(ceres(model).split("{")[1].split("}")[0].replace(",", " ").split(), float).reshape(6, 6)
-    np.testing.assert_allclose(np.diag(np.linalg.inv(L.T @ L))[2:5], n.floor[2:5], rtol=1e-6)
+    assert_allclose(np.diag(np.linalg.inv(L.T @ L))[2:5], n.floor[2:5], rtol=1e-6)
     for stretch in model.stretches:
         assert (np.linalg.eigvalsh(stretch.covariance[1:]) > 0).all()
     snippet = gtsam(model)
@@ -211,7 +205,7 @@ def test_an_axis_that_never_moved_has_a_covariance_in_each_export(rng: np.random
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="tomllib is of Python 3.11")
-def test_noise_toml_has_all_figures(planar: NoiseModel) -> None:
+def test_noise_toml_has_all_figures(planar):
     import tomllib
 
     read = tomllib.loads(toml(planar))
@@ -226,7 +220,7 @@ def test_noise_toml_has_all_figures(planar: NoiseModel) -> None:
 # --- the command -----------------------------------------------------------------------------------------------
 
 
-def test_the_command_on_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_on_tables(tmp_path, capsys):
     made = drives(np.random.default_rng(5), 3, length=300.0)
     estimates, truth = write_tables(made, tmp_path)
     words = ("fit-covariance", estimates, "--truth", truth, "--span", SPAN)
@@ -263,7 +257,7 @@ def test_the_command_on_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert (same, err) == (kept, "consistency: --no-correct is now called --keep-mean-error\n")
 
 
-def test_every_kind_of_file_gives_the_same_drive(tmp_path: Path) -> None:
+def test_every_kind_of_file_gives_the_same_drive(tmp_path):
     drive = drives(np.random.default_rng(5), 1, length=100.0)[0]
     estimates, truth = write_tables([drive], tmp_path)
     E, M = vectors(drive.estimate), vectors(drive.truth)
@@ -277,19 +271,19 @@ def test_every_kind_of_file_gives_the_same_drive(tmp_path: Path) -> None:
         cs.read_drives(tmp_path / "a.tum", tmp_path / "true.tum"),
     ]  # fmt: skip
     for (each,) in found:
-        np.testing.assert_allclose(each.t, drive.t)
-        np.testing.assert_allclose(each.estimate[:, :2, :2], drive.estimate[:, :2, :2], atol=1e-9)
-        np.testing.assert_allclose(each.truth[:, 0, -1], drive.truth[:, 0, -1], atol=1e-9)
+        assert_allclose(each.t, drive.t)
+        assert_allclose(each.estimate[:, :2, :2], drive.estimate[:, :2, :2], atol=1e-9)
+        assert_allclose(each.truth[:, 0, -1], drive.truth[:, 0, -1], atol=1e-9)
 
 
-def test_offset_of_clocks_motions_and_folders_of_speeds(tmp_path: Path) -> None:
+def test_offset_of_clocks_motions_and_folders_of_speeds(tmp_path):
     """Estimates 0.2 s late are shifted; motions are compounded; speeds in a folder are integrated."""
     drive = drives(np.random.default_rng(5), 1, length=100.0)[0]
     estimates, _ = write_tables([replace(drive, t=drive.t - 0.2)], tmp_path / "late")
     true = write_tables([drive], tmp_path)[1]
     (shifted,) = cs.read_drives(estimates, reading=Reading(truth=true, time_offset=0.2))
-    np.testing.assert_allclose(shifted.t, drive.t)
-    np.testing.assert_allclose(shifted.truth, drive.truth, atol=1e-9)
+    assert_allclose(shifted.t, drive.t)
+    assert_allclose(shifted.truth, drive.truth, atol=1e-9)
     steps = np.linalg.inv(drive.estimate[:-1]) @ drive.estimate[1:]
     rows = np.column_stack([drive.t, np.concatenate([np.zeros((1, 3)), vectors(steps)])])
     motions = tmp_path / "motions.csv"
@@ -297,7 +291,7 @@ def test_offset_of_clocks_motions_and_folders_of_speeds(tmp_path: Path) -> None:
     one = tmp_path / "one.csv"
     one.write_text(true.read_text().replace("run,", "").replace("\n1,", "\n"))
     (found,) = cs.read_drives(motions, reading=Reading(truth=one, motions=True))
-    np.testing.assert_allclose(found.estimate, drive.estimate, atol=1e-9)
+    assert_allclose(found.estimate, drive.estimate, atol=1e-9)
     for name in ("wheels", "truth"):
         (tmp_path / "drives" / name).mkdir(parents=True)
     for name in ("a", "b"):
@@ -315,7 +309,7 @@ def test_offset_of_clocks_motions_and_folders_of_speeds(tmp_path: Path) -> None:
         cs.read_drives(tmp_path / "drives" / "wheels", tmp_path / "drives" / "truth")
 
 
-def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(tmp_path, capsys):
     made = drives(np.random.default_rng(5), 2, length=300.0)
     estimates, truth = (str(path) for path in write_tables(made, tmp_path))
     broken = tmp_path / "broken.csv"
@@ -327,7 +321,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     late.write_text("run,t,x,y,heading\n1,9000,0,0,0\n1,9001,1,0,0\n2,9000,0,0,0\n2,9001,1,0,0\n")
     (tmp_path / "full").mkdir()
     good = ("--truth", truth, "--span", SPAN)
-    cases: list[tuple[tuple[str, ...], str]] = [
+    cases = [
         ((str(tmp_path / "none.csv"), *good), "no such file"),
         ((estimates, "--span", SPAN), "--truth"),
         ((estimates, "--truth", truth), "--span"),
@@ -353,7 +347,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-def test_picture(planar: NoiseModel, full: NoiseModel, tmp_path: Path) -> None:
+def test_picture(planar, full, tmp_path):
     pytest.importorskip("matplotlib")
     for model in (planar, full):
         figure = model.plot(tmp_path / f"{model.name}.png")

@@ -1,7 +1,5 @@
 """Groups of runs and steps by a column: how they are cut, judged, named, refused and read."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace
@@ -13,7 +11,7 @@ from command import consistency
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.planning.single_log import in_pieces
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.scale import ratio_interval, scale_test, weighted_of
@@ -22,16 +20,15 @@ from consistency.referee.diagnostics.records.outcome import made_from_errors, se
 from consistency.referee.diagnostics.statistics.number_of_runs import group_runs, power_of, required_runs
 from consistency.referee.diagnostics.verdict.answers import GROUP, SHARES, shares_of
 from consistency.referee.pages.by_group import by_group
-from consistency.referee.types import Array
 
 
-def errors(runs: int = 40, steps: int = 20, n: int = 2, seed: int = 1) -> tuple[Array, Array]:
+def errors(runs=40, steps=20, n=2, seed=1):
     """Errors of unit variance, which are the same in every call, and their covariances."""
     error = np.random.default_rng(seed).standard_normal((runs, steps, n))
     return error, np.broadcast_to(np.eye(n), (*error.shape, n)).copy()
 
 
-def wrong_in_the_first(steps: int = 20) -> tuple[Array, Array, Array]:
+def wrong_in_the_first(steps=20):
     """Errors twice as large where a column of 0, 1, 2, 3 is 0, their covariances, and the column."""
     error, covariance = errors(steps=steps)
     column = np.tile(np.arange(steps) % 4, (len(error), 1))
@@ -42,7 +39,7 @@ def wrong_in_the_first(steps: int = 20) -> tuple[Array, Array, Array]:
 # --- how a column is cut -------------------------------------------------------------------------------------
 
 
-def test_numbers_are_cut_at_quantiles_with_few_digits() -> None:
+def test_numbers_are_cut_at_quantiles_with_few_digits():
     values = np.arange(1.0, 101.0)
     groups = groups_of(column_of("n", values), 4)
     assert groups.edges == (25.0, 50.0, 75.0)
@@ -52,7 +49,7 @@ def test_numbers_are_cut_at_quantiles_with_few_digits() -> None:
     assert groups_of(column_of("t", 1.7e9 + values), 2).edges == (1700000050.0,)
 
 
-def test_values_that_are_the_same_stay_together() -> None:
+def test_values_that_are_the_same_stay_together():
     few = groups_of(column_of("sats", [4, 4, 4, 4, 5, 6, 6]), 5)
     assert few.names == ("sats <= 4", "4 < sats <= 5", "sats > 5")
     assert np.bincount(few.index).tolist() == [4, 1, 2]
@@ -60,14 +57,14 @@ def test_values_that_are_the_same_stay_together() -> None:
     assert tied.edges == (0.0,)
 
 
-def test_edges_can_be_given_and_used_again() -> None:
+def test_edges_can_be_given_and_used_again():
     groups = groups_of(column_of("n", [1.0, 40.0, 41.0, np.nan, np.inf]), [40, 120])
     assert groups.index.tolist() == [0, 0, 1, -1, -1]
     assert groups.names[1] == "40 < n <= 120"
     assert groups_of(column_of("n", [200.0]), groups.edges).index.tolist() == [2]
 
 
-def test_words_are_groups() -> None:
+def test_words_are_groups():
     groups = groups_of(column_of("weather", np.array([["sun", "rain"], ["", None]], object)))
     assert groups.names == ("weather is rain", "weather is sun")
     assert groups.index.tolist() == [[1, 0], [-1, -1]]
@@ -75,14 +72,14 @@ def test_words_are_groups() -> None:
     assert groups_of(column_of("indoor", [True, False])).names == ("indoor is False", "indoor is True")
 
 
-def test_only_what_is_judged_makes_groups() -> None:
+def test_only_what_is_judged_makes_groups():
     counted = np.array([True, True, True, False])
     assert groups_of(column_of("w", ["a", "b", "b", "c"]), counted=counted).names == ("w is a", "w is b")
     assert groups_of(column_of("n", [1.0, 2.0, 3.0, 99.0]), 2, counted).edges == (2.0,)
 
 
 @pytest.mark.parametrize(
-    ("values", "bins", "why"),
+    "values, bins, why",
     [
         ([1.0, 1.0], 5, "has one value only"),
         ([np.nan], 5, "has no value where errors are judged"),
@@ -93,12 +90,12 @@ def test_only_what_is_judged_makes_groups() -> None:
         ([1.0, 2.0], [1.0, np.nan], "must be finite and increase"),
     ],
 )
-def test_columns_and_bins_that_make_no_groups(values: list[object], bins: object, why: str) -> None:
+def test_columns_and_bins_that_make_no_groups(values, bins, why):
     with pytest.raises(ValueError, match=why):
         groups_of(column_of("n", values), bins)  # type: ignore[arg-type]
 
 
-def test_values_of_runs_hold_in_all_of_their_steps() -> None:
+def test_values_of_runs_hold_in_all_of_their_steps():
     assert on_steps([1, 2], (2, 3)).tolist() == [[1, 1, 1], [2, 2, 2]]
     assert on_steps([1, 2, 3], (1, 3)).tolist() == [[1, 2, 3]]
     with pytest.raises(ValueError, match=r"has shape \(3,\), needs \(2, 3\) or \(2,\)"):
@@ -108,7 +105,7 @@ def test_values_of_runs_hold_in_all_of_their_steps() -> None:
 # --- weights --------------------------------------------------------------------------------------------------
 
 
-def test_equal_weights_change_nothing() -> None:
+def test_equal_weights_change_nothing():
     means = np.random.default_rng(2).gamma(5.0, 0.2, 50)
     weights = np.full(50, 7)
     assert scale_test(means, 2, 9, weights=weights) == scale_test(means, 2, 9)
@@ -117,7 +114,7 @@ def test_equal_weights_change_nothing() -> None:
     assert equivalence(means, 2, 9, settings, weights=weights) == equivalence(means, 2, 9, settings)
 
 
-def test_a_weighted_mean_spreads_as_fewer_runs() -> None:
+def test_a_weighted_mean_spreads_as_fewer_runs():
     means, weights = np.array([1.0, 2.0, 3.0]), np.array([1, 1, 4])
     found = weighted_of(means, weights)
     assert found.ratio == pytest.approx((1 + 2 + 12) / 6)
@@ -131,7 +128,7 @@ def test_a_weighted_mean_spreads_as_fewer_runs() -> None:
     assert high / low > np.divide(*ratio_interval(means, 3)[:0:-1])
 
 
-def test_runs_count_by_their_steps_in_a_group() -> None:
+def test_runs_count_by_their_steps_in_a_group():
     """By the mean NIS so far a run stays long in a group when later errors are small: plain means are not 1."""
     rng, runs = np.random.default_rng(3), 4000
     variance, error, rows = 1.0, rng.standard_normal(runs), []
@@ -152,12 +149,12 @@ def test_runs_count_by_their_steps_in_a_group() -> None:
 # --- verdicts -------------------------------------------------------------------------------------------------
 
 
-def verdict_by(column: Array, **settings: object) -> Verdict:
+def verdict_by(column, **settings):
     error, covariance, _ = wrong_in_the_first()
     return cs.judge(error, covariance, by={"mode": column}, **settings)
 
 
-def test_the_wrong_group_is_named_and_where_it_is_right() -> None:
+def test_the_wrong_group_is_named_and_where_it_is_right():
     error, covariance, column = wrong_in_the_first()
     error[column == 0] /= 2.0  # right everywhere: the same draws
     right = cs.judge(error, covariance, by={"mode": column})
@@ -176,7 +173,7 @@ def test_the_wrong_group_is_named_and_where_it_is_right() -> None:
     assert right.reasons[0].startswith("consistent: ")
 
 
-def test_without_groups_no_number_changes() -> None:
+def test_without_groups_no_number_changes():
     error, covariance, column = wrong_in_the_first()
     plain = cs.judge(error, covariance)
     assert plain.by_group is None
@@ -187,7 +184,7 @@ def test_without_groups_no_number_changes() -> None:
     assert sum(shares.values()) == pytest.approx(1.0)
 
 
-def test_a_wrong_group_makes_a_whole_that_is_right_wrong() -> None:
+def test_a_wrong_group_makes_a_whole_that_is_right_wrong():
     """The mean over all is 1; one group is too small, and one too large."""
     error, covariance = errors(runs=80)
     names = np.array(list("abcd"))[(np.arange(20) + np.arange(80)[:, None]) % 4]
@@ -206,7 +203,7 @@ def test_a_wrong_group_makes_a_whole_that_is_right_wrong() -> None:
     assert [g.status for g in allowed.by_group.groups][:2] == ["overconfident", "consistent"]
 
 
-def test_a_group_on_the_other_side_than_the_whole_makes_it_inconsistent() -> None:
+def test_a_group_on_the_other_side_than_the_whole_makes_it_inconsistent():
     error, covariance = errors(runs=80)
     kinds = np.repeat(["large", "small"], [60, 20])
     error[kinds == "large"] *= 2.0
@@ -215,7 +212,7 @@ def test_a_group_on_the_other_side_than_the_whole_makes_it_inconsistent() -> Non
     assert cs.judge(error, covariance, by={"kind": kinds}).status == "inconsistent"
 
 
-def test_a_group_in_few_runs_says_so() -> None:
+def test_a_group_in_few_runs_says_so():
     error, covariance = errors(runs=30)
     rare = np.where(np.arange(30) < 4, "rare", "usual")
     verdict = cs.judge(error, covariance, by={"kind": rare})
@@ -226,7 +223,7 @@ def test_a_group_in_few_runs_says_so() -> None:
     assert line.endswith("such runs would probably decide")
 
 
-def test_steps_without_a_value_are_counted() -> None:
+def test_steps_without_a_value_are_counted():
     error, covariance, column = wrong_in_the_first()
     column = column.astype(float)
     column[:, :3] = np.nan
@@ -235,7 +232,7 @@ def test_steps_without_a_value_are_counted() -> None:
     assert "120 steps without a value of mode are in no group" in verdict.reasons
 
 
-def test_heavy_tails_in_a_group_are_called_so() -> None:
+def test_heavy_tails_in_a_group_are_called_so():
     """Three of forty runs in one group are far larger: no scale that is wrong, however it is found."""
     few, many = (stats.chi2.ppf((np.arange(count) + 0.5) / count, 3) for count in (40, 240))
     few[-3:] *= 2.5
@@ -245,7 +242,7 @@ def test_heavy_tails_in_a_group_are_called_so() -> None:
     assert verdict.status == "heavy-tailed"
 
 
-def test_a_tolerated_ratio_is_no_fault_of_a_group() -> None:
+def test_a_tolerated_ratio_is_no_fault_of_a_group():
     column = wrong_in_the_first()[2]
     error, covariance = errors(runs=100)
     error[column[:1].repeat(100, axis=0) == 0] *= np.sqrt(1.3)
@@ -257,7 +254,7 @@ def test_a_tolerated_ratio_is_no_fault_of_a_group() -> None:
     assert {group.equivalence.factor for group in tolerant.by_group.groups} == {2.0}
 
 
-def test_standard_deviations_are_judged_by_group_one_by_one() -> None:
+def test_standard_deviations_are_judged_by_group_one_by_one():
     error, covariance, column = wrong_in_the_first()
     sigma = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
     verdict = cs.judge(error, deviations=sigma, axes=("x", "y"), by={"mode": column})
@@ -271,7 +268,7 @@ def test_standard_deviations_are_judged_by_group_one_by_one() -> None:
     assert "; x: consistent in each of 4 groups by mode; y: consistent in each of 4 groups by mode" in right.reasons[0]
 
 
-def test_groups_go_with_runs_windows_and_pieces() -> None:
+def test_groups_go_with_runs_windows_and_pieces():
     error, covariance, column = wrong_in_the_first()
     groups = groups_of(column_of("mode", column))
     record = Record("mine", error, covariance, nees=np.square(error).sum(-1), dof=2, groups=groups)
@@ -285,7 +282,7 @@ def test_groups_go_with_runs_windows_and_pieces() -> None:
     assert in_pieces(log, 20).groups.index[1, :4].tolist() == [0, 1, 2, 3]
 
 
-def test_the_plan_counts_on_the_share_of_groups() -> None:
+def test_the_plan_counts_on_the_share_of_groups():
     runs = group_runs(3, 1.5, 5)
     asked = [question for question in SHARES if "pose and map" not in question]
     rate = shares_of(asked)[GROUP] * 0.05 / 5
@@ -295,7 +292,7 @@ def test_the_plan_counts_on_the_share_of_groups() -> None:
         group_runs(3, 1.5, 1)
 
 
-def test_the_figure_has_a_row_for_each_group() -> None:
+def test_the_figure_has_a_row_for_each_group():
     (figure,) = by_group(verdict_by(wrong_in_the_first()[2]))
     assert figure.title == "By mode"
     (axes,) = figure.drawings[0]().axes
@@ -309,7 +306,7 @@ def test_the_figure_has_a_row_for_each_group() -> None:
 # --- what selects on the outcome ------------------------------------------------------------------------------
 
 
-def test_columns_made_from_the_errors_are_refused() -> None:
+def test_columns_made_from_the_errors_are_refused():
     error, covariance = errors()
     nees = np.square(error).sum(-1)
     made = {"a": nees, "b": np.log(nees), "c": np.abs(error[..., 1]), "d": -error[..., 0], "e": nees > 9.21}
@@ -321,7 +318,7 @@ def test_columns_made_from_the_errors_are_refused() -> None:
             cs.judge(error, covariance, by={name: np.arange(40)})
 
 
-def test_honest_columns_are_not_refused() -> None:
+def test_honest_columns_are_not_refused():
     error, covariance = errors()
     flat, nees = error.reshape(-1, 2), np.square(error).sum(-1).ravel()
     number = np.arange(len(flat)) % 40.0
@@ -333,7 +330,7 @@ def test_honest_columns_are_not_refused() -> None:
     assert selects_on_outcome(Column("n_matches", number), ("x", "y"), flat, flat, covariance) == ""
 
 
-def test_the_way_of_one_run_is_not_its_drift() -> None:
+def test_the_way_of_one_run_is_not_its_drift():
     """Errors that only grow are in the order of the way, of which they are not made."""
     way = np.linspace(0.0, 100.0, 200)
     drift = np.column_stack([0.01 * way, 0.001 * way**2])
@@ -343,16 +340,16 @@ def test_the_way_of_one_run_is_not_its_drift() -> None:
 
 
 @pytest.mark.parametrize("name", ["x", "true_x", "x_gt", "est_y", "sigma", "P_xx", "std_y"])
-def test_names_that_select_on_the_outcome(name: str) -> None:
+def test_names_that_select_on_the_outcome(name):
     assert selects_on_outcome(Column(name, np.arange(40.0)), ("x", "y")) != ""
 
 
 @pytest.mark.parametrize("name", ["p_hpa", "gnss_std", "speed", "true_speed", "t", "var_of_matches"])
-def test_names_that_do_not(name: str) -> None:
+def test_names_that_do_not(name):
     assert selects_on_outcome(Column(name, np.arange(40.0)), ("x", "y")) == ""
 
 
-def test_groups_of_the_outcome_show_and_do_not_convict() -> None:
+def test_groups_of_the_outcome_show_and_do_not_convict():
     rng = np.random.default_rng(6)
     error, variance = rng.standard_normal((60, 20, 1)), rng.chisquare(5, (60, 20)) / 5.0
     verdict = cs.judge(error, variance[..., None, None], by={"quality": 3.0 * np.sqrt(variance)})
@@ -370,7 +367,7 @@ def test_groups_of_the_outcome_show_and_do_not_convict() -> None:
 
 
 @pytest.fixture
-def table(tmp_path: Path) -> Path:
+def table(tmp_path):
     """Runs of one component with their truth, whose P is too small by x4 where n_matches is 5."""
     rng, rows = np.random.default_rng(8), []
     for run in range(40):
@@ -384,7 +381,7 @@ def table(tmp_path: Path) -> Path:
     return tmp_path / "est.csv"
 
 
-def test_a_column_of_the_table(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_column_of_the_table(table, capsys):
     out, _ = consistency(capsys, "analyse", table, "--state", "a", "--by", "n_matches", "--bins", "40,", "--json")
     by = json.loads(out)["est"]["statistics"]["by"]
     assert [group["name"] for group in by["groups"]] == ["n_matches <= 40", "n_matches > 40"]
@@ -395,13 +392,13 @@ def test_a_column_of_the_table(table: Path, capsys: pytest.CaptureFixture[str]) 
     assert record.groups.index[:3, 0].tolist() == [0, 1, 0]
 
 
-def test_the_size_of_the_truth_is_seen_by_its_values(table: Path) -> None:
+def test_the_size_of_the_truth_is_seen_by_its_values(table):
     verdict = cs.judge(cs.read(table, state=["a"], by="far"))
     assert verdict.by_group.outcome == "is a component of the truth"
     assert GROUP not in [answer.question for answer in verdict.answers]
 
 
-def test_a_table_beside_the_estimates(table: Path, tmp_path: Path) -> None:
+def test_a_table_beside_the_estimates(table, tmp_path):
     """The last value at or before a step counts; before the first there is none."""
     (tmp_path / "sats.csv").write_text("run,t,sats\n" + "".join(f"{run},0.5,9\n{run},1.2,4\n" for run in range(40)))
     record = cs.read(table, state=["a"], by="sats", by_file=tmp_path / "sats.csv")
@@ -413,7 +410,7 @@ def test_a_table_beside_the_estimates(table: Path, tmp_path: Path) -> None:
     assert record.groups.index[:3, -1].tolist() == [0, 1, 0]
 
 
-def test_a_trajectory_with_a_table(tmp_path: Path) -> None:
+def test_a_trajectory_with_a_table(tmp_path):
     rng, t = np.random.default_rng(9), np.arange(400) / 10.0
     poses = np.column_stack([t, rng.standard_normal((400, 3)), np.zeros((400, 3)), np.ones(400)])
     covariance = np.column_stack([t, np.tile(0.01 * np.eye(6).ravel(), (400, 1))])
@@ -428,7 +425,7 @@ def test_a_trajectory_with_a_table(tmp_path: Path) -> None:
         cs.read(tmp_path / "est.txt", **files, by="n_matches")
 
 
-def test_windows_take_the_value_at_their_beginning(tmp_path: Path) -> None:
+def test_windows_take_the_value_at_their_beginning(tmp_path):
     rng, rows, true = np.random.default_rng(10), [], []
     for step in range(41):
         small, P = 0.01 * rng.standard_normal(3), "0.0001,0,0,0.0001,0,0.0001"
@@ -443,13 +440,13 @@ def test_windows_take_the_value_at_their_beginning(tmp_path: Path) -> None:
     assert record.as_runs.groups.index[:4, 0].tolist() == [0, 1, 0, 1]
 
 
-def test_innovations_have_no_groups(tmp_path: Path) -> None:
+def test_innovations_have_no_groups(tmp_path):
     (tmp_path / "nis.csv").write_text("t,nis,nis_dof,mode\n0,1,1,1\n1,1,1,2\n")
     with pytest.raises(cs.InputError, match=r"--by mode: .*nis.csv has no truth"):
         cs.read(tmp_path / "nis.csv", by="mode")
 
 
-def test_a_component_that_is_not_judged_is_environment(tmp_path: Path) -> None:
+def test_a_component_that_is_not_judged_is_environment(tmp_path):
     rng = np.random.default_rng(11)
     rows = [f"{k},{a},0,{a + b},{c},1,{a}" for k, (a, b, c) in enumerate(rng.standard_normal((60, 3)))]
     (tmp_path / "est.csv").write_text("t,a,P_a_b,true_a,b,P_a_a,mine\n" + "\n".join(rows) + "\n")
@@ -458,7 +455,7 @@ def test_a_component_that_is_not_judged_is_environment(tmp_path: Path) -> None:
     assert cs.read(tmp_path / "est.csv", state=["a"], by="mine").groups.outcome == "is a component of the estimate"
 
 
-def test_a_key_of_an_archive(tmp_path: Path) -> None:
+def test_a_key_of_an_archive(tmp_path):
     error, covariance, column = wrong_in_the_first()
     np.savez(tmp_path / "mine.npz", errors=error, covariances=covariance, mode=column, lab=np.arange(40) % 2)
     assert cs.read(tmp_path / "mine.npz", by="lab").groups.index[:3, 5].tolist() == [0, 1, 0]
@@ -471,7 +468,7 @@ def test_a_key_of_an_archive(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         (["--by", "nope"], "--by nope: .*est.csv has no such column; there are: run, step"),
         (["--bins", "4"], "--bins: goes with --by COLUMN"),
@@ -483,9 +480,7 @@ def test_a_key_of_an_archive(tmp_path: Path) -> None:
         (["--by", "n_matches", "--truth-errors", "common"], "does not go with --by"),
     ],
 )
-def test_options_that_do_not_fit(
-    table: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, options: list[str], message: str
-) -> None:
+def test_options_that_do_not_fit(table, capsys, monkeypatch, options, message):
     monkeypatch.chdir(table.parent)
     for name, text in (("one", "a,site\n1,2\n"), ("two", "run,site\n99,2\n"), ("three", "run,site\n0,1\n0,2\n")):
         Path(f"{name}.csv").write_text(text)
@@ -493,7 +488,7 @@ def test_options_that_do_not_fit(
     assert re.search(message, err)
 
 
-def test_plan_says_how_many_runs_groups_take(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_says_how_many_runs_groups_take(capsys):
     out, _ = consistency(capsys, "plan", "--detect", "1.5", "--groups", "5")
     each = group_runs(3, 1.5, 5)
     assert f"{5 * each} runs, {each} in each of 5 groups, find that in one group by itself (--by)" in out

@@ -1,20 +1,17 @@
 """Files with names and axes of the user's own: each is read as a file with those of docs/files.md."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from command import consistency
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.referee.readers.formats.column_renaming import renamed
 from consistency.referee.readers.places import one_of_each_kind
-from consistency.referee.types import Array
 
 STEPS = 6
 NED, FRD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.diag([1.0, -1.0, -1.0])  # to ENU, to FLU
@@ -23,7 +20,7 @@ POSE = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 MOVING = ["vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz"]
 
 
-def table(path: Path, names: list[str], *columns: Array) -> Path:
+def table(path, names, *columns):
     rows = np.column_stack(columns)
     text = "\n".join(",".join(map(repr, map(float, row))) for row in rows)
     path.parent.mkdir(exist_ok=True)
@@ -31,7 +28,7 @@ def table(path: Path, names: list[str], *columns: Array) -> Path:
     return path
 
 
-def states(k: int) -> tuple[Array, Array, Array]:
+def states(k):
     """Estimates and truth t, x, y, z, a quaternion and k numbers more, (STEPS, 8 + k), and covariances."""
     rng = np.random.default_rng()
     n = 6 + k
@@ -43,7 +40,7 @@ def states(k: int) -> tuple[Array, Array, Array]:
     return own, true, root @ np.swapaxes(root, 1, 2) + np.eye(n)
 
 
-def turned(state: Array, world: Array = NED, body: Array = FRD) -> Array:
+def turned(state, world=NED, body=FRD):
     """A state of enu and flu in axes whose matrices are ``world`` and ``body``."""
     out = state.copy()
     out[:, 1:4] = state[:, 1:4] @ world
@@ -55,7 +52,7 @@ def turned(state: Array, world: Array = NED, body: Array = FRD) -> Array:
     return out
 
 
-def carried(P: Array, convention: str, world: Array = NED, body: Array = FRD) -> Array:
+def carried(P, convention, world=NED, body=FRD):
     """Covariances of the same errors in these axes."""
     position, rotation = {"left": (body, body), "so3-body": (world, body)}.get(convention, (world, world))
     velocity = body if convention == "left" else world
@@ -66,7 +63,7 @@ def carried(P: Array, convention: str, world: Array = NED, body: Array = FRD) ->
     return np.asarray(T[:n, :n] @ P @ T[:n, :n].T)
 
 
-def with_covariance(path: Path, own: Array, P: Array) -> Path:
+def with_covariance(path, own, P):
     n = P.shape[-1]
     names = [*POSE, *MOVING[: own.shape[1] - 8], *(f"P_{i}_{j}" for i in range(n) for j in range(n))]
     return table(path, names, own, P.reshape(len(P), -1))
@@ -74,7 +71,7 @@ def with_covariance(path: Path, own: Array, P: Array) -> Path:
 
 @pytest.mark.parametrize("k", [0, 3, 9])
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_the_nees_is_that_in_other_axes(convention: str, k: int, tmp_path: Path) -> None:
+def test_the_nees_is_that_in_other_axes(convention, k, tmp_path):
     own, true, P = states(k)
     names = [*POSE, *MOVING[:k]]
     enu, ned = table(tmp_path / "enu.csv", names, true), table(tmp_path / "ned.csv", names, turned(true))
@@ -91,24 +88,24 @@ def test_the_nees_is_that_in_other_axes(convention: str, k: int, tmp_path: Path)
         cs.read(down, ned, error=convention),
     ]
     for record in found:
-        np.testing.assert_allclose(record.nees, expected, rtol=1e-6)
+        assert_allclose(record.nees, expected, rtol=1e-6)
     assert np.abs(cs.read(down, enu, error=convention).nees / expected - 1.0).max() > 0.01
     assert any(
         "the truth, in enu and flu, is read in the axes of the estimates, ned and frd" in n for n in found[0].notes
     )
 
 
-def test_the_additive_error_is_taken_in_the_axes_of_the_estimates(tmp_path: Path) -> None:
+def test_the_additive_error_is_taken_in_the_axes_of_the_estimates(tmp_path):
     own, true, P = states(3)
     names = [*POSE, *MOVING[:3]]
     down = with_covariance(tmp_path / "down.csv", turned(own), P)
     enu, ned = table(tmp_path / "enu.csv", names, true), table(tmp_path / "ned.csv", names, turned(true))
     record = cs.read(down, enu, error="additive", world="ned", body_axes="frd")
-    np.testing.assert_allclose(record.nees, cs.read(down, ned, error="additive").nees, rtol=1e-6)
+    assert_allclose(record.nees, cs.read(down, ned, error="additive").nees, rtol=1e-6)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_the_covariance_of_the_truth_is_turned_with_it(convention: str, tmp_path: Path) -> None:
+def test_the_covariance_of_the_truth_is_turned_with_it(convention, tmp_path):
     own, true, P = states(0)
     rng = np.random.default_rng()
     root = rng.normal(size=(STEPS, 6, 6))
@@ -116,17 +113,17 @@ def test_the_covariance_of_the_truth_is_turned_with_it(convention: str, tmp_path
     plain = with_covariance(tmp_path / "own.csv", own, P)
     enu = with_covariance(tmp_path / "enu.csv", true, of_truth)
     ned = with_covariance(tmp_path / "ned.csv", turned(true), carried(of_truth, convention))
-    given: dict[str, Any] = {"error": convention, "truth_covariance": "columns", "truth_errors": "independent"}
+    given = {"error": convention, "truth_covariance": "columns", "truth_errors": "independent"}
     expected = cs.read(plain, enu, **given)
     record = cs.read(plain, ned, **given, truth_world="ned", truth_body_axes="frd")
-    np.testing.assert_allclose(record.truth_covariance, expected.truth_covariance, rtol=1e-6, atol=1e-9)
+    assert_allclose(record.truth_covariance, expected.truth_covariance, rtol=1e-6, atol=1e-9)
 
 
 PLANE = ["t", "x", "y", "heading", "P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]
 
 
 @pytest.mark.parametrize("convention", ["so2", "left", "right"])
-def test_poses_in_the_plane(convention: str, tmp_path: Path) -> None:
+def test_poses_in_the_plane(convention, tmp_path):
     rng = np.random.default_rng()
     t, own = np.arange(STEPS, dtype=float), rng.normal(size=(STEPS, 3))
     true = own + 0.3 * rng.normal(size=(STEPS, 3))
@@ -135,31 +132,29 @@ def test_poses_in_the_plane(convention: str, tmp_path: Path) -> None:
     T = np.diag([1.0, -1.0, -1.0]) if convention == "left" else np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
     i, j = np.triu_indices(3)
 
-    def down(pose: Array) -> Array:
+    def down(pose):
         return np.column_stack([pose[:, 1], pose[:, 0], 0.5 * np.pi - pose[:, 2]])
 
     plain = table(tmp_path / "own.csv", PLANE, t, own, P[:, i, j])
     ned = table(tmp_path / "down.csv", PLANE, t, down(own), (T @ P @ T)[:, i, j])
     truth, truth_down = (table(tmp_path / f"{k}.csv", PLANE[:4], t, v) for k, v in (("t", true), ("td", down(true))))
     expected = cs.read(plain, truth, error=convention).nees
-    np.testing.assert_allclose(cs.read(ned, truth, error=convention, world="ned").nees, expected, rtol=1e-6)
-    np.testing.assert_allclose(
-        cs.read(plain, truth_down, error=convention, truth_world="ned").nees, expected, rtol=1e-6
-    )
+    assert_allclose(cs.read(ned, truth, error=convention, world="ned").nees, expected, rtol=1e-6)
+    assert_allclose(cs.read(plain, truth_down, error=convention, truth_world="ned").nees, expected, rtol=1e-6)
 
 
-def test_a_truth_of_positions(tmp_path: Path) -> None:
+def test_a_truth_of_positions(tmp_path):
     own, true, P = states(0)
     plain = with_covariance(tmp_path / "own.csv", own, P)
     down = with_covariance(tmp_path / "down.csv", turned(own), carried(P, "left"))
     points = table(tmp_path / "points.csv", POSE[:4], true[:, :4])
     expected = cs.read(plain, points, error="left", lever_arm=[0.5, 0.2, -0.1])
     record = cs.read(down, points, error="left", lever_arm=[0.5, -0.2, 0.1], world="ned", body_axes="frd")
-    np.testing.assert_allclose(record.nees, expected.nees, rtol=1e-6)
+    assert_allclose(record.nees, expected.nees, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("options", "why"),
+    "options, why",
     [
         ({"world": "neu"}, r"--world neu: is not right-handed"),
         ({"truth_world": "ne"}, r"--truth-world ne: must be three letters of e, w, n, s, u, d"),
@@ -167,14 +162,14 @@ def test_a_truth_of_positions(tmp_path: Path) -> None:
         ({"truth_body_axes": "flf"}, r"--truth-body-axes flf: is not right-handed"),
     ],
 )
-def test_axes_that_are_none_are_refused(options: dict[str, str], why: str, tmp_path: Path) -> None:
+def test_axes_that_are_none_are_refused(options, why, tmp_path):
     own, true, P = states(0)
     plain, truth = with_covariance(tmp_path / "own.csv", own, P), table(tmp_path / "truth.csv", POSE, true)
     with pytest.raises(cs.InputError, match=why):
         cs.read(plain, truth, **options)  # type: ignore[arg-type]
 
 
-def test_axes_need_poses(tmp_path: Path) -> None:
+def test_axes_need_poses(tmp_path):
     t = np.arange(STEPS, dtype=float)
     own = table(tmp_path / "own.csv", ["t", "a", "P_a_a"], t, t, t + 1.0)
     truth = table(tmp_path / "truth.csv", ["t", "a"], t, t + 0.5)
@@ -196,7 +191,7 @@ NAMES = "x=pos_n,y=pos_e,z=pos_d,qx=att_1,qy=att_2,qz=att_3,qw=att_0,vx=vel_n,vy
 TRUE_NAMES = NAMES.rpartition(",")[0]
 
 
-def test_columns_by_names_of_the_users_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_columns_by_names_of_the_users_own(tmp_path, capsys):
     own, true, P = states(3)
     plain, truth = with_covariance(tmp_path / "own.csv", own, P), table(tmp_path / "t.csv", [*POSE, *MOVING[:3]], true)
     entries = [f"C{i}_{j}" for i in range(9) for j in range(9)]
@@ -208,8 +203,8 @@ def test_columns_by_names_of_the_users_own(tmp_path: Path, capsys: pytest.Captur
     columns = dict(pair.split("=") for pair in f"t=time_us,{NAMES}".split(","))
     of_truth = dict(pair.split("=") for pair in f"t=time_us,{TRUE_NAMES}".split(","))
     record = cs.read(mine, other, error="so3", columns=columns, truth_columns=of_truth)
-    np.testing.assert_allclose(record.nees, expected.nees, rtol=1e-9)
-    np.testing.assert_allclose(record.t, expected.t)
+    assert_allclose(record.nees, expected.nees, rtol=1e-9)
+    assert_allclose(record.t, expected.t)
     shown, _ = consistency(
         capsys, "analyse", mine, "--truth", other, "--error", "so3", "--columns", f"t=time_us,{NAMES}",
         "--truth-columns", f"t=time_us,{TRUE_NAMES}", "--json",
@@ -217,7 +212,7 @@ def test_columns_by_names_of_the_users_own(tmp_path: Path, capsys: pytest.Captur
     assert '"convention": "so3"' in shown
 
 
-def test_a_folder_of_tables_is_read_as_runs(tmp_path: Path) -> None:
+def test_a_folder_of_tables_is_read_as_runs(tmp_path):
     rng = np.random.default_rng()
     t = np.arange(STEPS, dtype=float)
     names = ["when", "east", "north", "psi", *PLANE[4:]]
@@ -230,13 +225,13 @@ def test_a_folder_of_tables_is_read_as_runs(tmp_path: Path) -> None:
     assert (record.name, record.runs.tolist()) == ("est", [0, 1, 2])
     for run in range(3):
         one = cs.read(tmp_path / "est" / f"{run}.csv", tmp_path / "truth" / f"{run}.csv", columns=columns)
-        np.testing.assert_allclose(record.nees[run], one.nees[0], rtol=1e-12)  # type: ignore[index]
+        assert_allclose(record.nees[run], one.nees[0], rtol=1e-12)  # type: ignore[index]
     (tmp_path / "truth" / "2.csv").unlink()
     with pytest.raises(cs.InputError, match=r"--truth .*truth: holds no table '2' for .*2\.csv"):
         cs.read(tmp_path / "est", tmp_path / "truth", columns=columns)
 
 
-def test_a_folder_of_poses_with_own_names(tmp_path: Path) -> None:
+def test_a_folder_of_poses_with_own_names(tmp_path):
     names = {"x": "pn", "y": "pe", "z": "pd"}
     for run in range(2):
         own, true, P = states(0)
@@ -250,7 +245,7 @@ def test_a_folder_of_poses_with_own_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "columns", "expected"),
+    "names, columns, expected",
     [
         (["a", "b"], {"x": "a"}, ["x", "b"]),
         (["a", "x"], {"x": "a"}, ["x", "x not used"]),
@@ -262,12 +257,12 @@ def test_a_folder_of_poses_with_own_names(tmp_path: Path) -> None:
         (["Pos N"], {"x": "pos_n"}, ["x"]),
     ],
 )
-def test_names_in_place_of_others(names: list[str], columns: dict[str, str], expected: list[str]) -> None:
+def test_names_in_place_of_others(names, columns, expected):
     assert renamed(names, columns, Path("a.csv")) == expected
 
 
 @pytest.mark.parametrize(
-    ("columns", "why"),
+    "columns, why",
     [
         ("x", r"'x': columns are named as x=pos_n"),
         ("x=a,x=b", r"column 'x' is named twice"),
@@ -276,16 +271,14 @@ def test_names_in_place_of_others(names: list[str], columns: dict[str, str], exp
         ("x_0=t,x_*=P_0_*", r"own\.csv: two columns are named 'x_0'"),
     ],
 )
-def test_names_that_cannot_be_used_are_refused(
-    columns: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_that_cannot_be_used_are_refused(columns, why, tmp_path, capsys):
     own, true, P = states(0)
     plain, truth = with_covariance(tmp_path / "own.csv", own, P), table(tmp_path / "t.csv", POSE, true)
     _, said = consistency(capsys, "analyse", plain, "--truth", truth, "--columns", columns, status=2)
     assert re.search(why, said)
 
 
-def test_refusals_name_the_option(tmp_path: Path) -> None:
+def test_refusals_name_the_option(tmp_path):
     t = np.arange(STEPS, dtype=float)
     own = table(tmp_path / "own.csv", ["clock", "pos_n", "pos_e"], t, t, t)
     with pytest.raises(cs.InputError, match=r"--columns t=NAME says what it is called, in a truth --truth-columns"):
@@ -294,7 +287,7 @@ def test_refusals_name_the_option(tmp_path: Path) -> None:
         cs.read(own, own, columns={"t": "clock"}, truth_columns={"t": "clock"})
 
 
-def test_notes_of_like_files_are_one() -> None:
+def test_notes_of_like_files_are_one():
     notes = ["a/0.csv: read so", "b/0.csv: read otherwise", "a/1.csv: read so", "a/2.csv: read so", "", "whole"]
     assert one_of_each_kind(notes) == ("a/0.csv and 2 others: read so", "b/0.csv: read otherwise", "whole")
     assert one_of_each_kind(["a: so", "b: so", "c"]) == ("a: so", "b: so", "c")

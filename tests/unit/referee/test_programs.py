@@ -101,7 +101,7 @@ def test_a_run_has_a_folder_and_an_environment_of_its_own(place, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["./nothing", "{seed}"], "./nothing: no such program"),
         (["nothing-of-this-name"], "nothing-of-this-name: no such command"),
@@ -118,7 +118,7 @@ def test_a_program_that_is_none_is_refused_before_any_folder(words, message, pla
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         (["--runs", "0"], "--runs must be at least 1"),
         (["--jobs", "0"], "--jobs must be at least 1"),
@@ -454,7 +454,7 @@ def test_an_unfinished_folder_says_so(place, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
         (lambda place: script(place, COPY + "\n# changed"), "filter has changed since the runs"),
         (lambda place: (place / "gains.txt").write_text("2"), "gains.txt has changed since"),

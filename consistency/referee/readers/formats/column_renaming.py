@@ -88,7 +88,7 @@ def _alike(name: str) -> list[str]:
 
 
 def _plays(name: str, words: Sequence[str]) -> bool:
-    """Whether a column has one of some spellings: with a unit, at the end of a longer name, or in an estimate's name."""
+    """Whether a column has one of some spellings: with a unit, in a longer name, or in an estimate's name."""
     plain = plain_name(name)
     bare = re.sub(rf"_({'|'.join(UNITS)})$", "", plain)
     stem = stem_of(name, OWN[1:]) or plain

@@ -11,8 +11,8 @@ import pytest
 from draws import identities, independent
 from scipy import integrate, stats
 
-from consistency.bench.runs import sequential
 from consistency.diagnostics import Design, Record, Verdict, e_process, ever, follow, judge, look, sequential_design
+from consistency.referee.diagnostics import judge_record
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
 from consistency.referee.diagnostics.statistics import e_process as betting
@@ -233,14 +233,14 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch):
         status = script.get((evidence.name, runs), "consistent" if evidence.name == "early" else "undecided")
         return Verdict(evidence.name, status, runs, 1, design.settings, reasons=(f"{status}: at {runs}",))
 
-    monkeypatch.setattr(sequential, "look", verdict_at)
-    monkeypatch.setattr(sequential, "speaks", lambda design, evidence, spent: spent is not None)
+    monkeypatch.setattr(judge_record, "look", verdict_at)
+    monkeypatch.setattr(judge_record, "speaks", lambda design, evidence, spent: spent is not None)
     verdicts = {}
 
     def read(runs, name):
         return Record(name, runs=np.arange(runs))
 
-    counts = list(sequential.looks(sequential_design(3), ["early", "late"], read, verdicts))
+    counts = list(judge_record.looks(sequential_design(3), ["early", "late"], read, verdicts))
     assert counts == [12, 15, 18, 21, 24]
     assert {name: v.status for name, v in verdicts.items()} == {"early": "overconfident", "late": "conservative"}
     assert [call for call in calls if call[0] == "early"] == [("early", 12)]

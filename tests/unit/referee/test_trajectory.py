@@ -107,7 +107,7 @@ def test_readers_keep_the_path_for_the_pictures(tmp_path):
     assert_allclose(one.path[..., 0, :] - one.path[..., 1, :], one.error[..., :3], atol=1e-12)
     v = cs.judge(one)
     titles = [figure.title for figure in record_figures(one, v)]
-    assert titles == ["Errors and stated bounds", "NEES", "Trajectory", "Coverage"]
+    assert titles == ["NEES", "Errors over their stated sigma", "Errors and stated bounds", "Trajectory", "Coverage"]
     labels = [line.get_label() for axes in drawn(overview(one, v)).axes for line in axes.lines]
     assert {"truth", "estimate", "all together"} <= set(labels)
     assert one.of_runs(slice(0, 1)).path is not None

@@ -82,7 +82,8 @@ def test_a_fault_of_a_correlation_names_the_combination(rng):
     assert all(verdict.axes.inflation[axis].holds(1.0) for axis in "xyz")
     assert not any("worst axis" in text or "mainly" in text for text in verdict.reasons)
     assert any(
-        "no axis is shown to be wrong by itself, only errors in a combination of x and y (correlation" in text
+        "no axis is shown to be wrong to that side by itself, only errors in a combination of x and y (correlation"
+        in text
         for text in verdict.reasons
     )
 

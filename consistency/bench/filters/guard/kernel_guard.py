@@ -36,7 +36,7 @@ class Watch(NamedTuple):
     sightings: Indices  # (n_landmarks,)
     misses: Indices  # (n_landmarks,) rejected one after the other, up to the last
     begun: Indices  # (n_landmarks,) row with which each landmark began, until another agrees with it; then -1
-    anew: Array  # (M,) rows with which a landmark restarts
+    again: Array  # (M,) rows with which a landmark restarts
     kept: Array  # (m,) of the known landmarks in a step
     own: Array  # (m,) squared distance of each alone
     order: Indices  # (m,) those that pass the gate

@@ -324,7 +324,9 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     if v.faults and worst is not None:
         lines.append(f"covariance ratio of the worst axis: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
     elif _any_of(SCALE, v.faults) and v.worst_axis is not None:
-        lines.append(f"no axis is shown to be wrong by itself, only errors {combination_text(v)}; of all {of_all}")
+        lines.append(
+            f"no axis is shown to be wrong to that side by itself, only errors {combination_text(v)}; of all {of_all}"
+        )
     if v.by_group is not None:
         lines += lines_of_groups(v.by_group, v.unit)
     if v.lost is not None and _has_lost(v) and (v.lost.count or v.settings.lost is not None):

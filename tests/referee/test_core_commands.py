@@ -72,8 +72,8 @@ def test_help(command, capsys):
     status, out, err = here([*command.split(), "--help"], capsys)
     assert (status, err) == (0, "")
     assert "Usage: " in out
-    assert ("--truth" in out) == (command in ("analyse", "compare", "baseline"))
-    assert ("--false-alarm" in out) == (command in ("analyse", "compare", "monitor", "plan"))
+    assert ("\n  --truth " in out) == (command in ("analyse", "compare", "baseline"))
+    assert ("\n  --false-alarm " in out) == (command in ("analyse", "compare", "monitor", "plan"))
 
 
 @pytest.mark.parametrize(

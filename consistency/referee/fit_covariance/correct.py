@@ -94,9 +94,11 @@ class Correction:
 
     @property
     def needed(self) -> int | None:
-        """Runs that would probably decide; None where that is not known."""
+        """Runs that would probably decide, where those judged do not; None where that is not known."""
         shown = self.verdict.equivalence
-        return None if shown is None else shown.runs
+        if shown is None or shown.runs is None:
+            return None
+        return max(shown.runs, len(self.judged) + 1)
 
     @property
     def status(self) -> str:

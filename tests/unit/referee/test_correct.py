@@ -380,3 +380,13 @@ def test_pictures_are_drawn(tmp_path):
     assert [len(line.get_xdata()) for line in runs.lines if line.get_marker() == "s"] == [5]
     assert factors.get_xlabel() == "factor on variances"
     assert {line.get_label() for line in coverage.lines} >= {"stated", "corrected"}
+
+
+def test_more_runs_than_those_judged_would_decide():
+    """One run that differs keeps the others from showing anything."""
+    rng = np.random.default_rng(8)
+    errors = rng.normal(size=(40, 100, 3))
+    errors[17] *= 1.45
+    found = cs.correct(errors, np.broadcast_to(np.eye(3), (40, 100, 3, 3)))
+    assert found.status == "undecided"
+    assert found.needed > 40

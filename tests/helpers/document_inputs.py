@@ -46,6 +46,8 @@ NOT_RUN = [
     ("docs/reference/file-kinds.md", "consistency analyse drive.bag", "tests/unit/referee/test_bags.py"),
     ("docs/reference/file-kinds.md", "consistency analyse drive --truth-topic", "tests/unit/referee/test_bags.py"),
     ("docs/reference/file-kinds.md", "consistency analyse drives --truth-topic", "tests/unit/referee/test_bags.py"),
+    ("docs/reference/file-kinds.md", "consistency analyse est.csv --truth truth.csv --columns",
+     "tests/unit/referee/test_own_names.py reads such tables"),
     ("docs/files.md", "consistency analyse keyframes.csv", "tests/unit/referee/test_relative.py has cross-covariances"),
     ("docs/files.md", "consistency analyse est.tum", "tests/oracle/test_gtsam_windows.py has such marginals"),
     ("docs/files.md", "joint = marginals", "tests/oracle/test_gtsam_windows.py does the same"),

@@ -122,7 +122,7 @@ def test_the_renderer_of_the_document_works(copy):
     words = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a", "--report", "out.csv"]
     done = python(copy, f"from consistency.commands import main\nmain({words})")
     assert done.stdout.endswith("out.csv\n"), done.stderr
-    heads, cells = (copy / "out.csv").read_text().splitlines()
+    heads, cells, *_ = (copy / "out.csv").read_text().splitlines()
     assert heads == "filter,verdict,ANEES,true / stated,RMSE m,RMSE deg,NIS/dof,failed"
     assert cells.startswith("est,overconfident,29.00,")
     imports = "from pathlib import Path\nfrom consistency.referee.gating.session import path_fault"
@@ -153,7 +153,7 @@ def test_a_default_stands_once(copy):
     """One file: the command line, its help, Python and the gates have it."""
     changed(copy / "consistency/referee/defaults.py", "FALSE_ALARM = 0.05", "FALSE_ALARM = 0.037")
     asked = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a"]
-    for words in (asked, ["analyse", "--help"]):
+    for words in ([*asked, "--verbose"], ["analyse", "--help"]):
         assert "0.037" in python(copy, f"from consistency.commands import main\nmain({words})").stdout
     gate = "import consistency as cs\nprint(cs.judge(cs.read('est.csv', truth='truth.csv', state='a')).statistics)"
     assert "0.037" in python(copy, gate).stdout

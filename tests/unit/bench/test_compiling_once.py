@@ -120,7 +120,7 @@ def test_arguments_of_other_types_are_other_kinds():
 
 def test_content_is_found_once(monkeypatch):
     class Unknown:
-        unknown, key, found = "something", "", 0
+        unknown, key, found, size = "something", "", 0, 0
         functions: ClassVar[dict[str, int]] = {}
 
         def __init__(self, function, signature):

@@ -221,7 +221,8 @@ def test_unfinished_work_is_neither_ignored_nor_dropped_unasked(tmp_path):
     with Unfinished(out) as first:
         fill(first.journal, 0, 1)
     for _ in range(2):
-        with pytest.raises(cs.InputError, match=r"with 2 finished runs; add --resume .* to go on, or --overwrite"):
+        said = "with 2 finished runs; add --resume to the same command to continue, or --overwrite"
+        with pytest.raises(cs.InputError, match=said):
             Unfinished(out)
     with Unfinished(out, resume=True) as again:
         assert again.journal.runs == {0, 1}

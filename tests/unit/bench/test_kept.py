@@ -64,7 +64,7 @@ def test_damaged_code_is_compiled_anew_and_said_once(cache, capsys, damage):
     assert use() == (False, 0)
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert ("somebody else" if damage in (empty, open_to_all) else "compiled anew") in said
+    assert ("somebody else" if damage in (empty, open_to_all) else "compiled again") in said
     assert use() == (True, 1)
     assert capsys.readouterr().err == ""
 

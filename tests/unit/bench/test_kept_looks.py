@@ -20,6 +20,7 @@ from consistency.bench.store.log import read_log
 from consistency.bench.store.results import StoredResults, open_results
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.diagnostics import Record
+from consistency.referee.diagnostics import judge_record
 from consistency.referee.document.judged_filters import document
 from consistency.referee.show.as_json import render
 
@@ -105,14 +106,14 @@ def test_ctrl_c_keeps_what_is_finished(
     """While runs are done, and while a look is taken after the last of them."""
     with monkeypatch.context() as patch:
         if look:
-            look_at = sequential.look
+            look_at = judge_record.look
 
             def pressed(design: Any, record: Record, spent: float | None) -> Any:
                 if len(record.run_numbers) == 20:
                     raise KeyboardInterrupt
                 return look_at(design, record, spent)
 
-            patch.setattr(sequential, "look", pressed)
+            patch.setattr(judge_record, "look", pressed)
         else:
             stop_at(14, KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):

@@ -263,7 +263,7 @@ MISTAKES = [
     *((kind, {"rate": -0.1}, r"\.rate': .*greater than or equal to 0") for kind in GOOD if "rate" in GOOD[kind]),
     ("heavy-tails", {"sigma_px": [1.0, -1.0, 1.0]}, r"\.sigma\.1': .*greater than or equal to 0"),
     ("heavy-tails", {"sigma_px": [1.0, 1.0]}, r"\.sigma\.2': missing"),
-    ("heavy-tails", {"sigma_m": [1.0, 1.0, 1.0]}, r"\.sigma_m': unknown key; allowed here: kind, name, rate, sigma "),
+    ("heavy-tails", {"sigma_m": [1.0, 1.0, 1.0]}, r"\.sigma_m': unknown key; allowed here: kind, name, rate, sigma"),
     ("track-error", {"correlation": 1.0}, r"\.correlation': .*less than 1 \(got 1\.0\)$"),
     ("track-error", {"correlation": -0.5}, r"\.correlation': .*greater than or equal to 0"),
     ("mismatch", {"disparity_px": [9.0, 9.0]}, r"disparity must be \[low, high\] with low < high$"),

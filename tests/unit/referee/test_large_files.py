@@ -83,7 +83,11 @@ def test_numbers_in_blocks_are_those_line_by_line(name, tmp_path):
 
 def test_the_line_of_a_fault_far_down_is_named(tmp_path):
     path, rows = tmp_path / "a.txt", [f"{k} 2 3" for k in range(1, 400)]
-    for line, bad, what in ((7, "7 2", "has 2 columns"), (390, "390 two 3", "not a number"), (399, "398 2 3", "twice")):
+    for line, bad, what in (
+        (7, "7 2", "has 2 columns"),
+        (390, "390 two 3", "not a number"),
+        (399, "398 2 3", "duplicated"),
+    ):
         path.write_text("# t a b\n" + "\n".join([*rows[: line - 1], bad, *rows[line:]]) + "\n", encoding="utf-8")
         for size in (50, 2**22):
             found = numbers_of(path, size)

@@ -102,7 +102,7 @@ def test_gates_are_summed_up_and_written(session, workers):
             "    the estimator is overconfident*covariance too small by x2*",
             "test_it.py::test_few *too few runs *8 *102 *",
             "test_it.py::test_wanted *fault found (expected) *",
-            "4 gates, 2 failed, 1 failed as expected; chance that any fails without a fault at most 0.003",
+            "4 gates, 2 failed, 1 failed as expected; probability that any fails without a fault at most 0.003",
         ]
     )
     gates = {each["test"].split("::")[1]: each for each in gates_of(session.path)}

@@ -214,7 +214,7 @@ def test_too_short_pieces_are_undecided():
     one = log(np.random.default_rng(5), 400, 0.9)
     v = judge(in_pieces(one))
     assert (v.status, v.runs) == ("undecided", FEWEST)
-    assert "20 pieces of 20 steps are not shown to be independent: errors go on over" in v.reasons[0]
+    assert "20 pieces of 20 steps are not shown to be independent: errors last over" in v.reasons[0]
     few = judge(in_pieces(log(np.random.default_rng(5), 4000), 10))
     assert "10 pieces of one log are too few, at least 20 are needed" in few.reasons[0]
 

@@ -122,8 +122,12 @@ def test_images_of_any_kind_become_grey():
     assert grey(colour)[0, 0] == round(0.587 * 200)
     assert grey(np.full((4, 5), 65535, np.uint16))[0, 0] == 255
     assert grey(np.full((4, 5), 300.0))[0, 0] == 255
-    for wrong, said in ((np.zeros((2, 2, 2)), "shape"), (np.zeros((0, 3)), "no image"), (np.array([["a"]]), "no image"),
-                        (np.full((2, 2), np.nan), "finite")):  # fmt: skip
+    for wrong, said in (
+        (np.zeros((2, 2, 2)), "shape"),
+        (np.zeros((0, 3)), "not an image"),
+        (np.array([["a"]]), "not an image"),
+        (np.full((2, 2), np.nan), "finite"),
+    ):
         with pytest.raises(cs.InputError, match=said):
             grey(wrong, "my image")
 

@@ -162,3 +162,16 @@ def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report):
     studies = (replace(report.studies[0], tracks=(changed,)), replace(report.studies[1], tracks=(changed,)))
     (axes,) = panels(opening(replace(report, studies=studies))[0])
     assert axes.get_xlim()[1] == pytest.approx(3.0)
+
+
+def test_findings_on_paper_leave_the_rules_out(report):
+    finding = {
+        "id": "one", "claim": "it holds", "accept": "p above 0.05", "source": "a paper", "scenario": "none",
+        "published": "yes", "measured": "yes", "verdict": "reproduced", "runs": 4, "seed": 0,
+    }  # fmt: skip
+    made = compose(replace(report, findings=(finding,)))
+    [(_, [on_page])] = made.chapters[0].blocks[0].groups
+    [(_, [on_paper])] = made.paper[0].blocks[0].groups
+    assert [line.text for line in on_page[1].below] == ["Accepted if: p above 0.05", "a paper. "]
+    assert [line.text for line in on_paper[1].below] == ["a paper"]
+    assert on_paper[2:] == on_page[2:]

@@ -73,9 +73,9 @@ def shown(report: Report, exhibits: Sequence[Exhibit]) -> tuple[Block, ...]:
     return tuple(blocks)
 
 
-def findings_table(findings: Sequence[dict[str, Any]], label: str, caption: str = "") -> Table:
+def findings_table(findings: Sequence[dict[str, Any]], label: str, caption: str = "", with_rules: bool = True) -> Table:
     """Claim, rule, published and measured value and verdict of each finding."""
-    rows = [_row(finding) for finding in findings]
+    rows = [_row(finding, with_rules) for finding in findings]
     return table(OF_FINDINGS, rows, label, caption=caption, style="prose")
 
 
@@ -87,29 +87,17 @@ def all_findings(report: Report) -> tuple[Block, ...]:
 
 def findings_on_paper(report: Report) -> tuple[Block, ...]:
     """The same without the rules."""
-    if not report.findings:
-        return ()
-    rows = [
-        (
-            Stack(str(finding["id"]), (), bold=True),
-            Stack(str(finding["claim"]), (Small(str(finding["source"] or "")),)),
-            str(finding["published"]),
-            str(finding["measured"]),
-            Status(outcome(str(finding["source"] or ""), str(finding["verdict"]))),
-        )
-        for finding in report.findings
-    ]
     caption = "The rule by which each is accepted, fixed before this run, stands in the HTML page"
-    return (table(OF_FINDINGS, rows, "Findings", caption=caption, style="prose"),)
+    return (findings_table(report.findings, "Findings", caption, with_rules=False),) if report.findings else ()
 
 
-def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:
+def _row(finding: dict[str, Any], with_rules: bool) -> tuple[Cell, ...]:
     below = []
-    if finding["accept"]:
-        below.append(Small(f"Accepted if: {finding['accept']}", italic=True))
-    source, run = str(finding["source"] or ""), _run(finding)
-    if source or run:
-        below.append(Small(f"{source}. {run}" if source else run))
+    source = str(finding["source"] or "")
+    if with_rules:
+        below = _rule(finding, source)
+    elif source:
+        below = [Small(source)]
     return (
         Stack(str(finding["id"]), (), bold=True),
         Stack(str(finding["claim"]), tuple(below)),
@@ -117,6 +105,17 @@ def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:
         str(finding["measured"]),
         Status(outcome(source, str(finding["verdict"]))),
     )
+
+
+def _rule(finding: dict[str, Any], source: str) -> list[Small]:
+    """When a finding is accepted, where it was published, and what was run."""
+    below = []
+    if finding["accept"]:
+        below.append(Small(f"Accepted if: {finding['accept']}", italic=True))
+    run = _run(finding)
+    if source or run:
+        below.append(Small(f"{source}. {run}" if source else run))
+    return below
 
 
 def _run(finding: dict[str, Any]) -> str:

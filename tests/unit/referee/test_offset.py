@@ -190,6 +190,14 @@ def test_estimates_show_an_offset_of_its_own_sign(rng):
     assert not shows_in_estimates(still, 0.04)
 
 
+def test_the_error_of_a_row_is_not_in_the_motion_that_it_is_compared_with(rng, monkeypatch):
+    """Errors of single fixes go with the motion of the estimates to their own row, by 40 standard errors."""
+    monkeypatch.setattr(clock_offset, "SHOWN", 1e-7)
+    runs = [run_of(rng, 0.0) for _ in range(30)]
+    assert not shows_in_estimates(runs, 0.01)
+    assert not shows_in_estimates(runs, -0.01)
+
+
 def test_what_estimates_show_by_hand(rng, monkeypatch):
     """Sums 3, 5 and 4, each with 10: an offset of -0.4 s; without one of them -0.45, -0.35 and -0.4.
 

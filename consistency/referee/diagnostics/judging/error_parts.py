@@ -311,10 +311,6 @@ def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple
 
 def _sum_of_correlations(covariance: Array) -> Array:
     """Correlation matrices of covariances (N, n, n), added up."""
-    n = covariance.shape[-1]
-    total = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i, n):
-            each = covariance[:, i, j] / (np.sqrt(covariance[:, i, i]) * np.sqrt(covariance[:, j, j]))
-            total[i, j] = total[j, i] = each.sum()
-    return total
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    rows = [(covariance[:, i] / (sigma[:, i, None] * sigma)).sum(axis=0) for i in range(sigma.shape[1])]
+    return np.array(rows)

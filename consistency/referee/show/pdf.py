@@ -59,7 +59,9 @@ class Paper:
                 return soft(value)
             case tuple():
                 return [self.plain(each) for each in value]
-            case blocks.Name() | blocks.Quantity() | blocks.Reason():
+            case blocks.Quantity():
+                return soft(written(value).replace(" ", "\u00a0"))
+            case blocks.Name() | blocks.Reason():
                 return soft(written(value))
             case blocks.Reasons():
                 return {"kind": "Reasons", "entries": [self._fields(entry) for entry in value.entries]}

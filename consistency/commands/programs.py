@@ -21,7 +21,6 @@ from consistency.commands.shared_options import (
     tell_notes,
 )
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.extras import is_installed
 from consistency.referee.readers.options import Reading
 
 
@@ -105,7 +104,6 @@ def monte_carlo_command(
     shown = document(verdicts, out.name)
     print_document(shown, as_json, write_reports(records, verdicts, shown, report, junit, overwrite))
     if not as_json:
-        following = f"; next: consistency report {out}" if is_installed("report") else ""
-        print(f"runs in {out}{following}")
+        print(f"runs in {out}; next: consistency report {out}")
     if fail_on is not None and not all(verdict.consistent for verdict in verdicts.values()):
         raise typer.Exit(1)

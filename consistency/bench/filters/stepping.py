@@ -166,8 +166,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, record: RunRecor
             if info is not None and len(info.innovation):
                 record.nis[step - 1], record.dof[step - 1] = _nis(info), len(info.innovation)
                 record.log_det[step - 1] = info.log_det
-            _require_finite("the estimate", mean)
-            _require_finite("the covariance", *covariances)
+            _require_finite("the estimate", mean, *covariances)
             rank.require(covariances)
             map_ = _map(filter_, state, trial) if step == T else None
         except (Exception, GeneratorExit, SystemExit) as exception:  # whatever a user's filter throws is a result
@@ -187,7 +186,7 @@ def reason_of(exception: BaseException) -> str:
     """Why a run failed, in one sentence, whatever the exception is."""
     if isinstance(exception, _Unusable):
         return str(exception)
-    if isinstance(exception, np.linalg.LinAlgError) and not _line_of(exception):
+    if isinstance(exception, np.linalg.LinAlgError):
         return "the innovation covariance is not positive definite"
     try:
         text = str(exception)
@@ -202,11 +201,7 @@ def _line_of(exception: BaseException) -> str:
     """File and line where the user's code raised, in brackets; nothing where it did not."""
     frames = traceback.extract_tb(exception.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith(tuple(NOT_THE_USERS))]
-    if not own:
-        return ""
-    if own[-1].filename.startswith("<"):  # a class of the script that runs, which came to this process without its file
-        return f" (line {own[-1].lineno} of the script)"
-    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})"
+    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
 
 
 def _nis(info: Info) -> float:

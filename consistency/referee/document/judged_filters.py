@@ -118,14 +118,13 @@ def _coverage(v: Verdict) -> Cell:
 
 def _worst_axis(v: Verdict) -> Cell:
     worst = clear(v.worst_axis)
-    return NONE if worst is None else f"{worst[0]}, {ratio_text(worst[1]).replace(' ', NO_BREAK)}"
+    return NONE if worst is None else f"{worst[0]}, {ratio_text(worst[1])}"
 
 
 def _failed(v: Verdict) -> Cell:
     return f"{len(v.failures)} of {v.runs}"
 
 
-NO_BREAK = "\u00a0"
 FILTER = Column("Filter")
 BRIEF = (
     Measure(Column("Verdict"), lambda v: Status(v.status)),

@@ -59,9 +59,7 @@ class Paper:
                 return soft(value)
             case tuple():
                 return [self.plain(each) for each in value]
-            case blocks.Quantity():
-                return soft(written(value).replace(" ", "\u00a0"))
-            case blocks.Name() | blocks.Reason():
+            case blocks.Name() | blocks.Quantity() | blocks.Reason():
                 return soft(written(value))
             case blocks.Reasons():
                 return {"kind": "Reasons", "entries": [self._fields(entry) for entry in value.entries]}

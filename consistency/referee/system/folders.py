@@ -33,9 +33,7 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results", option: s
         _clear(folder)
     if folder.exists() or folder.is_symlink():
         if not overwrite:
-            raise InputError(
-                f"{option} {folder}: exists already; choose another folder or add --overwrite (Python: overwrite=True)"
-            )
+            raise InputError(f"{option} {folder}: exists already; choose another folder or add --overwrite")
         try:
             before = read_manifest(folder).get("kind")
             if before != kind:

@@ -10,7 +10,7 @@ import pytest
 from misbehaving import Still, raises
 
 import consistency as cs
-from consistency.bench.filters.stepping import reason_of, run_filter
+from consistency.bench.filters.stepping import run_filter
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.store.results import joined
 from consistency.bench.types import Trial
@@ -118,20 +118,6 @@ def test_a_pose_that_is_no_gaussian_is_named(xyz):
     results = cs.run_trials(xyz, [Tuple()], runs=1, jobs=1)
     (reason,) = results.failures["reason"]
     assert reason == "TypeError: pose must return cs.Gaussian(mean, covariance), not tuple"
-
-
-def raised(source, at):
-    """What code of a user's raises, compiled as that of a file."""
-    with pytest.raises(Exception) as caught:  # noqa: PT011
-        exec(compile(source, at, "exec"), {"np": np})
-    return reason_of(caught.value)
-
-
-def test_the_reason_of_an_exception_says_where_the_users_code_raised_it():
-    singular = "\nnp.linalg.inv(np.zeros((2, 2)))"
-    assert raised(singular, "/home/me/mine.py") == "LinAlgError: Singular matrix (mine.py:2)"
-    assert raised(singular, "<dynamic-code>") == "LinAlgError: Singular matrix (line 2 of the script)"
-    assert reason_of(np.linalg.LinAlgError("no")) == "the innovation covariance is not positive definite"
 
 
 def test_a_filter_that_breaks_at_once(xyz):

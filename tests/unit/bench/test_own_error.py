@@ -112,7 +112,7 @@ def test_a_filter_without_map_has_none(uvd):
     "own, reason",
     [
         (np.eye(2), "ValueError: own_covariance() gave an array of shape (2, 2), not (3, 3)"),
-        (np.diag([1.0, 1.0, np.nan]), "the covariance is not finite"),
+        (np.diag([1.0, 1.0, np.nan]), "the estimate is not finite"),
         (np.eye(3) + np.eye(3, k=1), "the covariance of the error 'right' is not symmetric"),
         (np.diag([1.0, 1.0, -1.0]), "the covariance of the error 'right' is not positive definite"),
         (np.diag([1.0, 1.0, 0.0]), "the covariance of the error 'right' is not positive definite"),

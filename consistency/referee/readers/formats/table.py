@@ -15,8 +15,8 @@ from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
-from consistency.referee.readers.formats.named_columns import TRUE, naming
-from consistency.referee.readers.formats.other_names import state_places, true_columns, with_clock, with_known_names
+from consistency.referee.readers.formats.named_columns import naming
+from consistency.referee.readers.formats.other_names import true_columns, with_clock, with_known_names
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.table_columns import (
     POSE,
@@ -146,13 +146,6 @@ def _require_truth(
     if r.align is not None and convention == "vector":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
     if truth is None and not {"nis", "nis_dof"} <= set(sheet.data):
-        beside = state_places(list(sheet.data), axes, TRUE)
-        absent = [axis for axis in axes if axis not in beside]
-        if beside and absent:
-            raise InputError(
-                f"{sheet.path}: column 'true_{absent[0]}' is missing; there are: {sheet.columns}; the state is "
-                f"{','.join(axes)}, --state A,B names another"
-            )
         others = f"columns nis and nis_dof to be judged by the NIS alone, or columns true_{axes[0]}, … beside the state"
         state = ""
         if not any(axis in sheet for axis in axes):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import plural, short
@@ -31,9 +32,8 @@ def sentence(found: Correction) -> str:
         parts.append(decided_by)
     if found.status == "inconsistent":
         parts.append(f"no factor mends this: {found.verdict.reasons[0]}")
-    fits = found.shown.values()
-    if all(each.holds(1.0) for fit in fits for each in fit.factor) and not any(fit.factors.floor.any() for fit in fits):
-        parts.append("no factor is shown to be needed: 1 lies in every interval")
+    if not found.is_needed:
+        parts.append(f"no factor is shown to be needed, at {CONFIDENCE:.0%} for all of them together")
     return "; ".join(parts)
 
 

@@ -70,19 +70,17 @@ def chance_of_one(value: float, left_out: Array) -> float:
 def floor_interval(value: float, open_value: float, left_out: Array) -> Interval:
     """Interval of a variance that may be 0 from its values with each run left out, (k,), which may lie below 0.
 
-    It is that of a ratio where the data exclude 0, and reaches to 0 otherwise; of a variance of 0 it is one-sided.
+    It is that of a ratio where none of these is 0, and symmetric otherwise; of a variance of 0 it is one-sided.
 
     Parameters
     ----------
     open_value : the variance that fits best where it may lie below 0
     """
+    if value > 0.0 and left_out.min() > 0.0:
+        return interval_of_ratio(value, left_out)
     tail = 2.0 * TAIL if value == 0.0 else TAIL
     reach = student(len(left_out), tail) * jackknife(left_out)
-    high = max(open_value, 0.0) + reach
-    if value == 0.0 or left_out.min() <= 0.0:
-        return Interval(value, 0.0, high)
-    ratio = interval_of_ratio(value, left_out)
-    return ratio if value > reach else Interval(value, 0.0, max(high, ratio.high))
+    return Interval(value, max(value - reach, 0.0), max(open_value, 0.0) + reach)
 
 
 def mean_over_runs(values: Array) -> Interval:

@@ -12,8 +12,8 @@ from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.fit_covariance.correct import ByGroup, Correction, by_group, with_factors
 from consistency.referee.fit_covariance.correction_text import data, sentence
+from consistency.referee.fit_covariance.fit_folder import toml, write_fit
 from consistency.referee.fit_covariance.page import correction_page
-from consistency.referee.fit_covariance.writing import pairs, write_fit
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
 from consistency.referee.readers.formats.restated import TextFile
 from consistency.referee.readers.formats.sheet import EMPTY
@@ -30,7 +30,8 @@ def write_correction(
     files : that the covariances came in; without any the errors and covariances are written as archives of NumPy
     """
     write = partial(_write_runs, found, record, files)
-    texts = {"correction.toml": toml(found), "corrected_covariance.py": pasted(found)}
+    head = f"{found.status} after: P' = D P D + F, with D = diag(sqrt(factor)) and F = diag(floor) of each component."
+    texts = {"correction.toml": toml(head, data(found)), "corrected_covariance.py": pasted(found)}
     return write_fit(folder, ("correction", found.name), texts, correction_page(found), write, overwrite)
 
 
@@ -104,23 +105,6 @@ def _write_archive(path: Path, record: Record, of_runs: dict[int, ByGroup]) -> N
 
 
 # --- lines for other programs -----------------------------------------------------------------------------------------
-
-
-def toml(found: Correction) -> str:
-    """correction.toml: factors with their intervals, and the data that they hold for."""
-    known = data(found)
-    del known["referee"]
-    blocks = known.pop("blocks")
-    tables = {key: known.pop(key) for key in ("stated", "corrected")}
-    lines = [
-        f"# {found.status} after: P' = D P D + F, with D = diag(sqrt(factor)) and F = diag(floor) of each component.",
-        *pairs(known),
-    ]
-    for key, values in tables.items():
-        lines += ["", f"[{key}]", *pairs(values)]
-    for block in blocks:
-        lines += ["", "[[blocks]]", *pairs(block)]
-    return "\n".join(lines) + "\n"
 
 
 def pasted(found: Correction) -> str:

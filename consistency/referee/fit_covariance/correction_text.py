@@ -13,7 +13,7 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Document, Table, Text, table
 from consistency.referee.fit_covariance.correct import FEW, LEVELS, Correction, HeldOut
-from consistency.referee.fit_covariance.covariance_ratios import IN_TURN
+from consistency.referee.fit_covariance.covariance_ratios import IN_TURN, shown
 
 UNITS = {"position": " m", "attitude": " rad", "velocity": " m/s"}
 
@@ -35,13 +35,6 @@ def sentence(found: Correction) -> str:
     if not found.is_needed:
         parts.append(f"no factor is shown to be needed, at {CONFIDENCE:.0%} for all of them together")
     return "; ".join(parts)
-
-
-def shown(interval: Interval) -> str:
-    """A ratio with its interval."""
-    if not np.isfinite(interval.high):
-        return short(interval.value)
-    return f"{short(interval.value)} [{short(interval.low)}, {short(interval.high)}]"
 
 
 def correction_document(found: Correction) -> Document:

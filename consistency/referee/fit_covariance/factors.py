@@ -54,18 +54,22 @@ class Factors:
 
     def of_components(self) -> tuple[Array, Array]:
         """Factor and floor of each component of the error, (n,) both."""
-        n = sum(map(len, self.blocks))
-        factor, floor = np.ones(n), np.zeros(n)
-        for block, s, f in zip(self.blocks, self.factor, self.floor, strict=True):
-            factor[list(block.places)] = s
-            floor[list(block.places)] = f
-        return factor, floor
+        shares = members(self.blocks)
+        return self.factor @ shares, self.floor @ shares
 
     def applied(self, P: Array) -> Array:
         """Corrected covariances of stated ones, (..., n, n)."""
         factor, floor = self.of_components()
         d = np.sqrt(factor)
         return np.asarray(P * np.outer(d, d) + np.diag(floor))
+
+
+def members(blocks: Sequence[Block]) -> Array:
+    """Which components each block has, (B, n), 1 or 0."""
+    found = np.zeros((len(blocks), sum(map(len, blocks))))
+    for b, block in enumerate(blocks):
+        found[b, list(block.places)] = 1.0
+    return found
 
 
 def blocks_of(axes: Sequence[str], n: int, per_axis: bool) -> tuple[Block, ...]:
@@ -97,10 +101,7 @@ def run_moments(record: Record, blocks: Sequence[Block]) -> Array:
     Q = np.full((len(record.run_numbers), len(blocks), len(blocks)), np.nan)
     for run, (error, P) in enumerate(steps_of_runs(record)):
         if len(error):
-            parts = np.zeros((*error.shape, len(blocks)))
-            for b, block in enumerate(blocks):
-                places = list(block.places)
-                parts[:, places, b] = error[:, places]
+            parts = error[..., None] * members(blocks).T
             Q[run] = np.mean(np.swapaxes(parts, 1, 2) @ np.linalg.solve(P, parts), axis=0)
     return Q
 

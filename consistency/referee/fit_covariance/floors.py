@@ -14,6 +14,7 @@ from consistency.referee.fit_covariance.factors import (
     Fit,
     fit_alone,
     known_dof,
+    members,
     run_score,
     steps_of_runs,
 )
@@ -133,13 +134,11 @@ def scores(record: Record, blocks: tuple[Block, ...], free: Indices, theta: Arra
 def derivatives(C: Array, factors: Factors, free: Indices) -> Array:
     """Derivatives (k, p, n, n) of corrected covariances C (k, n, n) by factors and floors."""
     n = C.shape[-1]
-    members = np.zeros((len(factors.blocks), n))
-    for b, block in enumerate(factors.blocks):
-        members[b, list(block.places)] = 1.0
-    rates = 0.5 * members / factors.factor[:, None]  # of the square root of a factor, over it
+    own = members(factors.blocks)
+    rates = 0.5 * own / factors.factor[:, None]  # of the square root of a factor, over it
     scaled = C - np.diag(factors.of_components()[1])
     by_factor = (rates[:, :, None] + rates[:, None, :]) * scaled[:, None]
-    by_floor = np.broadcast_to(members[free, :, None] * np.eye(n), (len(C), len(free), n, n))
+    by_floor = np.broadcast_to(own[free, :, None] * np.eye(n), (len(C), len(free), n, n))
     return np.concatenate([by_factor, by_floor], axis=1)
 
 

@@ -47,10 +47,14 @@ CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 EACH = replace(style(0), size=2.0, alpha=0.7)
 
 
+def page_of(said: Document, figures: tuple[Figure, ...]) -> Document:
+    """A document with its pictures."""
+    return replace(said, chapters=(Chapter("", "", "", figures),))
+
+
 def noise_page(model: NoiseModel) -> Document:
     """What the model says, and its pictures."""
-    said = noise_document(model)
-    return Document(said.title, "", (Chapter("", "", "", noise_figures(model)),), said.opening, said.data)
+    return page_of(noise_document(model), noise_figures(model))
 
 
 def noise_figures(model: NoiseModel) -> tuple[Figure, ...]:
@@ -149,13 +153,12 @@ def draw_ratios(axes: Axes, names: Sequence[str], *ratios: Array) -> None:
 
 def correction_page(found: Correction) -> Document:
     """What a correction says, and its pictures."""
-    said = correction_document(found)
     caption = (
         "Ratio of true to stated covariance of each held-out run, as stated and corrected; the factor of each block "
         "with its interval; and the share of held-out errors inside the ellipsoid of each probability."
     )
     figure = Figure("Held-out runs, factors and coverage", caption, (partial(draw_correction, found),))
-    return Document(said.title, "", (Chapter("", "", "", (figure,)),), said.opening, said.data)
+    return page_of(correction_document(found), (figure,))
 
 
 def plot_correction(found: Correction, at: str | Path | None) -> Drawing:

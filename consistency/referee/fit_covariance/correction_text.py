@@ -32,7 +32,7 @@ def sentence(found: Correction) -> str:
         parts.append(decided_by)
     if found.status == "inconsistent":
         parts.append(f"no factor mends this: {found.verdict.reasons[0]}")
-    if not found.is_needed:
+    elif not found.is_needed:
         parts.append(f"no factor is shown to be needed, at {CONFIDENCE:.0%} for all of them together")
     return "; ".join(parts)
 

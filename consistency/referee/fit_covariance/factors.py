@@ -183,7 +183,7 @@ def known_dof(left_out: Array, sizes: Array) -> Array:
 
     They are at least those of runs whose steps are all the same.
     """
-    return np.maximum(dof_of_ratio(left_out), (len(left_out) - 1) * sizes)
+    return np.asarray(np.maximum(dof_of_ratio(left_out), (len(left_out) - 1) * sizes))
 
 
 def run_score(C: Array, error: Array) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import special, stats
+from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
@@ -52,18 +52,18 @@ def interval_of_ratio(value: float, left_out: Array) -> Interval:
     probability: each is the farther one of both, since few runs do not tell how a ratio is distributed.
     """
     reach = student(len(left_out))
-    half = 0.5 * float(dof_of_ratio(left_out))
+    nu = float(dof_of_ratio(left_out))
     low = value * np.exp(-reach * jackknife(np.log(left_out)))
-    high = value * half / max(special.gammaincinv(half, special.ndtr(-reach)), 1e-300)
-    return Interval(value, float(low), float(high))
+    least = float(stats.chi2.ppf(stats.norm.sf(reach), nu))
+    return Interval(value, float(low), value * nu / max(least, 1e-300))
 
 
 def chance_of_one(value: float, left_out: Array) -> float:
     """Probability of a ratio as far from 1, or farther, where the right one is 1, by :func:`interval_of_ratio`."""
-    half = 0.5 * float(dof_of_ratio(left_out))
-    errors = np.log(value) * np.sqrt(half)
+    nu = float(dof_of_ratio(left_out))
+    errors = np.log(value) * np.sqrt(0.5 * nu)
     if value < 1.0:
-        errors = -special.ndtri(special.gammainc(half, half * value))
+        errors = stats.norm.isf(stats.chi2.cdf(nu * value, nu))
     return float(min(2.0 * stats.t.sf(errors, len(left_out) - 1), 1.0))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -124,9 +125,10 @@ class Correction:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        from consistency.referee.fit_covariance.page import plot_correction  # draws
+        from consistency.referee.fit_covariance.page import draw_correction
+        from consistency.referee.pages.write_pages import plotted
 
-        return plot_correction(self, path)
+        return plotted(partial(draw_correction, self), path)
 
     def __repr__(self) -> str:
         from consistency.referee.fit_covariance.correction_text import sentence  # of this class

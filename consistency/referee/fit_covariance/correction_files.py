@@ -40,24 +40,33 @@ def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], fo
 
     Returns the names of what ``analyse`` reads: a file, or a folder of trajectories.
     """
-    groups = record.groups
     numbers = dict(zip(found.runs, record.run_numbers.tolist(), strict=True))
-    judged = {numbers[name]: factors for name, factors in zip(found.judged, found.used, strict=True)}
-    every = dict.fromkeys(numbers.values(), by_group(found.fits))
-    for name, of_runs in ((HELD_OUT, judged), (CORRECTED, every)):
-        at = folder / name
-        at.mkdir()
-        pieces = record.unit != "run" and name == HELD_OUT
-        if not files or pieces or (groups is not None and any(file.by_column is None for file in files)):
-            _write_archive(at / f"{found.name}.npz", record, of_runs)
-            continue
-        of_files = every if record.unit == "run" else dict.fromkeys((file.run for file in files), by_group(found.fits))
-        change = partial(_change, found.axes, groups, judged if name == HELD_OUT else of_files)
-        for file in files:
-            if file.run_column is not None or change(file.run, "") is not None:
-                (at / file.path.name).write_text(file.restated(change), encoding="utf-8")
-    made = [(name, [path.name for path in (folder / name).iterdir()]) for name in (HELD_OUT, CORRECTED)]
-    return [f"{name}/{files[0]}" if len(files) == 1 else name for name, files in made]
+    held_out = {numbers[name]: factors for name, factors in zip(found.judged, found.used, strict=True)}
+    groups = record.groups
+    is_text = bool(files) and (groups is None or all(file.by_column is not None for file in files))
+    are_runs = record.unit == "run"  # pieces of one log are not in its file
+    runs = numbers.values() if are_runs else [file.run for file in files]
+    corrected = dict.fromkeys(runs if is_text else numbers.values(), by_group(found.fits))
+    return [
+        _write_one(folder / HELD_OUT, found, record, files if is_text and are_runs else (), held_out),
+        _write_one(folder / CORRECTED, found, record, files if is_text else (), corrected),
+    ]
+
+
+def _write_one(
+    folder: Path, found: Correction, record: Record, files: Sequence[TextFile], of_runs: dict[int, ByGroup]
+) -> str:
+    """Write runs by their factors, as text or as an archive; the name of the file, or of the folder of several."""
+    folder.mkdir()
+    if not files:
+        _write_archive(folder / f"{found.name}.npz", record, of_runs)
+        return f"{folder.name}/{found.name}.npz"
+    change = partial(_change, found.axes, record.groups, of_runs)
+    for file in files:
+        if file.run_column is not None or file.run in of_runs:
+            (folder / file.path.name).write_text(file.restated(change), encoding="utf-8")
+    made = [path.name for path in folder.iterdir()]
+    return f"{folder.name}/{made[0]}" if len(made) == 1 else folder.name
 
 
 def _change(

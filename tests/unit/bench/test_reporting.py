@@ -178,7 +178,7 @@ class Page(HTMLParser):
     def handle_data(self, data):
         if self.tags and self.tags[-1] == "style":
             self.style += data
-        self.text.append(data.replace("\u00a0%", " %"))
+        self.text.append(data.replace("\u00a0", " "))
 
 
 def test_the_model_is_what_analyse_says(folder):

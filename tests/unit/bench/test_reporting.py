@@ -651,6 +651,7 @@ def test_the_calibration_is_a_table_of_promises_with_the_interval_of_the_worst_w
     report = build_report(folder)
     page = shown(report)
     assert "How far the referee can be trusted" in page
+    assert "<details><summary>Measured rates</summary>" in page
     assert "steps that &lt;depend&gt; on each other" in page
     assert "plan keeps its word" in page
     assert printed(report).startswith(b"%PDF")

@@ -227,7 +227,7 @@ WRONG = {
     "truth of another run": (
         lambda at: [(text()(at)), (at / "d").mkdir(), (at / "e").mkdir(), (at / "d/a.txt").write_text(TUM)],
         ("d", "--truth", "e", "--covariance", "e"),
-        "--truth e: holds no file 'a' with .txt or .tum",
+        "or table, for d/a.txt; files of the two folders are paired by name",
     ),
     "one covariance of many runs": (
         lambda at: [(text()(at)), (at / "d").mkdir(), (at / "d/a.txt").write_text(TUM)],

@@ -29,7 +29,7 @@ def judgement(study: Judged) -> list[Block]:
     if study.failures:
         rows: list[tuple[Cell, ...]] = [(name, str(run), str(step), why) for name, run, step, why in study.failures]
         failed = f"Failed runs of {study.name}"
-        blocks.append(table(FAILURES, rows, failed, caption=f"{failed}: {len(rows)}"))
+        blocks.append(table(FAILURES, rows, failed, caption=f"{failed}: {len(rows)}. In step 1: no estimate is left"))
     return blocks
 
 

@@ -132,6 +132,9 @@ def test_failures_are_failed_unless_a_fault_is_found(rng):
     hung = judge(Record("f", error / 2.0, identities(error), failures=whole), Settings(SURE))
     assert hung.reasons[0] == "failed: 1 of 60 runs failed, first run 3: time-out after 1 s"
     assert fragment(Reasons((reason(hung),))).startswith("f failed: 1 of 60 runs failed")
+    lost = (Failure("f", 99, 7, "KeyError: 3"),)  # a run without a map, beside 60 with one
+    of_map = judge(Record("f", error / 2.0, identities(error), failures=lost, landmarks=np.arange(20)), Settings(SURE))
+    assert of_map.reasons[0] == "failed: 1 of 61 runs failed, first run 99 in step 7: KeyError: 3"
     single = independent(rng, 1, 20, 3)
     assert judge(Record("f", single, identities(single), failures=broke), Settings(SURE)).status == "failed"
 

@@ -18,6 +18,7 @@ from consistency.referee.diagnostics.judging import error_parts
 from consistency.referee.diagnostics.questions.shape import pair_p_values
 from consistency.referee.diagnostics.verdict.parts import Axes, Interval
 from consistency.referee.diagnostics.words.blocks import block_text, unlike_text
+from consistency.referee.diagnostics.words.sentences import reasons
 
 SURE = 1e-5
 INERTIAL = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz")
@@ -101,13 +102,13 @@ def test_steps_of_few_runs_are_left_out(rng):
     assert np.isnan(pair_p_values(error[:5], P[:5], known[:5])).all()
 
 
-@pytest.mark.parametrize("here, steps, looks", [(slice(None), 10, 3), (slice(4, 5), 10, 6), (slice(4, 5), 1, 60)])
+@pytest.mark.parametrize("here, steps, looks", [(slice(None), 10, 6), (slice(4, 5), 10, 12), (slice(4, 5), 1, 120)])
 def test_pairs_are_corrected_for_their_number_and_that_of_steps(monkeypatch, here, steps, looks):
-    """Of 3 axes and 10 steps; a single step, chosen among all, shares the rate with whole runs."""
-    known = SimpleNamespace(error=np.zeros((9, 10, 3)), covariance=np.zeros((9, 10, 3, 3)))
-    sample = SimpleNamespace(dof=3, known_errors=known, counted=np.ones((9, 10), bool))
+    """Of 4 axes and 10 steps; a single step, chosen among all, shares the rate with whole runs."""
+    known = SimpleNamespace(error=np.zeros((9, 10, 4)), covariance=np.zeros((9, 10, 4, 4)))
+    sample = SimpleNamespace(dof=4, known_errors=known, counted=np.ones((9, 10), bool))
     for p, shown in ((0.0099 / looks, True), (0.0101 / looks, False)):
-        of_steps = {10: np.ones((3, 3)), 1: np.ones((3, 3)), steps: np.full((3, 3), p)}
+        of_steps = {10: np.ones((4, 4)), 1: np.ones((4, 4)), steps: np.full((4, 4), p)}
         monkeypatch.setattr(error_parts, "pair_p_values", lambda error, *_, known=of_steps: known[error.shape[1]])
         assert (error_parts._shown_pairs(sample, here, 0.01) == shown).all()
 
@@ -150,6 +151,34 @@ def test_axes_of_unlike_factors_are_named_where_the_whole_is_right(rng):
     assert "unlike factors" not in sentence  # the sentence on the scale has them
 
 
+def opposite_signs(rng):
+    """Errors of x and y that are correlated by -0.6, with 0.6 stated."""
+    true, stated = np.eye(3), np.eye(3)
+    true[0, 1] = true[1, 0] = -0.6
+    stated[0, 1] = stated[1, 0] = 0.6
+    error = independent(rng, 100, 30, 3) @ np.linalg.cholesky(true).T
+    return Record("f", error, np.broadcast_to(stated, (100, 30, 3, 3)), axes=("x", "y", "heading"))
+
+
+def test_a_correlation_is_named_only_if_it_is_shown_to_be_wrong(rng):
+    verdict = judge(opposite_signs(rng), Settings(SURE))
+    assert "correlation of the wrong sign: -0.6" in reasons(verdict)[0]
+    unshown = reasons(replace(verdict, shape=replace(verdict.shape, shown=False)))[0]
+    assert "correlation" not in unshown
+    assert unshown.startswith("inconsistent: covariance of the wrong shape; no axis by itself is wrong")
+
+
+def test_the_status_depends_on_the_pair_farthest_off(rng, monkeypatch):
+    """A pair that is shown to be wrong is named before it."""
+    shown = np.zeros((3, 3), bool)
+    shown[0, 2] = shown[2, 0] = True
+    monkeypatch.setattr(error_parts, "_shown_pairs", lambda *_: shown)
+    verdict = judge(opposite_signs(rng), Settings(SURE))
+    assert (verdict.shape.pair, verdict.shape.shown, verdict.shape.wrong_sign) == ((0, 2), True, False)
+    assert verdict.shape.alone
+    assert verdict.status == "inconsistent"
+
+
 def of(ratios, status="overconfident", subset=None):
     """Findings with these ratios of axes, and blocks of them where they are given."""
     names = tuple(name for name in ratios if name not in ("position", "attitude", "velocity"))
@@ -171,6 +200,8 @@ def test_a_block_is_named_only_if_its_axes_are_alike():
     assert block_text(of(alike)) == text
     assert block_text(of(alike, subset="x")) == block_text(of(alike, subset="x, y")) == text
     assert block_text(of(alike, subset="heading")) == ""
+    of_correlation = {"x": RIGHT, "y": RIGHT, "position": (3.0, 2.5, 3.5), "heading": RIGHT}
+    assert block_text(of(of_correlation)) == ""
     single = alike | {"y": RIGHT}
     assert block_text(of(single, subset="x")) == ""
     assert unlike_text(of(single)) == "x too small by x2.00 [1.80, 2.20], y and heading right"

@@ -384,6 +384,8 @@ def test_every_status_is_shown_with_its_meaning(report):
     for part in (f"({meaning})" for meaning in STATUSES.values()):
         assert part in text
     source = shown(report)
+    assert "LinAlgError: singular" in source
+    assert "a hang or a crash is counted there, in whatever step it was" in source
     for status in STATUSES:
         assert f'<span class="verdict {status}">{status}</span>' in source
 

@@ -261,7 +261,7 @@ def test_a_report_that_is_not_replaced_is_refused_before_the_work(archive, tmp_p
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "mine.txt").write_text("mine")
-    why = f"--report {taken}: exists already; choose another folder or add --overwrite"
+    why = f"--report {taken}: exists already; choose another folder or add --overwrite (overwrite=True in Python)"
     assert why in refused(capsys, "analyse", archive, "--report", taken)
     other = tmp_path / "junit.xml"
     other.write_text("<testsuites></testsuites>\n")

@@ -11,7 +11,7 @@ import numpy as np
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN
-from consistency.referee.document.blocks import Block, Column, Details, Figure, Quantity, table
+from consistency.referee.document.blocks import Block, Cell, Column, Details, Figure, Quantity, table
 from consistency.referee.document.colours import EXPECTED, solid
 from consistency.referee.pages.judged import Judged
 from consistency.referee.show.painting import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
@@ -64,7 +64,7 @@ def _in_numbers(study: Judged, found: tuple[Forest, ...]) -> tuple[Details, ...]
     if not ratios:
         return ()
     columns = (Column("Axis"), *(Column(track.name, number=True) for track in study.tracks))
-    rows = [(name, *map(_quantity, intervals)) for name, intervals in ratios[0].rows]
+    rows: list[tuple[Cell, ...]] = [(name, *map(_quantity, intervals)) for name, intervals in ratios[0].rows]
     shown = table(columns, rows, f"Covariance ratio by axis of {study.name}")
     return (Details("Covariance ratio by axis, in numbers", (shown,)),)
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.options import OF_AXES, Reading, flag_of
 from consistency.referee.readers.truth_matching import Estimator, Poses
 from consistency.referee.types import Array
 
@@ -22,7 +22,6 @@ X, Y, Z = np.eye(3)
 WORLD = {"e": X, "w": -X, "n": Y, "s": -Y, "u": Z, "d": -Z}  # of axes, in east, north, up
 BODY = {"f": X, "b": -X, "l": Y, "r": -Y, "u": Z, "d": -Z}  # in forward, left, up
 ENU, FLU = "enu", "flu"
-OPTIONS = ("world", "body_axes", "truth_world", "truth_body_axes")
 
 
 class Axes(NamedTuple):
@@ -47,7 +46,7 @@ def in_axes_of_estimates(e: Estimator, r: Reading) -> Estimator:
     InputError
         Axes are none, or left-handed; the estimates have no poses; or axes of the plane do not lie in one.
     """
-    given = r.given(OPTIONS)
+    given = r.given(OF_AXES)
     if not given:
         return e
     if e.innovations_alone or not (e.in_space or tuple(e.axes) == ("x", "y", "heading")):

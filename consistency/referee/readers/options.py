@@ -14,6 +14,7 @@ from consistency.referee.errors import InputError
 
 COLUMNS = "columns"  # covariance of the truth: of its own file
 GROUPED = ("by", "by_file", "bins")  # options
+OF_AXES = ("world", "body_axes", "truth_world", "truth_body_axes")
 MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
 
 
@@ -130,7 +131,9 @@ class Reading:
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""
-        return [name for name in names or [each.name for each in fields(self)] if getattr(self, name) is not None]
+        if names is None:
+            names = [each.name for each in fields(self)]
+        return [name for name in names if getattr(self, name) is not None]
 
     def refuse(self, flag: str, others: Mapping[str, str]) -> None:
         """Refuse options that do not go with ``flag``, each with its reason."""

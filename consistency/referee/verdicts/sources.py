@@ -12,7 +12,7 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
-from consistency.referee.readers.pipeline.kinds import is_program_runs
+from consistency.referee.readers.pipeline.read_files import is_program_runs
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning.early_stopping import Design

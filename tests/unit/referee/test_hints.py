@@ -30,8 +30,7 @@ from consistency.referee.readers.mix_ups import reading_fit
 from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.mix_ups.known import Guess, _ned
 from consistency.referee.readers.mix_ups.reading_fit import FACTOR, fit_of
-from consistency.referee.readers.pipeline.motion_causes import causes_of_motions
-from consistency.referee.readers.pipeline.relative_motions import Stretch
+from consistency.referee.readers.pipeline.relative_motions import Stretch, causes_of_motions
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
 from consistency.referee.readers.truth_matching import Poses

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.frame_fit import Sound, frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.clock_offset import ROUNDS, SETTLED, clock_shift
-from consistency.referee.readers.truth_matching import Aligned, Poses
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
@@ -32,6 +32,24 @@ OF_ALL = "an error that is the same in all runs and steps is not judged"
 OSCILLATING = "the errors alternate or oscillate, so that it is not known what the frame takes of them"
 NO_MEAN = "the errors cancel over each run, so that the frame's own error outweighs their mean"
 SLIGHT = 0.01  # of a covariance: what an uncertain first pose adds to the others, and counts as nothing below
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Runs in the world of the truth, with notes on the alignment."""
+
+    runs: Sequence[Poses]  # moved estimates, with covariances of the residual errors
+    align: str = "none"  # the mode
+    notes: tuple[str, ...] = ()
+    caption: str = ""  # what the verdict has to say of it
+    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
+    unavailable: tuple[str, ...] = ()  # questions that have no answer
+    unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
+
+    @property
+    def of_record(self) -> dict[str, Any]:
+        """What a record has of it."""
+        return {name: value for name, value in vars(self).items() if name not in ("runs", "notes")}
 
 
 def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) -> list[WorldTransform]:

@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.records.outcome import made_from_errors, se
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Known, Poses
+from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Poses, submatrices
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
@@ -26,34 +26,135 @@ NO_TRUTH = "has no truth, so that there are no errors to group"
 NO_COLUMNS = "has no columns of its own; --by-file FILE names a table with the column and t or run"
 
 
-def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estimator, Column | None]:
-    """The estimator with the values of the column in each row, and the column of all rows; None without ``--by``.
+def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estimator, Column]:
+    """The estimator with the values of the column in each row, and the column of all rows.
 
     Raises
     ------
     InputError
-        The files have no such column, or no time at which to look it up.
+        There are no errors, or the files have no such column, or no time at which to look it up.
     """
-    if r.by is None:
-        return e, None
-    runs = list(e.runs)
+    assert r.by is not None
+    if e.innovations_alone:
+        raise InputError(f"--by {r.by}: {e.path} {NO_TRUTH}")
+    cells = [p.by for p in e.runs if p.by is not None]
     if r.by_file is not None:
         sheet = _sheet(r)
-        runs = [replace(p, by=_looked_up(sheet, r.by, p.run, p.seconds)) for p in runs]
-    elif any(p.by is None for p in runs):
+        cells = [_looked_up(sheet, r.by, p.run, p.seconds) for p in e.runs]
+    if len(cells) < len(e.runs):
         raise InputError(f"--by {r.by}: {e.path} {NO_COLUMNS}")
-    cells = [p.by for p in runs if p.by is not None]
     column = column_of(r.by, np.concatenate(cells))
     column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
-    ends = np.cumsum([0, *map(len, cells)])
-    parts = zip(runs, ends, ends[1:], strict=False)
-    return replace(e, runs=[replace(p, by=column.values[start:end]) for p, start, end in parts]), column
+    ends = np.cumsum([len(each) for each in cells])
+    parts = zip(e.runs, np.split(column.values, ends[:-1]), strict=True)
+    return replace(e, runs=[replace(p, by=values) for p, values in parts]), column
 
 
-def of_record(record: Record, r: Reading) -> tuple[Record, Column | None]:
-    """A record that its reader has made, with the values of the column."""
-    if r.by is None:
-        return record, None
+def in_groups(
+    records: Sequence[Record], column: Column, e: Estimator, pairs: Sequence[Poses], r: Reading
+) -> list[Record]:
+    """The records of an estimator with their groups.
+
+    Parameters
+    ----------
+    pairs : estimates that are judged, beside their truth; none where motions are judged
+
+    Raises
+    ------
+    InputError
+        As :func:`grouped`.
+    """
+    judged = {axis for record in records for axis in record.axes}
+    if pairs:
+        column = _beside_states(column, e, [i for i, axis in enumerate(e.axes) if axis in judged], pairs)
+    return [grouped(record, column, r) for record in records]
+
+
+def _beside_states(column: Column, e: Estimator, judged: Sequence[int], pairs: Sequence[Poses]) -> Column:
+    """The column, marked where its values are those of a judged component of the truth or the estimate, or a sigma."""
+    some = [p.pairs(_some(len(p.t), len(pairs))) for p in pairs]
+    column = replace(column, values=np.concatenate([p.by for p in some if p.by is not None]))
+    states = _columns_of(e, judged)
+    truth = np.concatenate([_with_columns(p.truth, states) for p in some])
+    estimate = np.concatenate([_with_columns(p.estimate, states) for p in some])
+    P = submatrices(np.concatenate([p.covariance for p in some]), judged)
+    return replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged], truth, estimate, P))
+
+
+def _columns_of(e: Estimator, judged: Sequence[int]) -> list[int]:
+    """Columns of a state that are judged components; of rotations in space, which are quaternions, none."""
+    if not e.convention:  # errors of an archive stand in the place of a truth
+        return []
+    if not e.in_space:
+        return list(judged)
+    columns = []
+    for i in judged:
+        if i < ROTATION.start:
+            columns.append(i)
+        elif i >= ROTATION.stop:
+            columns.append(i + 1)
+    return columns
+
+
+def _with_columns(state: Array, columns: Sequence[int]) -> Array:
+    """Those columns of a state (k, m) that it has."""
+    there = [i for i in columns if i < state.shape[1]]
+    return state[:, there]
+
+
+def _some(count: int, parts: int = 1) -> Indices:
+    """At most ``ENOUGH`` of so many rows in all, evenly chosen."""
+    most = max(ENOUGH // parts, 2)
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.int64))
+
+
+def grouped(record: Record, column: Column, r: Reading, option: str = "--by") -> Record:
+    """The record with its groups.
+
+    Raises
+    ------
+    InputError
+        The column is made from the errors, or makes no groups.
+    """
+    if record.by is None:
+        return record
+    if record.nees is None:
+        raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
+    bins = BINS
+    if r.bins is not None:
+        bins = r.bins
+        if column.words:
+            flag = option.replace("by", "bins")
+            raise InputError(f"{flag}: {column.name} holds words, each of which is a group; leave the option out")
+    counted = np.isfinite(record.nees)
+    if not counted.any():
+        return record
+    run, step = (places[_some(int(counted.sum()))] for places in np.nonzero(counted))
+    error = None
+    if record.error is not None:
+        error = record.error[run, step]
+    if why := made_from_errors(column.name, record.by[run, step], error, record.nees[run, step]):
+        raise InputError(
+            f"{option} {column.name}: the column is made from the errors ({why}), and groups of small and of large "
+            "errors differ in any estimator; take a column that was fixed before the error was, or rename one that is "
+            "only called so"
+        )
+    try:
+        groups = groups_of(replace(column, values=record.by), bins, counted)
+    except ValueError as wrong:
+        raise InputError(f"{option} {column.name}: {wrong}") from None
+    return replace(record, groups=groups)
+
+
+def record_in_groups(record: Record, r: Reading) -> Record:
+    """A record that its reader has made, with its groups.
+
+    Raises
+    ------
+    InputError
+        The files have no such column, or as :func:`grouped`.
+    """
+    assert r.by is not None
     cells = record.by
     if r.by_file is not None:
         sheet = _sheet(r)
@@ -62,70 +163,7 @@ def of_record(record: Record, r: Reading) -> tuple[Record, Column | None]:
         raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
     column = column_of(r.by, cells)
     column = replace(column, outcome=selects_on_outcome(column, record.axes))
-    return replace(record, by=column.values), column
-
-
-def beside_states(
-    column: Column, e: Estimator, judged: Sequence[int], runs: Sequence[Poses], known: Sequence[Known]
-) -> Column:
-    """The column, marked where its values are those of a judged component of the truth or the estimate, or a sigma."""
-    some = [k.of(_some(len(k.rows), len(runs))) for k in known]
-    rows = list(zip(runs, some, strict=True))
-    values = np.concatenate([p.by[k.rows] for p, k in rows if p.by is not None])
-    states = [] if e.convention == "" else _columns_of(e, judged)  # errors of an archive stand in the place of a truth
-    truth, estimate = (
-        np.concatenate([state[:, [i for i in states if i < state.shape[1]]] for state in of_runs])
-        for of_runs in ([k.truth for k in some], [p.estimate[k.rows] for p, k in rows])
-    )
-    P = np.concatenate([p.covariance[k.rows] for p, k in rows])[:, judged][:, :, judged]
-    axes = [e.axes[i] for i in judged]
-    return replace(column, outcome=selects_on_outcome(replace(column, values=values), axes, truth, estimate, P))
-
-
-def _columns_of(e: Estimator, judged: Sequence[int]) -> list[int]:
-    """Columns of a state that are judged components; of rotations in space, which are quaternions, none."""
-    if not e.in_space:
-        return list(judged)
-    return [i if i < ROTATION.start else i + 1 for i in judged if i not in ROTATION]
-
-
-def _some(count: int, parts: int = 1) -> Indices:
-    """At most ``ENOUGH`` of so many rows in all, evenly chosen."""
-    return np.unique(np.linspace(0, max(count - 1, 0), min(count, max(ENOUGH // parts, 2))).astype(np.int64))
-
-
-def grouped(record: Record, column: Column | None, r: Reading, option: str = "--by") -> Record:
-    """The record with its groups; itself without a column.
-
-    Raises
-    ------
-    InputError
-        The column is made from the errors, or makes no groups.
-    """
-    if column is None or record.by is None:
-        return record
-    if record.nees is None:
-        raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
-    if column.words and r.bins is not None:
-        raise InputError(
-            f"{option.replace('by', 'bins')}: {column.name} holds words, each of which is a group; leave the option out"
-        )
-    counted = np.isfinite(record.nees)
-    if not counted.any():
-        return record
-    run, step = (places[_some(int(counted.sum()))] for places in np.nonzero(counted))
-    error = None if record.error is None else record.error[run, step]
-    if why := made_from_errors(column.name, record.by[run, step], error, record.nees[run, step]):
-        raise InputError(
-            f"{option} {column.name}: the column is made from the errors ({why}), and groups of small and of large "
-            "errors differ in any estimator; take a column that was fixed before the error was, or rename one that is "
-            "only called so"
-        )
-    try:
-        groups = groups_of(replace(column, values=record.by), BINS if r.bins is None else r.bins, counted)
-    except ValueError as wrong:
-        raise InputError(f"{option} {column.name}: {wrong}") from None
-    return replace(record, groups=groups)
+    return grouped(replace(record, by=column.values), column, r)
 
 
 def with_groups(
@@ -140,12 +178,13 @@ def with_groups(
     """
     if by is None:
         raise InputError("bins: goes with by=")
-    named = by if isinstance(by, Mapping) else {"array": by}
-    if len(named) != 1:
-        raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(named)} names")
-    ((name, values),) = named.items()
+    if not isinstance(by, Mapping):
+        by = {"array": by}
+    if len(by) != 1:
+        raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(by)} names")
     if record.nees is None:
         raise InputError(f"by: {record.name} {NO_TRUTH}")
+    ((name, values),) = by.items()
     try:
         column = column_of(name, on_steps(values, record.nees.shape))
     except ValueError as wrong:
@@ -168,7 +207,6 @@ def _sheet(r: Reading) -> TableRows:
     from consistency.referee.readers.formats.other_names import with_clock
     from consistency.referee.readers.formats.sheet import read_sheet
 
-    assert r.by is not None
     assert r.by_file is not None
     sheet = with_clock(read_sheet(r.by_file), required=False)
     if r.by not in sheet:

@@ -7,6 +7,7 @@ A change of either world frame changes neither. Log(M D^-1) is the adjoint of it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +18,10 @@ from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.words.numbers import p_text, plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
+from consistency.referee.readers.mix_ups.hints import Change, Pairs, hints
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble
-from consistency.referee.readers.truth_matching import at, common_times
+from consistency.referee.readers.truth_matching import Poses, at, common_times
 from consistency.referee.readers.windows import MARGINAL, Relative, windows
 from consistency.referee.types import Array, Indices
 
@@ -30,6 +32,7 @@ DOUBTS = {  # by whether sizes of errors depend on each other, and whether they 
     (False, True): ("go the same way", "a bias, or noise that lasts longer than a window"),
     (False, False): ("go opposite ways", "noise of the pose that they share"),
 }
+SEARCHED = 20_000  # rows with truth, of all runs, in which mix-ups are looked for
 BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
 
 
@@ -243,3 +246,32 @@ def _too_few(of: Independence, relative: Relative) -> str:
         f"which takes {ENOUGH}; without --windows independent they are steps of their run, however they depend on "
         "each other"
     )
+
+
+def causes_of_motions(
+    name: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
+) -> list[str]:
+    """Mix-ups of motions, or of poses with cross-covariances, without which the errors of the windows fit."""
+    most = SEARCHED // len(stretches)
+    stretches = [replace(s, rows=s.rows[:most], truth=s.truth[:most]) for s in stretches]
+    planar = len(axes) == 3
+    runs = [
+        Poses(
+            s.place, s.t, s.estimate, s.covariance, np.ones(len(s.t), bool), s.t[s.rows], s.truth,
+            "planar" if planar else "spatial", s.convention, 0.0,
+        )
+        for s in stretches
+    ]  # fmt: skip
+
+    def errors_without(change: Change) -> Pairs:
+        found = []
+        for s, p in zip(stretches, runs, strict=True):
+            with np.errstate(invalid="ignore"), suppress(InputError):  # infinite covariances; no window fits
+                q = change(p)
+                cross = None if s.cross is None else change(replace(p, covariance=s.cross)).covariance
+                s = replace(s, estimate=q.estimate, covariance=q.covariance, cross=cross, convention=q.convention)
+                one = windows_of(replace(s, truth=q.truth), relative)
+                found.append((one.error, one.covariance))
+        return found
+
+    return hints(name, axes, runs, judged=judged, errors_without=errors_without)

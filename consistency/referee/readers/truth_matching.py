@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -268,6 +268,9 @@ class Poses:
             self, true_t=self.true_t[samples], truth=self.truth[samples], true_clock=at(self.true_clock, samples),
             true_covariance=at(self.true_covariance, samples),
         )  # fmt: skip
+
+
+Change = Callable[[Poses], Poses]  # what is read otherwise
 
 
 def at(values: Array | None, rows: Any) -> Array | None:

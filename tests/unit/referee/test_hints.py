@@ -25,11 +25,10 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     on_body,
 )
+from consistency.referee.readers.heading_units import turns
 from consistency.referee.readers.mix_ups import hints as readers_hints
-from consistency.referee.readers.mix_ups import reading_fit
-from consistency.referee.readers.mix_ups.hints import hints, turns
+from consistency.referee.readers.mix_ups.hints import FACTOR, SMALL, fit_of, hints
 from consistency.referee.readers.mix_ups.known import Guess, _ned
-from consistency.referee.readers.mix_ups.reading_fit import FACTOR, fit_of
 from consistency.referee.readers.pipeline.relative_motions import Stretch, causes_of_motions
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
@@ -504,7 +503,7 @@ def test_one_number_for_all_variances_is_no_covariance_of_an_estimator(rng):
 
 def test_many_components_are_fitted_like_few(rng):
     """Each matrix by itself where they are large; one without a factor is left out, and the others stay."""
-    n = reading_fit.SMALL + 5
+    n = SMALL + 5
     A = rng.normal(size=(4, n, n))
     P, e = A @ np.swapaxes(A, 1, 2), rng.normal(size=(4, n))
     P[1, 0, 1] = P[1, 1, 0] = 2.0 * np.sqrt(P[1, 0, 0] * P[1, 1, 1])

@@ -22,7 +22,7 @@ from consistency.referee.readers.alignment.world_frames import (
     on_body,
     spread,
 )
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import Change, Poses
 from consistency.referee.types import Array
 
 ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
@@ -34,8 +34,6 @@ ARM = 1e-3  # of the size of the path: shorter lever arms are not named
 TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
 
 OF = {"both files": ("estimate", "truth"), "the estimates": ("estimate",), "the truth": ("truth",)}  # fields of poses
-
-Change = Callable[[Poses], Poses]
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.words.numbers import p_text, plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
-from consistency.referee.readers.mix_ups.hints import Change, Pairs, hints
+from consistency.referee.readers.mix_ups.hints import Pairs, hints
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble
-from consistency.referee.readers.truth_matching import Poses, at, common_times
+from consistency.referee.readers.truth_matching import Change, Poses, at, common_times
 from consistency.referee.readers.windows import MARGINAL, Relative, windows
 from consistency.referee.types import Array, Indices
 

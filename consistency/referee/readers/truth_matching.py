@@ -139,9 +139,9 @@ def _bends(position: Array, after: Indices) -> Array:
     last = len(position) - 2  # the last sample with a second difference
     if last < 1:
         return np.zeros(len(after))
-    both = [np.clip(after + side, 1, last) for side in (0, 1)]
-    second = [np.linalg.norm(position[i + 1] - 2.0 * position[i] + position[i - 1], axis=1) for i in both]
-    return np.asarray(np.maximum(*second) / 8.0)
+    second = np.linalg.norm(np.diff(position, 2, axis=0), axis=1)  # of samples 1, 2, ...
+    before, behind = (second[np.clip(after + side, 1, last) - 1] for side in (0, 1))
+    return np.asarray(np.maximum(before, behind) / 8.0)
 
 
 @dataclass(frozen=True)
@@ -228,10 +228,14 @@ class Poses:
         """Time of each estimate, (N,), s; NaN where steps have none."""
         if not self.numbered:
             return self.t
-        return np.full(len(self.t), np.nan) if self.clock is None else self.clock
+        if self.clock is None:
+            return np.full(len(self.t), np.nan)
+        return self.clock
 
     def later(self, shift: float) -> Poses:
-        return replace(self, t=self.t + shift) if shift else self
+        if not shift:
+            return self
+        return replace(self, t=self.t + shift)
 
     def sound(self) -> Poses:
         """Estimates that are finite, with a finite covariance."""

@@ -63,8 +63,8 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
     def of_block(truth: Array, rows: Indices) -> Array:
         out = np.empty((len(rows), len(judged), len(free)))
         for k, motion in enumerate(STEP * free):
-            after = p.error_of(rows, _small(motion).placed(truth, p.manifold))
-            before = p.error_of(rows, _small(-motion).placed(truth, p.manifold))
+            after = p.error_of(rows, _small(-motion).placed(truth, p.manifold))
+            before = p.error_of(rows, _small(motion).placed(truth, p.manifold))
             out[:, :, k] = _whitened(p, rows, (after - before) / (2.0 * STEP), judged)
         return out
 

@@ -27,8 +27,9 @@ from consistency.referee.readers.alignment.world_frames import (
 )
 from consistency.referee.readers.heading_units import turns
 from consistency.referee.readers.mix_ups import hints as readers_hints
-from consistency.referee.readers.mix_ups.hints import FACTOR, SMALL, fit_of, hints
+from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.mix_ups.known import Guess, _ned
+from consistency.referee.readers.mix_ups.reading_fit import FACTOR, SMALL, fit_of, thinned
 from consistency.referee.readers.pipeline.relative_motions import Stretch, causes_of_motions
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
@@ -276,7 +277,7 @@ def test_independent_estimates_by_hand():
 
 def test_few_of_many_runs_are_looked_at(rng, monkeypatch):
     looked = list[int]()
-    monkeypatch.setattr(readers_hints, "_same", lambda some: bool(looked.append(len(some))) or True)
+    monkeypatch.setattr(readers_hints, "is_same", lambda some: bool(looked.append(len(some))) or True)
     run = planar(rng)[0]
     for runs in (1, 200, 201, 2000, 2001):
         hints("f", ("x", "y", "heading"), [run] * runs)
@@ -515,7 +516,7 @@ def test_many_components_are_fitted_like_few(rng):
     log_det = np.mean([np.linalg.slogdet(P[k])[1] for k in (0, 2, 3)])
     assert found.likelihood == pytest.approx(-0.5 * (np.mean(nees) + log_det), rel=1e-9)
     many = [states(np.ones((1, 400)), np.eye(400))] * 40
-    assert len(readers_hints._thinned(many, 0.0)) == 20
+    assert len(thinned(many, 0.0)) == 20
 
 
 def assert_named(causes, said):

@@ -96,7 +96,7 @@ def clocks_and_frames(
     for _ in range(ROUNDS):
         before, later = shift, [p.later(shift) for p in runs]
         frames = frames_of(name, later, align, judged)
-        shift, notes = clock_shift(name, _moved(later, frames), time_offset)
+        shift, notes = clock_shift(name, _moved(runs, frames), time_offset)
         if abs(shift - before) <= SETTLED:
             break
     if shift == before:

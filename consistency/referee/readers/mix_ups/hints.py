@@ -7,251 +7,24 @@ leaves are judged in the same way for all causes, and a cause is named if they c
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from functools import partial
 
 import numpy as np
 
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.readers.truth_matching import Change, Poses
-from consistency.referee.types import Array, Indices
+from consistency.referee.readers.mix_ups.known import Guess, guesses_of
+from consistency.referee.readers.mix_ups.reading_fit import LEAST_GAIN, ReadingFit, fit_of, is_same, thinned
+from consistency.referee.readers.truth_matching import Change, Poses, submatrices
+from consistency.referee.types import Array
 
-if TYPE_CHECKING:
-    from consistency.referee.readers.mix_ups.known import Guess
-
-MOST = 1000  # estimates that are looked at, of all runs together
-MOST_NUMBERS = 4_000_000  # of their covariances
-MOST_RUNS, LEAST_EACH = 200, 20  # that are looked at, evenly over all, and estimates of each
 WRONG = 1.0  # decades that the NEES is off, from which on causes are named that look like a bias or a drift
 APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
 SAID = 0.2  # decades from which on the scale that remains is stated
-LEAST_GAIN = float(np.log(1e3))  # log likelihood that a cause gains over simple faults, and as much as it has rivals
 LIKE = 1.0  # log likelihood by which two causes may differ that are equally likely
-ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
-LEAST = 3  # estimates that show two files to be the same
-RIGHT = 0.4  # decades that components may differ by with the mix-up undone, or more where chance allows it
-SCALE = 1.0  # decades that all may be off by with the mix-up undone: a filter's own fault beside it
-ENOUGH = 100.0  # independent estimates that show a scale to be the one that a cause makes
-BIAS = 6.0  # standard deviations that a filter is off by without a mix-up
-FACTOR = 6.0  # by which a wrong filter's covariance is off without a mix-up: the table of benchmarks/hints.py has 4
-ANY = 1e8  # the same of a number that stands for all variances
-ODD = 1e-3  # probability that errors with the stated covariance are not taken for such
-GROUPS = {3: ([0, 1],), 6: ([0, 1, 2], [3, 4, 5])}  # position and attitude, of poses
-SMALL = 30  # components up to which all matrices are solved at once, which is slower for larger ones
-FEW = 12  # components up to which a factor on one of them is a fault that others can be told from
+NEARLY_ALL = 0.99  # of the estimates that can be whitened as declared
 
 Pairs = Sequence[tuple[Array, Array]]
 ErrorsWithout = Callable[[Change], Pairs]
-
-
-# --- how well the errors fit under one reading ------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class ReadingFit:
-    """Errors of K estimates in n components under one reading; those that cannot be whitened are left out."""
-
-    whitened: Sequence[Array]  # of each run, (k, n)
-    factor: Array  # (K, n, n), L of the correlations R = L L'
-    sigma: Array  # (K, n)
-    error: Array  # (K, n)
-
-    @property
-    def n(self) -> int:
-        return int(self.error.shape[1])
-
-    @cached_property
-    def w(self) -> Array:
-        """(K, n)."""
-        return np.concatenate(self.whitened)
-
-    @cached_property
-    def own(self) -> Array:
-        """Errors over their standard deviations, (K, n)."""
-        return np.asarray(self.error / self.sigma)
-
-    @cached_property
-    def decades(self) -> Array:
-        """log10 of the median NEES over that of chi-square, of all n components and of each alone, (1 + n,)."""
-        nees = np.median(np.column_stack([np.square(self.w).sum(axis=1), np.square(self.own)]), axis=0)
-        right = distributions.chi2.ppf(0.5, np.append(self.n, np.ones(self.n)))
-        return np.asarray(np.log10(np.maximum(nees, 1e-300) / right))
-
-    @cached_property
-    def likelihood(self) -> float:
-        """Mean log likelihood of an estimate, but for a constant."""
-        diagonal = np.diagonal(self.factor, axis1=1, axis2=2)
-        log_det = 2.0 * (np.log(diagonal).sum(axis=1) + np.log(self.sigma).sum(axis=1))
-        return -0.5 * float(np.square(self.w).sum(axis=1).mean() + log_det.mean())
-
-    @cached_property
-    def size(self) -> float:
-        """Effective number of independent estimates, for the scale.
-
-        Squares of Gaussian errors with the autocorrelation rho have that of rho^2, so that K of them say as much as
-        K / (1 + 2 sum (1 - l / k) rho_l^2) independent ones; the mean is 0 by assumption, and an error that is constant
-        over a run counts once. Chance in the rho of a single run leaves down to a third of that. It is no more than the
-        spread of the NEES over estimates, and over 8 or more runs, allows.
-        """
-        K, n = self.w.shape
-        size = K / _memory(self.whitened)
-        nees = np.square(self.w).sum(axis=1) / n
-        size *= min(1.0, 2.0 * float(nees.mean()) ** 2 / (n * max(float(nees.var()), 1e-300)))
-        means = np.array([np.square(w).mean() for w in self.whitened])
-        if len(means) >= 8 and means.std() > 0:
-            size = min(size, 2.0 * float(means.mean()) ** 2 * len(means) / (n * float(means.var(ddof=1))))
-        return max(float(size), 1.0)
-
-    def right(self, roughly: bool) -> bool:
-        """Whether all is right but for a factor that all components share: within decades, or at a rate of ``ODD``."""
-        if roughly:
-            return bool(abs(self.decades[0]) < SCALE and self._alike().all())
-        n, size, common = self.n, self.size, float(np.square(self.w).mean())
-        w = self.w / np.sqrt(common)
-        pairs = np.triu_indices(n, 1)
-        limit = distributions.chi2.isf(ODD / (2 * n + len(pairs[0]) + 1), 1)
-        scale = size * _deviance(np.square(self.own).mean(axis=0) / common)
-        products = (w.T @ w / len(w))[pairs]
-        below = float((np.square(w).sum(axis=1) < distributions.chi2.ppf(0.5, n)).mean())
-        normal = np.concatenate([w.mean(axis=0), products, [2.0 * below - 1.0]]) * np.sqrt(size)
-        return bool((scale <= limit).all() and (np.square(normal) <= limit).all())
-
-    def _alike(self) -> Indices:
-        """Components whose NEES is off like that of all, within decades or by chance in few estimates, (n,) of bool."""
-        within = np.abs(self.decades[1:] - self.decades[0]) < RIGHT
-        ratio = np.square(self.own).mean(axis=0) / np.square(self.w).mean()
-        chance = self.size * _deviance(ratio) <= distributions.chi2.isf(ODD / self.n, 1)
-        return np.asarray(within | chance)
-
-    def is_shown(self) -> bool:
-        """Whether all is right, the common factor too, with enough independent estimates to show it."""
-        off = self.n * self.size * _deviance(np.square(self.w).mean())
-        return self.size >= ENOUGH and self.right(False) and bool(off <= distributions.chi2.isf(ODD, 1))
-
-    def near(self) -> float:
-        """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``."""
-        mean = float(np.square(self.w).mean())
-        f = float(np.clip(mean, 10.0**-SCALE, 10.0**SCALE))
-        return self.likelihood + 0.5 * self.n * (mean - mean / f - float(np.log(f)))
-
-    def fault(self) -> float:
-        """Log likelihood of an estimate that another covariance, the same for all whitened errors, would gain."""
-        M = self.w.T @ self.w / len(self.w)
-        sign, log_det = np.linalg.slogdet(M)
-        if not sign > 0:
-            return np.inf
-        return 0.5 * float(np.trace(M) - log_det - self.n)
-
-    def simple(self) -> float:
-        """Log likelihood of an estimate with the simple fault that explains the errors best.
-
-        That is any factor on the covariance of all components, with one of at most ``FACTOR`` on that of a single one,
-        of position or of attitude, or of any size there where one number was written for all variances; or a bias of
-        at most ``BIAS`` standard deviations of each component with a factor within ``SCALE``.
-        """
-        singles = [[j] for j in range(self.n)] if self.n <= FEW else []
-        groups = [[], *singles, *GROUPS.get(self.n, ())]
-        constant, growing = self.error.mean(axis=0) / self.sigma, np.tile(self.own.mean(axis=0), (len(self.own), 1))
-        gains = [self._with_bias(constant), self._with_bias(growing), *map(self._with_factor, groups)]
-        return self.likelihood + max(gains)
-
-    def _with_bias(self, bias: Array) -> float:
-        """Log likelihood that an estimate gains by a bias (K, n), over the standard deviations."""
-        before = float(np.square(self.w).sum(axis=1).mean())
-        size = float(np.sqrt(np.square(bias).mean(axis=0)).max())
-        shift = _solved(self.factor, bias * min(1.0, BIAS / max(size, 1e-300)))
-        after = float(np.square(self.w - shift).sum(axis=1).mean())
-        common = float(np.clip(after / self.n, 10.0**-SCALE, 10.0**SCALE))
-        return 0.5 * (before - after / common - self.n * float(np.log(common)))
-
-    def _with_factor(self, group: list[int]) -> float:
-        """Log likelihood that an estimate gains by a factor on some components, beside one on all."""
-        most = np.log(FACTOR)
-        if np.ptp(self.sigma) <= 1e-9 * self.sigma.max():
-            most = np.log(ANY)
-        f = np.exp(np.linspace(-most, most, 61))
-        of_group = np.zeros_like(self.own)
-        of_group[:, group] = self.own[:, group]
-        part = _solved(self.factor, of_group)
-        before = float(np.square(self.w).sum(axis=1).mean())
-        mixed, alone = float((self.w * part).sum(axis=1).mean()), float(np.square(part).sum(axis=1).mean())
-        a = f**-0.5 - 1.0
-        after = np.maximum(before + 2.0 * a * mixed + a**2 * alone, 1e-300)
-        common = np.log(after / self.n)
-        return float((0.5 * (before - self.n - self.n * common - len(group) * np.log(f))).max())
-
-
-def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
-    """Errors (k, n) of some runs with their covariances (k, n, n); None without any that can be whitened."""
-    if not runs:
-        return None
-    errors, P = (np.concatenate(each) for each in zip(*runs, strict=True))
-    ends = np.cumsum([len(error) for error, _ in runs])[:-1]
-    with np.errstate(invalid="ignore"):
-        variance = np.diagonal(P, axis1=1, axis2=2)
-        good = np.isfinite(errors).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (variance > 0).all(axis=1)
-    sigma = np.sqrt(variance[good])
-    R = P[good]
-    R /= sigma[:, :, None] * sigma[:, None, :]
-    L, definite = _factors(R)
-    good[good] = definite
-    if not good.any():
-        return None
-    if not definite.all():
-        L, sigma = L[definite], sigma[definite]
-    error = errors[good]
-    w = np.full(errors.shape, np.nan)
-    w[good] = _solved(L, error / sigma)
-    whitened = [part[np.isfinite(part).all(axis=1)] for part in np.split(w, ends)]
-    return ReadingFit([part for part in whitened if len(part)], L, sigma, error)
-
-
-def _deviance(ratio: Array | float) -> Array:
-    """Twice the log likelihood that a variance loses to one that is off by a ratio, per estimate."""
-    return np.asarray(ratio - np.log(np.maximum(ratio, 1e-300)) - 1.0)
-
-
-def _factors(R: Array) -> tuple[Array, Indices]:
-    """Lower Cholesky factors (K, n, n), and which of the matrices have one, (K,) of bool."""
-    try:
-        return np.linalg.cholesky(R), np.ones(len(R), bool)
-    except np.linalg.LinAlgError:
-        L = np.full_like(R, np.nan)
-        for own, matrix in zip(L, R, strict=True):
-            with suppress(np.linalg.LinAlgError):
-                own[:] = np.linalg.cholesky(matrix)
-        return L, np.isfinite(L[:, 0, 0])
-
-
-def _solved(L: Array, x: Array) -> Array:
-    """L^-1 x of lower factors (K, n, n) and vectors (K, n)."""
-    if L.shape[-1] <= SMALL:
-        return np.asarray(np.linalg.solve(L, x[..., None])[..., 0])
-    from scipy.linalg import solve_triangular
-
-    return np.array([solve_triangular(one, vector, lower=True) for one, vector in zip(L, x, strict=True)])
-
-
-def _memory(runs: Sequence[Array]) -> float:
-    """1 + 2 sum over lags l of (1 - l / k) rho_l^2 of a component, over all runs, the largest; k is the longest run."""
-    k, n = max(map(len, runs)), runs[0].shape[1]
-    total, pairs = np.zeros((k, n)), np.zeros((k, 1))
-    for run in runs:
-        own = len(run)
-        transform = np.fft.rfft(run, 2 * own, axis=0)
-        total[:own] += np.fft.irfft(transform * transform.conj(), 2 * own, axis=0)[:own]
-        pairs[:own, 0] += own - np.arange(own)
-    if not (total[0] > 0).all():
-        return float(k)
-    rho = total / np.maximum(pairs, 1) * (pairs[0] / total[0])
-    square = rho**2 - 1.0 / np.maximum(pairs, 1)  # less what chance makes
-    longer = (1.0 - np.arange(1, k) / k)[:, None] * square[1:]
-    return max(1.0, float((1.0 + 2.0 * longer.sum(axis=0)).max()))
-
-
-# --- which reading is named -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -290,19 +63,17 @@ def hints(
     part = list(range(len(axes)) if judged is None else judged)
     some, worlds = runs, errors_without is None
     if errors_without is None:
-        some = _thinned(runs, shift)
+        some = thinned(runs, shift)
         errors_without = partial(_errors_without, some)
-        if _same(some):
+        if is_same(some):
             return [
                 f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies "
                 "of one; give the true poses as the truth"
             ]
     fit_without = partial(_fit_without, errors_without, part, len(axes))
     declared = fit_without(lambda p: p)
-    if declared is not None and declared.size * declared.fault() < LEAST_GAIN:
+    if declared is not None and not declared.is_off():
         return []
-    from consistency.referee.readers.mix_ups.known import guesses_of  # few files need them
-
     guesses = guesses_of(some, axes, part, worlds)
     fits = [(guess, fit_without(guess.change)) for guess in guesses]
     if declared is None:
@@ -316,30 +87,11 @@ def hints(
     return [f"{name}: the NEES{of_axis} is {_times(declared.decades[worst])}, but about right if {cause}"]
 
 
-def _thinned(runs: Sequence[Poses], shift: float) -> list[Poses]:
-    """Some estimates of some runs, without those that are not finite."""
-    most = max(MOST_NUMBERS // runs[0].covariance.shape[-1] ** 2, 1)
-    runs = runs[:: -(-len(runs) // min(MOST_RUNS, most))]
-    each = max(min(MOST, most) // len(runs), min(LEAST_EACH, most // len(runs)))
-    return [p.later(shift).some(each).sound() for p in runs]
-
-
-def _same(runs: Sequence[Poses]) -> bool:
-    """Whether the errors are rounding in nearly all estimates, in values and beside their standard deviations."""
-    same = total = 0
-    for p in runs:
-        error, known = np.abs(p.errors()), p.known().rows
-        with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))[known]
-            rounding = ROUNDING * max(1.0, float(np.abs(p.truth).max(initial=0.0)))
-            same += int(((error[known] <= rounding) & (error[known] <= NEGLIGIBLE * sigma)).all(axis=1).sum())
-        total += len(known)
-    return total >= LEAST and same >= NEARLY_ALL * total
-
-
 def _errors_without(runs: Sequence[Poses], change: Change) -> Pairs:
-    changed = map(change, runs)
-    return [(p.errors(), p.covariance) for p in changed]
+    pairs = []
+    for p in map(change, runs):
+        pairs.append((p.errors(), p.covariance))
+    return pairs
 
 
 def _fit_without(errors_without: ErrorsWithout, part: list[int], n: int, change: Change) -> ReadingFit | None:
@@ -347,12 +99,13 @@ def _fit_without(errors_without: ErrorsWithout, part: list[int], n: int, change:
     pairs = errors_without(change)
     if len(part) == n or not all(error.shape[1] == n for error, _ in pairs):
         return fit_of(pairs)
-    return fit_of([(error[:, part], P[:, part][:, :, part]) for error, P in pairs])
+    return fit_of([(error[:, part], submatrices(P, part)) for error, P in pairs])
 
 
 def _cause(fits: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFit) -> str | None:
     """The likeliest cause in words, if any is confirmed."""
-    gross = bool(abs(declared.decades[0]) > WRONG or (np.abs(declared.decades) > APART).any())
+    off = np.abs(declared.decades)
+    gross = bool(off[0] > WRONG or (off > APART).any())
     candidates = list(_candidates(fits, declared, gross))
     named = _likeliest(candidates, declared, gross, LEAST_GAIN + np.log(max(len(fits), 1)))
     if named is not None:
@@ -385,9 +138,15 @@ def _candidates(
 
 def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Candidate | None:
     """The likeliest candidate that is right but for a common factor; of like ones the first, and the last at need."""
-    right = [one for one in candidates if one.size * one.gain >= bar and one.fit.right(gross)]
-    right = [one for one in right if _status(one.fit) <= _status(declared)]
-    right = [one for one in right if not one.guess.last] or right
+    right, at_need = [], []
+    for one in candidates:
+        if one.size * one.gain < bar or not one.fit.right(gross) or _status(one.fit) > _status(declared):
+            continue
+        if one.guess.last:
+            at_need.append(one)
+        else:
+            right.append(one)
+    right = right or at_need
     most = max((one.gain for one in right), default=0.0)
     return next((one for one in right if one.size * (most - one.gain) <= LIKE), None)
 
@@ -404,5 +163,6 @@ def _status(fit: ReadingFit) -> int:
 
 
 def _times(off: float) -> str:
-    size = "large" if off > 0 else "small"
-    return f"{10.0 ** abs(off):.2g} times too {size}"
+    if off > 0:
+        return f"{10.0**off:.2g} times too large"
+    return f"{10.0**-off:.2g} times too small"

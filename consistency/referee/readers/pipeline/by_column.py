@@ -45,9 +45,12 @@ def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estima
         raise InputError(f"--by {r.by}: {e.path} {NO_COLUMNS}")
     column = column_of(r.by, np.concatenate(cells))
     column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
-    ends = np.cumsum([len(each) for each in cells])
-    parts = zip(e.runs, np.split(column.values, ends[:-1]), strict=True)
-    return replace(e, runs=[replace(p, by=values) for p, values in parts]), column
+    runs, start = [], 0
+    for p in e.runs:
+        end = start + len(p.t)
+        runs.append(replace(p, by=column.values[start:end]))
+        start = end
+    return replace(e, runs=runs), column
 
 
 def in_groups(

@@ -15,7 +15,7 @@ from consistency.referee.diagnostics.records.record import Record, each_alone
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.readers.heading_units import require_radians
-from consistency.referee.readers.mix_ups.hints import hints
+from consistency.referee.readers.mix_ups.reading_fit import is_plausible
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
 from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
@@ -282,14 +282,24 @@ def _estimated(e: Estimator, errors: Sequence[Array], judged: Sequence[int]) -> 
 def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
     """Mix-ups of the whole state, or of its poses by themselves."""
     if not e.in_space:
-        return hints(e.said, e.axes, runs, shift)
+        return _hints(e, runs, shift, range(len(e.axes)))
     whole = []
     if len(e.axes) > len(AXES):
-        whole = hints(e.said, e.axes, runs, shift, judged)
+        whole = _hints(e, runs, shift, judged)
     of_pose = [i for i in judged if i < len(AXES)]
     if whole or not of_pose:
         return whole
-    return hints(e.said, e.axes[: len(AXES)], [p.alone() for p in runs], shift, of_pose)
+    poses = replace(e, axes=e.axes[: len(AXES)])
+    return _hints(poses, [p.alone() for p in runs], shift, of_pose)
+
+
+def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
+    """Hints on mix-ups, which are loaded where the errors do not fit."""
+    if is_plausible(runs, shift, judged):
+        return []
+    from consistency.referee.readers.mix_ups.hints import hints
+
+    return hints(e.said, e.axes, runs, shift, judged)
 
 
 # --- records -----------------------------------------------------------------------------------------

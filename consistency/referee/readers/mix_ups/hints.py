@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 
 from consistency.referee.readers.mix_ups.known import Guess, guesses_of
+from consistency.referee.readers.mix_ups.known_worlds import worlds_of
 from consistency.referee.readers.mix_ups.reading_fit import LEAST_GAIN, ReadingFit, fit_of, is_same, thinned
 from consistency.referee.readers.truth_matching import Change, Poses, submatrices
 from consistency.referee.types import Array
@@ -74,7 +75,9 @@ def hints(
     declared = fit_without(lambda p: p)
     if declared is not None and not declared.is_off():
         return []
-    guesses = guesses_of(some, axes, part, worlds)
+    guesses = guesses_of(some, axes, part)
+    if worlds:
+        guesses += worlds_of(some)
     fits = [(guess, fit_without(guess.change)) for guess in guesses]
     if declared is None:
         shown = [guess.text for guess, fit in fits if fit is not None and fit.is_shown()]

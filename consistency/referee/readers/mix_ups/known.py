@@ -1,4 +1,4 @@
-"""The mix-ups in files that are looked for: a unit, order, side, convention, world or body of one file or of both."""
+"""The mix-ups in files that are looked for: a unit, order, side or convention of one file or of both."""
 
 from __future__ import annotations
 
@@ -14,14 +14,6 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
 from consistency.referee.geometry.groups import inverse, matrices, vectors
-from consistency.referee.readers.alignment.world_frames import (
-    WorldTransform,
-    fitted_body,
-    fitted_frame,
-    moved,
-    on_body,
-    spread,
-)
 from consistency.referee.readers.truth_matching import Change, Poses, submatrices
 from consistency.referee.types import Array
 
@@ -30,8 +22,6 @@ DEGREE = np.pi / 180.0
 MILLI = 1e-3
 SINGULAR = 1e-3  # smallest eigenvalue of a correlation from which on a direction is named
 UNIT = 1e-3  # lengths of quaternions differ by less from 1
-ARM = 1e-3  # of the size of the path: shorter lever arms are not named
-TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
 
 OF = {"both files": ("estimate", "truth"), "the estimates": ("estimate",), "the truth": ("truth",)}  # fields of poses
 
@@ -48,8 +38,8 @@ class Guess:
     volume: float = 0.0  # log of the factor of volumes of the truth, whose density it divides
 
 
-def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], worlds: bool = True) -> list[Guess]:
-    """Possible mix-ups, the likelier first; ``part`` is judged. Motions have no ``worlds``."""
+def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> list[Guess]:
+    """Possible mix-ups of covariances, units and orders, the likelier first; ``part`` is judged."""
     kind, convention = runs[0].manifold, runs[0].convention
     n = runs[0].covariance.shape[-1]
     if kind == "spatial" and n > 6:
@@ -58,26 +48,15 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], worl
     if kind == "vector":
         own = [*scales, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
         return [*own, *_quaternion_states(runs, axes)]
+    of_covariance = *scales, *_permuted(axes, 3)
     if kind == "spatial":
-        own = [*_orders(convention), *_quaternions(), *scales, *_permuted(axes, 3), *_units(3, slice(3, 6))]
         words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
         half = Guess(words, lambda p: _weighed(p, slice(3, 6), 2.0), exact=True)
-        own += [half, *_positions(3)]
+        own = [*_orders(convention), *_quaternions(), *of_covariance, *_units(3, slice(3, 6)), half, *_positions(3)]
     else:
         sides = [kind for kind in PLANAR if kind not in (convention, "vector")]
-        own = [
-            *map(_of_error, sides),
-            *_headings(),
-            *scales,
-            *_permuted(axes, 3),
-            *_units(2, slice(2, 3)),
-            *_positions(2),
-        ]
-    own.append(Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False))
-    if not worlds:
-        return own
-    own += _ned(convention) if kind == "spatial" else [_mirrored(convention)]
-    return [*own, *_frames(runs), *_bodies(runs)]
+        own = [*map(_of_error, sides), *_headings(), *of_covariance, *_units(2, slice(2, 3)), *_positions(2)]
+    return [*own, Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False)]
 
 
 def _roots(part: list[int]) -> Iterator[Guess]:
@@ -131,7 +110,7 @@ def _diagonal(P: Array) -> Array:
     return np.diagonal(P, axis1=1, axis2=2)[:, :, None]
 
 
-def _of_finite(p: Poses, function: Callable[[Array], Array]) -> Poses:
+def of_finite(p: Poses, function: Callable[[Array], Array]) -> Poses:
     """The run with a function of those estimates that are finite."""
     finite = np.isfinite(p.estimate).all(axis=1)
     estimate = p.estimate.copy()
@@ -141,7 +120,7 @@ def _of_finite(p: Poses, function: Callable[[Array], Array]) -> Poses:
 
 
 def _inverse(p: Poses) -> Poses:
-    return _of_finite(p, lambda own: vectors(inverse(matrices(own))))
+    return of_finite(p, lambda own: vectors(inverse(matrices(own))))
 
 
 def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
@@ -227,44 +206,6 @@ def _reordered(
         return replace(p, convention=convention or p.convention)
 
     return change
-
-
-def _ned(convention: str) -> Iterator[Guess]:
-    """A world whose z points down, with a body whose z does so too or not."""
-    north = WorldTransform(Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))
-    down = np.diag([1.0, -1.0, -1.0])
-    turned = {"so3-body": slice(3, 6), "left": slice(0, 6)}.get(convention, slice(0, 0))
-    T = np.eye(6)
-    T[turned, turned] = np.kron(np.eye(2), down)[turned, turned]
-
-    def turned_body(own: Array) -> Array:
-        turn = Rotation.from_quat(own[:, 3:]) * Rotation.from_matrix(down)
-        return np.column_stack([own[:, :3], turn.as_quat()])
-
-    def with_body(p: Poses) -> Poses:
-        p = _of_finite(moved(p, north), turned_body)
-        return replace(p, covariance=T @ p.covariance @ T)
-
-    worlds = "one file is in a world of x north, y east, z down, the other in one of x east, y north, z up"
-    remedy = "add --world ned{0} if that is the estimates, --truth-world ned{1} if it is the truth"
-    yield Guess(f"{worlds}; {remedy.format('', '')}", lambda p: moved(p, north), fine=False)
-    remedy = remedy.format(" --body-axes frd", " --truth-body-axes frd")
-    yield Guess(f"{worlds}, and their bodies have z down and z up; {remedy}", with_body, fine=False)
-
-
-def _mirrored(convention: str) -> Guess:
-    A = np.diag([1.0, -1.0, -1.0])
-    if convention != "left":
-        A[:2, :2] = [[0.0, 1.0], [1.0, 0.0]]
-
-    def change(p: Poses) -> Poses:
-        x, y, heading = p.estimate.T
-        own = np.column_stack([y, x, wrap(0.5 * np.pi - heading)])
-        return replace(p, estimate=own, covariance=A @ p.covariance @ A.T)
-
-    words = "one file is in a plane of x north, y east, the other in one of x east, y north"
-    remedy = "add --world ned if that is the estimates, --truth-world ned if it is the truth"
-    return Guess(f"{words}; {remedy}", change, fine=False)
 
 
 def _orders(convention: str) -> Iterator[Guess]:
@@ -367,54 +308,3 @@ def _inverted(P: Array, part: list[int]) -> Array:
     regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
     out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])
     return out
-
-
-# --- frames -----------------------------------------------------------------------------------------
-
-
-def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
-    """The worlds of the files differ by a turn about z and a shift, the same in all runs, or another in each."""
-    frame = fitted_frame(runs)
-    if frame is None or not (size := spread(runs)) > 0:
-        return
-    angle = np.rad2deg(frame.heading)
-    several = len(runs) > 1
-    if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
-        turn, mode = "", "posyaw"
-        if abs(angle) > TURN:
-            turn = f"turned by {angle:.1f} degrees about z and "
-        if several:
-            mode = "posyaw-all"
-        words = (
-            f"the world of the estimates is {turn}shifted by {_place(frame.shift, runs)} m to meet that of the truth; "
-            f"write both in one world, or add --align {mode}"
-        )
-        yield Guess(words, lambda p: moved(p, frame), fine=False)
-    if several:
-        words = "each run is turned about z and shifted by itself to meet the truth; add --align posyaw"
-        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame), last=True, fine=False)
-
-
-def _bodies(runs: Sequence[Poses]) -> Iterator[Guess]:
-    """The bodies of the files differ by a constant turn or lever arm."""
-    body = fitted_body(runs)
-    if body is None:
-        return
-    angle, size = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0, spread(runs)
-    parts = []
-    if np.linalg.norm(angle) >= TURN:
-        turned = f"({angle[0]:.1f}, {angle[1]:.1f}, {angle[2]:.1f}) degrees about x, y, z"
-        if runs[0].manifold == "planar":
-            turned = f"{angle[2]:.1f} degrees about z"
-        parts.append(f"turned by {turned}")
-    if np.linalg.norm(body.arm) >= ARM * size:
-        parts.append(f"shifted by a lever arm of {_place(body.arm, runs)} m")
-    if parts:
-        words = f"the body of the truth is {' and '.join(parts)} against that of the estimates; write poses of one body"
-        yield Guess(words, lambda p: on_body(p, body), fine=False)
-
-
-def _place(values: Array, runs: Sequence[Poses]) -> str:
-    """Coordinates in space, or x and y."""
-    d = 2 if runs[0].manifold == "planar" else 3
-    return f"({', '.join(f'{value:.3g}' for value in values[:d])})"

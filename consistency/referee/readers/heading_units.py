@@ -1,4 +1,4 @@
-"""Headings in degrees where radians are needed, and errors of angles that are off by whole turns."""
+"""Headings in degrees where radians are needed, told by what no heading in radians does."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from consistency.referee.types import Array
 JUMP, SMOOTH, OFTEN = 180.0, 60.0, 3  # degrees between rows, and what is left less a whole turn; no rad jump as often
 TURNING, ALONG = 0.15, 0.2  # rad, spread of a course; the part of it that headings in degrees do not explain, at most
 STANDING, FEWEST = 1e-6, 10  # m between two rows; steps along a path
-NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
 FITTING = (0.05, 4.0)  # median of squared errors over variances, of which chi-square has 0.45
 
 
@@ -90,20 +89,3 @@ def fit_in_degrees(runs: Sequence[Poses]) -> bool:
     some = np.isfinite(gap) & (variance > np.pi**2)
     ratio = np.square(gap[some] - 360.0 * np.round(gap[some] / 360.0)) / variance[some]
     return 2 * len(ratio) > len(gap) and bool(FITTING[0] < np.median(ratio) < FITTING[1])
-
-
-def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
-    """Components of errors (runs, steps, n) that look like angles: their large errors are whole turns."""
-    found = []
-    in_degrees = 360.0, "360", np.rad2deg(SHARP), "wrap it to [-180, 180]"
-    for turn, by, sharp, how in ((2.0 * np.pi, "2 pi", SHARP, remedy), in_degrees):
-        with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-            far = (np.abs(error) > 0.5 * turn) & (np.abs(error) > 2.0 * NEAR * sigma) & (NEAR * sigma < sharp)
-            home = np.abs(error - turn * np.round(error / turn)) <= NEAR * sigma
-        for k, axis in enumerate(axes):
-            jumps = int(far[..., k].sum())
-            if jumps >= LEAST and home[..., k][far[..., k]].all():
-                steps = f"{jumps} of {int(np.isfinite(error[..., k]).sum())} steps"
-                found.append(f"{name}: the error of {axis} is off by {by} in {steps}, as that of an angle; {how}")
-    return found

@@ -178,14 +178,13 @@ def symmetric(covariance: Array, place: Callable[[int], str], one_triangle: bool
 
 def longest_start(tracks: Sequence[Track]) -> int:
     """Rows that a start known exactly may take, in which a covariance is singular; 0 where a run begins otherwise."""
-    rows = np.array([len(track.column) for track in tracks], int)
-    starts = np.array([_first_full(track) for track in tracks], int)
-    ended = starts[starts < rows]
-    if not len(ended):
-        return int(rows.max(initial=0))
-    if not starts.min():
+    starts = [(_first_full(track), len(track.column)) for track in tracks]
+    ended = [start for start, rows in starts if start < rows]
+    if not ended:
+        return max((rows for _, rows in starts), default=0)
+    if min(start for start, _ in starts) == 0:
         return 0
-    return int(ended.max())
+    return max(ended)
 
 
 def _first_full(track: Track) -> int:

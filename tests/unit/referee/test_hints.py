@@ -25,9 +25,8 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     on_body,
 )
-from consistency.referee.readers.heading_units import turns
 from consistency.referee.readers.mix_ups import hints as readers_hints
-from consistency.referee.readers.mix_ups.hints import hints
+from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.mix_ups.known import Guess
 from consistency.referee.readers.mix_ups.known_worlds import _ned
 from consistency.referee.readers.mix_ups.reading_fit import FACTOR, SMALL, fit_of, thinned

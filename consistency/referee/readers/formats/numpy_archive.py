@@ -15,7 +15,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR
 from consistency.referee.parsing import is_file, reading, require_name, require_room
 from consistency.referee.readers.formats.sheet import are_dof, bounded
-from consistency.referee.readers.heading_units import turns
+from consistency.referee.readers.mix_ups.hints import turns
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric

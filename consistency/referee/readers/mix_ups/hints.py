@@ -23,6 +23,7 @@ APART = 2.0  # the same of a single component: one run that is off by a constant
 SAID = 0.2  # decades from which on the scale that remains is stated
 LIKE = 1.0  # log likelihood by which two causes may differ that are equally likely
 NEARLY_ALL = 0.99  # of the estimates that can be whitened as declared
+NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
 
 Pairs = Sequence[tuple[Array, Array]]
 ErrorsWithout = Callable[[Change], Pairs]
@@ -169,3 +170,20 @@ def _times(off: float) -> str:
     if off > 0:
         return f"{10.0**off:.2g} times too large"
     return f"{10.0**-off:.2g} times too small"
+
+
+def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
+    """Components of errors (runs, steps, n) that look like angles: their large errors are whole turns."""
+    found = []
+    in_degrees = 360.0, "360", np.rad2deg(SHARP), "wrap it to [-180, 180]"
+    for turn, by, sharp, how in ((2.0 * np.pi, "2 pi", SHARP, remedy), in_degrees):
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+            far = (np.abs(error) > 0.5 * turn) & (np.abs(error) > 2.0 * NEAR * sigma) & (NEAR * sigma < sharp)
+            home = np.abs(error - turn * np.round(error / turn)) <= NEAR * sigma
+        for k, axis in enumerate(axes):
+            jumps = int(far[..., k].sum())
+            if jumps >= LEAST and home[..., k][far[..., k]].all():
+                steps = f"{jumps} of {int(np.isfinite(error[..., k]).sum())} steps"
+                found.append(f"{name}: the error of {axis} is off by {by} in {steps}, as that of an angle; {how}")
+    return found

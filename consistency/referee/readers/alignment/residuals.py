@@ -266,8 +266,8 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     t = np.sqrt(np.maximum(size, 0.0))
     wide = t[:, None, None]
     bound = (1.0 + wide) * own + seen + seen / np.where(wide > 0, wide, 1.0)
-    P = p.covariance.copy()
-    P[np.ix_(sound.rows, judged, judged)] = 0.5 * (bound + np.swapaxes(bound, 1, 2))
+    P, index = p.covariance.copy(), np.array(judged)
+    P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + np.swapaxes(bound, 1, 2))
     P[row] = 0.0
     return replace(p, covariance=P), np.square(1.0 + t[sound.rows != row])
 

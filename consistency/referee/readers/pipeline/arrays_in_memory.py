@@ -97,9 +97,7 @@ def _require_rows(shapes: Mapping[str, tuple[int, ...]]) -> None:
             text += f"; one component is errors[:, None] and {stated}"
         raise InputError(text)
     for key, own in shapes.items():
-        needs = shape
-        if key.endswith("covariances"):
-            needs = (*shape, shape[1])
+        needs = (*shape, shape[1]) if key.endswith("covariances") else shape
         if own == needs:
             continue
         remedy = ""

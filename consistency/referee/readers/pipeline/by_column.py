@@ -123,12 +123,9 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
         return record
     if record.nees is None:
         raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
-    bins = BINS
-    if r.bins is not None:
-        bins = r.bins
-        if column.words:
-            flag = option.replace("by", "bins")
-            raise InputError(f"{flag}: {column.name} holds words, each of which is a group; leave the option out")
+    if column.words and r.bins is not None:
+        flag = option.replace("by", "bins")
+        raise InputError(f"{flag}: {column.name} holds words, each of which is a group; leave the option out")
     counted = np.isfinite(record.nees)
     if not counted.any():
         return record
@@ -143,7 +140,7 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
             "only called so"
         )
     try:
-        groups = groups_of(replace(column, values=record.by), bins, counted)
+        groups = groups_of(replace(column, values=record.by), BINS if r.bins is None else r.bins, counted)
     except ValueError as wrong:
         raise InputError(f"{option} {column.name}: {wrong}") from None
     return replace(record, groups=groups)
@@ -210,6 +207,7 @@ def _sheet(r: Reading) -> TableRows:
     from consistency.referee.readers.formats.other_names import with_clock
     from consistency.referee.readers.formats.sheet import read_sheet
 
+    assert r.by is not None
     assert r.by_file is not None
     sheet = with_clock(read_sheet(r.by_file), required=False)
     if r.by not in sheet:

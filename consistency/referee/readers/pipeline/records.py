@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -61,9 +61,9 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
         from consistency.referee.readers.pipeline.by_column import with_values
 
         e, column = with_values(e, r, judged)
-    relative = windows_asked(r)
+    relative, pairs = windows_asked(r), list[Poses]()
     if relative is not None:
-        records, pairs = [_record_of_windows(e, judged, r, relative)], []
+        records = [_record_of_windows(e, judged, r, relative)]
     else:
         records, pairs = _records_of_poses(e, judged, r)
     if column is None:
@@ -100,7 +100,9 @@ def _judged(e: Estimator, r: Reading) -> list[int]:
 
 def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
     """Records of the poses of an estimator, and the estimates of each run that they judge, beside their truth."""
-    runs, shift, of_clocks, of_alignment = e.runs, 0.0, [], {}
+    runs, shift = e.runs, 0.0
+    of_clocks: list[str] = []
+    of_alignment: dict[str, Any] = {}
     if r.align is not None:
         from consistency.referee.readers.alignment.residuals import clocks_and_frames
 
@@ -117,7 +119,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         pairs = [p.pairs(p.t != 0) for p in pairs]
     for i, p in enumerate(pairs):
         if p.open_end and _is_cut(p, runs[i]):
-            pairs[i] = p.pairs(slice(-1))
+            pairs[i] = p.pairs(np.arange(len(p.t) - 1))
             notes.insert(0, p.open_end)
     errors = [p.errors() for p in pairs]
     if e.in_space:
@@ -221,7 +223,7 @@ def _left_out(e: Estimator, runs: Sequence[Poses], pairs: Sequence[Poses]) -> li
         if not runs[0].numbered:
             what += f" within {runs[0].max_dt:g} s (--max-dt)"
         notes.append(f"{e.said}: {left_out} of {total} estimates have {what} and are left out")
-    furthest = max(float(np.max(p.apart, initial=0.0)) for p in pairs)
+    furthest = max(p.apart.max(initial=0.0) for p in pairs if p.apart is not None)
     if furthest > ROUNDING and not e.in_space:
         notes.append(f"{e.said}: the truth is interpolated, from samples up to {furthest:.2g} s away")
     return notes
@@ -249,8 +251,8 @@ def _bent(p: Poses) -> Array:
     """What the interpolated truth may be off by, (k,), in standard deviations of the position."""
     assert p.bend is not None
     sigma = np.sqrt(np.abs(_variances(p)[:, :3]).mean(axis=1))
-    some = (sigma > 0) & (p.bend > 1e-9)
-    return np.divide(p.bend, sigma, out=np.zeros(len(sigma)), where=some)
+    bent = np.zeros(len(sigma))
+    return np.asarray(np.divide(p.bend, sigma, out=bent, where=(sigma > 0) & (p.bend > 1e-9)))
 
 
 def _variances(p: Poses) -> Array:

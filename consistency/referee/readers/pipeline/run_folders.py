@@ -77,10 +77,12 @@ def _one_estimator(
             raise InputError(f"{one.path}: has another state or kind of covariance than {first.path}")
         poses.append(replace(one.runs[0], run=run))
     without = dict.fromkeys(set(all_runs).difference(own), f"it holds no estimates of '{name}'")
-    t, notes, causes = first.t, {}, {}
+    t = first.t
+    notes: dict[str, str] = {}
+    causes: dict[str, str] = {}
     if t is not None:
         t = max((one.t for one in own.values() if one.t is not None), key=len)
-    for one in reversed(own.values()):
+    for one in reversed(list(own.values())):
         notes |= {_without_paths(note, one): note for note in one.notes}
         causes |= {_without_paths(cause, one): cause for cause in one.causes}
     return replace(

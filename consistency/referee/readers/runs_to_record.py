@@ -52,6 +52,11 @@ class Track:
         return replace(self, error=self.error[:, index], covariance=P, truth_covariance=of_truth)
 
 
+def in_columns(tracks: Sequence[Track], columns: Sequence[Indices]) -> list[Track]:
+    """Tracks whose rows belong to other steps, (k,) each."""
+    return [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
+
+
 def assemble(
     name: str,
     tracks: Sequence[Track],

@@ -81,10 +81,6 @@ class Known(NamedTuple):
     apart: Array  # (k,), s to the nearest sample
     bend: Array  # (k,), what the interpolation may be off by in the first three components, or two in the plane
 
-    def of(self, kept: Array) -> Known:
-        """Some of them, by truth values or indices."""
-        return Known(*(values[kept] for values in self))
-
 
 def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, max_dt: float) -> Known:
     """The truth at ``times`` (N,), s, from samples at ``reference`` (M,), increasing, with ``values`` (M, m).

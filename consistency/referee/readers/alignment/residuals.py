@@ -145,17 +145,19 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
     """Covariances of the residuals of a fit; unchanged where these are not known."""
     for_all = mode.endswith("-all")
     free = _directions(mode, runs)
-    residuals, bases, some = [], [], []
+    residuals, tangents, some = [], [], []
     for i, p in enumerate(runs):
         sound = sound_of(p, judged)
         if len(sound.rows):
             some.append(i)
             residuals.append(sound.whitened)
-            bases.append(tangent(p, sound, free, judged))
-    bases = orthonormal(bases) if for_all else [orthonormal([A])[0] for A in bases]
-    dof, of = max(Q.shape[-1] for Q in bases), "each run"
+            tangents.append(tangent(p, sound, free, judged))
+    of = "each run"
     if for_all:
-        of = "all runs"
+        bases, of = orthonormal(tangents), "all runs"
+    else:
+        bases = [orthonormal([A])[0] for A in tangents]
+    dof = max(Q.shape[-1] for Q in bases)
     what = f"aligned by {mode}, a frame of {dof} degrees of freedom for {of}"
     of_runs = Aligned(runs, caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
     if len(some) < ENOUGH:
@@ -187,9 +189,12 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
-    out, factors = zip(*(from_first_pose(name, p, judged) for p in runs), strict=True)
-    every = np.concatenate(factors)
-    larger = 1.0
+    out, factors = [], []
+    for p in runs:
+        first, larger_by = from_first_pose(name, p, judged)
+        out.append(first)
+        factors.append(larger_by)
+    every, larger = np.concatenate(factors), 1.0
     if len(every):
         larger = float(np.median(every))
     if larger < 1.0 + SLIGHT:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from consistency.referee.readers.formats.sheet import TableRows
 
 ENOUGH = 5000  # rows that show what a column is made from
-ROTATION = range(3, 6)  # components of a pose in space
 NO_TRUTH = "has no truth, so that there are no errors to group"
 NO_COLUMNS = "has no columns of its own; --by-file FILE names a table with the column and t or run"
 
@@ -67,42 +67,35 @@ def in_groups(
     InputError
         As :func:`grouped`.
     """
-    judged = {axis for record in records for axis in record.axes}
     if pairs:
-        column = _beside_states(column, e, [i for i, axis in enumerate(e.axes) if axis in judged], pairs)
+        axes = itertools.chain.from_iterable(record.axes for record in records)
+        column = _beside_states(column, e, sorted(map(list(e.axes).index, axes)), pairs)
     return [grouped(record, column, r) for record in records]
 
 
 def _beside_states(column: Column, e: Estimator, judged: Sequence[int], pairs: Sequence[Poses]) -> Column:
     """The column, marked where its values are those of a judged component of the truth or the estimate, or a sigma."""
-    some = [p.pairs(_some(len(p.t), len(pairs))) for p in pairs]
-    column = replace(column, values=np.concatenate([p.by for p in some if p.by is not None]))
-    states = _columns_of(e, judged)
-    truth = np.concatenate([_with_columns(p.truth, states) for p in some])
-    estimate = np.concatenate([_with_columns(p.estimate, states) for p in some])
-    P = submatrices(np.concatenate([p.covariance for p in some]), judged)
-    return replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged], truth, estimate, P))
+    columns = _columns_of(e, judged)
+    values, truth, estimate, P = [], [], [], []
+    for p in pairs:
+        some = p.pairs(_some(len(p.t), len(pairs)))
+        values.append(some.by)
+        truth.append(some.truth[:, columns[columns < some.truth.shape[1]]])
+        estimate.append(some.estimate[:, columns[columns < some.estimate.shape[1]]])
+        P.append(submatrices(some.covariance, judged))
+    column = replace(column, values=np.concatenate(values))
+    stacked = map(np.concatenate, (truth, estimate, P))
+    return replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged], *stacked))
 
 
-def _columns_of(e: Estimator, judged: Sequence[int]) -> list[int]:
+def _columns_of(e: Estimator, judged: Sequence[int]) -> Indices:
     """Columns of a state that are judged components; of rotations in space, which are quaternions, none."""
+    columns = np.array(judged, np.int64)
     if not e.convention:  # errors of an archive stand in the place of a truth
-        return []
-    if not e.in_space:
-        return list(judged)
-    columns = []
-    for i in judged:
-        if i < ROTATION.start:
-            columns.append(i)
-        elif i >= ROTATION.stop:
-            columns.append(i + 1)
+        return columns[:0]
+    if e.in_space:
+        columns = np.concatenate([columns[columns < 3], columns[columns > 5] + 1])
     return columns
-
-
-def _with_columns(state: Array, columns: Sequence[int]) -> Array:
-    """Those columns of a state (k, m) that it has."""
-    there = [i for i in columns if i < state.shape[1]]
-    return state[:, there]
 
 
 def _some(count: int, parts: int = 1) -> Indices:

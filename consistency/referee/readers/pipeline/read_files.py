@@ -265,9 +265,12 @@ def _guessed(name: str, r: Reading, read: Callable[[str | None], list[Record]]) 
     default = first[0].convention
     if default not in (*PLANAR, *SPATIAL) or default == "vector":
         raise InputError(f"--error {GUESS}: is for poses; the errors of {name} are plain differences")
-    kinds = [kind for kind in (SPATIAL if default in SPATIAL else PLANAR) if kind not in (default, "vector")]
-    others = {kind: {one.name: one for one in read(kind)} for kind in kinds}
-    return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
+    guesses = {one.name: {default: one} for one in first}
+    for kind in SPATIAL if default in SPATIAL else PLANAR:
+        if kind not in (default, "vector"):
+            for one in read(kind):
+                guesses[one.name][kind] = one
+    return [replace(one, guesses=guesses[one.name]) for one in first]
 
 
 def _declared(records: list[Record], r: Reading) -> list[Record]:

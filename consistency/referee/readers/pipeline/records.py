@@ -18,7 +18,7 @@ from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.reading_fit import is_plausible
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
-from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
+from consistency.referee.readers.runs_to_record import Track, assemble, in_columns, not_estimated
 from consistency.referee.readers.truth_matching import (
     AXES,
     ROUNDING,
@@ -213,17 +213,19 @@ def _is_cut(p: Poses, whole: Poses) -> bool:
 
 def _left_out(e: Estimator, runs: Sequence[Poses], pairs: Sequence[Poses]) -> list[str]:
     """Notes on left-out rows, and on a truth between whose samples estimates are."""
-    notes = []
-    total = sum(len(p.t) for p in runs)
-    left_out = total - sum(len(p.t) for p in pairs)
-    if left_out:
-        what = "no truth"
-        if not all(p.stated.all() for p in runs):
+    notes, what = [], "no truth"
+    total, left_out, furthest = 0, 0, 0.0
+    for p, found in zip(runs, pairs, strict=True):
+        total += len(p.t)
+        left_out += len(p.t) - len(found.t)
+        if not p.stated.all():
             what = "no truth or no covariance"
+        if found.apart is not None:
+            furthest = max(furthest, found.apart.max(initial=0.0))
+    if left_out:
         if not runs[0].numbered:
             what += f" within {runs[0].max_dt:g} s (--max-dt)"
         notes.append(f"{e.said}: {left_out} of {total} estimates have {what} and are left out")
-    furthest = max(p.apart.max(initial=0.0) for p in pairs if p.apart is not None)
     if furthest > ROUNDING and not e.in_space:
         notes.append(f"{e.said}: the truth is interpolated, from samples up to {furthest:.2g} s away")
     return notes
@@ -271,14 +273,17 @@ def _largest_median(of_runs: Iterable[Array]) -> float:
 
 def _estimated(e: Estimator, errors: Sequence[Array], judged: Sequence[int]) -> tuple[list[int], list[str]]:
     """Components, of those judged, that a robot in the plane estimates, too; and a note on the others."""
-    part = list(judged)
-    variances = [_variances(p)[p.stated][:, part] for p in e.runs]
-    idle = not_estimated([error[:, part] for error in errors], variances)
+    part = np.array(judged)
+    variances, of_part = [], []
+    for p, error in zip(e.runs, errors, strict=True):
+        variances.append(_variances(p)[p.stated][:, part])
+        of_part.append(error[:, part])
+    idle = not_estimated(of_part, variances)
     if not idle.any():
-        return part, []
-    names = ", ".join(e.axes[i] for i in np.array(part)[idle])
+        return list(judged), []
+    names = ", ".join(np.array(e.axes)[part[idle]])
     note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too"
-    return [int(i) for i in np.array(part)[~idle]], [note]
+    return part[~idle].tolist(), [note]
 
 
 def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
@@ -309,20 +314,15 @@ def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[i
 
 def _track(e: Estimator, p: Poses, error: Array) -> Track:
     """Errors of a run with their covariances; its columns are not yet known."""
-    path, width = None, e.position
+    path, t, width = None, None, e.position
     if width:
         path = np.stack([p.truth[:, :width], p.estimate[:, :width]], axis=1)
+    if e.t is None and not (p.numbered and p.clock is None):  # an archive has the times of its steps
+        t = p.seconds
     return Track(
-        p.run, np.arange(len(p.t)), p.place, error, p.covariance, p.nis, p.nis_dof, by=p.by, t=_times(e, p),
+        p.run, np.arange(len(p.t)), p.place, error, p.covariance, p.nis, p.nis_dof, by=p.by, t=t,
         truth_covariance=p.true_covariance, path=path,
     )  # fmt: skip
-
-
-def _times(e: Estimator, p: Poses) -> Array | None:
-    """Time of each estimate, s; None where steps have none, and in an archive, which has those of its steps."""
-    if e.t is not None or (p.numbered and p.clock is None):
-        return None
-    return p.seconds
 
 
 def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -> tuple[list[Track], Array, list[str]]:
@@ -332,26 +332,25 @@ def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -
     """
     if e.t is not None:
         columns = [p.t.astype(np.int64) for p in pairs]
-        return _placed(tracks, columns), e.t, []
-    tracks = [track for track in tracks if len(track.column)]
-    pairs = [p for p in pairs if len(p.t)]
-    keys = [p.t for p in pairs]
+        return in_columns(tracks, columns), e.t, []
+    keys, seconds, some = [], [], []
+    for p, track in zip(pairs, tracks, strict=True):
+        if len(p.t):
+            keys.append(p.t)
+            seconds.append(p.seconds)
+            some.append(track)
     if not pairs[0].numbered:
         columns, t = common_times(keys)
-        return _placed(tracks, columns), t, []
+        return in_columns(some, columns), t, []
     columns, steps = common_steps(keys)
     t = np.full(len(steps), np.nan)
-    for p, column in zip(reversed(pairs), reversed(columns), strict=True):
-        t[column] = p.seconds
+    for column, times in zip(reversed(columns), reversed(seconds), strict=True):
+        t[column] = times
     notes = []
     if not np.array_equal(steps, np.arange(1, len(steps) + 1)):
         has = f"{steps[0]:g} to {steps[-1]:g}"
         notes.append(f"{e.said}: step k below is the k-th step of the file, which has {has}")
-    return _placed(tracks, columns), t, notes
-
-
-def _placed(tracks: Sequence[Track], columns: Sequence[Array]) -> list[Track]:
-    return [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
+    return in_columns(some, columns), t, notes
 
 
 def _innovations(e: Estimator) -> Record:

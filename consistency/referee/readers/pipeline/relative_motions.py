@@ -20,7 +20,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
 from consistency.referee.readers.mix_ups.hints import Pairs, hints
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.runs_to_record import Track, assemble
+from consistency.referee.readers.runs_to_record import Track, assemble, in_columns
 from consistency.referee.readers.truth_matching import Change, Manifold, Poses, at, common_times
 from consistency.referee.readers.windows import MARGINAL, Relative, windows
 from consistency.referee.types import Array, Indices
@@ -160,15 +160,19 @@ def relative_recording(
     InputError
         Input that :func:`windows_of` refuses, or a covariance that is singular in every window.
     """
-    found = [windows_of(stretch, relative) for stretch in stretches]
-    tracks = [one.track.part(judged) for one in found]
-    times = [one.t for one in found]
+    found, tracks, times, whitened = [], [], [], []
+    for stretch in stretches:
+        one = windows_of(stretch, relative)
+        found.append(one)
+        tracks.append(one.track.part(judged))
+        times.append(one.t)
+        whitened.append(whiten(one.error, one.covariance))
     t = np.full(max(map(len, times)), np.nan)
     if np.isfinite(np.concatenate(times)).all():
         columns, t = common_times(times)
-        tracks = [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
+        tracks = in_columns(tracks, columns)
     notes = _notes(name, found, len(axes), stretches[0].convention, relative)
-    of = independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
+    of = independence(np.concatenate(whitened))
     if relative.independent and of.doubtful:
         notes.append(_doubt(name, of, relative))
     names = tuple(axes[i] for i in judged)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.groups import Groups
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
+VELOCITY = {"vx", "vy", "vz"}
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,15 @@ class Errors:
         """(N, T, n)."""
         assert self.record.error is not None
         return self.record.error
+
+    @property
+    def reported(self) -> dict[str, list[int]]:
+        """The groups and velocity, whose ratio is reported and not tested."""
+        velocity = [i for i, axis in enumerate(self.names) if axis in VELOCITY]
+        groups = dict(self.groups)
+        if 1 < len(velocity) < len(self.names):
+            groups.setdefault("velocity", velocity)
+        return groups
 
     @property
     def covariance(self) -> Array:

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 
 from consistency.referee.diagnostics.judging.error_parts import VISIBLE
-from consistency.referee.diagnostics.judging.status import smaller
-from consistency.referee.diagnostics.verdict.answers import (
-    ALONE,
-    AXIS,
-    BIAS,
-    DIRECTION,
-    GROUP,
-    JOINT,
-    MAIN,
-    SCALE,
-    SHAPE,
-    STEP,
-)
-from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovations, Interval, JointScore, Scale
+from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
+from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovations, Interval, JointScore
 from consistency.referee.diagnostics.verdict.verdict import Faults, Findings
-from consistency.referee.diagnostics.words.groups import groups_text
+from consistency.referee.diagnostics.words.blocks import block_text, unlike_ratios, unlike_text
 from consistency.referee.diagnostics.words.numbers import (
-    SMALLEST_P,
     is_uncertain,
     off_by,
     off_by_factor,
@@ -38,64 +25,6 @@ MOST = 3  # axes that a sentence names with their figures
 NAMED = 0.1  # part of a unit vector that a sentence names
 
 NamedRatio = tuple[str, Interval]
-
-
-def fault_sentence(v: Findings, s: Scale, faults: Faults) -> str:
-    """The sentence where a question found a fault."""
-    if v.parts:
-        return _faults_of_parts(v)
-    of_scale, of_bias = _any_of(SCALE, faults), _any_of(BIAS, faults)
-    is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
-    found: list[tuple[str, Collection[str]]] = []  # sentences, with the questions that they answer
-    contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in faults
-    if v.status == "heavy-tailed" or "outliers" in faults or (contrary and not opposite(v, faults)):
-        found.append((tails_text(v, faults), ["outliers"]))
-    if of_bias:
-        found.append((bias_text(v, "bias" not in faults), BIAS))
-    if of_scale and v.status not in ("biased", "heavy-tailed"):
-        found.append((scale_text(v, faults), SCALE))
-    if _any_of(SHAPE, faults) and v.status not in ("biased", "heavy-tailed"):
-        found.append((shape_text(v, faults), SHAPE))
-    if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
-        found.append((joint_text(v, v.joint), [JOINT]))
-    found.sort(key=lambda one: _rank(v, faults, one[1]))
-    parts = [text for text, _ in found]
-    if v.status == "heavy-tailed":
-        parts.append(f"in the mean the covariance ratio is {ratio_text(s.inflation)}")
-    if v.by_group is not None:
-        parts.append(groups_text(v.by_group, GROUP in faults))
-    if len(faults) == 1:
-        parts += [ALONE[question] for question in faults if question in ALONE]
-    if "innovation scale" in faults and v.innovations is not None:
-        parts.append(innovations_text(v, v.innovations))
-    if "innovation whiteness" in faults:
-        parts.append("innovations correlated over steps")
-    if (of_scale or GROUP in faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
-        parts.append("no bias found")
-    return "; ".join(part for part in parts if part)
-
-
-def _rank(v: Findings, faults: Faults, questions: Collection[str]) -> tuple[bool, float, int]:
-    """Order of a fault in the sentence: what the status says, then by p value, the size before what else is wrong."""
-    named = {"biased": BIAS, "heavy-tailed": ["outliers"]}.get(v.status, ())
-    p = min((faults[question].adjusted for question in questions if question in faults), default=1.0)
-    order = (SCALE, BIAS, SHAPE)
-    return questions is not named and questions != named, max(p, SMALLEST_P), [*order, questions].index(questions)
-
-
-def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
-    return any(question in asked for question in questions)
-
-
-def _faults_of_parts(v: Findings) -> str:
-    texts = []
-    for name, part in v.parts.items():
-        if part.faults:
-            sentence = part.reasons[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
-            texts.append(f"{name}: {sentence}")
-    if len(texts) > MOST:
-        texts = [*texts[:MOST], f"and {len(texts) - MOST} more"]
-    return "; ".join(texts)
 
 
 # --- the scale ---------------------------------------------------------------------------------------
@@ -122,8 +51,12 @@ def scale_text(v: Findings, faults: Faults) -> str:
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
-    text = _size_text(v, inflation, about) + _where(v)
-    text += _first_visible(v)
+    text, blocks = _size_text(v, inflation, about), ""
+    if not about:
+        blocks = block_text(v)
+    if blocks:
+        return f"{text}{_first_visible(v)}: {blocks}"
+    text += _where(v) + _first_visible(v)
     if not about and v.status == "overconfident" and AXIS in faults and not v.settings.one_sided:
         text += _contrary_axis(v)
     return text
@@ -156,7 +89,7 @@ def _where(v: Findings) -> str:
 
 def combination_text(v: Findings) -> str:
     """The two components whose correlation is least as stated, where no component is shown to be wrong by itself."""
-    if v.shape is None or v.shape.pair is None or v.axes is None:
+    if v.shape is None or v.shape.pair is None or not v.shape.shown or v.axes is None:
         return "in a combination of axes"
     a, b = (v.axes.names[i] for i in v.shape.pair)
     return f"in a combination of {a} and {b} (correlation {v.shape.actual:+.2f}, stated {v.shape.stated:+.2f})"
@@ -319,15 +252,18 @@ def _sigmas(value: float) -> str:
     return f"{value:+.1e}"
 
 
-def shape_text(v: Findings, faults: Faults) -> str:
-    """The two axes that are correlated least as stated, where it can be seen."""
+def shape_text(v: Findings, faults: Faults, scale: str = "") -> str:
+    """Two axes whose correlation is shown to be wrong; otherwise the factors of blocks or axes, where these differ.
+
+    '' where the sentence on the ``scale`` has these factors.
+    """
     assert v.shape is not None
     assert v.axes is not None
     shape, where, worth_a_word = v.shape, "", VISIBLE
     if "shape" not in faults:
         where, worth_a_word = f" in {v.place(shape.step or 1)}", NOTABLE
     gap = abs(shape.actual - shape.stated)
-    if shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
+    if shape.shown and shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
         a, b = (v.axes.names[i] for i in shape.pair)
         what = "covariance of the wrong shape: correlation"
         if shape.wrong_sign:
@@ -336,9 +272,14 @@ def shape_text(v: Findings, faults: Faults) -> str:
         if shape.alone:
             text += "; no axis by itself is wrong"
         return text
-    if "shape" in faults:
+    if shape.alone:
+        return f"covariance of the wrong shape{where}; no axis by itself is wrong"
+    off = list(unlike_ratios(v).values())[:MOST]
+    if not off:
         return f"covariance of the wrong shape{where}"
-    return f"covariance of the wrong shape{where}: axes are wrong by different factors"
+    if all(off_by(ratio) in scale for ratio in off):
+        return ""
+    return f"unlike factors: {unlike_text(v)}"
 
 
 def tails_text(v: Findings, faults: Faults) -> str:

@@ -69,7 +69,7 @@ def _sentence_and_figures(v: Findings, faults: Faults) -> tuple[str, list[str]]:
         figures = [*_truth(v), *_early_ends(v), *_levels(v, v.scale), *_single_log(v, v.scale), *_together(v)]
         figures += _coverage(v)
         if faults:
-            from consistency.referee.diagnostics.words.faults import fault_sentence
+            from consistency.referee.diagnostics.words.fault_sentence import fault_sentence
 
             return fault_sentence(v, v.scale, faults), figures
         return _no_fault(v, v.scale), figures

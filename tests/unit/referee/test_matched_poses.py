@@ -92,3 +92,11 @@ def test_errors_that_fit_are_plausible_and_others_are_not(rng):
     half = [replace(p, estimate=p.estimate * [1.0, 1.0, 57.3]) for p in right]
     assert is_plausible(half, 0.0, [0, 1])
     assert not is_plausible(half, 0.0, range(3))
+
+
+def test_a_start_that_is_known_exactly_is_no_estimate(rng):
+    p = run_of(rng, 4)
+    t = np.array([0.0])
+    start = replace(p.of_rows(np.array([0])), t=t, true_t=t, numbered=True, covariance=np.zeros((1, 3, 3)))
+    with pytest.raises(InputError, match=r"est.csv: holds the start alone, step 0, .* add steps from 1 on"):
+        records_of(estimator_of(replace(start, truth=p.truth[:1], true_covariance=None)), Reading())

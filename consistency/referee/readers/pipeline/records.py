@@ -339,6 +339,8 @@ def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -
             keys.append(p.t)
             seconds.append(p.seconds)
             some.append(track)
+    if not keys:
+        raise InputError(f"{e.path}: holds the start alone, step 0, which is known exactly; add steps from 1 on")
     if not pairs[0].numbered:
         columns, t = common_times(keys)
         return in_columns(some, columns), t, []

@@ -79,6 +79,7 @@ def _beside_states(column: Column, e: Estimator, judged: Sequence[int], pairs: S
     values, truth, estimate, P = [], [], [], []
     for p in pairs:
         some = p.pairs(_some(len(p.t), len(pairs)))
+        assert some.by is not None
         values.append(some.by)
         truth.append(some.truth[:, columns[columns < some.truth.shape[1]]])
         estimate.append(some.estimate[:, columns[columns < some.estimate.shape[1]]])

@@ -30,14 +30,17 @@ def keep_numbers(folder: Path, estimators: Sequence[Estimator]) -> None:
         for key in OF_POSES:
             arrays[f"{i} {key}"] = getattr(p, key)
         arrays[f"{i} times"] = one.t
-        texts = {key: getattr(one, key) for key in TEXTS}
+        texts: dict[str, Any] = {
+            "path": str(one.path),
+            "files": list(map(str, p.files)),
+            "alone": one.stated.alone,
+            "groups": {name: [group.start, group.stop] for name, group in one.stated.groups.items()},
+            "beside": p.true_t is p.t,
+        }
+        for key in TEXTS:
+            texts[key] = getattr(one, key)
         for key in TEXTS_OF_POSES:
             texts[f"poses {key}"] = getattr(p, key)
-        texts["path"] = str(one.path)
-        texts["files"] = list(map(str, p.files))
-        texts["alone"] = one.stated.alone
-        texts["groups"] = {name: [group.start, group.stop] for name, group in one.stated.groups.items()}
-        texts["beside"] = p.true_t is p.t
         about.append(texts)
     there = {key: array for key, array in arrays.items() if array is not None}
     partial = folder / f"{NUMBERS}.partial"

@@ -9,9 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from consistency.referee.errors import InputError
 from consistency.referee.readers.mix_ups.reading_fit import is_plausible
 from consistency.referee.readers.options import Reading
+from consistency.referee.readers.pipeline.by_column import _columns_of
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.truth_matching import Estimator, Poses
+from consistency.referee.readers.truth_matching import Estimator, Poses, submatrices
 
 SIGMA = np.array([0.1, 0.1, 0.02])
 
@@ -100,3 +101,17 @@ def test_a_start_that_is_known_exactly_is_no_estimate(rng):
     start = replace(p.of_rows(np.array([0])), t=t, true_t=t, numbered=True, covariance=np.zeros((1, 3, 3)))
     with pytest.raises(InputError, match=r"est.csv: holds the start alone, step 0, .* add steps from 1 on"):
         records_of(estimator_of(replace(start, truth=p.truth[:1], true_covariance=None)), Reading())
+
+
+def test_some_components_of_matrices(rng):
+    P = rng.normal(size=(4, 3, 3))
+    assert_array_equal(submatrices(P, [0, 2]), P[np.ix_(range(4), [0, 2], [0, 2])])
+    assert_array_equal(submatrices(P, range(1, 3)), P[:, 1:, 1:])
+
+
+def test_columns_of_a_state_pass_over_the_four_numbers_of_a_rotation(rng):
+    """Components 3 to 5 are the rotation, whose columns 3 to 6 are a quaternion."""
+    planar = estimator_of(run_of(rng))
+    assert_array_equal(_columns_of(planar, [0, 2]), [0, 2])
+    assert_array_equal(_columns_of(replace(planar, in_space=True), [0, 2, 3, 5, 6, 8]), [0, 2, 7, 9])
+    assert len(_columns_of(replace(planar, convention=""), [0, 2])) == 0

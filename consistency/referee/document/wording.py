@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.words.numbers import short
+from consistency.referee.diagnostics.words.numbers import short, with_subject
 from consistency.referee.document.blocks import (
     Answer,
     Block,
@@ -24,6 +25,7 @@ from consistency.referee.document.blocks import (
 )
 
 NONE = Quantity(None)
+INTERVAL = re.compile(r"\[([^\s\[\]]+), ([^\s\[\]]+)\]")
 SMALLEST = 1e-6  # p value below which digits say nothing
 
 
@@ -91,6 +93,11 @@ def p_cell(p: float) -> str:
     return "< 1e-6" if p < SMALLEST else f"{p:.2g}"
 
 
+def unbroken(text: str) -> str:
+    """The text, in which no line ends inside an interval or before %."""
+    return INTERVAL.sub("[\\1,\u00a0\\2]", text.replace(" %", "\u00a0%"))
+
+
 def listed(words: Sequence[str]) -> str:
     """a, b and c."""
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
@@ -107,9 +114,10 @@ def fragment(*blocks: Block) -> str:
 def _lines(block: Block) -> list[str]:
     match block:
         case Reasons():
-            return [
-                line for e in block.entries for line in (f"{e.name} is {e.sentence}", *(f"  - {o}" for o in e.others))
-            ]
+            lines = []
+            for entry in block.entries:
+                lines += [with_subject(entry.name, entry.sentence), *(f"  - {other}" for other in entry.others)]
+            return lines
         case Facts():
             width = max(len(name) for name, _ in block.rows)
             return [f"  {name:<{width}}  {value}" for name, value in block.rows]
@@ -129,7 +137,8 @@ def _table(table: Table) -> list[str]:
     below: list[list[str]] = [[]]
     for cells in table.rows:
         rows.append([written(cell, PLAIN) for cell in cells if not isinstance(cell, Reason)])
-        below.append([f"    {c.name} is {c.sentence}" for c in cells if isinstance(c, Reason) and not c.has_passed])
+        failed = [cell for cell in cells if isinstance(cell, Reason) and not cell.has_passed]
+        below.append([f"    {with_subject(cell.name, cell.sentence)}" for cell in failed])
     widths = [max(map(len, column)) for column in zip(*rows, strict=False)]
     lines = []
     for row, more in zip(rows, below, strict=True):

@@ -26,8 +26,17 @@ from consistency.referee.diagnostics.records.record import Evidence, JointNees, 
 from consistency.referee.diagnostics.records.skipping import Skip
 from consistency.referee.diagnostics.records.whitening import spread_steps, standardise, whiten
 from consistency.referee.diagnostics.statistics.accuracy import coverage, coverage_interval, noncredibility, rmse
-from consistency.referee.diagnostics.statistics.e_process import EProcess, e_process, ever
-from consistency.referee.diagnostics.statistics.nees import Pit, anees, anees_interval, chi2_mean_interval, nees, pit
+from consistency.referee.diagnostics.statistics.nees import (
+    EProcess,
+    Pit,
+    anees,
+    anees_interval,
+    chi2_mean_interval,
+    e_process,
+    ever,
+    nees,
+    pit,
+)
 from consistency.referee.diagnostics.statistics.normality import Normality, normality
 from consistency.referee.diagnostics.statistics.number_of_runs import (
     detectable_ratio,

@@ -54,8 +54,8 @@ def compare_command(
 ) -> None:
     """Compare a filter with another, or with an earlier version. On the same trials, the comparison is run by run."""
     from consistency.referee.verdicts.baselines import is_baseline
-    from consistency.referee.verdicts.command_settings import skip_asked
     from consistency.referee.verdicts.compare_sources import compare_filters, compare_with, document
+    from consistency.referee.verdicts.sources import skip_asked
 
     require_word("--fail-on", fail_on, "worse")
     if not 0.0 < false_alarm < 1.0:

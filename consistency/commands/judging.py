@@ -92,8 +92,7 @@ def analyse_command(
     """Check whether stated covariances match the errors. Explain the verdict."""
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
-    from consistency.referee.verdicts.command_settings import settings_of, skip_asked
-    from consistency.referee.verdicts.sources import files_source, judge_all
+    from consistency.referee.verdicts.sources import files_source, judge_all, settings_of, skip_asked
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -231,7 +230,7 @@ def plan_command(
 ) -> None:
     """Compute how many runs a verdict needs. Without a pilot, the number holds however steps depend on each other."""
     from consistency.referee.document.needed_runs import plan_lines
-    from consistency.referee.verdicts.command_settings import plan as plan_runs
+    from consistency.referee.verdicts.planned_runs import plan as plan_runs
 
     if scenario is not None and like is not None:
         raise InputError("give either a SCENARIO for a pilot or --like RESULTS")
@@ -241,7 +240,7 @@ def plan_command(
         raise InputError(f"--filter: name the filter to plan for in {scenario}")
     pilots, pilot_dof = None, len(POSE)
     if like is not None and are_files(like, Reading()):
-        from consistency.referee.verdicts.command_settings import pilots_of_records
+        from consistency.referee.verdicts.planned_runs import pilots_of_records
 
         pilots, pilot_dof = pilots_of_records(read_files(like, Reading()), filters)
         dof = pilot_dof

@@ -115,7 +115,7 @@ def tune_command(
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free
-    from consistency.referee.verdicts.command_settings import settings_of
+    from consistency.referee.verdicts.sources import settings_of
 
     require_word("--fail-on", fail_on, "inconsistent")
     if (scenario is None) == (log is None):

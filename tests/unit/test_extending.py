@@ -135,7 +135,7 @@ def test_the_kind_of_files_of_the_document_is_read(copy):
     load, row = code("Add a kind of files")
     module = copy / "consistency/referee/readers/formats/run_lines.py"
     module.write_text(example("run_lines.py"), encoding="utf-8")
-    kinds = copy / "consistency/referee/readers/pipeline/kinds.py"
+    kinds = copy / "consistency/referee/readers/pipeline/read_files.py"
     changed(kinds, "KINDS = (", f"{load}\n\nKINDS = (")
     last = ")\n\n\ndef kind_of"
     changed(kinds, last, f"    {row.strip()},\n{last}")

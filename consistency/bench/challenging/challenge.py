@@ -31,7 +31,7 @@ from consistency.referee.diagnostics.words.numbers import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
-from consistency.referee.verdicts.command_settings import refused
+from consistency.referee.verdicts.sources import refused
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
 SIZE_QUESTIONS = (*SCALE, JOINT, "outliers")  # what a confirmation needs a fault in: errors that are too large

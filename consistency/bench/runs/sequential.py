@@ -28,7 +28,7 @@ from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import say
 from consistency.referee.types import Array
-from consistency.referee.verdicts.command_settings import refused
+from consistency.referee.verdicts.sources import refused
 
 
 def run_until_decided(
@@ -140,7 +140,7 @@ def pilots_in_world(scenario: str, filters: Sequence[str], runs: int, seed: int)
 
 
 def pilots_of(results: Tables, filters: Sequence[str] | None = None) -> dict[str, tuple[Array, int]]:
-    """Pilots of :func:`consistency.referee.verdicts.command_settings.plan`, of every filter or of those named."""
+    """Pilots of :func:`consistency.referee.verdicts.planned_runs.plan`, of every filter or of those named."""
     return {of.name: (_pilot_means(of), of.t.size) for of in records_of(results, filters)}
 
 

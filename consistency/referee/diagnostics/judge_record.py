@@ -12,7 +12,7 @@ from consistency.referee.diagnostics.judging.status import deciding_axis
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics.e_process import e_process, ever
+from consistency.referee.diagnostics.statistics.nees import e_process, ever
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import RejectionScore, Scale
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, MapScore, Verdict

@@ -221,7 +221,7 @@ class Document:
     answer: str
     chapters: tuple[Chapter, ...]
     opening: tuple[Block, ...] = ()  # below the answer, before the contents
-    data: Any = None  # the same for programs: names, numbers, texts and arrays
+    data: Any = None  # the same for programs: names, numbers, texts, arrays and verdicts
 
     @property
     def parts(self) -> tuple[tuple[Block, ...], ...]:

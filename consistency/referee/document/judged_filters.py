@@ -268,7 +268,7 @@ def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = T
     blocks: list[Block] = [_overview(verdicts), *(Text(line) for line in _below(verdicts))]
     if reasons:
         blocks.append(Reasons(tuple(reason(v, name, verbose=verbose) for name, v in verdicts.items())))
-    return Document(title, "", (), tuple(blocks), {name: v.as_dictionary() for name, v in verdicts.items()})
+    return Document(title, "", (), tuple(blocks), dict(verdicts))
 
 
 def _overview(verdicts: Mapping[str, Verdict]) -> Table:

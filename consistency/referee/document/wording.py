@@ -1,4 +1,4 @@
-"""Numbers as words, the same in every format."""
+"""Numbers as words, the same in every format, and blocks as plain text."""
 
 from __future__ import annotations
 
@@ -8,8 +8,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.words.numbers import short
-from consistency.referee.document.blocks import Answer, Cell, Quantity, Reason, Status
+from consistency.referee.diagnostics.words.numbers import short, with_subject
+from consistency.referee.document.blocks import (
+    Answer,
+    Block,
+    Bullets,
+    Cell,
+    Facts,
+    Heading,
+    Quantity,
+    Reason,
+    Reasons,
+    Status,
+    Table,
+    Text,
+)
 
 NONE = Quantity(None)
 INTERVAL = re.compile(r"\[([^\s\[\]]+), ([^\s\[\]]+)\]")
@@ -88,3 +101,46 @@ def unbroken(text: str) -> str:
 def listed(words: Sequence[str]) -> str:
     """a, b and c."""
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
+
+
+# --- blocks ------------------------------------------------------------------------------------------
+
+
+def fragment(*blocks: Block) -> str:
+    """Lines of all blocks; figures and settings are left out."""
+    return "\n".join(line for block in blocks for line in _lines(block))
+
+
+def _lines(block: Block) -> list[str]:
+    match block:
+        case Reasons():
+            lines = []
+            for entry in block.entries:
+                lines += [with_subject(entry.name, entry.sentence), *(f"  - {other}" for other in entry.others)]
+            return lines
+        case Facts():
+            width = max(len(name) for name, _ in block.rows)
+            return [f"  {name:<{width}}  {value}" for name, value in block.rows]
+        case Table():
+            return _table(block)
+        case Bullets():
+            return [f"  - {text}" for text in block.texts]
+        case Text() | Heading():
+            return [block.text]
+        case _:
+            return []
+
+
+def _table(table: Table) -> list[str]:
+    """Rows in columns; what did not pass is said below its row."""
+    rows = [[column.head for column in table.columns]]
+    below: list[list[str]] = [[]]
+    for cells in table.rows:
+        rows.append([written(cell, PLAIN) for cell in cells if not isinstance(cell, Reason)])
+        failed = [cell for cell in cells if isinstance(cell, Reason) and not cell.has_passed]
+        below.append([f"    {with_subject(cell.name, cell.sentence)}" for cell in failed])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=False)]
+    lines = []
+    for row, more in zip(rows, below, strict=True):
+        lines += ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip(), *more]
+    return lines

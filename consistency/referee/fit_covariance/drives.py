@@ -25,7 +25,7 @@ from consistency.referee.readers.formats.file_kinds import (
 from consistency.referee.readers.formats.table import read_tables
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.pipeline.kinds import Found, kind_of
+from consistency.referee.readers.pipeline.read_files import Found, kind_of
 from consistency.referee.readers.places import refuse
 from consistency.referee.readers.truth_matching import Estimator, Poses, truth_at
 from consistency.referee.types import Array, Indices

@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Reason, Status, Table, table
+from consistency.referee.document.wording import fragment
 from consistency.referee.gating.session import Ledger, ending, outcome_text, wanted
 from consistency.referee.gating.watch import Entry
 from consistency.referee.show import rendered
-from consistency.referee.show.text import fragment
 from consistency.referee.system.atomic import write_whole
 
 NUMBERS = {"p", "false-alarm rate", "runs", "planned", "true / stated"}

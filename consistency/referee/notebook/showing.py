@@ -13,8 +13,9 @@ from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Bullets, Facts, Figure
 from consistency.referee.document.judged_filters import summary
+from consistency.referee.document.wording import fragment
 from consistency.referee.errors import InputError
-from consistency.referee.show import as_html, text
+from consistency.referee.show import as_html
 
 
 def record_text(record: Record) -> str:
@@ -32,7 +33,7 @@ def record_html(record: Record) -> str:
 
 
 def verdict_text(verdict: Verdict) -> str:
-    return text.fragment(*summary(verdict))
+    return fragment(*summary(verdict))
 
 
 def verdict_html(verdict: Verdict) -> str:

@@ -28,7 +28,6 @@ from consistency.referee.programs.process import Processes, Stopped, run_program
 from consistency.referee.programs.study_folder import new_folder, opened, require_usable, write_manifest
 from consistency.referee.programs.words import OF_A_RUN, Program, seed_of
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.pipeline.kinds import found_in
 from consistency.referee.readers.pipeline.program_runs import (
     PATHS,
     ProgramRun,
@@ -41,7 +40,7 @@ from consistency.referee.readers.pipeline.program_runs import (
     runs_in,
     without_log,
 )
-from consistency.referee.readers.pipeline.read_files import GUESS, checked_options, records_of_found
+from consistency.referee.readers.pipeline.read_files import GUESS, checked_options, found_in, records_of_found
 from consistency.referee.readers.truth_matching import Estimator
 from consistency.referee.system.progress import Advance, progress, say
 

@@ -13,8 +13,8 @@ from typing import Any
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
-from consistency.referee.readers.pipeline.kinds import PROGRAM_RUNS, is_program_runs
 from consistency.referee.readers.pipeline.program_runs import ProgramStudy, study_in
+from consistency.referee.readers.pipeline.read_files import PROGRAM_RUNS, is_program_runs
 from consistency.referee.system.atomic import PARTIAL, write_whole
 from consistency.referee.system.folders import IN_PYTHON, writing
 from consistency.referee.system.provenance import manifest_of

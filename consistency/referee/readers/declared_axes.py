@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.options import OF_AXES, Reading, flag_of
 from consistency.referee.readers.truth_matching import Estimator, Poses
 from consistency.referee.types import Array
 
@@ -22,7 +22,6 @@ X, Y, Z = np.eye(3)
 WORLD = {"e": X, "w": -X, "n": Y, "s": -Y, "u": Z, "d": -Z}  # of axes, in east, north, up
 BODY = {"f": X, "b": -X, "l": Y, "r": -Y, "u": Z, "d": -Z}  # in forward, left, up
 ENU, FLU = "enu", "flu"
-OPTIONS = ("world", "body_axes", "truth_world", "truth_body_axes")
 
 
 class Axes(NamedTuple):
@@ -47,24 +46,22 @@ def in_axes_of_estimates(e: Estimator, r: Reading) -> Estimator:
     InputError
         Axes are none, or left-handed; the estimates have no poses; or axes of the plane do not lie in one.
     """
-    given = r.given(OPTIONS)
+    given = r.given(OF_AXES)
     if not given:
         return e
     if e.innovations_alone or not (e.in_space or tuple(e.axes) == ("x", "y", "heading")):
         raise InputError(f"{flag_of(given[0])}: needs poses or positions with a truth; {e.path} has none")
     own, true = axes_of_files(r, e.in_space)
-    change = Change(
-        _matrix("--world", own.world, WORLD).T @ _matrix("--truth-world", true.world, WORLD),
-        _matrix("--body-axes", own.body, BODY).T @ _matrix("--truth-body-axes", true.body, BODY),
-    )
-    if all(np.array_equal(matrix, np.eye(3)) for matrix in change):
+    world = _matrix("--world", own.world, WORLD).T @ _matrix("--truth-world", true.world, WORLD)
+    body = _matrix("--body-axes", own.body, BODY).T @ _matrix("--truth-body-axes", true.body, BODY)
+    if np.array_equal([world, body], [np.eye(3)] * 2):
         return e
-    if not e.in_space and abs(change.world[2, 2] + change.body[2, 2]) != 2.0:
+    if not e.in_space and abs(world[2, 2] + body[2, 2]) != 2.0:
         raise InputError(
             f"{flag_of(given[0])}: in the plane, as in {e.path}, the third axes of world and body must be both up "
             f"or both down; the estimates are in {own.world} and {own.body}, the truth in {true.world} and {true.body}"
         )
-    runs = [_with_truth(p, change, e.in_space) for p in e.runs]
+    runs = [_with_truth(p, Change(world, body), e.in_space) for p in e.runs]
     what = (
         f"the truth, in {true.world} and {true.body}, is read in the axes of the estimates, {own.world} and {own.body}"
     )

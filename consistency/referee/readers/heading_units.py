@@ -28,51 +28,64 @@ def require_radians(file: str, runs: Sequence[Poses]) -> None:
     """
     if not runs or runs[0].manifold != "planar":
         return
-    for side, sides in (("truth", [p.truth for p in runs]), ("estimates", [p.estimate for p in runs])):
-        poses = [each[np.isfinite(each).all(axis=1)] for each in sides]
-        beyond = any((np.abs(each[:, 2]) > 2.0 * np.pi + 0.1).any() for each in poses)
-        why = ""
+    for side, name in (("truth", "truth"), ("estimates", "estimate")):
+        poses, beyond = [], False
+        for p in runs:
+            values = getattr(p, name)
+            poses.append(values[np.isfinite(values).all(axis=1)])
+            beyond |= bool((np.abs(poses[-1][:, 2]) > 2.0 * np.pi + 0.1).any())
         if beyond and jumps([each[:, 2] for each in poses]):
             why = "jump by a whole turn of 360"
         elif turn_in_degrees(poses):
             why = "change by 57 times the turn of the path"
         elif beyond and fit_in_degrees(runs):
             why = "lie beyond 2 pi, and their errors fit variances beyond pi^2, which those in rad cannot"
-        if why:
-            remedy = "write headings in rad (multiply by pi / 180), and variances in rad^2 (by its square)"
-            raise InputError(f"{file}: the headings of the {side} {why}, so that they seem to be in degrees; {remedy}")
+        else:
+            continue
+        remedy = "write headings in rad (multiply by pi / 180), and variances in rad^2 (by its square)"
+        raise InputError(f"{file}: the headings of the {side} {why}, so that they seem to be in degrees; {remedy}")
 
 
 def jumps(headings: Sequence[Array]) -> bool:
     """Whether headings (N,) within one turn of 360 jump by it: where all else is smooth, or often."""
-    found, smooth = 0, True
+    found, least = 0, 1
     for heading in headings:
+        if len(heading) and np.ptp(heading) > 360.0:
+            return False
         step = np.abs(np.diff(heading))
         found += int((step > JUMP).sum())
-        smooth &= bool((np.minimum(step, np.abs(360.0 - step)) <= SMOOTH).all())
-    return all(np.ptp(each) <= 360.0 for each in headings if len(each)) and found >= (1 if smooth else OFTEN)
+        if (np.minimum(step, np.abs(360.0 - step)) > SMOOTH).any():
+            least = OFTEN
+    return found >= least
 
 
 def turn_in_degrees(poses: Sequence[Array]) -> bool:
     """Whether headings of poses (N, 3), read as degrees, explain how the direction of the path turns."""
     turning, unexplained, steps = 0.0, 0.0, 0
     for each in poses:
+        if len(each) < 2:
+            continue
         way = np.diff(each[:, :2], axis=0)
         size = np.hypot(*way.T)
-        moving = size > max(0.1 * float(np.median(size)) if len(size) else 0.0, STANDING)
-        if moving.any():
-            course = np.unwrap(np.arctan2(way[moving, 1], way[moving, 0]))
-            apart = np.unwrap(wrap(np.deg2rad(each[:-1, 2][moving]) - course))
-            turning, unexplained = turning + course.var() * len(course), unexplained + apart.var() * len(course)
-            steps += len(course)
+        moving = size > max(0.1 * float(np.median(size)), STANDING)
+        if not moving.any():
+            continue
+        course = np.unwrap(np.arctan2(way[moving, 1], way[moving, 0]))
+        apart = np.unwrap(wrap(np.deg2rad(each[:-1, 2][moving]) - course))
+        turning += course.var() * len(course)
+        unexplained += apart.var() * len(course)
+        steps += len(course)
     return steps >= FEWEST and turning > TURNING**2 * steps and unexplained < ALONG**2 * turning
 
 
 def fit_in_degrees(runs: Sequence[Poses]) -> bool:
     """Whether errors of headings, read as degrees, are of the size of variances, most of them beyond pi^2."""
-    known = [p.known() for p in runs]
-    gap = np.concatenate([k.truth[:, 2] - p.estimate[k.rows, 2] for p, k in zip(runs, known, strict=True)])
-    variance = np.concatenate([p.covariance[k.rows, 2, 2] for p, k in zip(runs, known, strict=True)])
+    gaps, variances = [], []
+    for p in runs:
+        known = p.known()
+        gaps.append(known.truth[:, 2] - p.estimate[known.rows, 2])
+        variances.append(p.covariance[known.rows, 2, 2])
+    gap, variance = np.concatenate(gaps), np.concatenate(variances)
     some = np.isfinite(gap) & (variance > np.pi**2)
     ratio = np.square(gap[some] - 360.0 * np.round(gap[some] / 360.0)) / variance[some]
     return 2 * len(ratio) > len(gap) and bool(FITTING[0] < np.median(ratio) < FITTING[1])

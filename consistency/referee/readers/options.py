@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from consistency.referee.errors import InputError
 
 COLUMNS = "columns"  # covariance of the truth: of its own file
 GROUPED = ("by", "by_file", "bins")  # options
+OF_AXES = ("world", "body_axes", "truth_world", "truth_body_axes")
 MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
 
 
@@ -30,21 +32,26 @@ def _seconds(text: str) -> float | str:
 
 def _lengths(text: str) -> list[float]:
     """Numbers; NaN where one is none, which the readers refuse."""
-    numbers = [_seconds(part) for part in text.split(",")]
-    return [each if isinstance(each, float) else math.nan for each in numbers]
+    numbers = [math.nan] * (text.count(",") + 1)
+    for i, part in enumerate(text.split(",")):
+        with suppress(ValueError):
+            numbers[i] = float(part)
+    return numbers
 
 
 def _columns(text: str) -> dict[str, str]:
     """Names of columns here and in a file, of a text such as ``x=pos_n,y=pos_e``."""
-    pairs = [part.split("=") for part in text.split(",")]
-    if not all(len(pair) == 2 and all(name.strip() for name in pair) for pair in pairs):
-        raise InputError(f"'{text}': columns are named as x=pos_n,y=pos_e: the name here, then that in the file")
-    names = [new.strip() for new, _ in pairs]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"'{text}': column '{twice[0]}' is named twice")
-    if uneven := ["=".join(pair) for pair in pairs if ("*" in pair[0]) != ("*" in pair[1])]:
-        raise InputError(f"'{uneven[0]}': a * stands in both names or in none")
-    return dict(zip(names, (old.strip() for _, old in pairs), strict=True))
+    columns: dict[str, str] = {}
+    for pair in text.split(","):
+        new, _, old = map(str.strip, pair.partition("="))
+        if not new or not old or "=" in old:
+            raise InputError(f"'{text}': columns are named as x=pos_n,y=pos_e: the name here, then that in the file")
+        if new in columns:
+            raise InputError(f"'{text}': column '{new}' is named twice")
+        if ("*" in new) != ("*" in old):
+            raise InputError(f"'{pair}': a * stands in both names or in none")
+        columns[new] = old
+    return columns
 
 
 def _bins(text: str) -> int | list[float]:
@@ -130,7 +137,9 @@ class Reading:
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""
-        return [name for name in names or [each.name for each in fields(self)] if getattr(self, name) is not None]
+        if names is None:
+            names = [each.name for each in fields(self)]
+        return [name for name in names if getattr(self, name) is not None]
 
     def refuse(self, flag: str, others: Mapping[str, str]) -> None:
         """Refuse options that do not go with ``flag``, each with its reason."""
@@ -141,7 +150,9 @@ class Reading:
     @property
     def tolerance(self) -> float:
         """Seconds between an estimate and its truth at most."""
-        return MAX_DT if self.max_dt is None else self.max_dt
+        if self.max_dt is None:
+            return MAX_DT
+        return self.max_dt
 
     @property
     def shift(self) -> float:

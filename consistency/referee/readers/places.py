@@ -29,7 +29,9 @@ def refuse(bad: Any, place: Callable[[int], str], what: str | Callable[[int], st
     """Refuse rows, (N,) of bool, that are ``bad``, by what is wrong with the first of them."""
     if bad.any():
         row = int(np.argmax(bad))
-        raise InputError(f"{place(row)}: {what if isinstance(what, str) else what(row)}")
+        if not isinstance(what, str):
+            what = what(row)
+        raise InputError(f"{place(row)}: {what}")
 
 
 def exact(value: float) -> str:
@@ -56,11 +58,15 @@ def one_of_each_kind(notes: Iterable[str]) -> tuple[str, ...]:
     for text, names in files.items():
         if len(names) > 2:
             names = [f"{names[0]} and {len(names) - 1} others"]
-        out += [f"{name}: {text}" if text else name for name in names]
+        if text:
+            names = [f"{name}: {text}" for name in names]
+        out += names
     return tuple(out)
 
 
 def listed(items: Sequence[object], most: int = 5) -> str:
     """The first of some items, separated by commas."""
-    text = ", ".join(map(str, items[:most]))
-    return f"{text}, …" if len(items) > most else text
+    words = [str(item) for item in items[:most]]
+    if len(items) > most:
+        words.append("…")
+    return ", ".join(words)

@@ -16,6 +16,7 @@ from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.places import Places, listed, refuse
+from consistency.referee.readers.truth_matching import at, submatrices
 from consistency.referee.types import Array, Failure, Indices
 
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
@@ -45,10 +46,15 @@ class Track:
         if len(index) == self.error.shape[1]:
             return self
         of_truth = self.truth_covariance
-        return replace(
-            self, error=self.error[:, index], covariance=self.covariance[:, index][:, :, index],
-            truth_covariance=None if of_truth is None else of_truth[:, index][:, :, index],
-        )  # fmt: skip
+        if of_truth is not None:
+            of_truth = submatrices(of_truth, index)
+        P = submatrices(self.covariance, index)
+        return replace(self, error=self.error[:, index], covariance=P, truth_covariance=of_truth)
+
+
+def in_columns(tracks: Sequence[Track], columns: Sequence[Indices]) -> list[Track]:
+    """Tracks whose rows belong to other steps, (k,) each."""
+    return [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
 
 
 def assemble(
@@ -77,42 +83,48 @@ def assemble(
     """
     tracks = sorted(tracks, key=lambda track: track.run)
     _require_different(file, tracks)
-    notes = list(notes)
-    failures, parts, skipped = [], [], 0
+    failures, parts, short, skipped = [], [], [], 0
     longest = longest_start(tracks)
     for track in tracks:
         start, end, reason = judged_rows(track, longest)
         if reason:
             failures.append(Failure(name, track.run, int(track.column[end]) + 1, f"{reason} ({track.place[end]})"))
+        elif end and track.column[end - 1] < len(t) - 1:
+            short.append(track.run)
         skipped += start
         parts.append(_cut(track, start, end))
-    if not failures and all(part.nees is not None and np.isnan(part.nees).all() for part in parts):
+    arrays = _on_steps(parts, len(t))
+    if not failures and arrays["nees"] is not None and np.isnan(arrays["nees"]).all():
         raise InputError(_singular(file, tracks, axes))
+    notes = list(notes)
     if skipped:
         notes.append(f"{name}: {skipped} estimates before the covariance has full rank are left out")
-    short = [part.run for part in parts if len(part.column) and part.column[-1] < len(t) - 1]
-    short = [run for run in short if run not in {failure.run for failure in failures}]
     if short and not may_end:
         notes.append(
             f"{name}: {plural(len(short), 'run')} of {len(parts)} ({listed(short)}) end before step {len(t)}; "
             "if the filter broke down there, write a row of NaN, so that the failure counts"
         )
-
-    def grid(key: str) -> Array | None:
-        values = [value for part in parts if (value := getattr(part, key)) is not None]
-        if not values:
-            return None
-        out = np.full((len(parts), len(t), *values[0].shape[1:]), np.nan)
-        for row, (part, value) in enumerate(zip(parts, values, strict=True)):
-            out[row, part.column] = value
-        return out
-
-    arrays: dict[str, Any] = {key: grid(key) for key in ARRAYS}
+    dof = len(axes) if arrays["error"] is not None else 0
     return Record(
-        name, runs=np.array([part.run for part in parts], dtype=np.int64), t=t, nees=grid("nees"),
-        dof=len(axes) if arrays["error"] is not None else 0, axes=axes, failures=tuple(failures),
-        convention=convention, notes=tuple(notes), times=grid("t"), **arrays,
+        name, runs=np.array([track.run for track in tracks], dtype=np.int64), t=t, dof=dof, axes=axes,
+        failures=tuple(failures), convention=convention, notes=tuple(notes), **arrays,
     )  # fmt: skip
+
+
+def _on_steps(tracks: Sequence[Track], steps: int) -> dict[str, Any]:
+    """Arrays over (runs, steps), as a record has them, NaN where a run has no row."""
+    arrays: dict[str, Any] = {}
+    for key in (*ARRAYS, "nees", "t"):
+        arrays[key] = None
+        for row, track in enumerate(tracks):
+            values = getattr(track, key)
+            if values is None:
+                continue
+            if arrays[key] is None:
+                arrays[key] = np.full((len(tracks), steps, *values.shape[1:]), np.nan)
+            arrays[key][row, track.column] = values
+    arrays["times"] = arrays.pop("t")
+    return arrays
 
 
 def with_failed_runs(record: Record, failed: Mapping[int, str]) -> Record:
@@ -125,7 +137,9 @@ def with_failed_runs(record: Record, failed: Mapping[int, str]) -> Record:
     for name, array in arrays_of(record).items():
         nothing = np.full((len(failed), *array.shape[1:]), np.nan)
         arrays[name] = np.concatenate([array, nothing])[order]
-    failures = [*record.failures, *(Failure(record.name, run, 1, reason) for run, reason in failed.items())]
+    failures = list(record.failures)
+    for run, reason in failed.items():
+        failures.append(Failure(record.name, run, 1, reason))
     failures.sort(key=lambda failure: failure.run)
     return replace(record, **arrays, runs=numbers[order], failures=tuple(failures))
 
@@ -222,9 +236,7 @@ def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int
 
 def _cut(track: Track, start: int, end: int) -> Track:
     """Rows before ``end``, with their NEES from ``start`` on."""
-    arrays: dict[str, Any] = {
-        key: array[:end] for key in ("column", "t", *ARRAYS) if (array := getattr(track, key)) is not None
-    }
+    arrays: dict[str, Any] = {key: at(getattr(track, key), slice(end)) for key in ("column", "t", *ARRAYS)}
     track = replace(track, place=track.place.at(slice(end)), **arrays)
     error, P = track.error, track.covariance
     if error is None or P is None:
@@ -254,22 +266,28 @@ def not_estimated(errors: Sequence[Array], variances: Sequence[Array]) -> Indice
 
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
-    variances = [np.diagonal(t.covariance, axis1=-2, axis2=-1) for t in tracks if t.covariance is not None]
-    none = (np.abs(np.concatenate(variances)) <= ROUNDED.zero).all(axis=0)
-    still = ~(np.abs(np.concatenate([t.error for t in tracks if t.error is not None])) > NO_ERROR).any(axis=0)
+    """Message that no covariance has full rank, and what to judge in place of all components."""
+    P = np.concatenate([track.covariance for track in tracks if track.covariance is not None])
+    errors = np.concatenate([track.error for track in tracks if track.error is not None])
+    none = (np.abs(np.diagonal(P, axis1=-2, axis2=-1)) <= ROUNDED.zero).all(axis=0)
+    still = ~(np.abs(errors) > NO_ERROR).any(axis=0)
     if none.all():
         return f"{file}: the covariance is zero in every step; nothing to judge"
-    of = ""
-    if none.any():
-        of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})"
+    names = np.array(axes)
+    singular = f"{file}: the covariance is singular in every step"
+    if not none.any():
+        return f"{singular}; write only the states that the filter estimates by themselves"
+    singular += f" (variance zero: {', '.join(names[none])})"
     missing, idle = none & ~still, ~none & still
     if missing.any() and idle.any():
-        with_errors, without = (", ".join(np.array(axes)[which]) for which in (missing, idle))
-        of += f"; {with_errors} has errors without a variance, and {without} a variance without errors: write each "
-        return f"{file}: the covariance is singular in every step{of}variance in the row of its own component"
-    unused = none if still.all() else none | idle
-    left = ",".join(axis for axis, no in zip(axes, unused, strict=True) if not no)
-    advice = f"judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
-    if not none.any():
-        advice = "write only the states that the filter estimates by themselves"
-    return f"{file}: the covariance is singular in every step{of}; {advice}"
+        return (
+            f"{singular}; {', '.join(names[missing])} has errors without a variance, and {', '.join(names[idle])} a "
+            "variance without errors: write each variance in the row of its own component"
+        )
+    unused = none
+    if not still.all():
+        unused = none | idle
+    left = ",".join(names[~unused])
+    return (
+        f"{singular}; judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
+    )

@@ -67,10 +67,14 @@ def declared(records: Sequence[Record], r: Reading) -> list[Record]:
                 f"{record.name}: the covariance of the truth in run {record.run_numbers[run]}, step {step + 1} is not "
                 "a covariance: it is not symmetric, or negative in some direction"
             )
-        missing = int((np.isnan(P).any(axis=(2, 3)) & np.isfinite(record.nees)).sum()) if record.nees is not None else 0
+        record = replace(record, truth_errors=r.truth_errors, truth_shared=bool(r.truth_shared))
+        missing = 0
+        if record.nees is not None:
+            missing = int((np.isnan(P).any(axis=(2, 3)) & np.isfinite(record.nees)).sum())
         if missing and not np.isfinite(P).any():
             raise InputError(f"{record.name}: the truth has a covariance in none of the steps that are judged")
-        note = f"{record.name}: {plural(missing, 'estimate')} whose truth has no covariance are left out"
-        notes = (*record.notes, note) if missing else record.notes
-        found.append(replace(record, truth_errors=r.truth_errors, truth_shared=bool(r.truth_shared), notes=notes))
+        if missing:
+            note = f"{record.name}: {plural(missing, 'estimate')} whose truth has no covariance are left out"
+            record = replace(record, notes=(*record.notes, note))
+        found.append(record)
     return found

@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.places import Places
@@ -82,10 +81,6 @@ class Known(NamedTuple):
     apart: Array  # (k,), s to the nearest sample
     bend: Array  # (k,), what the interpolation may be off by in the first three components, or two in the plane
 
-    def of(self, kept: Array) -> Known:
-        """Some of them, by truth values or indices."""
-        return Known(*(values[kept] for values in self))
-
 
 def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, max_dt: float) -> Known:
     """The truth at ``times`` (N,), s, from samples at ``reference`` (M,), increasing, with ``values`` (M, m).
@@ -140,9 +135,9 @@ def _bends(position: Array, after: Indices) -> Array:
     last = len(position) - 2  # the last sample with a second difference
     if last < 1:
         return np.zeros(len(after))
-    both = [np.clip(after + side, 1, last) for side in (0, 1)]
-    second = [np.linalg.norm(position[i + 1] - 2.0 * position[i] + position[i - 1], axis=1) for i in both]
-    return np.asarray(np.maximum(*second) / 8.0)
+    second = np.linalg.norm(np.diff(position, 2, axis=0), axis=1)  # of samples 1, 2, ...
+    before, behind = (second[np.clip(after + side, 1, last) - 1] for side in (0, 1))
+    return np.asarray(np.maximum(before, behind) / 8.0)
 
 
 @dataclass(frozen=True)
@@ -174,6 +169,8 @@ class Poses:
     nis_dof: Array | None = None  # (N,)
     by: Array | None = None  # (N,), cells of the column that makes groups, or their values
     open_end: str = ""  # the last row stands in a line without an end: what to note if it is cut short
+    apart: Array | None = None  # (N,), s to the nearest sample of a truth that was matched
+    bend: Array | None = None  # (N,), what that truth may be off by, as in :class:`Known`
 
     def known(self, shift: float = 0.0) -> Known:
         """The truth at the timestamps, ``shift`` s later."""
@@ -182,15 +179,31 @@ class Poses:
             return Known(np.arange(len(self.t)), self.truth, np.arange(len(self.t)), none, none)
         return truth_at(self.t + shift, self.true_t, self.truth, self.manifold, self.max_dt)
 
-    def truth_covariances(self, known: Known, shift: float = 0.0) -> Array | None:
-        """Covariance of the truth at the rows of ``known``, that of the nearest sample, (k, n, n)."""
-        if self.true_covariance is None:
-            return None
-        return self.true_covariance[nearest(self.t[known.rows] + shift, self.true_t, known.before)]
+    def matched(self, shift: float = 0.0) -> Poses:
+        """The estimates whose truth is known, ``shift`` s later, each with that truth beside it."""
+        known = self.known(shift)
+        found = self.of_rows(known.rows)
+        P = self.true_covariance
+        if P is not None:
+            P = P[nearest(found.t + shift, self.true_t, known.before)]
+        return replace(
+            found, true_t=found.t, truth=known.truth, true_covariance=P, true_clock=at(self.true_clock, known.before),
+            apart=known.apart, bend=known.bend,
+        )  # fmt: skip
+
+    def pairs(self, kept: Array) -> Poses:
+        """Some of the estimates, by truth values or indices, with the truth beside each of them."""
+        rows = np.arange(len(self.t))[kept]
+        if len(rows) == len(self.t):
+            return self
+        found = self.of_rows(rows).beside(rows)
+        return replace(found, true_t=found.t, apart=at(self.apart, rows), bend=at(self.bend, rows))
 
     def errors(self, shift: float = 0.0) -> Array:
         """Truth less estimate, (N, n), with the truth ``shift`` s later; NaN where one of both is not known."""
         known = self.known(shift)
+        if len(known.rows) == len(self.t):
+            return self.error_of(known.rows, known.truth)
         out = np.full(self.covariance.shape[:2], np.nan)
         out[known.rows] = self.error_of(known.rows, known.truth)
         return out
@@ -211,10 +224,14 @@ class Poses:
         """Time of each estimate, (N,), s; NaN where steps have none."""
         if not self.numbered:
             return self.t
-        return np.full(len(self.t), np.nan) if self.clock is None else self.clock
+        if self.clock is None:
+            return np.full(len(self.t), np.nan)
+        return self.clock
 
     def later(self, shift: float) -> Poses:
-        return replace(self, t=self.t + shift) if shift else self
+        if not shift:
+            return self
+        return replace(self, t=self.t + shift)
 
     def sound(self) -> Poses:
         """Estimates that are finite, with a finite covariance."""
@@ -253,6 +270,9 @@ class Poses:
         )  # fmt: skip
 
 
+Change = Callable[[Poses], Poses]  # what is read otherwise
+
+
 def at(values: Array | None, rows: Any) -> Array | None:
     """Some rows of values, if there are any."""
     if values is None:
@@ -260,25 +280,15 @@ def at(values: Array | None, rows: Any) -> Array | None:
     return np.asarray(values[rows])
 
 
+def submatrices(P: Array, index: Sequence[int]) -> Array:
+    """Rows and columns ``index`` of matrices (N, n, n)."""
+    part = list(index)
+    return np.asarray(P[:, part][:, :, part])
+
+
 def unstated(rows: int, n: int) -> tuple[Array, Array]:
     """Covariances (rows, n, n) that are NaN, and that none is stated, (rows,): where a file states none."""
     return np.broadcast_to(np.nan, (rows, n, n)), np.zeros(rows, bool)
-
-
-@dataclass(frozen=True)
-class Aligned:
-    """Runs in the world of the truth, with notes on the alignment."""
-
-    runs: Sequence[Poses]  # moved estimates, with covariances of the residual errors
-    align: str = "none"  # the mode
-    notes: tuple[str, ...] = ()
-    caption: str = ""  # what the verdict has to say of it
-    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
-    unavailable: tuple[str, ...] = ()  # questions that have no answer
-    unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
-
-    def on(self, record: Record) -> Record:
-        return replace(record, **{key: value for key, value in vars(self).items() if key not in ("runs", "notes")})
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,13 +35,17 @@ class Relative:
     @property
     def text(self) -> str:
         """100 steps, 10 s, 50 m."""
-        unit = "steps" if self.unit == "step" and self.size != 1 else self.unit
+        unit = self.unit
+        if unit == "step" and self.size != 1:
+            unit = "steps"
         return f"{self.size:g} {unit}"
 
     @property
     def option(self) -> str:
         """Value of the option: 100, 10s, 50m."""
-        return f"{self.size:g}{'' if self.unit == 'step' else self.unit}"
+        if self.unit == "step":
+            return f"{self.size:g}"
+        return f"{self.size:g}{self.unit}"
 
 
 def relative_of(size: str | float | None, motions: bool = False, windows: str | None = None) -> Relative | None:
@@ -62,11 +67,11 @@ def relative_of(size: str | float | None, motions: bool = False, windows: str | 
             raise InputError("--windows goes with --relative, which cuts a log into windows")
         return None
     match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([sm]?)\s*", str(size))
-    try:
-        value = float(match[1]) if match else math.nan
-    except ValueError:
-        value = math.nan
-    unit = UNITS[match[2]] if match else "step"
+    value, unit = math.nan, "step"
+    if match:
+        unit = UNITS[match[2]]
+        with suppress(ValueError):
+            value = float(match[1])
     if not (math.isfinite(value) and value > 0) or (unit == "step" and value % 1):
         raise InputError(f"--relative {size}: must be {FORMS}")
     return Relative(value, unit, motions, motions or windows is not None)

@@ -9,8 +9,7 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from consistency.referee.document.blocks import Block, Cell, Reasons, Status, Table
-from consistency.referee.document.wording import PLAIN, written
-from consistency.referee.show.text import fragment
+from consistency.referee.document.wording import PLAIN, fragment, written
 
 COLOURS = {
     "consistent": "green", "overconfident": "red", "conservative": "yellow", "biased": "red", "heavy-tailed": "red",

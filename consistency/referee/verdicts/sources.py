@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.skipping import Skip
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
-from consistency.referee.readers.pipeline.kinds import is_program_runs
-from consistency.referee.verdicts.command_settings import settings_of, skip_asked
+from consistency.referee.readers.pipeline.read_files import is_program_runs
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning.early_stopping import Design
+    from consistency.referee.diagnostics.records.skipping import Skip
+
+OPTION = {"ratio": "detect", "false_alarm": "false-alarm", "max_runs": "max-runs"}  # as commands call settings
 
 
 @dataclass(frozen=True)
@@ -87,3 +88,51 @@ def judge_all(
             record = replace(record, optimal_gain=True)
         verdicts[name] = judge(record, settings, design)
     return verdicts
+
+
+# --- what the options of a command ask for -----------------------------------------------------------
+
+
+def settings_of(confidence: float | None = None, **given: Any) -> Settings:
+    """Settings of a verdict from the options of a command; those that are None keep their defaults.
+
+    Raises
+    ------
+    InputError
+        A value out of its range, or both a confidence and a false-alarm rate.
+    """
+    given = {name: value for name, value in given.items() if value is not None}
+    if confidence is not None:
+        if "false_alarm" in given:
+            raise InputError("--confidence is 1 less --false-alarm; give one of them")
+        if not 0.0 < confidence < 1.0:
+            raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
+        given["false_alarm"] = 1.0 - confidence
+    try:
+        return Settings(**given)
+    except ValueError as error:
+        raise refused(error) from None
+
+
+def skip_asked(given: str | float | Skip | None) -> Skip | None:
+    """The first steps or seconds that an option asks to leave out.
+
+    Raises
+    ------
+    InputError
+        It is neither a number of steps nor of seconds.
+    """
+    if given is None:
+        return None
+    from consistency.referee.diagnostics.records.skipping import skip_of
+
+    try:
+        return skip_of(given)
+    except ValueError as error:
+        raise refused(error) from None
+
+
+def refused(error: ValueError) -> InputError:
+    """What a plan refuses, with the option of the command in place of the argument."""
+    name, rest = str(error).split(" ", 1)
+    return InputError(f"--{OPTION.get(name, name)} {rest}")

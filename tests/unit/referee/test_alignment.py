@@ -35,10 +35,10 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.alignment import residuals
 from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, aligned, clocks_and_frames
+from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, Aligned, aligned, clocks_and_frames
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.truth_matching import Aligned, Poses
+from consistency.referee.readers.truth_matching import Poses
 
 STEPS = 30
 SIGMA = {"planar": np.array([0.1, 0.2, 0.02]), "spatial": np.array([0.1, 0.2, 0.15, 0.01, 0.02, 0.03])}

@@ -36,8 +36,8 @@ from consistency.referee.document.guard import rejection_cells, rejection_text
 from consistency.referee.document.judged_filters import FURTHER, TERMINAL, cells, document, page, with_values
 from consistency.referee.document.map import COLUMNS, map_cells, map_lines, map_text
 from consistency.referee.document.needed_runs import plan_lines
-from consistency.referee.document.wording import PLAIN, PRINTED, unbroken, written
-from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal, text
+from consistency.referee.document.wording import PLAIN, PRINTED, fragment, unbroken, written
+from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal
 
 INF, NAN = float("inf"), float("nan")
 GOOD = Reason("ekf", "consistent: no fault found", ("mean NEES 3.0",))
@@ -122,7 +122,7 @@ def test_json_holds_the_data_and_no_word_more():
 
 
 def test_text_puts_what_did_not_pass_below_its_row():
-    said = text.fragment(*TREE.opening, *TREE.chapters[0].blocks).splitlines()
+    said = fragment(*TREE.opening, *TREE.chapters[0].blocks).splitlines()
     assert said[0] == "filter  verdict     n"
     assert said[1] == "ekf     consistent  2.00"
     assert said[2:5] == ["gate", "g", "    a<b> is overconfident: covariance too small & skewed\x1b"]
@@ -187,7 +187,7 @@ def test_one_document_says_the_same_on_the_terminal_and_in_files():
     assert [len(case.findall("failure")) for case in suite] == [0, 1]
     assert suite[1][0].get("message") == verdicts["bad"].reasons[0]
     for name, v in verdicts.items():
-        assert f"{name} is {v.reasons[0]}" in text.fragment(*tree.opening)
+        assert f"{name} is {v.reasons[0]}" in fragment(*tree.opening)
         assert f"**{name}** is {v.reasons[0]}" in as_md.render(tree)
     assert not list(document(verdicts, reasons=False).reasons)
 

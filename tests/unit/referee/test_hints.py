@@ -26,12 +26,11 @@ from consistency.referee.readers.alignment.world_frames import (
     on_body,
 )
 from consistency.referee.readers.mix_ups import hints as readers_hints
-from consistency.referee.readers.mix_ups import reading_fit
 from consistency.referee.readers.mix_ups.hints import hints, turns
-from consistency.referee.readers.mix_ups.known import Guess, _ned
-from consistency.referee.readers.mix_ups.reading_fit import FACTOR, fit_of
-from consistency.referee.readers.pipeline.motion_causes import causes_of_motions
-from consistency.referee.readers.pipeline.relative_motions import Stretch
+from consistency.referee.readers.mix_ups.known import Guess
+from consistency.referee.readers.mix_ups.known_worlds import _ned
+from consistency.referee.readers.mix_ups.reading_fit import FACTOR, SMALL, fit_of, thinned
+from consistency.referee.readers.pipeline.relative_motions import Stretch, causes_of_motions
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
 from consistency.referee.readers.truth_matching import Poses
@@ -278,7 +277,7 @@ def test_independent_estimates_by_hand():
 
 def test_few_of_many_runs_are_looked_at(rng, monkeypatch):
     looked = list[int]()
-    monkeypatch.setattr(readers_hints, "_same", lambda some: bool(looked.append(len(some))) or True)
+    monkeypatch.setattr(readers_hints, "is_same", lambda some: bool(looked.append(len(some))) or True)
     run = planar(rng)[0]
     for runs in (1, 200, 201, 2000, 2001):
         hints("f", ("x", "y", "heading"), [run] * runs)
@@ -505,7 +504,7 @@ def test_one_number_for_all_variances_is_no_covariance_of_an_estimator(rng):
 
 def test_many_components_are_fitted_like_few(rng):
     """Each matrix by itself where they are large; one without a factor is left out, and the others stay."""
-    n = reading_fit.SMALL + 5
+    n = SMALL + 5
     A = rng.normal(size=(4, n, n))
     P, e = A @ np.swapaxes(A, 1, 2), rng.normal(size=(4, n))
     P[1, 0, 1] = P[1, 1, 0] = 2.0 * np.sqrt(P[1, 0, 0] * P[1, 1, 1])
@@ -517,7 +516,7 @@ def test_many_components_are_fitted_like_few(rng):
     log_det = np.mean([np.linalg.slogdet(P[k])[1] for k in (0, 2, 3)])
     assert found.likelihood == pytest.approx(-0.5 * (np.mean(nees) + log_det), rel=1e-9)
     many = [states(np.ones((1, 400)), np.eye(400))] * 40
-    assert len(readers_hints._thinned(many, 0.0)) == 20
+    assert len(thinned(many, 0.0)) == 20
 
 
 def assert_named(causes, said):

@@ -16,7 +16,6 @@ from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
 from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
 from consistency.referee.diagnostics.questions.shape import pair_p_values
-from consistency.referee.diagnostics.records.groups import spans_of
 from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
@@ -185,6 +184,8 @@ def by_group_of(
     both_sides = replace(settings, allow=None) if record.reduced else settings
     factor = max(settings.factor, settings.tolerated)
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
+    from consistency.referee.diagnostics.records.groups import spans_of
+
     by_group, spans = [], None if groups.edges is None else spans_of(groups.edges)
     for number, (name, one) in enumerate(zip(groups.names, found, strict=True)):
         if not len(one.means):

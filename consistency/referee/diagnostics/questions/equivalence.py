@@ -10,7 +10,7 @@ from scipy import special
 
 from consistency.referee.diagnostics.questions.scale import FEW, MeanTest, scale_test
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.e_process import e_process, ever
+from consistency.referee.diagnostics.statistics.nees import e_process, ever
 from consistency.referee.diagnostics.statistics.number_of_runs import LARGEST
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import Equivalence

@@ -7,7 +7,7 @@ from scipy import special
 
 from consistency.referee.diagnostics.questions.scale import run_means
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics.e_process import ever
+from consistency.referee.diagnostics.statistics.nees import ever
 from consistency.referee.diagnostics.statistics.number_of_runs import lost_runs, share_limit
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import EarlyEnds, Lost

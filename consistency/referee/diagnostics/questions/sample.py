@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
-from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.validity import negative
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, whiten, whiten_group
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array, Indices
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.records.groups import Groups
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
 VELOCITY = {"vx", "vy", "vz"}

@@ -6,14 +6,16 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.groups import Groups
-from consistency.referee.diagnostics.records.skipping import Skip, Skipped, without_first
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.records.groups import Groups
+    from consistency.referee.diagnostics.records.skipping import Skip, Skipped
 
 
 @dataclass(frozen=True)
@@ -174,6 +176,10 @@ class Record:
         InputError
             Nothing is left, or seconds are asked for and there are no times.
         """
+        if skip is None:
+            return self
+        from consistency.referee.diagnostics.records.skipping import without_first
+
         arrays = {name: getattr(self, name) for name in ("covariance", "nees", "nis", "nis_dof", "innovations")}
         world, t = self.world, self.times
         if world is not None:

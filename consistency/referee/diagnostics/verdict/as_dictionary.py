@@ -230,7 +230,9 @@ def group_numbers(by: ByGroup | None) -> Numbers:
 
 
 def plain(value: Any) -> Any:
-    """Arrays as lists, not finite numbers as None: what JSON can hold."""
+    """Verdicts as dictionaries, arrays as lists, not finite numbers as None: what JSON can hold."""
+    if hasattr(value, "as_dictionary"):
+        return plain(value.as_dictionary())
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record, shown_by
-from consistency.referee.diagnostics.records.skipping import Skipped
-from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import (
     TINY,
@@ -36,6 +34,10 @@ from consistency.referee.diagnostics.verdict.parts import (
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.records.skipping import Skipped
+
+Faults = Mapping[str, Answer]  # answers that found a fault, by their question
 UNKNOWN_ENDS = (float("nan"), float("nan"))
 
 
@@ -235,6 +237,8 @@ class Verdict(Findings):
     @property
     def statistics(self) -> dict[str, Any]:
         """Every number as one flat dictionary, as ``--json`` has it; parts that could not be computed are left out."""
+        from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
+
         numbers: dict[str, Any] = {
             "runs": self.runs,
             "steps": self.steps,
@@ -280,6 +284,8 @@ class Verdict(Findings):
     def _of_axes(self) -> dict[str, Any]:
         if self.axes is None:
             return {}
+        from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
+
         numbers = dictionary.axes_numbers(self.axes) | {"impossible": [list(pair) for pair in self.impossible]}
         for key, axis in (("worst_axis", self.worst_axis), ("axis", self.axis)):
             if axis is not None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 
 from consistency.referee.diagnostics.judging.error_parts import VISIBLE
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
-from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Answer, Innovations, Interval, JointScore
-from consistency.referee.diagnostics.verdict.verdict import Findings
+from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovations, Interval, JointScore
+from consistency.referee.diagnostics.verdict.verdict import Faults, Findings
 from consistency.referee.diagnostics.words.blocks import block_text, unlike_ratios, unlike_text
 from consistency.referee.diagnostics.words.numbers import (
     is_uncertain,
@@ -24,7 +24,6 @@ NOTABLE = 0.3  # difference of correlations that stands out in one step
 MOST = 3  # axes that a sentence names with their figures
 NAMED = 0.1  # part of a unit vector that a sentence names
 
-Faults = Mapping[str, Answer]
 NamedRatio = tuple[str, Interval]
 
 

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
-from consistency.referee.diagnostics.judging.status import clear, smaller
+from consistency.referee.diagnostics.judging.status import clear
 from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
-from consistency.referee.diagnostics.verdict.answers import ALONE, BIAS, GROUP, JOINT, SCALE, SHAPE, Settings
-from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovations, Location, Scale, Within
-from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
-from consistency.referee.diagnostics.words.faults import (
-    MOST,
-    Faults,
-    bias_text,
-    combination_text,
-    innovations_text,
-    joint_text,
-    opposite,
-    scale_text,
-    shape_text,
-    tails_text,
-)
-from consistency.referee.diagnostics.words.groups import groups_text, lines_of_groups, right_groups
+from consistency.referee.diagnostics.verdict.answers import SCALE, Settings
+from consistency.referee.diagnostics.verdict.parts import ByGroup, Equivalence, Innovations, Location, Scale, Within
+from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Faults, Findings, Verdict
 from consistency.referee.diagnostics.words.numbers import (
-    SMALLEST_P,
     is_or_are,
     p_text,
     percent,
@@ -84,7 +70,9 @@ def _sentence_and_figures(v: Findings, faults: Faults) -> tuple[str, list[str]]:
         figures = [*_truth(v), *_early_ends(v), *_levels(v, v.scale), *_single_log(v, v.scale), *_together(v)]
         figures += _coverage(v)
         if faults:
-            return _fault(v, v.scale, faults), figures
+            from consistency.referee.diagnostics.words.fault_sentence import fault_sentence
+
+            return fault_sentence(v, v.scale, faults), figures
         return _no_fault(v, v.scale), figures
     if v.scale is not None:
         return "no step has a covariance of full rank to judge", []
@@ -154,66 +142,6 @@ def _first_steps(v: Findings) -> list[str]:
     ]
 
 
-def _fault(v: Findings, s: Scale, faults: Faults) -> str:
-    """The sentence where a question found a fault."""
-    if v.parts:
-        return _faults_of_parts(v)
-    of_scale, of_bias = _any_of(SCALE, faults), _any_of(BIAS, faults)
-    is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
-    found: list[tuple[str, Collection[str]]] = []  # sentences, with the questions that they answer
-    contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in faults
-    if v.status == "heavy-tailed" or "outliers" in faults or (contrary and not opposite(v, faults)):
-        found.append((tails_text(v, faults), ["outliers"]))
-    if of_bias:
-        found.append((bias_text(v, "bias" not in faults), BIAS))
-    scale = ""
-    if of_scale and v.status not in ("biased", "heavy-tailed"):
-        scale = scale_text(v, faults)
-        found.append((scale, SCALE))
-    if _any_of(SHAPE, faults) and v.status not in ("biased", "heavy-tailed"):
-        found.append((shape_text(v, faults, scale), SHAPE))
-    if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
-        found.append((joint_text(v, v.joint), [JOINT]))
-    found.sort(key=lambda one: _rank(v, faults, one[1]))
-    parts = [text for text, _ in found]
-    if v.status == "heavy-tailed":
-        parts.append(f"in the mean the covariance ratio is {ratio_text(s.inflation)}")
-    if v.by_group is not None:
-        parts.append(groups_text(v.by_group, GROUP in faults))
-    if len(faults) == 1:
-        parts += [ALONE[question] for question in faults if question in ALONE]
-    if "innovation scale" in faults and v.innovations is not None:
-        parts.append(innovations_text(v, v.innovations))
-    if "innovation whiteness" in faults:
-        parts.append("innovations correlated over steps")
-    if (of_scale or GROUP in faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
-        parts.append("no bias found")
-    return "; ".join(part for part in parts if part)
-
-
-def _rank(v: Findings, faults: Faults, questions: Collection[str]) -> tuple[bool, float, int]:
-    """Order of a fault in the sentence: what the status says, then by p value, the size before what else is wrong."""
-    named = {"biased": BIAS, "heavy-tailed": ["outliers"]}.get(v.status, ())
-    p = min((faults[question].adjusted for question in questions if question in faults), default=1.0)
-    order = (SCALE, BIAS, SHAPE)
-    return questions is not named and questions != named, max(p, SMALLEST_P), [*order, questions].index(questions)
-
-
-def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
-    return any(question in asked for question in questions)
-
-
-def _faults_of_parts(v: Findings) -> str:
-    texts = []
-    for name, part in v.parts.items():
-        if part.faults:
-            sentence = part.reasons[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
-            texts.append(f"{name}: {sentence}")
-    if len(texts) > MOST:
-        texts = [*texts[:MOST], f"and {len(texts) - MOST} more"]
-    return "; ".join(texts)
-
-
 def _no_fault(v: Findings, s: Scale) -> str:
     """Whether the ratio is shown to be right, with that of the worst axis; and what share of lost runs stays open."""
     shown, runs = s.equivalence, plural(v.runs, v.unit)
@@ -227,7 +155,10 @@ def _no_fault(v: Findings, s: Scale) -> str:
     worst = clear(v.worst_axis)
     if worst is not None:
         axis = f" (worst axis: {worst[0]}, {ratio_text(worst[1])})"
-    axis += right_groups(v)
+    if v.by_group is not None or v.parts:
+        from consistency.referee.diagnostics.words.groups import right_groups
+
+        axis += right_groups(v)
     if shown.shown:
         return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
     do = "do"
@@ -330,12 +261,13 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     worst, of_all = clear(v.worst_axis), ratio_text(s.inflation)
     if v.faults and worst is not None:
         lines.append(f"covariance ratio of the worst axis: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
-    elif _any_of(SCALE, v.faults) and v.worst_axis is not None:
+    elif v.worst_axis is not None and not set(SCALE).isdisjoint(v.faults):
+        from consistency.referee.diagnostics.words.faults import combination_text
+
         lines.append(
             f"no axis is shown to be wrong to that side by itself, only errors {combination_text(v)}; of all {of_all}"
         )
-    if v.by_group is not None:
-        lines += lines_of_groups(v.by_group, v.unit)
+    lines += _groups(v.by_group, v.unit)
     if v.lost is not None and _has_lost(v) and (v.lost.count or v.settings.lost is not None):
         lines.append(
             f"lost {v.unit}s: {v.lost.count} of {v.lost.runs} failed or have a mean NEES above {short(v.lost.bound)}; "
@@ -348,9 +280,16 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     for name, part in v.parts.items():
         if part.scale is not None and part.location is not None:
             lines.append(f"{name}: {_level(part, part.scale, part.location)}")
-        if part.by_group is not None:
-            lines += [f"{name}: {line}" for line in lines_of_groups(part.by_group, v.unit)]
+        lines += [f"{name}: {line}" for line in _groups(part.by_group, v.unit)]
     return lines
+
+
+def _groups(by: ByGroup | None, unit: str) -> list[str]:
+    if by is None:
+        return []
+    from consistency.referee.diagnostics.words.groups import lines_of_groups
+
+    return lines_of_groups(by, unit)
 
 
 def _truth(v: Findings) -> list[str]:
@@ -439,6 +378,8 @@ def _without_truth(v: Findings, i: Innovations, faults: Faults) -> str:
         )
     parts = ["no truth: judged by the innovations alone, which cannot see most pose errors"]
     if "innovation scale" in faults:
+        from consistency.referee.diagnostics.words.faults import innovations_text
+
         parts.append(innovations_text(v, i, "they are"))
     if "innovation whiteness" in faults:
         parts.append("they are correlated over steps")

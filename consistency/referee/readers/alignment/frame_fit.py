@@ -18,7 +18,7 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     turned_frame,
 )
-from consistency.referee.readers.truth_matching import Known, Poses
+from consistency.referee.readers.truth_matching import Known, Poses, submatrices
 from consistency.referee.types import Array, Indices
 
 STEP = 1e-6  # m or rad, over which the change of an error is taken
@@ -37,7 +37,8 @@ class Sound:
 
 def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sound:
     """Estimates usable for an alignment; ``known`` is the truth at all timestamps, if already computed."""
-    known = p.known() if known is None else known
+    if known is None:
+        known = p.known()
     w = _whitened(p, known.rows, p.error_of(known.rows, known.truth), judged)
     fine = np.isfinite(w).all(axis=1) & p.stated[known.rows]
     return Sound(known.rows[fine], known.truth[fine], w[fine])
@@ -45,7 +46,7 @@ def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sou
 
 def _whitened(p: Poses, rows: Indices, error: Array, judged: Sequence[int]) -> Array:
     index = list(judged)
-    return by_runs(lambda e, at: whiten(e[:, index], p.covariance[at][:, index][:, :, index]), error, rows)
+    return by_runs(lambda e, at: whiten(e[:, index], submatrices(p.covariance[at], index)), error, rows)
 
 
 def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array:
@@ -60,12 +61,12 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
     """
 
     def of_block(truth: Array, rows: Indices) -> Array:
-        k, d = len(rows), len(free)
-        there = [_small(side * motion).placed(truth, p.manifold) for side in (-STEP, STEP) for motion in free]
-        errors = p.error_of(np.tile(rows, 2 * d), np.concatenate(there))
-        after, before = errors.reshape(2, d * k, errors.shape[-1])
-        change = _whitened(p, np.tile(rows, d), (after - before) / (2.0 * STEP), judged)
-        return np.moveaxis(change.reshape(d, k, len(judged)), 0, -1)
+        out = np.empty((len(rows), len(judged), len(free)))
+        for k, motion in enumerate(STEP * free):
+            after = p.error_of(rows, _small(-motion).placed(truth, p.manifold))
+            before = p.error_of(rows, _small(motion).placed(truth, p.manifold))
+            out[:, :, k] = _whitened(p, rows, (after - before) / (2.0 * STEP), judged)
+        return out
 
     return by_runs(of_block, sound.truth, sound.rows)
 
@@ -84,17 +85,21 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
     """
     known = [p.known() for p in runs]
 
-    def at(frame: WorldTransform) -> tuple[float, list[Poses], list[Sound]]:
-        there = [moved(p, frame) for p in runs]
-        found = [sound_of(p, judged, k) for p, k in zip(there, known, strict=True)]
-        return float(sum(np.square(sound.whitened).sum() for sound in found)), there, found
+    def at(frame: WorldTransform) -> tuple[float, list[tuple[Poses, Sound]]]:
+        found, nees = [], 0.0
+        for p, k in zip(runs, known, strict=True):
+            there = moved(p, frame)
+            sound = sound_of(there, judged, k)
+            found.append((there, sound))
+            nees += float(np.square(sound.whitened).sum())
+        return nees, found
 
     frame = turned_frame(runs) if free[:, 3:5].any() else fitted_frame(runs) or IDENTITY
-    nees, there, found = at(frame)
-    if not any(len(sound.rows) for sound in found):
+    nees, found = at(frame)
+    if not any(len(sound.rows) for _, sound in found):
         raise InputError(f"--align: no estimate of {name} has a truth and a covariance of full rank to be aligned by")
     for _ in range(ROUNDS):
-        step, size = _step(there, found, free, judged)
+        step, size = _step(found, free, judged)
         further = _small(step @ free).after(frame)
         while size > DONE and (tried := at(further))[0] > nees:
             step, size = 0.5 * step, 0.5 * size
@@ -102,14 +107,14 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
         frame = further
         if size <= DONE:
             break
-        nees, there, found = tried
+        nees, found = tried
     return frame
 
 
-def _step(runs: Sequence[Poses], found: Sequence[Sound], free: Array, judged: Sequence[int]) -> tuple[Array, float]:
+def _step(found: Sequence[tuple[Poses, Sound]], free: Array, judged: Sequence[int]) -> tuple[Array, float]:
     """Gauss-Newton step (d,), and its length in stated standard deviations."""
-    tangents = [tangent(p, sound, free, judged).reshape(-1, len(free)) for p, sound in zip(runs, found, strict=True)]
-    A, w = np.concatenate(tangents), np.concatenate([sound.whitened.ravel() for sound in found])
+    A = np.concatenate([tangent(p, sound, free, judged).reshape(-1, len(free)) for p, sound in found])
+    w = np.concatenate([sound.whitened.ravel() for _, sound in found])
     scale = _sizes(A)
     step = -np.linalg.lstsq(A / scale, w, rcond=RANK)[0] / scale
     return step, float(np.linalg.norm(A @ step))
@@ -125,5 +130,9 @@ def orthonormal(tangents: Sequence[Array]) -> list[Array]:
     A = np.concatenate([each.reshape(-1, each.shape[-1]) for each in tangents])
     U, s, _ = np.linalg.svd(A / _sizes(A), full_matrices=False)
     U = U[:, s > RANK * s[0]]
-    ends = np.cumsum([each.shape[0] * each.shape[1] for each in tangents])[:-1]
-    return [part.reshape(*each.shape[:2], -1) for part, each in zip(np.split(U, ends), tangents, strict=True)]
+    bases, start = [], 0
+    for each in tangents:
+        end = start + each.shape[0] * each.shape[1]
+        bases.append(U[start:end].reshape(*each.shape[:2], -1))
+        start = end
+    return bases

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import ENOUGH, inflation_of_mean, left_covariances
 from consistency.referee.diagnostics.verdict.answers import BIAS, GROUP, INNOVATIONS, MAIN, SHARES, STEP
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.frame_fit import Sound, frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
+from consistency.referee.readers.alignment.world_frames import WorldTransform, moved, positions, rotations
 from consistency.referee.readers.clock_offset import ROUNDS, SETTLED, clock_shift
-from consistency.referee.readers.truth_matching import Aligned, Poses
+from consistency.referee.readers.truth_matching import Poses, submatrices
 from consistency.referee.types import Array
 
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
@@ -34,6 +33,24 @@ NO_MEAN = "the errors cancel over each run, so that the frame's own error outwei
 SLIGHT = 0.01  # of a covariance: what an uncertain first pose adds to the others, and counts as nothing below
 
 
+@dataclass(frozen=True)
+class Aligned:
+    """Runs in the world of the truth, with notes on the alignment."""
+
+    runs: Sequence[Poses]  # moved estimates, with covariances of the residual errors
+    align: str = "none"  # the mode
+    notes: tuple[str, ...] = ()
+    caption: str = ""  # what the verdict has to say of it
+    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
+    unavailable: tuple[str, ...] = ()  # questions that have no answer
+    unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
+
+    @property
+    def of_record(self) -> dict[str, Any]:
+        """What a record has of it."""
+        return {name: value for name, value in vars(self).items() if name not in ("runs", "notes")}
+
+
 def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) -> list[WorldTransform]:
     """The frame of each run.
 
@@ -44,13 +61,18 @@ def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]
     """
     if mode == "origin":
         return [frame_of_first_pose(name, p) for p in runs]
-    base, _, shared = mode.partition("-")
-    kind = runs[0].manifold
-    if (base, kind) not in FREE:
+    free = _directions(mode, runs)
+    if mode.endswith("-all"):
+        return [frame_of_least_nees(name, runs, free, judged)] * len(runs)
+    return [frame_of_least_nees(name, [p], free, judged) for p in runs]
+
+
+def _directions(mode: str, runs: Sequence[Poses]) -> Array:
+    """Directions (d, 6) in which frames of a mode may move."""
+    key = mode.removesuffix("-all"), runs[0].manifold
+    if key not in FREE:
         raise InputError(f"--align {mode}: turns about x and y are for poses in space; for x, y, heading it is posyaw")
-    if shared:
-        return [frame_of_least_nees(name, runs, FREE[base, kind], judged)] * len(runs)
-    return [frame_of_least_nees(name, [p], FREE[base, kind], judged) for p in runs]
+    return FREE[key]
 
 
 def clocks_and_frames(
@@ -68,15 +90,25 @@ def clocks_and_frames(
     InputError
         The offset cannot be estimated, or nothing can be aligned.
     """
-    shift = time_offset if isinstance(time_offset, float) else 0.0
+    shift = 0.0
+    if isinstance(time_offset, float):
+        shift = time_offset
     for _ in range(ROUNDS):
-        before, frames = shift, frames_of(name, [p.later(shift) for p in runs], align, judged)
-        there = [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
-        shift, notes = clock_shift(name, there, time_offset)
+        before, later = shift, [p.later(shift) for p in runs]
+        frames = frames_of(name, later, align, judged)
+        shift, notes = clock_shift(name, _moved(runs, frames), time_offset)
         if abs(shift - before) <= SETTLED:
             break
-    found = aligned(name, [p.later(shift) for p in runs], align, judged, frames if shift == before else None)
-    return shift, notes, replace(found, runs=[replace(p, t=own.t) for p, own in zip(found.runs, runs, strict=True)])
+    if shift == before:
+        found = aligned(name, later, align, judged, frames)
+    else:
+        found = aligned(name, [p.later(shift) for p in runs], align, judged)
+    back = zip(found.runs, runs, strict=True)
+    return shift, notes, replace(found, runs=[replace(p, t=own.t) for p, own in back])
+
+
+def _moved(runs: Sequence[Poses], frames: Sequence[WorldTransform]) -> list[Poses]:
+    return [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
 
 
 def aligned(
@@ -99,8 +131,9 @@ def aligned(
     InputError
         The errors have no such frame, or no estimate can be aligned, as in :func:`frames_of`.
     """
-    frames = frames_of(name, runs, mode, judged) if frames is None else frames
-    there = [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
+    if frames is None:
+        frames = frames_of(name, runs, mode, judged)
+    there = _moved(runs, frames)
     found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
     return replace(found, align=mode, notes=(_sizes(name, mode, frames), *found.notes))
 
@@ -110,48 +143,60 @@ def aligned(
 
 def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) -> Aligned:
     """Covariances of the residuals of a fit; unchanged where these are not known."""
-    base, _, for_all = mode.partition("-")
-    found = [sound_of(p, judged) for p in runs]
-    some = [i for i, sound in enumerate(found) if len(sound.rows)]
-    tangents = [tangent(runs[i], found[i], FREE[base, runs[i].manifold], judged) for i in some]
-    bases = orthonormal(tangents) if for_all else [orthonormal([A])[0] for A in tangents]
+    for_all = mode.endswith("-all")
+    free = _directions(mode, runs)
+    residuals, tangents, some = [], [], []
+    for i, p in enumerate(runs):
+        sound = sound_of(p, judged)
+        if len(sound.rows):
+            some.append(i)
+            residuals.append(sound.whitened)
+            tangents.append(tangent(p, sound, free, judged))
+    of = "each run"
+    if for_all:
+        bases, of = orthonormal(tangents), "all runs"
+    else:
+        bases = [orthonormal([A])[0] for A in tangents]
     dof = max(Q.shape[-1] for Q in bases)
-    what = f"aligned by {mode}, a frame of {dof} degrees of freedom for {'all runs' if for_all else 'each run'}"
+    what = f"aligned by {mode}, a frame of {dof} degrees of freedom for {of}"
+    of_runs = Aligned(runs, caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
     if len(some) < ENOUGH:
-        note = (
-            f"{name}: fewer than {ENOUGH} runs do not show what the frame takes of the errors; nothing makes up for it"
-        )
-        return Aligned(runs, notes=(note,), caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
-    residuals = [found[i].whitened for i in some]
-    left = left_covariances(residuals, bases, bool(for_all))
+        note = f"fewer than {ENOUGH} runs do not show what the frame takes of the errors; nothing makes up for it"
+        return replace(of_runs, notes=(f"{name}: {note}",))
+    left = left_covariances(residuals, bases, for_all)
     if left.oscillating:
         most = f"at most about {100.0 * left.unseen:.2g} % of the NEES"
-        note = f"{name}: the errors alternate or oscillate; nothing makes up for what the frame takes of them, {most}"
-        caption = f"{what}: {OF_RUNS}, and {OSCILLATING} ({most})"
-        return Aligned(
-            runs, notes=(note,), caption=caption, reduced=True, unavailable=ALL_BUT_SCALE, unseen=left.unseen
-        )
-    kept = [max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST) for M in left.covariances]
-    factors = dict(zip(some, kept, strict=True))
-    out = [replace(p, covariance=p.covariance * factors.get(i, 1.0)) for i, p in enumerate(runs)]
-    note = (
-        f"{name}: the frame takes {100.0 * (1.0 - np.mean(kept)):.2g} % of the NEES of a right covariance, made up for"
-    )
+        note = f"the errors alternate or oscillate; nothing makes up for what the frame takes of them, {most}"
+        caption = f"{of_runs.caption}, and {OSCILLATING} ({most})"
+        return replace(of_runs, notes=(f"{name}: {note}",), caption=caption, unseen=left.unseen)
+    kept, largest = np.empty(len(some)), 0.0
+    for k, M in enumerate(left.covariances):
+        kept[k] = max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST)
+        largest = max(largest, float(np.linalg.eigvalsh(M)[:, -1].max()))
+    out = list(runs)
+    for i, share in zip(some, kept, strict=True):
+        out[i] = replace(runs[i], covariance=runs[i].covariance * share)
+    taken = 100.0 * (1.0 - kept.mean())
+    notes = (f"{name}: the frame takes {taken:.2g} % of the NEES of a right covariance, made up for",)
     if not for_all:
-        return Aligned(out, notes=(note,), caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
-    added = len(some) * (max(float(np.linalg.eigvalsh(M)[:, -1].max()) for M in left.covariances) - 1.0)
-    if added > COMMON:
-        caption = f"{what}: {OF_ALL}, nor are single steps"
-        return Aligned(out, notes=(note,), caption=caption, unavailable=(STEP, GROUP, *BIAS))
+        return replace(of_runs, runs=out, notes=notes)
+    of_all = Aligned(out, notes=notes, caption=f"{what}: {OF_ALL}")
+    if len(some) * (largest - 1.0) > COMMON:
+        return replace(of_all, caption=f"{of_all.caption}, nor are single steps", unavailable=(STEP, GROUP, *BIAS))
     if inflation_of_mean(residuals, bases) > 1.0 + COMMON:
-        return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}, nor is a bias: {NO_MEAN}", unavailable=BIAS)
-    return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}")
+        return replace(of_all, caption=f"{of_all.caption}, nor is a bias: {NO_MEAN}", unavailable=BIAS)
+    return of_all
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
-    out, factors = zip(*(from_first_pose(name, p, judged) for p in runs), strict=True)
-    every = np.concatenate(factors)
-    larger = float(np.median(every)) if len(every) else 1.0
+    out, factors = [], []
+    for p in runs:
+        first, larger_by = from_first_pose(name, p, judged)
+        out.append(first)
+        factors.append(larger_by)
+    every, larger = np.concatenate(factors), 1.0
+    if len(every):
+        larger = float(np.median(every))
     if larger < 1.0 + SLIGHT:
         return Aligned(out, caption="aligned by origin: the error of the first pose of each run is not judged")
     note = (
@@ -167,19 +212,18 @@ def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Alig
 
 def _sizes(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
     if len(frames) == 1 or mode.endswith("-all"):
-        axis, where = (
-            ", ".join(f"{value:.4g}" for value in values)
-            for values in (np.rad2deg(frames[0].turn.as_rotvec()), frames[0].shift)
-        )
-        return f"{name}: aligned by {mode}: turned by ({axis}) degrees about x, y, z and shifted by ({where}) m"
-    turns = _span([float(np.rad2deg(frame.turn.magnitude())) for frame in frames])
-    shifts = _span([float(np.linalg.norm(frame.shift)) for frame in frames])
+        x, y, z = np.rad2deg(frames[0].turn.as_rotvec())
+        turned = f"turned by ({x:.4g}, {y:.4g}, {z:.4g}) degrees about x, y, z"
+        x, y, z = frames[0].shift
+        return f"{name}: aligned by {mode}: {turned} and shifted by ({x:.4g}, {y:.4g}, {z:.4g}) m"
+    turns = _span(np.rad2deg([frame.turn.magnitude() for frame in frames]))
+    shifts = _span(np.linalg.norm([frame.shift for frame in frames], axis=1))
     each = f"each of {len(frames)} runs by itself"
     return f"{name}: aligned by {mode}, {each}: turned by {turns} degrees and shifted by {shifts} m"
 
 
-def _span(values: Sequence[float]) -> str:
-    return f"{min(values):.3g} to {max(values):.3g} (median {np.median(values):.3g})"
+def _span(values: Array) -> str:
+    return f"{values.min():.3g} to {values.max():.3g} (median {np.median(values):.3g})"
 
 
 def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
@@ -191,17 +235,9 @@ def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
         No estimate is finite and has a truth and a covariance.
     """
     row, truth = _first(name, p)
-    estimate = p.estimate[row]
-    if p.manifold == "planar":
-        return _onto(
-            Rotation.from_euler("z", truth[2] - estimate[2]), np.append(estimate[:2], 0), np.append(truth[:2], 0)
-        )
-    turn = Rotation.from_quat(truth[3:]) * Rotation.from_quat(estimate[3:]).inv()
-    return _onto(turn, estimate[:3], truth[:3])
-
-
-def _onto(turn: Rotation, own: Array, true: Array) -> WorldTransform:
-    return WorldTransform(turn, true - turn.apply(own))
+    own, true = p.estimate[[row]], truth[None]
+    turn = (rotations(true, p.manifold) * rotations(own, p.manifold).inv())[0]
+    return WorldTransform(turn, (positions(true, p.manifold) - turn.apply(positions(own, p.manifold)))[0])
 
 
 def _first(name: str, p: Poses) -> tuple[int, Array]:
@@ -228,14 +264,15 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     the run, and (k,) how many times as large its covariances are in the mean over components
     """
     row, _ = _first(name, p)
-    sound, P, index = sound_of(p, judged), p.covariance.copy(), list(judged)
-    block: Any = np.ix_(sound.rows, np.array(index), np.array(index))
-    seen = _seen(name, p, row, sound)[:, index][:, :, index]
-    size = np.trace(np.linalg.solve(P[block], seen), axis1=1, axis2=2) / len(index)
+    sound = sound_of(p, judged)
+    seen = submatrices(_seen(name, p, row, sound), judged)
+    own = submatrices(p.covariance[sound.rows], judged)
+    size = np.trace(np.linalg.solve(own, seen), axis1=1, axis2=2) / len(judged)
     t = np.sqrt(np.maximum(size, 0.0))
     wide = t[:, None, None]
-    bound = (1.0 + wide) * P[block] + seen + seen / np.where(wide > 0, wide, 1.0)
-    P[block] = 0.5 * (bound + np.swapaxes(bound, 1, 2))
+    bound = (1.0 + wide) * own + seen + seen / np.where(wide > 0, wide, 1.0)
+    P, index = p.covariance.copy(), np.array(judged)
+    P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + np.swapaxes(bound, 1, 2))
     P[row] = 0.0
     return replace(p, covariance=P), np.square(1.0 + t[sound.rows != row])
 
@@ -243,7 +280,9 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
 def _seen(name: str, p: Poses, row: int, sound: Sound) -> Array:
     """Covariance (k, n, n) of the error that the pose in ``row`` causes in each sound row."""
     n = p.covariance.shape[-1]
-    free = np.eye(6) if n == 6 else np.eye(6)[[0, 1, 5]]
+    free = np.eye(6)
+    if n == 3:
+        free = free[[0, 1, 5]]
     plain = replace(p, covariance=np.tile(np.eye(n), (len(p.t), 1, 1)))
     first = Sound(np.array([row]), _first(name, p)[1][None], np.zeros((1, n)))
     J = tangent(plain, sound, free, range(n)) @ np.linalg.inv(tangent(plain, first, free, range(n))[0])

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.truth_matching import Manifold, Poses
+from consistency.referee.readers.truth_matching import Manifold, Poses, submatrices
 from consistency.referee.types import Array
 
 
@@ -51,6 +51,7 @@ class WorldTransform:
         return out
 
 
+PLANE = (0, 1, 5)  # components of a pose in the plane, of one in space
 IDENTITY = WorldTransform(Rotation.identity(), np.zeros(3))
 
 
@@ -65,18 +66,19 @@ def carried(convention: str, frame: WorldTransform, n: int) -> Array:
 
     An error in the body frame is unchanged; that of ``right`` maps by the adjoint (Sola et al. 2018, eq. 159 and 175).
     """
-    T, d = np.eye(n), n // 2 if n == 6 else 2
     if convention == "left":
-        return T
+        return np.eye(n)
     turn = frame.turn.as_matrix()
-    T[:d, :d] = turn[:d, :d]
-    if n == 6 and convention in ("so3", "right"):
+    T = np.eye(6)
+    T[:3, :3] = turn
+    if convention in ("so3", "right"):
         T[3:, 3:] = turn
     if convention == "right":
-        x, y, z = frame.shift
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        T[:d, d:] = cross @ turn if n == 6 else cross[:2, 2:]
-    return T
+        T[:3, 3:] = skew(frame.shift) @ turn
+    if n == 6:
+        return T
+    part = PLANE[:n]
+    return T[np.ix_(part, part)]
 
 
 def fitted_frame(runs: Sequence[Poses]) -> WorldTransform | None:
@@ -99,25 +101,29 @@ def turned_frame(runs: Sequence[Poses]) -> WorldTransform:
     for p in runs:
         own, true = matched(p)
         if len(own):
-            turns.append((Rotation.from_quat(true[:, 3:]) * Rotation.from_quat(own[:, 3:]).inv()).mean())
-    turn = Rotation.concatenate(turns).mean() if turns else IDENTITY.turn
+            turns.append((rotations(true, p.manifold) * rotations(own, p.manifold).inv()).mean())
+    if not turns:
+        return IDENTITY
+    turn = Rotation.concatenate(turns).mean()
     own, true = _positions(runs)
-    return WorldTransform(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)) if len(own) else np.zeros(3))
+    return WorldTransform(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)))
 
 
 def spread(runs: Sequence[Poses]) -> float:
     """Root mean square distance of the true positions from their mean, m; 0 where there are none."""
     true = _positions(runs)[1]
-    return float(np.sqrt(np.square(true - true.mean(axis=0)).sum(axis=1).mean())) if len(true) else 0.0
+    if not len(true):
+        return 0.0
+    return float(np.sqrt(np.square(true - true.mean(axis=0)).sum(axis=1).mean()))
 
 
 def _positions(runs: Sequence[Poses]) -> tuple[Array, Array]:
     """Estimated and true positions (N, 3) of all runs, z = 0 in the plane."""
     own, true = [np.empty((0, 3))], [np.empty((0, 3))]
     for p in runs:
-        d = 2 if p.manifold == "planar" else 3
-        for side, values in zip((own, true), matched(p), strict=True):
-            side.append(np.pad(values[:, :d], ((0, 0), (0, 3 - d))))
+        estimate, truth = matched(p)
+        own.append(positions(estimate, p.manifold))
+        true.append(positions(truth, p.manifold))
     return np.concatenate(own), np.concatenate(true)
 
 
@@ -146,9 +152,9 @@ def fitted_body(runs: Sequence[Poses]) -> BodyTransform | None:
     for p in runs:
         own, true = matched(p)
         if len(own):
-            R, true_R = (_turns(values, p) for values in (own, true))
-            turns.append((R.inv() * true_R).mean())
-            arms.append(R.inv().apply(_places(true, p) - _places(own, p)))
+            back = rotations(own, p.manifold).inv()
+            turns.append((back * rotations(true, p.manifold)).mean())
+            arms.append(back.apply(positions(true, p.manifold) - positions(own, p.manifold)))
     if not turns:
         return None
     return BodyTransform(Rotation.concatenate(turns).mean(), np.concatenate(arms).mean(axis=0))
@@ -161,15 +167,15 @@ def on_body(p: Poses, body: BodyTransform) -> Poses:
     if not finite.any():
         return p
     own = p.estimate[finite]
-    R = _turns(own, p)
+    R = rotations(own, p.manifold)
     shift = R.apply(body.arm)
-    if p.manifold == "planar":
-        estimate[finite] = np.column_stack([own[:, :2] + shift[:, :2], wrap(own[:, 2] + body.turn.as_rotvec()[2])])
-    else:
-        estimate[finite] = np.column_stack([own[:, :3] + shift, (R * body.turn).as_quat()])
     J = _jacobian(p.convention, R.as_matrix(), body)
     if p.manifold == "planar":
-        J = J[:, [0, 1, 5]][:, :, [0, 1, 5]]
+        heading = wrap(own[:, 2] + body.turn.as_rotvec()[2])
+        estimate[finite] = np.column_stack([own[:, :2] + shift[:, :2], heading])
+        J = submatrices(J, PLANE)
+    else:
+        estimate[finite] = np.column_stack([own[:, :3] + shift, (R * body.turn).as_quat()])
     covariance[finite] = J @ p.covariance[finite] @ np.swapaxes(J, 1, 2)
     return replace(p, estimate=estimate, covariance=covariance)
 
@@ -183,9 +189,12 @@ def _jacobian(convention: str, R: Array, body: BodyTransform) -> Array:
     J = np.broadcast_to(np.eye(6), (len(R), 6, 6)).copy()
     back, arm = body.turn.inv().as_matrix(), np.broadcast_to(body.arm, (len(R), 3))
     if convention == "left":
-        J[:, :3, :3], J[:, :3, 3:], J[:, 3:, 3:] = back, -back @ skew(arm), back
+        J[:, :3, :3] = back
+        J[:, :3, 3:] = -back @ skew(arm)
+        J[:, 3:, 3:] = back
     elif convention == "so3-body":
-        J[:, :3, 3:], J[:, 3:, 3:] = -R @ skew(arm), back
+        J[:, :3, 3:] = -R @ skew(arm)
+        J[:, 3:, 3:] = back
     elif convention != "right":
         J[:, :3, 3:] = -skew((R @ arm[..., None])[..., 0])
     return np.asarray(J)
@@ -196,11 +205,15 @@ def skew(v: Array) -> Array:
     return np.asarray(np.cross(np.eye(3), v[..., None, :]))
 
 
-def _turns(values: Array, p: Poses) -> Rotation:
-    if p.manifold == "planar":
+def rotations(values: Array, manifold: Manifold) -> Rotation:
+    """Orientations of poses (k, m)."""
+    if manifold == "planar":
         return Rotation.from_rotvec(values[:, 2:3] * [0.0, 0.0, 1.0])
     return Rotation.from_quat(values[:, 3:])
 
 
-def _places(values: Array, p: Poses) -> Array:
-    return np.pad(values[:, :2], ((0, 0), (0, 1))) if p.manifold == "planar" else values[:, :3]
+def positions(values: Array, manifold: Manifold) -> Array:
+    """Positions (k, 3) of poses (k, m), z = 0 in the plane."""
+    if manifold == "planar":
+        return np.pad(values[:, :2], ((0, 0), (0, 1)))
+    return values[:, :3]

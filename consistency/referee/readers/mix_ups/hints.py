@@ -9,29 +9,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.readers.mix_ups.reading_fit import ReadingFit, fit_of
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.mix_ups.known import Guess, guesses_of
+from consistency.referee.readers.mix_ups.known_worlds import worlds_of
+from consistency.referee.readers.mix_ups.reading_fit import LEAST_GAIN, ReadingFit, fit_of, is_same, thinned
+from consistency.referee.readers.truth_matching import Change, Poses, submatrices
 from consistency.referee.types import Array
 
-if TYPE_CHECKING:
-    from consistency.referee.readers.mix_ups.known import Guess
-
-MOST = 1000  # estimates that are looked at, of all runs together
-MOST_NUMBERS = 4_000_000  # of their covariances
-MOST_RUNS, LEAST_EACH = 200, 20  # that are looked at, evenly over all, and estimates of each
 WRONG = 1.0  # decades that the NEES is off, from which on causes are named that look like a bias or a drift
 APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
 SAID = 0.2  # decades from which on the scale that remains is stated
-LEAST_GAIN = float(np.log(1e3))  # log likelihood that a cause gains over simple faults, and as much as it has rivals
 LIKE = 1.0  # log likelihood by which two causes may differ that are equally likely
-ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
+NEARLY_ALL = 0.99  # of the estimates that can be whitened as declared
 NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
 
-Change = Callable[[Poses], Poses]
 Pairs = Sequence[tuple[Array, Array]]
 ErrorsWithout = Callable[[Change], Pairs]
 
@@ -72,20 +65,20 @@ def hints(
     part = list(range(len(axes)) if judged is None else judged)
     some, worlds = runs, errors_without is None
     if errors_without is None:
-        some = _thinned(runs, shift)
+        some = thinned(runs, shift)
         errors_without = partial(_errors_without, some)
-        if _same(some):
+        if is_same(some):
             return [
                 f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies "
                 "of one; give the true poses as the truth"
             ]
     fit_without = partial(_fit_without, errors_without, part, len(axes))
     declared = fit_without(lambda p: p)
-    if declared is not None and declared.size * declared.fault() < LEAST_GAIN:
+    if declared is not None and not declared.is_off():
         return []
-    from consistency.referee.readers.mix_ups.known import guesses_of  # few files need them
-
-    guesses = guesses_of(some, axes, part, worlds)
+    guesses = guesses_of(some, axes, part)
+    if worlds:
+        guesses += worlds_of(some)
     fits = [(guess, fit_without(guess.change)) for guess in guesses]
     if declared is None:
         shown = [guess.text for guess, fit in fits if fit is not None and fit.is_shown()]
@@ -98,30 +91,11 @@ def hints(
     return [f"{name}: the NEES{of_axis} is {_times(declared.decades[worst])}, but about right if {cause}"]
 
 
-def _thinned(runs: Sequence[Poses], shift: float) -> list[Poses]:
-    """Some estimates of some runs, without those that are not finite."""
-    most = max(MOST_NUMBERS // runs[0].covariance.shape[-1] ** 2, 1)
-    runs = runs[:: -(-len(runs) // min(MOST_RUNS, most))]
-    each = max(min(MOST, most) // len(runs), min(LEAST_EACH, most // len(runs)))
-    return [p.later(shift).some(each).sound() for p in runs]
-
-
-def _same(runs: Sequence[Poses]) -> bool:
-    """Whether the errors are rounding in nearly all estimates, in values and beside their standard deviations."""
-    same = total = 0
-    for p in runs:
-        error, known = np.abs(p.errors()), p.known().rows
-        with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))[known]
-            rounding = ROUNDING * max(1.0, float(np.abs(p.truth).max(initial=0.0)))
-            same += int(((error[known] <= rounding) & (error[known] <= NEGLIGIBLE * sigma)).all(axis=1).sum())
-        total += len(known)
-    return total >= LEAST and same >= NEARLY_ALL * total
-
-
 def _errors_without(runs: Sequence[Poses], change: Change) -> Pairs:
-    changed = map(change, runs)
-    return [(p.errors(), p.covariance) for p in changed]
+    pairs = []
+    for p in map(change, runs):
+        pairs.append((p.errors(), p.covariance))
+    return pairs
 
 
 def _fit_without(errors_without: ErrorsWithout, part: list[int], n: int, change: Change) -> ReadingFit | None:
@@ -129,12 +103,13 @@ def _fit_without(errors_without: ErrorsWithout, part: list[int], n: int, change:
     pairs = errors_without(change)
     if len(part) == n or not all(error.shape[1] == n for error, _ in pairs):
         return fit_of(pairs)
-    return fit_of([(error[:, part], P[:, part][:, :, part]) for error, P in pairs])
+    return fit_of([(error[:, part], submatrices(P, part)) for error, P in pairs])
 
 
 def _cause(fits: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFit) -> str | None:
     """The likeliest cause in words, if any is confirmed."""
-    gross = bool(abs(declared.decades[0]) > WRONG or (np.abs(declared.decades) > APART).any())
+    off = np.abs(declared.decades)
+    gross = bool(off[0] > WRONG or (off > APART).any())
     candidates = list(_candidates(fits, declared, gross))
     named = _likeliest(candidates, declared, gross, LEAST_GAIN + np.log(max(len(fits), 1)))
     if named is not None:
@@ -167,9 +142,15 @@ def _candidates(
 
 def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Candidate | None:
     """The likeliest candidate that is right but for a common factor; of like ones the first, and the last at need."""
-    right = [one for one in candidates if one.size * one.gain >= bar and one.fit.right(gross)]
-    right = [one for one in right if _status(one.fit) <= _status(declared)]
-    right = [one for one in right if not one.guess.last] or right
+    right, at_need = [], []
+    for one in candidates:
+        if one.size * one.gain < bar or not one.fit.right(gross) or _status(one.fit) > _status(declared):
+            continue
+        if one.guess.last:
+            at_need.append(one)
+        else:
+            right.append(one)
+    right = right or at_need
     most = max((one.gain for one in right), default=0.0)
     return next((one for one in right if one.size * (most - one.gain) <= LIKE), None)
 
@@ -186,8 +167,9 @@ def _status(fit: ReadingFit) -> int:
 
 
 def _times(off: float) -> str:
-    size = "large" if off > 0 else "small"
-    return f"{10.0 ** abs(off):.2g} times too {size}"
+    if off > 0:
+        return f"{10.0**off:.2g} times too large"
+    return f"{10.0**-off:.2g} times too small"
 
 
 def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""The mix-ups in files that are looked for: a unit, order, side, convention, world or body of one file or of both."""
+"""The mix-ups in files that are looked for: a unit, order, side or convention of one file or of both."""
 
 from __future__ import annotations
 
@@ -14,15 +14,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
 from consistency.referee.geometry.groups import inverse, matrices, vectors
-from consistency.referee.readers.alignment.world_frames import (
-    WorldTransform,
-    fitted_body,
-    fitted_frame,
-    moved,
-    on_body,
-    spread,
-)
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import Change, Poses, submatrices
 from consistency.referee.types import Array
 
 ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
@@ -30,12 +22,8 @@ DEGREE = np.pi / 180.0
 MILLI = 1e-3
 SINGULAR = 1e-3  # smallest eigenvalue of a correlation from which on a direction is named
 UNIT = 1e-3  # lengths of quaternions differ by less from 1
-ARM = 1e-3  # of the size of the path: shorter lever arms are not named
-TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
 
 OF = {"both files": ("estimate", "truth"), "the estimates": ("estimate",), "the truth": ("truth",)}  # fields of poses
-
-Change = Callable[[Poses], Poses]
 
 
 @dataclass(frozen=True)
@@ -50,54 +38,54 @@ class Guess:
     volume: float = 0.0  # log of the factor of volumes of the truth, whose density it divides
 
 
-def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int], worlds: bool = True) -> list[Guess]:
-    """Possible mix-ups, the likelier first; ``part`` is judged. Motions have no ``worlds``."""
+def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> list[Guess]:
+    """Possible mix-ups of covariances, units and orders, the likelier first; ``part`` is judged."""
     kind, convention = runs[0].manifold, runs[0].convention
     n = runs[0].covariance.shape[-1]
     if kind == "spatial" and n > 6:
         return list(_blocks(n))
-    scales = [
-        Guess("its diagonal holds standard deviations; square them", _covariance(_squared)),
-        Guess("it is an information matrix; invert it", _covariance(partial(_inverted, part=part))),
-        Guess(
-            "it holds the upper root U of an information matrix U'U; write the inverse of U'U",
-            _covariance(lambda P: _inverted(_of_root(P), part)),
-        ),
-        Guess("it holds the lower root L of the covariance; write L L'", _covariance(_of_root)),
-        *_singular(runs, axes, part),
-    ]
+    scales = [*_roots(part), *_singular(runs, axes, part)]
     if kind == "vector":
         own = [*scales, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
         return [*own, *_quaternion_states(runs, axes)]
+    of_covariance = *scales, *_permuted(axes, 3)
     if kind == "spatial":
-        own = [*_orders(convention), *_quaternions(), *scales, *_permuted(axes, 3), *_units(3, slice(3, 6))]
         words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
         half = Guess(words, lambda p: _weighed(p, slice(3, 6), 2.0), exact=True)
-        own += [half, *_positions(3)]
+        own = [*_orders(convention), *_quaternions(), *of_covariance, *_units(3, slice(3, 6)), half, *_positions(3)]
     else:
-        own = [*_sides(convention), *_headings(), *scales, *_permuted(axes, 3), *_units(2, slice(2, 3)), *_positions(2)]
-    own.append(Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False))
-    if not worlds:
-        return own
-    own += _ned(convention) if kind == "spatial" else [_mirrored(convention)]
-    return [*own, *_frames(runs), *_bodies(runs)]
+        sides = [kind for kind in PLANAR if kind not in (convention, "vector")]
+        own = [*map(_of_error, sides), *_headings(), *of_covariance, *_units(2, slice(2, 3)), *_positions(2)]
+    return [*own, Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False)]
+
+
+def _roots(part: list[int]) -> Iterator[Guess]:
+    """Standard deviations, an inverse or a root in the place of the covariance."""
+    yield Guess("its diagonal holds standard deviations; square them", _covariance(_squared))
+    yield Guess("it is an information matrix; invert it", _covariance(partial(_inverted, part=part)))
+    words = "it holds the upper root U of an information matrix U'U; write the inverse of U'U"
+    yield Guess(words, _covariance(lambda P: _inverted(_of_root(P), part)))
+    yield Guess("it holds the lower root L of the covariance; write L L'", _covariance(_of_root))
 
 
 def _blocks(n: int) -> Iterator[Guess]:
     """Blocks of three of the covariance of an inertial state in another order; biases at its end, in theirs."""
-    names = ("p", "R", "v", "bg", "ba")[: n // 3]
-    for order in itertools.permutations(range(n // 3)):
-        if list(order) == sorted(order) or {*order[:3]} != {0, 1, 2}:
-            continue
-        text = ",".join(names[order.index(i)] for i in range(n // 3))
-        whole = [3 * block + i for block in order for i in range(3)]
-        yield Guess(f"the blocks of its covariance are in the order {text}; add --covariance-order {text}",
-                    _reordered(None, whole))  # fmt: skip
+    names = np.array(["p", "R", "v", "bg", "ba"])
+    behind = list(range(3, n // 3))
+    for pose in itertools.permutations(range(3)):
+        for rest in itertools.permutations(behind):
+            order = np.array([*pose, *rest])
+            if (np.diff(order) > 0).all():
+                continue
+            text = ",".join(names[np.argsort(order)])
+            whole = (3 * order[:, None] + np.arange(3)).ravel().tolist()
+            words = f"the blocks of its covariance are in the order {text}; add --covariance-order {text}"
+            yield Guess(words, _reordered(None, whole))
 
 
 def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> Iterator[Guess]:
     """Cross terms that make the covariance nearly singular, while each component by itself is right."""
-    P = np.concatenate([p.covariance for p in runs])[:, part][:, :, part]
+    P = submatrices(np.concatenate([p.covariance for p in runs]), part)
     P = P[np.isfinite(P).all(axis=(1, 2))]
     if len(part) < 2 or not len(P):
         return
@@ -110,24 +98,29 @@ def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> It
     if values[0] > SINGULAR:
         return
     v = vectors[:, 0] / vectors[np.argmax(np.abs(vectors[:, 0])), 0]
-    direction = " ".join(f"{c:+.2f} {axes[i]}" for c, i in zip(v, part, strict=True) if abs(c) > 0.1)
-    words = f"its cross terms are left out: it is nearly singular in the direction {direction} (in standard deviations)"
-    yield Guess(
-        f"{words}; look for lost digits or a correlation of 1",
-        _covariance(lambda P: _diagonal(P) * np.eye(P.shape[-1])),
+    direction = " ".join(f"{v[k]:+.2f} {axes[part[k]]}" for k in np.flatnonzero(np.abs(v) > 0.1))
+    words = (
+        f"its cross terms are left out: it is nearly singular in the direction {direction} (in standard deviations); "
+        "look for lost digits or a correlation of 1"
     )
+    yield Guess(words, _covariance(lambda P: _diagonal(P) * np.eye(P.shape[-1])))
 
 
 def _diagonal(P: Array) -> Array:
     return np.diagonal(P, axis1=1, axis2=2)[:, :, None]
 
 
-def _inverse(p: Poses) -> Poses:
+def of_finite(p: Poses, function: Callable[[Array], Array]) -> Poses:
+    """The run with a function of those estimates that are finite."""
     finite = np.isfinite(p.estimate).all(axis=1)
     estimate = p.estimate.copy()
     if finite.any():
-        estimate[finite] = vectors(inverse(matrices(p.estimate[finite])))
+        estimate[finite] = function(estimate[finite])
     return replace(p, estimate=estimate)
+
+
+def _inverse(p: Poses) -> Poses:
+    return of_finite(p, lambda own: vectors(inverse(matrices(own))))
 
 
 def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
@@ -139,28 +132,32 @@ def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[G
         if not len(values) or (np.abs(np.linalg.norm(values, axis=1) - 1.0) > UNIT).any():
             continue
         for w in (3, 0):
-            order = "w x y z" if w == 0 else "x y z w"
-            words = f"{', '.join(axes[four])} are a unit quaternion ({order}) with three degrees of freedom"
-            yield Guess(f"{words}; give poses, or a rotation vector with its 3 x 3 covariance",
-                        partial(_rotation_vectors, first=first, w=w), exact=True)  # fmt: skip
+            order = {0: "w x y z", 3: "x y z w"}[w]
+            words = (
+                f"{', '.join(axes[four])} are a unit quaternion ({order}) with three degrees of freedom; give poses, "
+                "or a rotation vector with its 3 x 3 covariance"
+            )
+            yield Guess(words, partial(_rotation_vectors, first=first, w=w), exact=True)
 
 
 def _rotation_vectors(p: Poses, first: int, w: int) -> Poses:
     """The state with a rotation vector, of the truth beside the estimate, in place of the quaternion."""
-    order = [first + (i + 1 - (w == 3)) % 4 for i in range(4)]
-    rest = [i for i in range(p.estimate.shape[1]) if not first <= i < first + 4]
-    known = p.known()
-    turn = Rotation.from_quat(p.estimate[known.rows][:, order])
-    small = (turn.inv() * Rotation.from_quat(known.truth[:, order])).as_rotvec()
+    order = np.arange(first, first + 4)
+    rest = np.delete(np.arange(p.estimate.shape[1]), order)
+    if w == 0:
+        order = np.roll(order, -1)
+    p = p.matched()
+    turn = Rotation.from_quat(p.estimate[:, order])
+    small = (turn.inv() * Rotation.from_quat(p.truth[:, order])).as_rotvec()
     x, y, z, s = turn.as_quat().T
-    G = 2.0 * np.stack([np.stack(row, -1) for row in ((s, z, -y, -x), (-z, s, x, -y), (y, -x, s, -z))], axis=1)
+    G = 2.0 * np.array([[s, z, -y, -x], [-z, s, x, -y], [y, -x, s, -z]])
     J = np.zeros((len(turn), len(rest) + 3, p.estimate.shape[1]))
     J[:, range(len(rest)), rest] = 1.0
-    J[:, len(rest) :, order] = G
-    P = J @ p.covariance[known.rows] @ np.swapaxes(J, 1, 2)
-    truth = np.hstack([known.truth[:, rest], small])
-    estimate = np.hstack([p.estimate[known.rows][:, rest], np.zeros_like(small)])
-    return replace(p.of_rows(known.rows), estimate=estimate, covariance=P, true_t=p.t[known.rows], truth=truth)
+    J[:, len(rest) :, order] = np.moveaxis(G, -1, 0)
+    P = J @ p.covariance @ np.swapaxes(J, 1, 2)
+    truth = np.hstack([p.truth[:, rest], small])
+    estimate = np.hstack([p.estimate[:, rest], np.zeros_like(small)])
+    return replace(p, estimate=estimate, covariance=P, truth=truth)
 
 
 def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator[Guess]:
@@ -205,67 +202,25 @@ def _reordered(
         if estimate is not None:
             p = replace(p, estimate=p.estimate[:, estimate])
         if covariance is not None:
-            p = replace(p, covariance=p.covariance[:, covariance][:, :, covariance])
+            p = replace(p, covariance=submatrices(p.covariance, covariance))
         return replace(p, convention=convention or p.convention)
 
     return change
 
 
-def _ned(convention: str) -> Iterator[Guess]:
-    """A world whose z points down, with a body whose z does so too or not."""
-    north = WorldTransform(Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))
-    down = np.diag([1.0, -1.0, -1.0])
-    turned = {"so3-body": slice(3, 6), "left": slice(0, 6)}.get(convention, slice(0, 0))
-    T = np.eye(6)
-    T[turned, turned] = np.kron(np.eye(2), down)[turned, turned]
-
-    def with_body(p: Poses) -> Poses:
-        p = moved(p, north)
-        finite = np.isfinite(p.estimate).all(axis=1)
-        if finite.any():
-            p.estimate[finite, 3:] = (Rotation.from_quat(p.estimate[finite, 3:]) * Rotation.from_matrix(down)).as_quat()
-        return replace(p, covariance=T @ p.covariance @ T)
-
-    worlds = "one file is in a world of x north, y east, z down, the other in one of x east, y north, z up"
-    words = f"{worlds}; add --world ned if that is the estimates, --truth-world ned if it is the truth"
-    yield Guess(words, lambda p: moved(p, north), fine=False)
-    words = (
-        f"{worlds}, and their bodies have z down and z up; add --world ned --body-axes frd if that is the estimates, "
-        "--truth-world ned --truth-body-axes frd if it is the truth"
-    )
-    yield Guess(words, with_body, fine=False)
-
-
-def _mirrored(convention: str) -> Guess:
-    A = np.diag([1.0, -1.0, -1.0])
-    if convention != "left":
-        A[:2, :2] = [[0.0, 1.0], [1.0, 0.0]]
-
-    def change(p: Poses) -> Poses:
-        x, y, heading = p.estimate.T
-        own = np.column_stack([y, x, wrap(0.5 * np.pi - heading)])
-        return replace(p, estimate=own, covariance=A @ p.covariance @ A.T)
-
-    words = "one file is in a plane of x north, y east, the other in one of x east, y north"
-    remedy = "add --world ned if that is the estimates, --truth-world ned if it is the truth"
-    return Guess(f"{words}; {remedy}", change, fine=False)
-
-
 def _orders(convention: str) -> Iterator[Guess]:
-    whole = [0, 1, 2, 3, 4, 5]
+    swapped = [3, 4, 5, 0, 1, 2]
     turned = "the covariance has its two blocks in the other order (--covariance-order)"
-    yield Guess(turned, _reordered(None, [*whole[3:], *whole[:3]]))
+    yield Guess(turned, _reordered(None, swapped))
     for other in SPATIAL:
         if other != convention:
-            words = f"the error is '{other}' (--error {other})"
-            yield Guess(words, _reordered(None, whole, other))
-            yield Guess(f"{words} and {turned}", _reordered(None, [*whole[3:], *whole[:3]], other))
+            guess = _of_error(other)
+            yield guess
+            yield Guess(f"{guess.text} and {turned}", _reordered(None, swapped, other))
 
 
-def _sides(convention: str) -> Iterator[Guess]:
-    for other in PLANAR:
-        if other not in (convention, "vector"):
-            yield Guess(f"the error is '{other}' (--error {other})", _reordered(None, [0, 1, 2], other))
+def _of_error(convention: str) -> Guess:
+    return Guess(f"the error is '{convention}' (--error {convention})", _reordered(convention=convention))
 
 
 def _quaternions() -> Iterator[Guess]:
@@ -274,10 +229,8 @@ def _quaternions() -> Iterator[Guess]:
         words = f"the quaternions of {of} are w x y z; write them x y z w"
         yield Guess(words, _changed(names, lambda values: values[:, first]))
     back = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
-    yield Guess(
-        "the quaternions of the estimates turn world into body; invert them",
-        _changed(["estimate"], lambda values: values * back),
-    )
+    words = "the quaternions of the estimates turn world into body; invert them"
+    yield Guess(words, _changed(["estimate"], lambda values: values * back))
 
 
 def _changed(names: Sequence[str], function: Callable[[Array], Any]) -> Change:
@@ -316,20 +269,16 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
         out[:, part] *= MILLI
         return out
 
-    yield Guess(
-        "its angles are in degrees (deg^2 for rad^2); multiply them by pi / 180", lambda p: _weighed(p, angles, DEGREE)
-    )
-    yield Guess(
-        "its positions are in millimetres (mm^2 for m^2); divide them by 1000", lambda p: _weighed(p, part, MILLI)
-    )
-    yield Guess(
-        "the positions of the estimates and their covariance are in millimetres; divide them by 1000",
-        lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),
-    )
-    words = "the positions of {} are in millimetres; divide them by 1000"
-    yield Guess(words.format("the estimates"), _changed(["estimate"], shrunk))
+    words = "its angles are in degrees (deg^2 for rad^2); multiply them by pi / 180"
+    yield Guess(words, lambda p: _weighed(p, angles, DEGREE))
+    words = "its positions are in millimetres (mm^2 for m^2); divide them by 1000"
+    yield Guess(words, lambda p: _weighed(p, part, MILLI))
+    remedy = "in millimetres; divide them by 1000"
+    words = f"the positions of the estimates and their covariance are {remedy}"
+    yield Guess(words, lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI))
+    yield Guess(f"the positions of the estimates are {remedy}", _changed(["estimate"], shrunk))
     volume = width * float(np.log(MILLI))
-    yield Guess(words.format("the truth"), _changed(["truth"], shrunk), fine=False, volume=volume)
+    yield Guess(f"the positions of the truth are {remedy}", _changed(["truth"], shrunk), fine=False, volume=volume)
 
 
 def _covariance(function: Callable[[Array], Array]) -> Change:
@@ -354,56 +303,8 @@ def _of_root(P: Array) -> Array:
 
 def _inverted(P: Array, part: list[int]) -> Array:
     """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
-    out, block = np.full_like(P, np.nan), P[:, part][:, :, part]
+    out, block = np.full_like(P, np.nan), submatrices(P, part)
     finite = np.flatnonzero(np.isfinite(block).all(axis=(1, 2)))
     regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
-    out[np.ix_(regular, np.array(part), np.array(part))] = np.linalg.inv(block[regular])
+    out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])
     return out
-
-
-# --- frames -----------------------------------------------------------------------------------------
-
-
-def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
-    """The worlds of the files differ by a turn about z and a shift, the same in all runs, or another in each."""
-    frame = fitted_frame(runs)
-    if frame is None or not (size := spread(runs)) > 0:
-        return
-    angle = np.rad2deg(frame.heading)
-    if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
-        turn = ""
-        if abs(angle) > TURN:
-            turn = f"turned by {angle:.1f} degrees about z and "
-        words = (
-            f"the world of the estimates is {turn}shifted by {_place(frame.shift, runs)} m to meet that of the truth; "
-            f"write both in one world, or add --align posyaw{'-all' * (len(runs) > 1)}"
-        )
-        yield Guess(words, lambda p: moved(p, frame), fine=False)
-    if len(runs) > 1:
-        words = "each run is turned about z and shifted by itself to meet the truth; add --align posyaw"
-        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame), last=True, fine=False)
-
-
-def _bodies(runs: Sequence[Poses]) -> Iterator[Guess]:
-    """The bodies of the files differ by a constant turn or lever arm."""
-    body = fitted_body(runs)
-    if body is None:
-        return
-    angle, size = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0, spread(runs)
-    parts = []
-    if np.linalg.norm(angle) >= TURN:
-        turned = f"({angle[0]:.1f}, {angle[1]:.1f}, {angle[2]:.1f}) degrees about x, y, z"
-        if runs[0].manifold == "planar":
-            turned = f"{angle[2]:.1f} degrees about z"
-        parts.append(f"turned by {turned}")
-    if np.linalg.norm(body.arm) >= ARM * size:
-        parts.append(f"shifted by a lever arm of {_place(body.arm, runs)} m")
-    if parts:
-        words = f"the body of the truth is {' and '.join(parts)} against that of the estimates; write poses of one body"
-        yield Guess(words, lambda p: on_body(p, body), fine=False)
-
-
-def _place(values: Array, runs: Sequence[Poses]) -> str:
-    """Coordinates in space, or x and y."""
-    d = 2 if runs[0].manifold == "planar" else 3
-    return f"({', '.join(f'{value:.3g}' for value in values[:d])})"

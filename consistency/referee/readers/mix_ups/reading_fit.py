@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,8 +11,15 @@ from functools import cached_property
 import numpy as np
 
 from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.readers.truth_matching import Poses, submatrices
 from consistency.referee.types import Array, Indices
 
+MOST = 1000  # estimates that are looked at, of all runs together
+MOST_NUMBERS = 4_000_000  # of their covariances
+MOST_RUNS, LEAST_EACH = 200, 20  # that are looked at, evenly over all, and estimates of each
+LEAST_GAIN = float(np.log(1e3))  # log likelihood that a cause gains over simple faults, and as much as it has rivals
+ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
+LEAST = 3  # estimates that show two files to be the same
 RIGHT = 0.4  # decades that components may differ by with the mix-up undone, or more where chance allows it
 SCALE = 1.0  # decades that all may be off by with the mix-up undone: a filter's own fault beside it
 ENOUGH = 100.0  # independent estimates that show a scale to be the one that a cause makes
@@ -43,6 +51,16 @@ class ReadingFit:
         return np.concatenate(self.whitened)
 
     @cached_property
+    def nees(self) -> Array:
+        """(K,)."""
+        return np.asarray(np.square(self.w).sum(axis=1))
+
+    @property
+    def scale(self) -> float:
+        """Mean NEES over its degrees of freedom."""
+        return float(self.nees.mean()) / self.n
+
+    @cached_property
     def own(self) -> Array:
         """Errors over their standard deviations, (K, n)."""
         return np.asarray(self.error / self.sigma)
@@ -50,16 +68,16 @@ class ReadingFit:
     @cached_property
     def decades(self) -> Array:
         """log10 of the median NEES over that of chi-square, of all n components and of each alone, (1 + n,)."""
-        nees = np.median(np.column_stack([np.square(self.w).sum(axis=1), np.square(self.own)]), axis=0)
+        medians = np.median(np.column_stack([self.nees, np.square(self.own)]), axis=0)
         right = distributions.chi2.ppf(0.5, np.append(self.n, np.ones(self.n)))
-        return np.asarray(np.log10(np.maximum(nees, 1e-300) / right))
+        return np.asarray(np.log10(np.maximum(medians, 1e-300) / right))
 
     @cached_property
     def likelihood(self) -> float:
         """Mean log likelihood of an estimate, but for a constant."""
         diagonal = np.diagonal(self.factor, axis1=1, axis2=2)
         log_det = 2.0 * (np.log(diagonal).sum(axis=1) + np.log(self.sigma).sum(axis=1))
-        return -0.5 * float(np.square(self.w).sum(axis=1).mean() + log_det.mean())
+        return -0.5 * float(self.nees.mean() + log_det.mean())
 
     @cached_property
     def size(self) -> float:
@@ -72,8 +90,8 @@ class ReadingFit:
         """
         K, n = self.w.shape
         size = K / _memory(self.whitened)
-        nees = np.square(self.w).sum(axis=1) / n
-        size *= min(1.0, 2.0 * float(nees.mean()) ** 2 / (n * max(float(nees.var()), 1e-300)))
+        variance = max(float((self.nees / n).var()), 1e-300)
+        size *= min(1.0, 2.0 * self.scale**2 / (n * variance))
         means = np.array([np.square(w).mean() for w in self.whitened])
         if len(means) >= 8 and means.std() > 0:
             size = min(size, 2.0 * float(means.mean()) ** 2 * len(means) / (n * float(means.var(ddof=1))))
@@ -83,33 +101,35 @@ class ReadingFit:
         """Whether all is right but for a factor that all components share: within decades, or at a rate of ``ODD``."""
         if roughly:
             return bool(abs(self.decades[0]) < SCALE and self._alike().all())
-        n, size, common = self.n, self.size, float(np.square(self.w).mean())
-        w = self.w / np.sqrt(common)
-        pairs = np.triu_indices(n, 1)
-        limit = distributions.chi2.isf(ODD / (2 * n + len(pairs[0]) + 1), 1)
-        scale = size * _deviance(np.square(self.own).mean(axis=0) / common)
+        w = self.w / np.sqrt(self.scale)
+        pairs = np.triu_indices(self.n, 1)
         products = (w.T @ w / len(w))[pairs]
-        below = float((np.square(w).sum(axis=1) < distributions.chi2.ppf(0.5, n)).mean())
-        normal = np.concatenate([w.mean(axis=0), products, [2.0 * below - 1.0]]) * np.sqrt(size)
-        return bool((scale <= limit).all() and (np.square(normal) <= limit).all())
+        below = float((self.nees / self.scale < distributions.chi2.ppf(0.5, self.n)).mean())
+        normal = np.concatenate([w.mean(axis=0), products, [2.0 * below - 1.0]])
+        of_axes = _deviance(np.square(self.own).mean(axis=0) / self.scale)
+        limit = distributions.chi2.isf(ODD / (len(normal) + len(of_axes)), 1)
+        return bool((self.size * np.append(of_axes, np.square(normal)) <= limit).all())
 
     def _alike(self) -> Indices:
         """Components whose NEES is off like that of all, within decades or by chance in few estimates, (n,) of bool."""
         within = np.abs(self.decades[1:] - self.decades[0]) < RIGHT
-        ratio = np.square(self.own).mean(axis=0) / np.square(self.w).mean()
+        ratio = np.square(self.own).mean(axis=0) / self.scale
         chance = self.size * _deviance(ratio) <= distributions.chi2.isf(ODD / self.n, 1)
         return np.asarray(within | chance)
 
     def is_shown(self) -> bool:
         """Whether all is right, the common factor too, with enough independent estimates to show it."""
-        off = self.n * self.size * _deviance(np.square(self.w).mean())
+        off = self.n * self.size * _deviance(self.scale)
         return self.size >= ENOUGH and self.right(False) and bool(off <= distributions.chi2.isf(ODD, 1))
 
     def near(self) -> float:
         """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``."""
-        mean = float(np.square(self.w).mean())
-        f = float(np.clip(mean, 10.0**-SCALE, 10.0**SCALE))
-        return self.likelihood + 0.5 * self.n * (mean - mean / f - float(np.log(f)))
+        f = _common_factor(self.scale)
+        return self.likelihood + 0.5 * self.n * (self.scale - self.scale / f - float(np.log(f)))
+
+    def is_off(self) -> bool:
+        """Whether another covariance explains the errors better by what a mix-up has to gain at least."""
+        return self.size * self.fault() >= LEAST_GAIN
 
     def fault(self) -> float:
         """Log likelihood of an estimate that another covariance, the same for all whitened errors, would gain."""
@@ -134,12 +154,11 @@ class ReadingFit:
 
     def _with_bias(self, bias: Array) -> float:
         """Log likelihood that an estimate gains by a bias (K, n), over the standard deviations."""
-        before = float(np.square(self.w).sum(axis=1).mean())
         size = float(np.sqrt(np.square(bias).mean(axis=0)).max())
         shift = _solved(self.factor, bias * min(1.0, BIAS / max(size, 1e-300)))
-        after = float(np.square(self.w - shift).sum(axis=1).mean())
-        common = float(np.clip(after / self.n, 10.0**-SCALE, 10.0**SCALE))
-        return 0.5 * (before - after / common - self.n * float(np.log(common)))
+        after = float(np.square(self.w - shift).sum(axis=1).mean()) / self.n
+        f = _common_factor(after)
+        return 0.5 * self.n * (self.scale - after / f - float(np.log(f)))
 
     def _with_factor(self, group: list[int]) -> float:
         """Log likelihood that an estimate gains by a factor on some components, beside one on all."""
@@ -150,20 +169,20 @@ class ReadingFit:
         of_group = np.zeros_like(self.own)
         of_group[:, group] = self.own[:, group]
         part = _solved(self.factor, of_group)
-        before = float(np.square(self.w).sum(axis=1).mean())
-        mixed, alone = float((self.w * part).sum(axis=1).mean()), float(np.square(part).sum(axis=1).mean())
+        mixed = float((self.w * part).sum(axis=1).mean())
+        alone = float(np.square(part).sum(axis=1).mean())
         a = f**-0.5 - 1.0
-        after = np.maximum(before + 2.0 * a * mixed + a**2 * alone, 1e-300)
-        common = np.log(after / self.n)
-        return float((0.5 * (before - self.n - self.n * common - len(group) * np.log(f))).max())
+        after = np.maximum(self.n * self.scale + 2.0 * a * mixed + a**2 * alone, 1e-300) / self.n
+        gains = self.n * (self.scale - 1.0 - np.log(after)) - len(group) * np.log(f)
+        return 0.5 * float(gains.max())
 
 
 def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
     """Errors (k, n) of some runs with their covariances (k, n, n); None without any that can be whitened."""
     if not runs:
         return None
-    errors, P = (np.concatenate(each) for each in zip(*runs, strict=True))
-    ends = np.cumsum([len(error) for error, _ in runs])[:-1]
+    errors = np.concatenate([error for error, _ in runs])
+    P = np.concatenate([covariance for _, covariance in runs])
     with np.errstate(invalid="ignore"):
         variance = np.diagonal(P, axis1=1, axis2=2)
         good = np.isfinite(errors).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (variance > 0).all(axis=1)
@@ -179,8 +198,19 @@ def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
     error = errors[good]
     w = np.full(errors.shape, np.nan)
     w[good] = _solved(L, error / sigma)
-    whitened = [part[np.isfinite(part).all(axis=1)] for part in np.split(w, ends)]
-    return ReadingFit([part for part in whitened if len(part)], L, sigma, error)
+    whitened, start = [], 0
+    for own, _ in runs:
+        part = w[start : start + len(own)]
+        part = part[np.isfinite(part).all(axis=1)]
+        if len(part):
+            whitened.append(part)
+        start += len(own)
+    return ReadingFit(whitened, L, sigma, error)
+
+
+def _common_factor(scale: float) -> float:
+    """The best factor on the covariance of all components, of at most ``SCALE``."""
+    return float(np.clip(scale, 10.0**-SCALE, 10.0**SCALE))
 
 
 def _deviance(ratio: Array | float) -> Array:
@@ -224,3 +254,38 @@ def _memory(runs: Sequence[Array]) -> float:
     square = rho**2 - 1.0 / np.maximum(pairs, 1)  # less what chance makes
     longer = (1.0 - np.arange(1, k) / k)[:, None] * square[1:]
     return max(1.0, float((1.0 + 2.0 * longer.sum(axis=0)).max()))
+
+
+# --- the files as they were declared -----------------------------------------------------------------
+
+
+@np.errstate(invalid="ignore")  # of poses that are not finite
+def is_plausible(runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> bool:
+    """Whether the errors fit as the files were declared, so that no mix-up is to be looked for."""
+    some = thinned(runs, shift)
+    if is_same(some):
+        return False
+    declared = fit_of([(p.errors()[:, judged], submatrices(p.covariance, judged)) for p in some])
+    return declared is not None and not declared.is_off()
+
+
+def thinned(runs: Sequence[Poses], shift: float) -> list[Poses]:
+    """Some estimates of some runs, without those that are not finite."""
+    most = max(MOST_NUMBERS // runs[0].covariance.shape[-1] ** 2, 1)
+    runs = runs[:: math.ceil(len(runs) / min(MOST_RUNS, most))]
+    each = max(min(MOST, most) // len(runs), min(LEAST_EACH, most // len(runs)))
+    return [p.later(shift).some(each).sound() for p in runs]
+
+
+def is_same(runs: Sequence[Poses]) -> bool:
+    """Whether the errors are rounding in nearly all estimates, in values and beside their standard deviations."""
+    same = total = 0
+    for p in runs:
+        rounding = ROUNDING * max(1.0, float(np.abs(p.truth).max(initial=0.0)))
+        p = p.matched()
+        error = np.abs(p.errors())
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
+            same += int(((error <= rounding) & (error <= NEGLIGIBLE * sigma)).all(axis=1).sum())
+        total += len(error)
+    return total >= LEAST and same >= NEARLY_ALL * total

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import Record, each_alone
+from consistency.referee.diagnostics.words.numbers import is_or_are
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
 from consistency.referee.readers.formats.numpy_archive import estimator_of_arrays
@@ -42,13 +43,18 @@ def record_of_arrays(
     if independent:
         _require_rows({key: array.shape for key, array in arrays.items()})
         arrays = {key: array[:, None] for key, array in arrays.items()}
-    shape, wanted = arrays[first].shape, ("runs", "steps", "n")[: 3 if first == "errors" else 2]
+    shape, wanted = arrays[first].shape, ["runs", "steps"]
+    if first == "errors":
+        wanted.append("n")
     if len(shape) != len(wanted) or 0 in shape:
         text = f"{first} has shape {shape}, needs ({', '.join(wanted)})"
         if len(shape) == len(wanted) - 1:
-            one, row = (" and ".join(f"{key}{at}" for key in given if key != "dof") for at in ("[None]", "[:, None]"))
-            text += f": {one} {'are' if 'and' in one else 'is'} one run of many steps; {row}, or independent=True of "
-            text += "cs.judge, says that each row is a run of its own, which the steps of a log are not"
+            names = [key for key in given if key != "dof"]
+            one, row = "[None] and ".join(names), "[:, None] and ".join(names)
+            text += (
+                f": {one}[None] {is_or_are(len(names))} one run of many steps; {row}[:, None], or independent=True of "
+                "cs.judge, says that each row is a run of its own, which the steps of a log are not"
+            )
         raise InputError(text)
     sigma = arrays.pop("deviations", None)
     if sigma is not None:
@@ -85,7 +91,9 @@ def _require_rows(shapes: Mapping[str, tuple[int, ...]]) -> None:
     if len(shape) != 2 or 0 in shape:
         text = f"errors has shape {shape}, needs (N, n) with independent=True"
         if len(shape) == 1:
-            stated = "deviations[:, None]" if "deviations" in shapes else "covariances[:, None, None] of its variances"
+            stated = "covariances[:, None, None] of its variances"
+            if "deviations" in shapes:
+                stated = "deviations[:, None]"
             text += f"; one component is errors[:, None] and {stated}"
         raise InputError(text)
     for key, own in shapes.items():

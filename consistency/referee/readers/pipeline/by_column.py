@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -14,107 +15,118 @@ from consistency.referee.diagnostics.records.outcome import made_from_errors, se
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Known, Poses
+from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Poses, submatrices
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
     from consistency.referee.readers.formats.sheet import TableRows
 
 ENOUGH = 5000  # rows that show what a column is made from
-ROTATION = range(3, 6)  # components of a pose in space
 NO_TRUTH = "has no truth, so that there are no errors to group"
 NO_COLUMNS = "has no columns of its own; --by-file FILE names a table with the column and t or run"
 
 
-def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estimator, Column | None]:
-    """The estimator with the values of the column in each row, and the column of all rows; None without ``--by``.
+def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estimator, Column]:
+    """The estimator with the values of the column in each row, and the column of all rows.
 
     Raises
     ------
     InputError
-        The files have no such column, or no time at which to look it up.
+        There are no errors, or the files have no such column, or no time at which to look it up.
     """
-    if r.by is None:
-        return e, None
-    runs = list(e.runs)
+    assert r.by is not None
+    if e.innovations_alone:
+        raise InputError(f"--by {r.by}: {e.path} {NO_TRUTH}")
+    cells = [p.by for p in e.runs if p.by is not None]
     if r.by_file is not None:
         sheet = _sheet(r)
-        runs = [replace(p, by=_looked_up(sheet, r.by, p.run, p.seconds)) for p in runs]
-    elif any(p.by is None for p in runs):
+        cells = [_looked_up(sheet, r.by, p.run, p.seconds) for p in e.runs]
+    if len(cells) < len(e.runs):
         raise InputError(f"--by {r.by}: {e.path} {NO_COLUMNS}")
-    cells = [p.by for p in runs if p.by is not None]
     column = column_of(r.by, np.concatenate(cells))
     column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
-    ends = np.cumsum([0, *map(len, cells)])
-    parts = zip(runs, ends, ends[1:], strict=False)
-    return replace(e, runs=[replace(p, by=column.values[start:end]) for p, start, end in parts]), column
+    runs, start = [], 0
+    for p in e.runs:
+        end = start + len(p.t)
+        runs.append(replace(p, by=column.values[start:end]))
+        start = end
+    return replace(e, runs=runs), column
 
 
-def of_record(record: Record, r: Reading) -> tuple[Record, Column | None]:
-    """A record that its reader has made, with the values of the column."""
-    if r.by is None:
-        return record, None
-    cells = record.by
-    if r.by_file is not None:
-        sheet = _sheet(r)
-        cells = np.stack([_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers])
-    if cells is None:
-        raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
-    column = column_of(r.by, cells)
-    column = replace(column, outcome=selects_on_outcome(column, record.axes))
-    return replace(record, by=column.values), column
+def in_groups(
+    records: Sequence[Record], column: Column, e: Estimator, pairs: Sequence[Poses], r: Reading
+) -> list[Record]:
+    """The records of an estimator with their groups.
+
+    Parameters
+    ----------
+    pairs : estimates that are judged, beside their truth; none where motions are judged
+
+    Raises
+    ------
+    InputError
+        As :func:`grouped`.
+    """
+    if pairs:
+        axes = itertools.chain.from_iterable(record.axes for record in records)
+        column = _beside_states(column, e, sorted(map(list(e.axes).index, axes)), pairs)
+    return [grouped(record, column, r) for record in records]
 
 
-def beside_states(
-    column: Column, e: Estimator, judged: Sequence[int], runs: Sequence[Poses], known: Sequence[Known]
-) -> Column:
+def _beside_states(column: Column, e: Estimator, judged: Sequence[int], pairs: Sequence[Poses]) -> Column:
     """The column, marked where its values are those of a judged component of the truth or the estimate, or a sigma."""
-    some = [k.of(_some(len(k.rows), len(runs))) for k in known]
-    rows = list(zip(runs, some, strict=True))
-    values = np.concatenate([p.by[k.rows] for p, k in rows if p.by is not None])
-    states = [] if e.convention == "" else _columns_of(e, judged)  # errors of an archive stand in the place of a truth
-    truth, estimate = (
-        np.concatenate([state[:, [i for i in states if i < state.shape[1]]] for state in of_runs])
-        for of_runs in ([k.truth for k in some], [p.estimate[k.rows] for p, k in rows])
-    )
-    P = np.concatenate([p.covariance[k.rows] for p, k in rows])[:, judged][:, :, judged]
-    axes = [e.axes[i] for i in judged]
-    return replace(column, outcome=selects_on_outcome(replace(column, values=values), axes, truth, estimate, P))
+    columns = _columns_of(e, judged)
+    values, truth, estimate, P = [], [], [], []
+    for p in pairs:
+        some = p.pairs(_some(len(p.t), len(pairs)))
+        assert some.by is not None
+        values.append(some.by)
+        truth.append(some.truth[:, columns[columns < some.truth.shape[1]]])
+        estimate.append(some.estimate[:, columns[columns < some.estimate.shape[1]]])
+        P.append(submatrices(some.covariance, judged))
+    column = replace(column, values=np.concatenate(values))
+    stacked = map(np.concatenate, (truth, estimate, P))
+    return replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged], *stacked))
 
 
-def _columns_of(e: Estimator, judged: Sequence[int]) -> list[int]:
+def _columns_of(e: Estimator, judged: Sequence[int]) -> Indices:
     """Columns of a state that are judged components; of rotations in space, which are quaternions, none."""
-    if not e.in_space:
-        return list(judged)
-    return [i if i < ROTATION.start else i + 1 for i in judged if i not in ROTATION]
+    columns = np.array(judged, np.int64)
+    if not e.convention:  # errors of an archive stand in the place of a truth
+        return columns[:0]
+    if e.in_space:
+        columns = np.concatenate([columns[columns < 3], columns[columns > 5] + 1])
+    return columns
 
 
 def _some(count: int, parts: int = 1) -> Indices:
     """At most ``ENOUGH`` of so many rows in all, evenly chosen."""
-    return np.unique(np.linspace(0, max(count - 1, 0), min(count, max(ENOUGH // parts, 2))).astype(np.int64))
+    most = max(ENOUGH // parts, 2)
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.int64))
 
 
-def grouped(record: Record, column: Column | None, r: Reading, option: str = "--by") -> Record:
-    """The record with its groups; itself without a column.
+def grouped(record: Record, column: Column, r: Reading, option: str = "--by") -> Record:
+    """The record with its groups.
 
     Raises
     ------
     InputError
         The column is made from the errors, or makes no groups.
     """
-    if column is None or record.by is None:
+    if record.by is None:
         return record
     if record.nees is None:
         raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
     if column.words and r.bins is not None:
-        raise InputError(
-            f"{option.replace('by', 'bins')}: {column.name} holds words, each of which is a group; leave the option out"
-        )
+        flag = option.replace("by", "bins")
+        raise InputError(f"{flag}: {column.name} holds words, each of which is a group; leave the option out")
     counted = np.isfinite(record.nees)
     if not counted.any():
         return record
     run, step = (places[_some(int(counted.sum()))] for places in np.nonzero(counted))
-    error = None if record.error is None else record.error[run, step]
+    error = None
+    if record.error is not None:
+        error = record.error[run, step]
     if why := made_from_errors(column.name, record.by[run, step], error, record.nees[run, step]):
         raise InputError(
             f"{option} {column.name}: the column is made from the errors ({why}), and groups of small and of large "
@@ -126,6 +138,26 @@ def grouped(record: Record, column: Column | None, r: Reading, option: str = "--
     except ValueError as wrong:
         raise InputError(f"{option} {column.name}: {wrong}") from None
     return replace(record, groups=groups)
+
+
+def record_in_groups(record: Record, r: Reading) -> Record:
+    """A record that its reader has made, with its groups.
+
+    Raises
+    ------
+    InputError
+        The files have no such column, or as :func:`grouped`.
+    """
+    assert r.by is not None
+    cells = record.by
+    if r.by_file is not None:
+        sheet = _sheet(r)
+        cells = np.stack([_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers])
+    if cells is None:
+        raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
+    column = column_of(r.by, cells)
+    column = replace(column, outcome=selects_on_outcome(column, record.axes))
+    return grouped(replace(record, by=column.values), column, r)
 
 
 def with_groups(
@@ -140,12 +172,13 @@ def with_groups(
     """
     if by is None:
         raise InputError("bins: goes with by=")
-    named = by if isinstance(by, Mapping) else {"array": by}
-    if len(named) != 1:
-        raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(named)} names")
-    ((name, values),) = named.items()
+    if not isinstance(by, Mapping):
+        by = {"array": by}
+    if len(by) != 1:
+        raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(by)} names")
     if record.nees is None:
         raise InputError(f"by: {record.name} {NO_TRUTH}")
+    ((name, values),) = by.items()
     try:
         column = column_of(name, on_steps(values, record.nees.shape))
     except ValueError as wrong:

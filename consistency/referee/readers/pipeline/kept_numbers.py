@@ -27,21 +27,25 @@ def keep_numbers(folder: Path, estimators: Sequence[Estimator]) -> None:
     about = []
     for i, one in enumerate(estimators):
         p = one.runs[0]
-        arrays |= {f"{i} {key}": array for key in OF_POSES if (array := getattr(p, key)) is not None}
-        if one.t is not None:
-            arrays[f"{i} times"] = one.t
-        about.append(
-            {key: _plain(getattr(one, key)) for key in TEXTS}
-            | {f"poses {key}": getattr(p, key) for key in TEXTS_OF_POSES}
-            | {
-                "path": str(one.path), "files": [str(file) for file in p.files], "alone": one.stated.alone,
-                "groups": {name: [group.start, group.stop] for name, group in one.stated.groups.items()},
-                "beside": p.true_t is p.t,
-            }
-        )  # fmt: skip
+        for key in OF_POSES:
+            arrays[f"{i} {key}"] = getattr(p, key)
+        arrays[f"{i} times"] = one.t
+        texts: dict[str, Any] = {
+            "path": str(one.path),
+            "files": list(map(str, p.files)),
+            "alone": one.stated.alone,
+            "groups": {name: [group.start, group.stop] for name, group in one.stated.groups.items()},
+            "beside": p.true_t is p.t,
+        }
+        for key in TEXTS:
+            texts[key] = getattr(one, key)
+        for key in TEXTS_OF_POSES:
+            texts[f"poses {key}"] = getattr(p, key)
+        about.append(texts)
+    there = {key: array for key, array in arrays.items() if array is not None}
     partial = folder / f"{NUMBERS}.partial"
     with partial.open("wb") as file:
-        np.savez(file, about=np.array(json.dumps(about)), **arrays)
+        np.savez(file, about=np.array(json.dumps(about, default=list)), **there)
     partial.replace(folder / NUMBERS)
 
 
@@ -57,25 +61,21 @@ def kept_numbers(folder: Path) -> list[Estimator]:
     with reading(path), np.load(path, allow_pickle=False) as archive:
         arrays = {key: archive[key] for key in archive.files}
         about = json.loads(str(arrays.pop("about")))
-        return [_estimator(i, one, arrays) for i, one in enumerate(about)]
+        return [_estimator(i, texts, arrays) for i, texts in enumerate(about)]
 
 
-def _estimator(i: int, about: dict[str, Any], arrays: dict[str, Any]) -> Estimator:
+def _estimator(i: int, texts: dict[str, Any], arrays: dict[str, Any]) -> Estimator:
     own: dict[str, Any] = {key: arrays.get(f"{i} {key}") for key in OF_POSES}
-    if about["beside"]:
+    for key in TEXTS_OF_POSES:
+        own[key] = texts[f"poses {key}"]
+    if texts["beside"]:
         own["true_t"] = own["t"]  # the same array says that every estimate has its truth beside it
-    texts = {key: about[f"poses {key}"] for key in TEXTS_OF_POSES}
-    path = Path(about["path"])
-    estimates, truth = (Path(file) for file in about["files"])
-    place = Places(lambda row: f"{path}, row {row + 1}", np.arange(len(arrays[f"{i} t"])))
-    poses = Poses(place=place, files=(estimates, truth), **own, **texts)
-    groups = {name: slice(*ends) for name, ends in about["groups"].items()}
-    return Estimator(
-        path=path, runs=[poses], stated=Stated(groups, about["alone"]), t=arrays.get(f"{i} times"),
-        **{key: about[key] for key in TEXTS} | {"axes": tuple(about["axes"])},
-    )  # fmt: skip
-
-
-def _plain(value: Any) -> Any:
-    """A value as JSON holds it."""
-    return list(value) if isinstance(value, (tuple, list)) else value
+    path = Path(texts["path"])
+    estimates, truth = map(Path, texts["files"])
+    place = Places(lambda row: f"{path}, row {row + 1}", np.arange(len(own["t"])))
+    poses = Poses(place=place, files=(estimates, truth), **own)
+    groups = {name: slice(*ends) for name, ends in texts["groups"].items()}
+    of_estimator = {key: texts[key] for key in TEXTS}
+    of_estimator["axes"] = tuple(texts["axes"])
+    stated = Stated(groups, texts["alone"])
+    return Estimator(path=path, runs=[poses], stated=stated, t=arrays.get(f"{i} times"), **of_estimator)

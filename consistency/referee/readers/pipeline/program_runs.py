@@ -7,12 +7,11 @@ file; a run whose files cannot be read has failed.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import re
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -95,8 +94,12 @@ def run_of(folder: Path) -> ProgramRun | None:
 
 def runs_in(folder: Path) -> dict[int, ProgramRun]:
     """Finished runs of a study by their number, in order."""
-    found = [run_of(each) for each in sorted((folder / "runs").glob("*"))]
-    return {one.run: one for one in sorted((one for one in found if one is not None), key=lambda one: one.run)}
+    found = {}
+    for each in sorted((folder / "runs").glob("*")):
+        run = run_of(each)
+        if run is not None:
+            found[run.run] = run
+    return dict(sorted(found.items()))
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,9 @@ class ProgramStudy:
     def reading(self) -> Reading:
         """Options by which the files of each run are read."""
         given: dict[str, Any] = dict(self.manifest["reading"])
-        given |= {name: Path(given[name]) for name in PATHS if name in given}
+        for name in PATHS:
+            if name in given:
+                given[name] = Path(given[name])
         return Reading(**given)
 
     @property
@@ -122,7 +127,7 @@ class ProgramStudy:
     def name(self) -> str:
         """Name of an estimator that is called after its file."""
         stem = Path(self.estimates).stem
-        return stem if "{" not in stem else "estimates"
+        return "estimates" if "{" in stem else stem
 
     @property
     def settings(self) -> Settings:
@@ -140,9 +145,10 @@ class ProgramStudy:
         """How many runs are there, where some are missing."""
         if self.manifest["complete"]:
             return ""
-        asked = self.manifest["runs"]
-        of = f" of {asked}" if asked else ""
-        return f"only {len(runs_in(self.folder))}{of} runs are there"
+        there = str(len(runs_in(self.folder)))
+        if self.manifest["runs"]:
+            there += f" of {self.manifest['runs']}"
+        return f"only {there} runs are there"
 
     def files_of(self, run: ProgramRun, r: Reading) -> tuple[Path, Reading]:
         """The estimates of a run, and the options by which they are read, with its own truth.
@@ -151,12 +157,11 @@ class ProgramStudy:
         where the user stood.
         """
         own: dict[str, Any] = {}
-        for name in PATHS:
-            path = getattr(r, name)
-            if path is not None:
-                recorded = "input" in run.values and is_recorded(str(path))
-                base = Path(run.values["here"]) if recorded else run.folder
-                own[name] = base / filled(str(path), run.known)
+        for name in r.given(PATHS):
+            path, base = str(getattr(r, name)), run.folder
+            if "input" in run.values and is_recorded(path):
+                base = Path(run.values["here"])
+            own[name] = base / filled(path, run.known)
         return run.folder / filled(self.estimates, run.known), replace(r, **own)
 
 
@@ -180,7 +185,8 @@ def with_options(study: ProgramStudy, r: Reading) -> Reading:
     deleted = [name for name in r.given() if name not in OF_NUMBERS]
     if deleted and any(study.folder.glob(f"runs/*/{NUMBERS}")):
         raise InputError(f"{flag_of(deleted[0])}: {study.folder} has the numbers alone that were read (--keep failed)")
-    return replace(study.reading, **{each.name: value for each in fields(r) if (value := getattr(r, each.name))})
+    given = {name: getattr(r, name) for name in r.given()}
+    return replace(study.reading, **{name: value for name, value in given.items() if value})
 
 
 # --- from runs to estimators -----------------------------------------------------------------------
@@ -259,15 +265,18 @@ class Runs:
         """
         if self.study.manifest.get("inputs"):
             return {}
-        ends = {run: self._ends[run] for run in runs}
-        early = {run: late for run, (_, late) in ends.items() if late}
+        early, ends = {}, {}
+        for run in runs:
+            ends[run], late = self._ends[run]
+            if late:
+                early[run] = late
         if len(early) == len(ends):
             early = {}
-        longest = max((end for end, _ in ends.values()), default=0.0)
-        short = [run for run, (end, _) in ends.items() if end < longest]
+        longest = max(ends.values(), default=0.0)
+        short = [run for run, end in ends.items() if end < longest]
         if 2 * len(short) < len(ends):
             for run in short:
-                early.setdefault(run, f"its estimates end at {ends[run][0]:.6g}, those of most runs at {longest:.6g}")
+                early.setdefault(run, f"its estimates end at {ends[run]:.6g}, those of most runs at {longest:.6g}")
         return early
 
     def _found(self, run: ProgramRun) -> list[Estimator]:
@@ -282,15 +291,20 @@ class Runs:
     @property
     def first(self) -> int:
         """How many of runs 0, 1, ... are there, up to the first that is missing."""
-        return next(run for run in itertools.count() if run not in self.found and run not in self.failed)
+        run = 0
+        while run in self.found or run in self.failed:
+            run += 1
+        return run
 
     def estimators(self, count: int | None = None) -> list[Estimator]:
         """The estimators of the first ``count`` runs by number, or of all that are there."""
-        found = {run: one for run, one in sorted(self.found.items()) if count is None or run < count}
-        failed = {run: why for run, why in self.failed.items() if count is None or run < count}
-        early = self._early(found)
-        found = {run: one for run, one in found.items() if run not in early}
-        failed |= early
+        if count is None:
+            count = max([*self.found, *self.failed], default=-1) + 1
+        found = {run: one for run, one in sorted(self.found.items()) if run < count}
+        failed = {run: why for run, why in self.failed.items() if run < count}
+        for run, why in self._early(found).items():
+            del found[run]
+            failed[run] = why
         return [replace(one, trials=self.trials) for one in merged(found, self.study.name, failed)]
 
 
@@ -316,13 +330,14 @@ def failures_in_words(records: Sequence[Record], folder: Path) -> list[str]:
     for record in records:
         for failure in record.failures:
             kinds.setdefault(kind_of_failure(failure.reason), {})[failure.run] = failure.reason
-    runs = runs_in(folder) if kinds else {}
-    said = []
+    if not kinds:
+        return []
+    runs, sentences = runs_in(folder), []
     for of_runs in kinds.values():
         first, why = min(of_runs.items())
         which = f"{plural(len(of_runs), 'run')} failed ({listed(sorted(of_runs))})"
-        said.append(f"{which}: {without_log(why)}; log {runs[first].log}, seed {runs[first].values['seed']}")
-    return said
+        sentences.append(f"{which}: {without_log(why)}; log {runs[first].log}, seed {runs[first].values['seed']}")
+    return sentences
 
 
 def log_lines(path: Path, lines: int) -> list[str]:
@@ -344,14 +359,16 @@ def _nothing(path: Path, option: str, run: ProgramRun) -> str:
     here = Path(run.values["here"]) / relative
     if option != "--estimates" and here.exists():
         return f"the program wrote no {relative}; for the one where you stand write {option} {{here}}/{relative}"
-    others = sorted(each.name for each in run.folder.iterdir() if each.name not in (LOG, RUN_FILE))
-    wrote = f" ({option}); it wrote {', '.join(others[:5])}" if others else f" ({option}), and nothing else"
-    return f"the program wrote no {relative}{wrote}"
+    others = sorted({each.name for each in run.folder.iterdir()} - {LOG, RUN_FILE})
+    if not others:
+        return f"the program wrote no {relative} ({option}), and nothing else"
+    return f"the program wrote no {relative} ({option}); it wrote {', '.join(others[:5])}"
 
 
 def _without_folder(one: Estimator, folder: Path) -> Estimator:
     """An estimator whose notes name the files of a run as any run has them."""
-    notes, causes = ([text.replace(f"{folder}/", "") for text in texts] for texts in (one.notes, one.causes))
+    notes = [note.replace(f"{folder}/", "") for note in one.notes]
+    causes = [cause.replace(f"{folder}/", "") for cause in one.causes]
     return replace(one, notes=notes, causes=causes)
 
 

@@ -1,38 +1,36 @@
 """Files of other estimators, read as errors and covariances; docs/files.md describes the formats.
 
-Filters, scenarios and results folders of this package do not belong here.
+Each kind of files has a row in ``KINDS``: how one is told, options that do not go with it, and its reader, which is
+loaded when a file of its kind is read. Filters, scenarios and results folders of this package do not belong here.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
-from consistency.referee.readers.declared_axes import in_axes_of_estimates
+from consistency.referee.parsing import is_file, read_json, require_name
 from consistency.referee.readers.formats.file_kinds import (
+    ARCHIVES,
+    TABLES,
     TRAJECTORIES,
     fitted_note,
     is_bag,
     is_drive,
+    is_foreign,
+    is_plane,
+    is_spatial,
     table_files,
     trajectory_files,
+    unknown_kind,
 )
-from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.pipeline.by_column import grouped, of_record
-from consistency.referee.readers.pipeline.kinds import (
-    OF_BAGS,
-    OF_TRAJECTORIES,
-    Found,
-    found_in,
-    is_program_runs,
-    refuse_options,
-)
+from consistency.referee.readers.options import OF_AXES, Reading, flag_of
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 from consistency.referee.readers.runs_to_record import with_failed_runs
 from consistency.referee.readers.truth_matching import Estimator
@@ -44,7 +42,136 @@ NO_GUESS = {
     "truth_covariance": ", whose covariance is of a declared error too",
     "relative": ", which judges motions in one error; name the conventions one by one",
 }
+OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
+OF_BAGS = ("topic", "truth_topic")
+OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # bags have these in messages
+OF_NAMES = ("columns", "truth_columns")
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
+OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
+ARCHIVE_KEYS = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}  # in place of options
+PROGRAM_RUNS = "monte-carlo"  # kind of the manifest of a folder with runs of a program
+Found = Sequence[Estimator | Record]
+
+
+# --- kinds of files --------------------------------------------------------------------------------
+
+
+def is_program_runs(path: Path) -> bool:
+    """Whether a path is a folder that ``consistency monte-carlo`` wrote."""
+    manifest = path / "manifest.json"
+    if not is_file(manifest):
+        return False
+    data = read_json(manifest)
+    return isinstance(data, dict) and data.get("kind") == PROGRAM_RUNS
+
+
+class Kind(NamedTuple):
+    """A kind of files; its reader gives estimators, or records where a file holds no poses and no errors."""
+
+    is_one: Callable[[Path, Reading], bool]
+    refused: tuple[str, ...]  # options
+    read: Callable[[Path, Reading, bool], Found]  # path, options, poses alone: covariances are not looked at
+
+
+def _bags(path: Path, r: Reading, poses_alone: bool) -> Found:
+    from consistency.referee.readers.formats.ros_bag import read_bags
+
+    return read_bags(path, r, poses_alone)
+
+
+def _archive(path: Path, r: Reading, poses_alone: bool) -> Found:
+    from consistency.referee.readers.formats.numpy_archive import read_archive
+
+    return read_archive(path, r, poses_alone)
+
+
+def _tables(path: Path, r: Reading, poses_alone: bool) -> Found:
+    from consistency.referee.readers.formats.table import read_tables
+
+    return read_tables(path, r, poses_alone)
+
+
+def _trajectories(path: Path, r: Reading, poses_alone: bool) -> Found:
+    from consistency.referee.readers.formats.tum import read_tum
+
+    return read_tum(path, r, poses_alone)
+
+
+def _program_runs(path: Path, r: Reading, poses_alone: bool) -> Found:
+    from consistency.referee.readers.pipeline.program_runs import read_program_runs
+
+    return read_program_runs(path, r, found_in)
+
+
+def _table_folder(path: Path, r: Reading, poses_alone: bool) -> Found:
+    from consistency.referee.readers.pipeline.run_folders import read_table_folder
+
+    return read_table_folder(path, r, poses_alone)
+
+
+def _is_table_folder(path: Path, r: Reading) -> bool:
+    return path.is_dir() and bool(table_files(path)) and (r.state is not None or not trajectory_files(path, r.columns))
+
+
+def _is_archive(path: Path, r: Reading) -> bool:
+    return path.suffix.lower() in ARCHIVES
+
+
+def _is_table(path: Path, r: Reading) -> bool:
+    named = path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path, r.columns))
+    return named or is_plane(path, r.columns)
+
+
+def _is_trajectory(path: Path, r: Reading) -> bool:
+    return path.suffix.lower() in (*TRAJECTORIES, ".csv", ".pos") or path.is_dir()
+
+
+KINDS = (  # a file is of the first that knows it
+    Kind(lambda path, r: is_program_runs(path), (), _program_runs),
+    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES), _bags),
+    Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
+    Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
+    Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
+    Kind(_is_trajectory, (*OF_BAGS, "state"), _trajectories),
+)
+
+
+def kind_of(path: Path, r: Reading) -> Kind | None:
+    """The kind of a file or folder; None if it is of none."""
+    if not is_foreign(path):
+        for kind in KINDS:
+            if kind.is_one(path, r):
+                return kind
+    return None
+
+
+def found_in(estimates: Path, r: Reading) -> Found:
+    """What the reader of a file gives; raises InputError for a file of no kind, and options that do not go with it."""
+    if not estimates.exists():
+        raise InputError(f"{estimates}: no such file")
+    require_name(estimates.name, "file")
+    if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
+        raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
+    kind = kind_of(estimates, r)
+    refuse_options(estimates, r, *(OF_BAGS if kind is None else kind.refused))
+    if kind is None:
+        raise unknown_kind(estimates)
+    if r.truth is not None and is_foreign(r.truth):
+        raise unknown_kind(r.truth)
+    return kind.read(estimates, r, False)
+
+
+def refuse_options(path: Path, r: Reading, *names: str) -> None:
+    """Refuse options among ``names`` that are given, but do not go with a file."""
+    given = r.given(names)
+    if given:
+        instead = ""
+        if path.suffix.lower() in ARCHIVES and given[0] in ARCHIVE_KEYS:
+            instead = f", an archive; it has a key '{ARCHIVE_KEYS[given[0]]}' in its place"
+        raise InputError(f"{flag_of(given[0])}: does not go with {path}{instead}")
+
+
+# --- from files to records ---------------------------------------------------------------------------
 
 
 def is_recording(path: Path, reading: Reading) -> bool:
@@ -71,7 +198,7 @@ def is_recording(path: Path, reading: Reading) -> bool:
 
 
 def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
-    """Tables in memory, with columns by name: one record for each estimator.
+    """Read tables in memory, with columns by name: one record for each estimator.
 
     Parameters
     ----------
@@ -138,9 +265,12 @@ def _guessed(name: str, r: Reading, read: Callable[[str | None], list[Record]]) 
     default = first[0].convention
     if default not in (*PLANAR, *SPATIAL) or default == "vector":
         raise InputError(f"--error {GUESS}: is for poses; the errors of {name} are plain differences")
-    kinds = [kind for kind in (SPATIAL if default in SPATIAL else PLANAR) if kind not in (default, "vector")]
-    others = {kind: {one.name: one for one in read(kind)} for kind in kinds}
-    return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
+    guesses = {one.name: {default: one} for one in first}
+    for kind in SPATIAL if default in SPATIAL else PLANAR:
+        if kind not in (default, "vector"):
+            for one in read(kind):
+                guesses[one.name][kind] = one
+    return [replace(one, guesses=guesses[one.name]) for one in first]
 
 
 def _declared(records: list[Record], r: Reading) -> list[Record]:
@@ -167,24 +297,37 @@ def _records(found: Found, r: Reading) -> list[Record]:
     records: list[Record] = []
     for one in found:
         if isinstance(one, Estimator):
-            records += [
-                replace(with_failed_runs(record, one.failed), trials=one.trials)
-                for record in records_of(in_axes_of_estimates(one, r), r)
-            ]
+            records += _records_of_runs(one, r)
+        elif r.by is None:
+            records.append(one)
         else:
-            records.append(grouped(*of_record(one, r), r))
+            from consistency.referee.readers.pipeline.by_column import record_in_groups
+
+            records.append(record_in_groups(one, r))
+    return records
+
+
+def _records_of_runs(e: Estimator, r: Reading) -> list[Record]:
+    """Records of the runs of an estimator, with those that left no estimates."""
+    if r.given(OF_AXES):
+        from consistency.referee.readers.declared_axes import in_axes_of_estimates
+
+        e = in_axes_of_estimates(e, r)
+    records = []
+    for record in records_of(e, r):
+        records.append(replace(with_failed_runs(record, e.failed), trials=e.trials))
     return records
 
 
 def _by_kind(estimates: Path, r: Reading) -> list[Record]:
     records = _records(found_in(estimates, r), r)
-    for path in filter(None, (estimates, r.covariance)):
-        if note := fitted_note(path):
-            records = [replace(records[0], notes=(note, *records[0].notes)), *records[1:]]
-    if r.truth is None or not is_drive(r.truth):
-        return records
-    of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
-    return [replace(records[0], notes=(f"{r.truth}: {of}", *records[0].notes)), *records[1:]]
+    notes = [fitted_note(path) for path in (r.covariance, estimates) if path is not None]
+    if r.truth is not None and is_drive(r.truth):
+        of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
+        notes.insert(0, f"{r.truth}: {of}")
+    if any(notes):
+        records[0] = replace(records[0], notes=(*filter(None, notes), *records[0].notes))
+    return records
 
 
 def pieces_asked(r: Reading) -> int | None:

@@ -5,9 +5,9 @@ It is the same for poses in the plane and in space, for states of any components
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,24 +15,20 @@ from consistency.referee.diagnostics.records.record import Record, each_alone
 from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.readers.heading_units import require_radians
-from consistency.referee.readers.mix_ups.hints import hints
+from consistency.referee.readers.mix_ups.reading_fit import is_plausible
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.pipeline.by_column import NO_TRUTH, beside_states, grouped, with_values
 from consistency.referee.readers.places import exact, refuse
-from consistency.referee.readers.runs_to_record import Track, assemble, not_estimated
+from consistency.referee.readers.runs_to_record import Track, assemble, in_columns, not_estimated
 from consistency.referee.readers.truth_matching import (
     AXES,
     ROUNDING,
     WHOLE,
-    Aligned,
     Estimator,
-    Known,
     Poses,
-    at,
     common_steps,
     common_times,
 )
-from consistency.referee.types import Array, Indices
+from consistency.referee.types import Array
 
 if TYPE_CHECKING:
     from consistency.referee.readers.windows import Relative
@@ -57,55 +53,24 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     InputError
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
-    if e.innovations_alone and r.by is not None:
-        raise InputError(f"--by {r.by}: {e.path} {NO_TRUTH}")
-    if e.innovations_alone:
+    if e.innovations_alone and r.by is None:
         return [_innovations(e)]
     require_radians(str(e.path), e.runs)
-    judged = _named(e, r)
-    e, column = with_values(e, r, judged)
-    relative = windows_asked(r)
+    judged, column = _judged(e, r), None
+    if r.by is not None:
+        from consistency.referee.readers.pipeline.by_column import with_values
+
+        e, column = with_values(e, r, judged)
+    relative, pairs = windows_asked(r), list[Poses]()
     if relative is not None:
-        return [grouped(_windows(e, judged, r, relative), column, r)]
-    shift, clocks, moved = _clocks_and_frames(e, r, judged)
-    runs = moved.runs
-    known = [_known(e, p, r, shift) for p in runs]
-    notes = [*e.notes, *_left_out(e, runs, known)]
-    if _start_is_exact(e, runs):
-        known = [k.of(p.t[k.rows] != 0) for p, k in zip(runs, known, strict=True)]
-    for i, (p, k) in enumerate(zip(runs, known, strict=True)):
-        if p.open_end and _is_cut(p, k.rows):
-            known[i], notes = k.of(np.arange(len(k.rows) - 1)), [p.open_end, *notes]
-    tracks = [_track(e, p, k, shift) for p, k in zip(runs, known, strict=True)]
-    if e.in_space:
-        notes += _space_notes(e, runs, known, tracks)
-        still = _not_estimated(e, tracks, judged) if r.axes is None else []
-        if still:
-            names = ", ".join(e.axes[i] for i in still)
-            notes.append(f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too")
-        judged = [i for i in judged if i not in still]
-    causes = [*_causes(e, runs, shift, judged), *e.causes]
-    notes += [*clocks, *moved.notes, *causes]
-    if e.convention:
-        notes.append(f"error convention {e.convention}: {e.definition}")
-    if column is not None:
-        column = beside_states(column, e, judged, runs, known)
-    tracks, t, numbering = _in_columns(e, runs, known, tracks)
-    notes += numbering
-    records = []
-    for ending, group in e.stated.groups.items():
-        part = [i for i in range(len(e.axes))[group] if i in judged]
-        if not part:
-            continue
-        some, axes = [track.part(part) for track in tracks], tuple(e.axes[i] for i in part)
-        record = assemble(f"{e.name}{ending}", some, t, axes, str(e.covariances or e.path), e.convention, notes)
-        files = {p.run: str(p.files[0]) for p in runs}
-        record = replace(moved.on(record), causes=tuple(causes), files=files)
-        if e.stated.alone:
-            record = each_alone(record)
-        records.append(grouped(record, column, r))
-        notes, causes = [], []
-    return records
+        records = [_record_of_windows(e, judged, r, relative)]
+    else:
+        records, pairs = _records_of_poses(e, judged, r)
+    if column is None:
+        return records
+    from consistency.referee.readers.pipeline.by_column import in_groups
+
+    return in_groups(records, column, e, pairs, r)
 
 
 def windows_asked(r: Reading) -> Relative | None:
@@ -117,61 +82,100 @@ def windows_asked(r: Reading) -> Relative | None:
     return relative_of(r.relative, bool(r.motions), r.windows)
 
 
-def _named(e: Estimator, r: Reading) -> list[int]:
+def _judged(e: Estimator, r: Reading) -> list[int]:
     """Components of the error that are judged: those of ``--axes``, or all that are stated."""
-    if unknown := [axis for axis in r.axes or () if axis not in e.axes]:
-        raise InputError(f"--axes {','.join(r.axes or ())}: '{unknown[0]}' is not one of {', '.join(e.axes)}")
     if r.axes is not None:
+        if unknown := set(r.axes).difference(e.axes):
+            first = next(axis for axis in r.axes if axis in unknown)
+            raise InputError(f"--axes {','.join(r.axes)}: '{first}' is not one of {', '.join(e.axes)}")
         judged = [i for i, axis in enumerate(e.axes) if axis in r.axes]
+    elif e.judged is not None:
+        judged = list(e.judged)
     else:
-        judged = list(range(len(e.axes)) if e.judged is None else e.judged)
+        judged = list(range(len(e.axes)))
     if e.in_space and e.stated != WHOLE:  # a velocity or a bias that is 0 throughout is not estimated
-        poses = range(len(AXES))
-        judged = [i for i in judged if i in poses or any((p.covariance[:, i, i] != 0).any() for p in e.runs)]
+        judged = [i for i in judged if i < len(AXES) or any(p.covariance[:, i, i].any() for p in e.runs)]
     return judged
 
 
-def _clocks_and_frames(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[float, list[str], Aligned]:
-    """Seconds to add to the times of the estimates, notes on them, and the runs in the world of the truth."""
+def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
+    """Records of the poses of an estimator, and the estimates of each run that they judge, beside their truth."""
+    runs, shift = e.runs, 0.0
+    of_clocks: list[str] = []
+    of_alignment: dict[str, Any] = {}
     if r.align is not None:
         from consistency.referee.readers.alignment.residuals import clocks_and_frames
 
-        return clocks_and_frames(e.said, e.runs, r.time_offset, r.align, judged)
-    if e.runs[0].numbered:
-        return 0.0, [], Aligned(e.runs)
-    from consistency.referee.readers.clock_offset import clock_shift
+        shift, of_clocks, moved = clocks_and_frames(e.said, runs, r.time_offset, r.align, judged)
+        runs, of_alignment = moved.runs, moved.of_record
+        of_clocks += moved.notes
+    elif not runs[0].numbered:
+        from consistency.referee.readers.clock_offset import clock_shift
 
-    return *clock_shift(e.said, e.runs, r.time_offset), Aligned(e.runs)
+        shift, of_clocks = clock_shift(e.said, runs, r.time_offset)
+    pairs = [_paired(e, p, r, shift) for p in runs]
+    notes = [*e.notes, *_left_out(e, runs, pairs)]
+    if _start_is_exact(e, runs):
+        pairs = [p.pairs(p.t != 0) for p in pairs]
+    for i, p in enumerate(pairs):
+        if p.open_end and _is_cut(p, runs[i]):
+            pairs[i] = p.pairs(np.arange(len(p.t) - 1))
+            notes.insert(0, p.open_end)
+    errors = [p.errors() for p in pairs]
+    if e.in_space:
+        notes += _space_notes(e, pairs, errors)
+        if r.axes is None:
+            judged, still = _estimated(e, errors, judged)
+            notes += still
+    causes = [*_causes(e, runs, shift, judged), *e.causes]
+    notes += [*of_clocks, *causes]
+    if e.convention:
+        notes.append(f"error convention {e.convention}: {e.definition}")
+    tracks = [_track(e, p, error) for p, error in zip(pairs, errors, strict=True)]
+    tracks, t, numbering = _in_columns(e, pairs, tracks)
+    notes += numbering
+    of_alignment |= {"files": {p.run: str(p.files[0]) for p in runs}}
+    records = []
+    for ending, group in e.stated.groups.items():
+        part = [i for i in range(len(e.axes))[group] if i in judged]
+        if not part:
+            continue
+        some, axes = [track.part(part) for track in tracks], tuple(e.axes[i] for i in part)
+        record = assemble(f"{e.name}{ending}", some, t, axes, str(e.covariances or e.path), e.convention, notes)
+        record = replace(record, causes=tuple(causes), **of_alignment)
+        if e.stated.alone:
+            record = each_alone(record)
+        records.append(record)
+        notes, causes = [], []
+    return records, pairs
 
 
 # --- estimates and truth ---------------------------------------------------------------------------
 
 
-def _known(e: Estimator, p: Poses, r: Reading, shift: float) -> Known:
-    """The truth of the estimates that have a covariance.
+def _paired(e: Estimator, p: Poses, r: Reading, shift: float) -> Poses:
+    """The estimates that have a covariance and a truth, beside that truth.
 
     Raises
     ------
     InputError
         There is none, in a run that is not of an archive; or estimates and truth of a step have different times.
     """
-    known = p.known(shift)
-    if not len(known.rows) and e.t is None:
+    found = p.matched(shift)
+    if not len(found.t) and e.t is None:
         raise _nothing_known(e, p, shift)
-    stated = p.stated[known.rows]
-    if len(stated) and not stated.any():
+    if len(found.t) and not found.stated.any():
         raise InputError(f"{p.files[0]}: no estimate has both a truth and a covariance within {p.max_dt:g} s")
-    if not stated.all():
-        known = known.of(stated)
-    if p.numbered and p.clock is not None and p.true_clock is not None:
-        t, true_t = p.clock[known.rows], p.true_clock[known.before]
+    found = found.pairs(found.stated)
+    if found.numbered and found.clock is not None and found.true_clock is not None:
+        t, true_t = found.clock, found.true_clock
         where = f"in the same step of {p.files[1]}; number the same instants by the same step, or raise --max-dt"
         refuse(
             np.abs(t - true_t) > r.tolerance + ROUNDING,
-            p.place.at(known.rows).__getitem__,
+            found.place.__getitem__,
             lambda row: f"t is {exact(t[row])}, but {exact(true_t[row])} {where}",
         )
-    return known
+    return found
 
 
 def _nothing_known(e: Estimator, p: Poses, shift: float) -> InputError:
@@ -195,60 +199,48 @@ def _start_is_exact(e: Estimator, runs: Sequence[Poses]) -> bool:
     return bool(np.isin(kinds, (Validity.DEFICIENT, Validity.INDEFINITE)).all())
 
 
-def _is_cut(p: Poses, rows: Indices) -> bool:
-    """Whether the last row of a file has a covariance that is not positive definite, unlike the row before."""
-    if len(rows) < 2 or rows[-1] != len(p.t) - 1:
+def _is_cut(p: Poses, whole: Poses) -> bool:
+    """Whether the last row of a whole file has a covariance that is not positive definite, unlike the row before."""
+    if len(p.t) < 2 or p.t[-1] != whole.t[-1]:
         return False
-    before, last = classify(p.covariance[rows[-2:]], ROUNDED)
+    before, last = classify(p.covariance[-2:], ROUNDED)
     finite = np.isfinite(p.estimate[-1]).all() and np.isfinite(p.covariance[-1]).all()
     return bool(finite and before == Validity.VALID and last != Validity.VALID)
-
-
-def _track(e: Estimator, p: Poses, known: Known, shift: float) -> Track:
-    """Errors of a run with their covariances; its columns are not yet known."""
-    rows, width, P = known.rows, e.position, p.covariance
-    return Track(
-        p.run, rows, p.place.at(rows), p.error_of(rows, known.truth), P if len(rows) == len(P) else P[rows],
-        at(p.nis, rows), at(p.nis_dof, rows), by=at(p.by, rows), t=None if e.t is not None else _times(p, rows),
-        truth_covariance=p.truth_covariances(known, shift),
-        path=np.stack([known.truth[:, :width], p.estimate[rows, :width]], axis=1) if width else None,
-    )  # fmt: skip
-
-
-def _times(p: Poses, rows: Indices) -> Array | None:
-    """Times of some rows, s; None where steps have none."""
-    return None if p.numbered and p.clock is None else p.seconds[rows]
 
 
 # --- what is found -----------------------------------------------------------------------------------
 
 
-def _left_out(e: Estimator, runs: Sequence[Poses], known: Sequence[Known]) -> list[str]:
+def _left_out(e: Estimator, runs: Sequence[Poses], pairs: Sequence[Poses]) -> list[str]:
     """Notes on left-out rows, and on a truth between whose samples estimates are."""
-    notes, total = [], sum(len(p.t) for p in runs)
-    if left_out := total - sum(len(k.rows) for k in known):
-        what = "no truth"
-        if not all(p.stated.all() for p in runs):
+    notes, what = [], "no truth"
+    total, left_out, furthest = 0, 0, 0.0
+    for p, found in zip(runs, pairs, strict=True):
+        total += len(p.t)
+        left_out += len(p.t) - len(found.t)
+        if not p.stated.all():
             what = "no truth or no covariance"
+        if found.apart is not None:
+            furthest = max(furthest, found.apart.max(initial=0.0))
+    if left_out:
         if not runs[0].numbered:
             what += f" within {runs[0].max_dt:g} s (--max-dt)"
         notes.append(f"{e.said}: {left_out} of {total} estimates have {what} and are left out")
-    furthest = max(float(k.apart.max(initial=0.0)) for k in known)
     if furthest > ROUNDING and not e.in_space:
         notes.append(f"{e.said}: the truth is interpolated, from samples up to {furthest:.2g} s away")
     return notes
 
 
-def _space_notes(e: Estimator, runs: Sequence[Poses], known: Sequence[Known], tracks: Sequence[Track]) -> list[str]:
+def _space_notes(e: Estimator, pairs: Sequence[Poses], errors: Sequence[Array]) -> list[str]:
     """Notes on probable mix-ups of conventions, and on a truth of too low a rate."""
     notes = []
-    angle = max(_median(np.linalg.norm(error[:, 3:6], axis=1)) for error in _errors(tracks))
+    angle = _largest_median(np.linalg.norm(error[:, 3:6], axis=1) for error in errors)
     if angle > FAR:
         notes.append(
             f"{e.said}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run, which is a "
             "matter of conventions or frames rather than of an estimator"
         )
-    bent = max(_median(_bend(p, k)) for p, k in zip(runs, known, strict=True))
+    bent = _largest_median(map(_bent, pairs))
     if bent > BENT:
         notes.append(
             f"{e.said}: the truth turns so fast that between its samples it may be off by {bent:.1f} sigma in the "
@@ -257,114 +249,151 @@ def _space_notes(e: Estimator, runs: Sequence[Poses], known: Sequence[Known], tr
     return notes
 
 
-def _errors(tracks: Sequence[Track]) -> list[Array]:
-    return [track.error for track in tracks if track.error is not None]
-
-
-def _bend(p: Poses, known: Known) -> Array:
+def _bent(p: Poses) -> Array:
     """What the interpolated truth may be off by, (k,), in standard deviations of the position."""
-    variances = np.diagonal(p.covariance, axis1=1, axis2=2)[known.rows, :3]
-    sigma = np.sqrt(np.abs(variances).mean(axis=1))
-    bent = (sigma > 0) & (known.bend > 1e-9)
-    return np.where(bent, known.bend / np.where(sigma > 0, sigma, 1.0), 0.0)
+    assert p.bend is not None
+    sigma = np.sqrt(np.abs(_variances(p)[:, :3]).mean(axis=1))
+    bent = np.zeros(len(sigma))
+    return np.asarray(np.divide(p.bend, sigma, out=bent, where=(sigma > 0) & (p.bend > 1e-9)))
 
 
-def _median(values: Array) -> float:
-    """Median of the finite values; 0 without any."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return 0.0
-    return float(np.median(finite))
+def _variances(p: Poses) -> Array:
+    return np.diagonal(p.covariance, axis1=1, axis2=2)
 
 
-def _not_estimated(e: Estimator, tracks: Sequence[Track], judged: Sequence[int]) -> list[int]:
-    """Components, of those judged, that a robot in the plane does not estimate."""
-    part = list(judged)
-    variances = [np.diagonal(p.covariance, axis1=1, axis2=2)[p.stated][:, part] for p in e.runs]
-    still = not_estimated([error[:, part] for error in _errors(tracks)], variances)
-    return [i for i, idle in zip(part, still, strict=True) if idle]
+def _largest_median(of_runs: Iterable[Array]) -> float:
+    """The largest median of the finite values of a run; 0 without any."""
+    largest = 0.0
+    for values in of_runs:
+        finite = values[np.isfinite(values)]
+        if len(finite):
+            largest = max(largest, float(np.median(finite)))
+    return largest
+
+
+def _estimated(e: Estimator, errors: Sequence[Array], judged: Sequence[int]) -> tuple[list[int], list[str]]:
+    """Components, of those judged, that a robot in the plane estimates, too; and a note on the others."""
+    part = np.array(judged)
+    variances, of_part = [], []
+    for p, error in zip(e.runs, errors, strict=True):
+        variances.append(_variances(p)[p.stated][:, part])
+        of_part.append(error[:, part])
+    idle = not_estimated(of_part, variances)
+    if not idle.any():
+        return list(judged), []
+    names = ", ".join(np.array(e.axes)[part[idle]])
+    note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too"
+    return part[~idle].tolist(), [note]
 
 
 def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
     """Mix-ups of the whole state, or of its poses by themselves."""
     if not e.in_space:
-        return hints(e.said, e.axes, runs, shift)
-    whole = hints(e.said, e.axes, runs, shift, judged) if len(e.axes) > len(AXES) else []
+        return _hints(e, runs, shift, range(len(e.axes)))
+    whole = []
+    if len(e.axes) > len(AXES):
+        whole = _hints(e, runs, shift, judged)
     of_pose = [i for i in judged if i < len(AXES)]
     if whole or not of_pose:
         return whole
-    return hints(e.said, e.axes[: len(AXES)], [p.alone() for p in runs], shift, of_pose)
+    poses = replace(e, axes=e.axes[: len(AXES)])
+    return _hints(poses, [p.alone() for p in runs], shift, of_pose)
+
+
+def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
+    """Hints on mix-ups, which are loaded where the errors do not fit."""
+    if is_plausible(runs, shift, judged):
+        return []
+    from consistency.referee.readers.mix_ups.hints import hints
+
+    return hints(e.said, e.axes, runs, shift, judged)
 
 
 # --- records -----------------------------------------------------------------------------------------
 
 
-def _in_columns(
-    e: Estimator, runs: Sequence[Poses], known: Sequence[Known], tracks: Sequence[Track]
-) -> tuple[list[Track], Array, list[str]]:
+def _track(e: Estimator, p: Poses, error: Array) -> Track:
+    """Errors of a run with their covariances; its columns are not yet known."""
+    path, t, width = None, None, e.position
+    if width:
+        path = np.stack([p.truth[:, :width], p.estimate[:, :width]], axis=1)
+    if e.t is None and not (p.numbered and p.clock is None):  # an archive has the times of its steps
+        t = p.seconds
+    return Track(
+        p.run, np.arange(len(p.t)), p.place, error, p.covariance, p.nis, p.nis_dof, by=p.by, t=t,
+        truth_covariance=p.true_covariance, path=path,
+    )  # fmt: skip
+
+
+def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -> tuple[list[Track], Array, list[str]]:
     """Tracks on common columns, the time of each column, (steps,), s, and a note if the file numbers them otherwise.
 
     Runs without a row are left out, but for those of an archive, which numbers its steps.
     """
     if e.t is not None:
-        return [replace(track, column=known.rows) for track, known in zip(tracks, known, strict=True)], e.t, []
-    some = [(p, track) for p, track in zip(runs, tracks, strict=True) if len(track.column)]
-    keys = [p.t[track.column] for p, track in some]
-    if not runs[0].numbered:
+        columns = [p.t.astype(np.int64) for p in pairs]
+        return in_columns(tracks, columns), e.t, []
+    keys, seconds, some = [], [], []
+    for p, track in zip(pairs, tracks, strict=True):
+        if len(p.t):
+            keys.append(p.t)
+            seconds.append(p.seconds)
+            some.append(track)
+    if not keys:
+        raise InputError(f"{e.path}: holds the start alone, step 0, which is known exactly; add steps from 1 on")
+    if not pairs[0].numbered:
         columns, t = common_times(keys)
-        return [replace(track, column=column) for (_, track), column in zip(some, columns, strict=True)], t, []
+        return in_columns(some, columns), t, []
     columns, steps = common_steps(keys)
     t = np.full(len(steps), np.nan)
-    for (p, track), column in zip(reversed(some), reversed(columns), strict=True):
-        t[column] = p.seconds[track.column]
-    tracks = [replace(track, column=column) for (_, track), column in zip(some, columns, strict=True)]
-    if np.array_equal(steps, np.arange(1, len(steps) + 1)):
-        return tracks, t, []
-    has = f"{steps[0]:g} to {steps[-1]:g}"
-    return tracks, t, [f"{e.said}: step k below is the k-th step of the file, which has {has}"]
+    for column, times in zip(reversed(columns), reversed(seconds), strict=True):
+        t[column] = times
+    notes = []
+    if not np.array_equal(steps, np.arange(1, len(steps) + 1)):
+        has = f"{steps[0]:g} to {steps[-1]:g}"
+        notes.append(f"{e.said}: step k below is the k-th step of the file, which has {has}")
+    return in_columns(some, columns), t, notes
 
 
 def _innovations(e: Estimator) -> Record:
     """The record of innovations without errors; a step whose estimate is broken fails."""
     tracks = []
     for p in e.runs:
-        rows = np.arange(len(p.t))
         error = np.where(np.isfinite(p.estimate).all(axis=1), 0.0, np.nan)[:, None]
-        tracks.append(Track(p.run, rows, p.place, error, nis=p.nis, nis_dof=p.nis_dof, t=p.clock))
-    tracks, t, numbering = _in_columns(e, e.runs, [], tracks)
+        tracks.append(Track(p.run, np.arange(len(p.t)), p.place, error, nis=p.nis, nis_dof=p.nis_dof, t=p.clock))
+    tracks, t, numbering = _in_columns(e, e.runs, tracks)
     record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", [*e.notes, *numbering])
     return replace(record, error=None, dof=0)
 
 
-def _windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:
+def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:
     """The record of motions over windows."""
-    from consistency.referee.readers.pipeline.motion_causes import causes_of_motions
-    from consistency.referee.readers.pipeline.relative_motions import Stretch, relative_recording
+    from consistency.referee.readers.pipeline.relative_motions import Stretch, causes_of_motions, relative_recording
 
     if e.stated != WHOLE:
         raise InputError(f"{e.path}: --relative needs covariances of whole poses; here parts are stated apart")
-    stretches, runs, known = [], [], []
+    runs, pairs, stretches = [], [], []
     for p in e.runs:
         if relative.motions:
             bare = np.append(False, ~p.stated[1:])
             refuse(bare, p.place.__getitem__, f"this motion has no covariance within {p.max_dt:g} s")
         elif p.cross is not None and not p.stated.all():
             p = p.of_rows(np.flatnonzero(p.stated))
-        runs.append(p)
-        known.append(p.known(r.shift))
-        if not len(known[-1].rows):
+        known = p.known(r.shift)
+        if not len(known.rows):
             raise _nothing_known(e, p, r.shift)
+        runs.append(p)
+        pairs.append(p.matched(r.shift))
         stretches.append(
             Stretch(
-                p.run, str(p.files[0]), p.place, p.seconds + r.shift, p.estimate, p.covariance, p.cross,
-                known[-1].rows, known[-1].truth, p.convention, p.by,
+                p.run, str(p.files[0]), p.place, p.seconds + r.shift, p.estimate, p.covariance, p.cross, known.rows,
+                known.truth, p.convention, p.by,
             )
         )  # fmt: skip
-    of = str(e.covariances or e.path)
     axes = AXES
     if stretches[0].d == 2:  # archives do not name them
         axes = ("x", "y", "heading")
-    record = relative_recording(e.name, of, stretches, axes, judged, relative)
+    record = relative_recording(e.name, str(e.covariances or e.path), stretches, axes, judged, relative)
     causes = causes_of_motions(e.said, stretches, axes, judged, relative)
-    notes = (*e.notes, *_left_out(e, runs, known), *record.notes, *causes)
+    notes = (*e.notes, *_left_out(e, runs, pairs), *record.notes, *causes)
     return replace(record, notes=notes, causes=tuple(causes))

@@ -7,6 +7,7 @@ A change of either world frame changes neither. Log(M D^-1) is the adjoint of it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,22 +15,25 @@ import numpy as np
 from consistency.referee.diagnostics.questions.independence import ENOUGH, Independence, independence
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import whiten
-from consistency.referee.diagnostics.words.numbers import p_text, plural
+from consistency.referee.diagnostics.words.numbers import is_or_are, p_text, plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
+from consistency.referee.readers.mix_ups.hints import Pairs, hints
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.runs_to_record import Track, assemble
-from consistency.referee.readers.truth_matching import at, common_times
+from consistency.referee.readers.runs_to_record import Track, assemble, in_columns
+from consistency.referee.readers.truth_matching import Change, Manifold, Poses, at, common_times
 from consistency.referee.readers.windows import MARGINAL, Relative, windows
 from consistency.referee.types import Array, Indices
 
 KIND = "left"
+MANIFOLDS: dict[int, Manifold] = {2: "planar", 3: "spatial"}
 DOUBTS = {  # by whether sizes of errors depend on each other, and whether they are alike: what they do, and its cause
     (True, True): ("are of like size", "conditions that last longer than a window"),
     (True, False): ("are of unlike size", "what takes turns from window to window"),
     (False, True): ("go the same way", "a bias, or noise that lasts longer than a window"),
     (False, False): ("go opposite ways", "noise of the pose that they share"),
 }
+SEARCHED = 20_000  # rows with truth, of all runs, in which mix-ups are looked for
 BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
 
 
@@ -52,7 +56,9 @@ class Stretch:
     @property
     def d(self) -> int:
         """2 in the plane, 3 in space."""
-        return 2 if self.covariance.shape[-1] == 3 else 3
+        if self.covariance.shape[-1] == 3:
+            return 2
+        return 3
 
 
 @dataclass(frozen=True)
@@ -92,9 +98,11 @@ def windows_of(stretch: Stretch, relative: Relative) -> Windows:
     error = log(inverse(D) @ M)
     covariance = _of_motions(s, T, first, last) if relative.motions else _of_poses(s, T, D, first, last, relative)
     if sound < len(s.t):  # a broken row ends the run, in a window of its own
-        finite = np.isfinite(s.estimate[sound]).all()
         first, last = np.append(first, max(sound - 1, 0)), np.append(last, sound)
-        error = np.concatenate([error, np.full((1, error.shape[1]), 0.0 if finite else np.nan)])
+        broken = 0.0
+        if not np.isfinite(s.estimate[sound]).all():
+            broken = np.nan
+        error = np.concatenate([error, np.full((1, error.shape[1]), broken)])
         covariance = np.concatenate([covariance, np.full((1, *s.covariance.shape[1:]), np.nan)])
     track = Track(s.run, np.arange(len(last)), s.place.at(last), error, covariance, t=s.t[first], by=at(s.by, first))
     return Windows(track, error, covariance, s.t[last], left_out)
@@ -107,7 +115,7 @@ def _sound(s: Stretch, relative: Relative) -> int:
         ok[1:] &= np.isfinite(s.cross[1:]).all(axis=(1, 2))
     if relative.motions:
         ok[0] = True
-    return len(ok) if ok.all() else int(np.argmin(ok))
+    return int(np.argmin(np.append(ok, False)))
 
 
 def _of_motions(s: Stretch, T: Array, first: Indices, last: Indices) -> Array:
@@ -152,56 +160,62 @@ def relative_recording(
     InputError
         Input that :func:`windows_of` refuses, or a covariance that is singular in every window.
     """
-    found = [windows_of(stretch, relative) for stretch in stretches]
-    times = [one.t for one in found]
-    part = list(judged)
-    tracks, t = [one.track.part(part) for one in found], np.full(max(map(len, times)), np.nan)
+    found, tracks, times, whitened = [], [], [], []
+    for stretch in stretches:
+        one = windows_of(stretch, relative)
+        found.append(one)
+        tracks.append(one.track.part(judged))
+        times.append(one.t)
+        whitened.append(whiten(one.error, one.covariance))
+    t = np.full(max(map(len, times)), np.nan)
     if np.isfinite(np.concatenate(times)).all():
         columns, t = common_times(times)
-        tracks = [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
-    notes = _notes(name, found, axes, stretches[0].convention, relative)
-    of = independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
-    if relative.independent:
-        notes += _doubt(name, of, relative)
-    names = tuple(axes[i] for i in part)
+        tracks = in_columns(tracks, columns)
+    notes = _notes(name, found, len(axes), stretches[0].convention, relative)
+    of = independence(np.concatenate(whitened))
+    if relative.independent and of.doubtful:
+        notes.append(_doubt(name, of, relative))
+    names = tuple(axes[i] for i in judged)
     record = assemble(name, tracks, t, names, file, KIND, notes, may_end=relative.independent)
+    record = replace(record, window=relative.text, independent=relative.independent)
     if not relative.independent:
-        return replace(record, window=relative.text)
+        return record
     caption = ""
     if of.doubtful:
         caption = f"the {_whose(relative)} do not seem to be independent, on which this rests"
-    unshown = _too_few(of, relative)
-    return replace(record, window=relative.text, independent=True, caption=caption, unshown=unshown)
+    return replace(record, caption=caption, unshown=_too_few(of, relative))
 
 
-def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention: str, relative: Relative) -> list[str]:
-    total, left_out = sum(len(one.t) for one in found), sum(one.left_out for one in found)
-    of = "motions" if relative.motions else "poses, with cross-covariances,"
-    group = "SE(2)" if len(axes) == 3 else "SE(3)"
+def _notes(name: str, found: Sequence[Windows], n: int, convention: str, relative: Relative) -> list[str]:
+    """Notes on the windows, what they do not show, and what is doubtful of them; errors have n components."""
+    of = "poses, with cross-covariances,"
+    if relative.motions:
+        of = "motions"
+    group = {3: "SE(2)", 6: "SE(3)"}[n]
+    total = sum(len(one.t) for one in found)
     notes = [
-        f"{name}: relative poses over {plural(total, 'window')} of {relative.text}; the error is Log(estimated^-1 true "
-        f"motion) of {group}, in the frame of the body at the end of a window; covariances of {of} are of the error "
+        f"relative poses over {plural(total, 'window')} of {relative.text}; the error is Log(estimated^-1 true motion) "
+        f"of {group}, in the frame of the body at the end of a window; covariances of {of} are of the error "
         f"{convention}",
-        f"{name}: what is constant over a window, or drifts more slowly than it, is not seen; longer windows see more",
+        "what is constant over a window, or drifts more slowly than it, is not seen; longer windows see more",
     ]
     if relative.independent:
-        notes.append(
-            f"{name}: errors of different {_whose(relative)} are declared to be independent: each window is a run"
-        )
+        notes.append(f"errors of different {_whose(relative)} are declared to be independent: each window is a run")
     else:
         notes.append(
-            f"{name}: windows are steps of their run, as their errors may depend on each other; where they do not, "
+            "windows are steps of their run, as their errors may depend on each other; where they do not, "
             "--windows independent makes each a run"
         )
+    left_out = sum(one.left_out for one in found)
     if left_out:
-        notes.append(f"{name}: {plural(left_out, 'window')} left out, too long because rows or truth are missing")
+        notes.append(f"{plural(left_out, 'window')} left out, too long because rows or truth are missing")
     wide = _widest(found)
     if wide > BENT:
         notes.append(
-            f"{name}: the stated rotation over a window has a sigma of {wide:.2g} rad in the median; beyond {BENT:g} "
+            f"the stated rotation over a window has a sigma of {wide:.2g} rad in the median; beyond {BENT:g} "
             "a covariance to first order is doubtful, so take shorter windows"
         )
-    return notes
+    return [f"{name}: {note}" for note in notes]
 
 
 def _whose(relative: Relative) -> str:
@@ -220,15 +234,13 @@ def _widest(found: Sequence[Windows]) -> float:
     return float(np.median(np.sqrt(np.maximum(largest, 0.0))))
 
 
-def _doubt(name: str, of: Independence, relative: Relative) -> list[str]:
+def _doubt(name: str, of: Independence, relative: Relative) -> str:
     """Note that windows are correlated, positively or negatively, though they are declared to be independent."""
-    if not of.doubtful:
-        return []
     way, cause = DOUBTS[bool(of.of_sizes), bool(of.alike)]
-    return [
+    return (
         f"{name}: errors of neighbouring windows {way} (p {p_text(of.p_value)}), so that they do not seem to be "
         f"independent: {cause} may be behind it, and the verdict holds for independent {_whose(relative)} only"
-    ]
+    )
 
 
 def _too_few(of: Independence, relative: Relative) -> str:
@@ -239,7 +251,39 @@ def _too_few(of: Independence, relative: Relative) -> str:
     if relative.motions or of.pieces >= ENOUGH:
         return ""
     return (
-        f"{plural(of.pieces, 'window')} {'is' if of.pieces == 1 else 'are'} too few windows to show independence, "
+        f"{plural(of.pieces, 'window')} {is_or_are(of.pieces)} too few windows to show independence, "
         f"which takes {ENOUGH}; without --windows independent they are steps of their run, however they depend on "
         "each other"
     )
+
+
+def causes_of_motions(
+    name: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
+) -> list[str]:
+    """Mix-ups of motions, or of poses with cross-covariances, without which the errors of the windows fit."""
+    most = SEARCHED // len(stretches)
+    stretches = [replace(s, rows=s.rows[:most], truth=s.truth[:most]) for s in stretches]
+    runs = [_poses_of(s) for s in stretches]
+
+    def errors_without(change: Change) -> Pairs:
+        found = []
+        for s, p in zip(stretches, runs, strict=True):
+            with np.errstate(invalid="ignore"), suppress(InputError):  # infinite covariances; no window fits
+                q = change(p)
+                cross = s.cross
+                if cross is not None:
+                    cross = change(replace(p, covariance=cross)).covariance
+                changed = replace(s, estimate=q.estimate, covariance=q.covariance, cross=cross, truth=q.truth)
+                one = windows_of(replace(changed, convention=q.convention), relative)
+                found.append((one.error, one.covariance))
+        return found
+
+    return hints(name, axes, runs, judged=judged, errors_without=errors_without)
+
+
+def _poses_of(s: Stretch) -> Poses:
+    """The rows of a run as poses or motions, which a change of the reading takes."""
+    return Poses(
+        s.place, s.t, s.estimate, s.covariance, np.ones(len(s.t), bool), s.t[s.rows], s.truth, MANIFOLDS[s.d],
+        s.convention, 0.0,
+    )  # fmt: skip

@@ -76,12 +76,15 @@ def _one_estimator(
         if (one.axes, one.stated, one.convention) != (first.axes, first.stated, first.convention):
             raise InputError(f"{one.path}: has another state or kind of covariance than {first.path}")
         poses.append(replace(one.runs[0], run=run))
-    without = {run: f"it holds no estimates of '{name}'" for run in all_runs if run not in own}
-    t = None
-    if first.t is not None:
+    without = dict.fromkeys(set(all_runs).difference(own), f"it holds no estimates of '{name}'")
+    t = first.t
+    notes: dict[str, str] = {}
+    causes: dict[str, str] = {}
+    if t is not None:
         t = max((one.t for one in own.values() if one.t is not None), key=len)
-    notes = {_without_paths(note, one): note for one in reversed(list(own.values())) for note in one.notes}
-    causes = {_without_paths(cause, one): cause for one in reversed(list(own.values())) for cause in one.causes}
+    for one in reversed(list(own.values())):
+        notes |= {_without_paths(note, one): note for note in one.notes}
+        causes |= {_without_paths(cause, one): cause for cause in one.causes}
     return replace(
         first, name=name, label=name, runs=poses, t=t, failed={**without, **failed},
         notes=list(reversed(notes.values())), causes=list(reversed(causes.values())),

@@ -1,4 +1,4 @@
-"""What the options of a command ask of the referee, and how many runs that takes."""
+"""How many runs a verdict takes that a command asks for."""
 
 from __future__ import annotations
 
@@ -9,51 +9,9 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.skipping import Skip, skip_of
-from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-
-OPTION = {
-    "ratio": "detect",
-    "false_alarm": "false-alarm",
-    "max_runs": "max-runs",
-}  # of the plan, as the command calls it
-
-
-def settings_of(confidence: float | None = None, **given: Any) -> Settings:
-    """Settings of a verdict from the options of a command; those that are None keep their defaults.
-
-    Raises
-    ------
-    InputError
-        A value out of its range, or both a confidence and a false-alarm rate.
-    """
-    given = {name: value for name, value in given.items() if value is not None}
-    if confidence is not None:
-        if "false_alarm" in given:
-            raise InputError("--confidence is 1 less --false-alarm; give one of them")
-        if not 0.0 < confidence < 1.0:
-            raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
-        given["false_alarm"] = 1.0 - confidence
-    try:
-        return Settings(**given)
-    except ValueError as error:
-        raise refused(error) from None
-
-
-def skip_asked(given: str | float | Skip | None) -> Skip | None:
-    """The first steps or seconds that an option asks to leave out.
-
-    Raises
-    ------
-    InputError
-        It is neither a number of steps nor of seconds.
-    """
-    try:
-        return skip_of(given)
-    except ValueError as error:
-        raise refused(error) from None
+from consistency.referee.verdicts.sources import refused
 
 
 def plan(
@@ -143,9 +101,3 @@ def pilots_of_records(
             raise InputError(f"{name}: a pilot needs at least {FEW} runs that did not fail, got {len(means)}")
         pilots[name] = means, record.nees.shape[1]
     return pilots, next(iter(named.values())).dof
-
-
-def refused(error: ValueError) -> InputError:
-    """What a plan refuses, with the option of the command in place of the argument."""
-    name, rest = str(error).split(" ", 1)
-    return InputError(f"--{OPTION.get(name, name)} {rest}")

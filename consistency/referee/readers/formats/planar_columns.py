@@ -42,27 +42,28 @@ def read_plane(path: Path, motions: bool = False, columns: Columns | None = None
     clock = None if head is None else clock_of(head.names)
     if head is None or clock is None:
         raise InputError(f"{path}: needs names of columns, t with x, y, heading, or t with v, omega")
-    places, rates = places_of(head.names, PLACES), False
-    if places is None:
-        places, rates = places_of(head.names, (SPEEDS, TURNS)), True
-    if places is None:
-        raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(head.names[:12])}")
-    others = covariance_places(head.names, POSE) | state_places(head.names, POSE, TRUE)
-    known = (*COVARIANCE, *LOWER_NAMES.values(), *(head.names[place] for place in others.values()))
-    stated = [name for name in dict.fromkeys(known) if name in head.names]
-    wanted = (*clock[0], *places, *(head.names.index(name) for name in stated))
-    lines, values = read_named(path, head, wanted, columns)
-    first = len(clock[0])
-    t, unit = times_of(lines, clock[0], values[:first], clock[1])
-    pose = np.column_stack(values[first : first + len(places)])
-    of = "planar poses"
-    if rates:
-        of = f"speed and turn rate, each held until the next, integrated to {'motions' if motions else 'poses'}"
-        pose = motions_of(t, pose[:, 0], pose[:, 1])
-        pose = pose if motions else poses_of(pose)
-    rows = increasing(replace(lines, values=np.column_stack([t, pose, *values[first + len(places) :]])))
-    note = f"{path}: read as {of}, {len(head.names)} columns, {UNIT_NAMES[unit]}"
-    data = dict(zip(["t", *POSE, *stated], rows.values.T, strict=True))
+    names, (times, stated_unit) = head.names, clock
+    poses, rates = places_of(names, PLACES), places_of(names, (SPEEDS, TURNS))
+    moving = poses or rates
+    if moving is None:
+        raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(names[:12])}")
+    kept = [name for name in (*COVARIANCE, *LOWER_NAMES.values()) if name in names]
+    for place in (covariance_places(names, POSE) | state_places(names, POSE, TRUE)).values():
+        kept.append(names[place])
+    kept = list(dict.fromkeys(kept))
+    lines, values = read_named(path, head, (*times, *moving, *map(names.index, kept)), columns)
+    t, unit = times_of(lines, times, values[: len(times)], stated_unit)
+    values = values[len(times) :]
+    pose, of = np.column_stack(values[: len(moving)]), "planar poses"
+    if poses is None:
+        what = "motions" if motions else "poses"
+        of = f"speed and turn rate, each held until the next, integrated to {what}"
+        pose = motions_of(t, *pose.T)
+        if not motions:
+            pose = poses_of(pose)
+    rows = increasing(replace(lines, values=np.column_stack([t, pose, *values[len(moving) :]])))
+    data = dict(zip(["t", *POSE, *kept], rows.values.T, strict=True))
+    note = f"{path}: read as {of}, {len(names)} columns, {UNIT_NAMES[unit]}"
     return TableRows(path, data, rows.line, "line", rows.open_line, rows.cut), note
 
 
@@ -82,8 +83,9 @@ def motions_of(t: Array, v: Array, omega: Array) -> Array:
 
 def poses_of(motions: Array) -> Array:
     """Poses (N, 3) from (0, 0, 0) on, of motions as :func:`motions_of` gives them; headings within half a turn."""
-    heading = np.cumsum(motions[:, 2])
+    forward, left, turn = motions.T
+    heading = np.cumsum(turn)
     before = np.concatenate([[0.0], heading[:-1]])
     c, s = np.cos(before), np.sin(before)
-    steps = np.column_stack([c * motions[:, 0] - s * motions[:, 1], s * motions[:, 0] + c * motions[:, 1]])
+    steps = np.column_stack([c * forward - s * left, s * forward + c * left])
     return np.column_stack([np.cumsum(steps, axis=0), wrap(heading)])

@@ -196,5 +196,5 @@ class _Log:
 
 def _time(row: dict[str, Any]) -> float:
     if "TimeUS" in row:
-        return row["TimeUS"] * MICRO
-    return row.get("TimeMS", np.nan) * 1e-3
+        return float(row["TimeUS"]) * MICRO
+    return float(row.get("TimeMS", np.nan)) * 1e-3

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import datetime as dt
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -145,21 +145,20 @@ def read_solution(path: Path) -> Fixes:
     found = parsed(path, solution.rows, solution.is_whole)
     if not found.parts:
         raise InputError(f"{path}: holds no solution")
-    kind = next((each for each in STATED if set(each) <= set(solution.names)), None)
+    names = ["t", *solution.names]
+    values = np.concatenate(found.parts)
+    columns = dict(zip(names, values.T, strict=True))
+    kind = next((each for each in STATED if set(each) <= set(names)), None)
     if kind is None:
-        known = "; ".join(", ".join(each) for each in (GEODETIC, CENTRED, BASELINE))
+        known = "; ".join(map(", ".join, (GEODETIC, CENTRED, BASELINE)))
         raise InputError(f"{path}: holds none of {known}; have RTKLIB write it with out-solformat =llh, =xyz or =enu")
-    rows = list(zip(found.line.tolist(), chain.from_iterable(found.parts), strict=True))
-    t = np.array([_time(path, number, row, solution.clock) for number, row in rows])
-    values = _numbers(path, rows)
-    columns = _columns(path, solution.names, values, rows)
-    place = np.column_stack([columns[name] for name in kind])
+    t, place = columns["t"], np.column_stack([columns[name] for name in kind])
     P = _covariance(path, columns, STATED[kind].split())
     if kind is CENTRED:
         place = geodetic(place)
         P = _turned(axes_at(place), P)
-    note = f"{path}: read as a solution of RTKLIB, {len(solution.names) + 2} columns, {_clock_note(solution.clock, t)}"
-    note += f"; {_qualities(columns)}"
+    read_as = f"read as a solution of RTKLIB, {len(names) + 1} columns, {_clock_note(solution.clock, t)}"
+    note = f"{path}: {read_as}; {_qualities(columns)}"
     values = np.column_stack([t, place, P.reshape(-1, 9)])
     lines = Fixes(path, values, found.line, note, cut=found.cut, geodetic=kind is not BASELINE)
     increasing(lines)
@@ -177,79 +176,64 @@ class _Solution:
     @property
     def width(self) -> int:
         """Fields of a row: the time has two, and an angle in degrees, minutes and seconds three."""
-        return 2 + len(self.names) + 2 * sum(name in ANGLES for name in self.names)
+        return 2 + len(self.names) + 2 * sum(map(ANGLES.count, self.names))
 
-    def rows(self, lines: list[Numbered]) -> tuple[list[list[str]], list[int]]:
+    def rows(self, lines: list[Numbered]) -> tuple[Array, list[int]]:
+        """Numbers of some rows, the time first, and the numbers of their lines; headers are kept."""
         rows, numbers = [], []
         for number, line in lines:
-            where = f"{self.path}, line {number}"
             if line.startswith("%"):
-                self._header(line[1:].split())
+                words = line[1:].split()
+                if words and words[0] in AHEAD:
+                    self.clock, self.names = words[0], words[1:]
                 continue
-            if not self.names:
-                raise InputError(f"{where}: stands under no header '%  GPST  latitude(deg) ...'")
-            row = line.replace(",", " ").split()
-            if len(row) != self.width:
-                what = f"its header names a time of two and {self.width - 2} more"
-                raise InputError(f"{where}: has {len(row)} fields; {what}")
-            rows.append(row)
+            rows.append(self._row(f"{self.path}, line {number}", line.replace(",", " ").split()))
             numbers.append(number)
-        return rows, numbers
+        return np.array(rows), numbers
 
     def is_whole(self, line: str, above: object) -> bool:
         return line.startswith("%") or len(line.replace(",", " ").split()) == self.width
 
-    def _header(self, words: Sequence[str]) -> None:
-        if words and words[0] in AHEAD:
-            self.clock, self.names = words[0], list(words[1:])
-
-
-Row = tuple[int, list[str]]  # number of a line and its fields
-
-
-def _numbers(path: Path, rows: Sequence[Row]) -> Array:
-    """Numbers behind the time."""
-    out = []
-    for number, row in rows:
+    def _row(self, where: str, fields: list[str]) -> list[float]:
+        if not self.names:
+            raise InputError(f"{where}: stands under no header '%  GPST  latitude(deg) ...'")
+        if len(fields) != self.width:
+            what = f"its header names a time of two and {self.width - 2} more"
+            raise InputError(f"{where}: has {len(fields)} fields; {what}")
         try:
-            out.append([float(field) for field in row[2:]])
+            values = list(map(float, fields[2:]))
         except ValueError:
-            raise InputError(f"{path}, line {number}: a field is not a number ({' '.join(row[2:])[:60]})") from None
-    return np.array(out)
+            raise InputError(f"{where}: a field is not a number ({' '.join(fields[2:])[:60]})") from None
+        row = [_time(where, fields[:2], self.clock)]
+        for name in self.names:
+            if name in ANGLES:
+                of = fields[-len(values) :][:3]
+                row.append(_degrees(f"{where}: '{' '.join(of)}'", *values[:3]))
+                values = values[3:]
+            else:
+                row.append(values.pop(0))
+        return row
 
 
-def _columns(path: Path, names: Sequence[str], values: Array, rows: Sequence[Row]) -> dict[str, Array]:
-    """Columns by name, with degrees, minutes and seconds in one; -0 degrees are negative."""
-    columns, at = {}, 0
-    for name in names:
-        if name not in ANGLES:
-            columns[name] = values[:, at]
-            at += 1
-            continue
-        whole, minutes, seconds = values[:, at : at + 3].T
-        bad = np.flatnonzero((minutes < 0) | (minutes >= 60) | (seconds < 0) | (seconds > 60) | (whole % 1 != 0))
-        if len(bad):
-            number, row = rows[bad[0]]
-            what = f"'{' '.join(row[2 + at : 5 + at])}' is not an angle of degrees, minutes and seconds"
-            raise InputError(f"{path}, line {number}: {what}")
-        columns[name] = np.copysign(np.abs(whole) + minutes / 60.0 + seconds / 3600.0, whole)
-        at += 3
-    return columns
+def _degrees(which: str, whole: float, minutes: float, seconds: float) -> float:
+    """Degrees of an angle; those of -0 degrees are negative."""
+    if not (0 <= minutes < 60 and 0 <= seconds <= 60 and whole % 1 == 0):
+        raise InputError(f"{which} is not an angle of degrees, minutes and seconds")
+    return math.copysign(abs(whole) + minutes / 60.0 + seconds / 3600.0, whole)
 
 
-def _time(path: Path, number: int, row: Sequence[str], clock: str) -> float:
+def _time(where: str, fields: Sequence[str], clock: str) -> float:
     """Seconds since 1970 in UTC of a date and a time of day, or of a week and its second."""
+    date, time = fields
     try:
-        if "/" in row[0]:
-            (year, month, day), (hour, minute, seconds) = row[0].split("/"), row[1].split(":")
-            at = dt.datetime(int(year), int(month), int(day), int(hour), int(minute))
-            second = float(seconds)
+        if "/" in date:
+            hour, minute, seconds = time.split(":")
+            year, month, day = map(int, date.split("/"))
+            at, second = dt.datetime(year, month, day, int(hour), int(minute)), float(seconds)
         else:
-            at, second = GPS + dt.timedelta(weeks=int(row[0])), float(row[1])
+            at, second = GPS + dt.timedelta(weeks=int(date)), float(time)
     except (ValueError, OverflowError):
-        raise InputError(
-            f"{path}, line {number}: '{' '.join(row[:2])}' is not a date and time, and no GPS week"
-        ) from None
+        raise InputError(f"{where}: '{date} {time}' is not a date and time, and no GPS week") from None
     t = (at - UNIX).total_seconds() - AHEAD[clock] + second
     return t - leap_seconds(t) if clock == "GPST" else t
 

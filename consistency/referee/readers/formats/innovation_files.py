@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import MOST_DOF, one_line, require_name
+from consistency.referee.parsing import MOST_DOF, require_name
 from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
 from consistency.referee.readers.formats.numpy_archive import Archive, load_arrays
 from consistency.referee.readers.formats.other_names import with_clock
-from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet, separator_of
+from consistency.referee.readers.formats.sheet import CsvTable, TableRows, are_dof, bounded, read_sheet
 from consistency.referee.readers.formats.table_columns import row_order
 from consistency.referee.readers.places import listed, refuse
 from consistency.referee.types import Array
@@ -185,41 +185,29 @@ def stream_nis(lines: Iterable[str], name: str) -> Iterator[tuple[str, float, fl
     InputError
         The header lacks a column, or a line cannot be used.
     """
-    columns: list[str] = []
-    separator = ","
+    table = CsvTable(Path(name))
     for number, line in enumerate(lines, 1):
         text = line.lstrip("\ufeff").strip()
         if not text or text.startswith("#"):
             continue
-        if not columns:
-            separator = separator_of(text)
-            columns = _stream_columns(text.split(separator), name)
+        is_header = not table.names
+        columns, numbers = table.rows([(number, text)])
+        if is_header:
+            _require_one_run(name, table.names)
             continue
-        fields, place = text.split(separator), f"{name}, line {number}"
-        if len(fields) != len(columns):
-            raise InputError(f"{place}: has {len(fields)} columns, the header has {len(columns)}")
-        row = dict(zip(columns, fields, strict=True))
-        nis, dof = (_number(place, key, row[key].strip()) for key in NEEDED)
+        row = TableRows(table.path, columns, np.array(numbers), "line")
+        nis, dof = float(row.numbers("nis")[0]), float(row.numbers("nis_dof")[0])
         if dof >= MOST_DOF:
-            raise InputError(f"{place}: nis_dof must be {DOF_NEEDED}, got {dof:g}")
+            raise InputError(f"{row.place(0)}: nis_dof must be {DOF_NEEDED}, got {dof:g}")
         if np.isnan(nis) and np.isnan(dof):
             dof = 0.0
-        yield place, nis, dof
-    if not columns:
+        yield row.place(0), nis, dof
+    if not table.names:
         raise InputError(f"{name}: is empty; its first line must name the columns, nis and nis_dof among them")
 
 
-def _stream_columns(header: Sequence[str], name: str) -> list[str]:
-    columns = [column.strip().strip('"') for column in header]
+def _require_one_run(name: str, columns: Sequence[str]) -> None:
     _require_columns(name, columns)
     for several in ("run", "filter"):
         if several in columns:
             raise InputError(f"{name}: column '{several}': lines as they come must be of one run of one filter")
-    return columns
-
-
-def _number(place: str, column: str, text: str) -> float:
-    try:
-        return float(bounded(np.array(float(text or "nan"))))
-    except ValueError:
-        raise InputError(f"{place}: column '{column}': not a number ({one_line(text, 60)})") from None

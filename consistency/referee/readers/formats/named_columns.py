@@ -305,7 +305,7 @@ def _numbered(plain: list[str], pattern: re.Pattern[str], sizes: Sequence[int]) 
 def _triangle(plain: list[str], prefix: str, labels: Sequence[str]) -> tuple[int, ...]:
     """Places of the entries of an upper triangle, or of their mirror images; none where one is not there."""
     join = "_" if prefix.endswith("_") else ""
-    found = []
+    found: list[int] = []
     for a, b in itertools.combinations_with_replacement(labels, 2):
         there = all_places(plain, [f"{prefix}{a}{join}{b}"]) or all_places(plain, [f"{prefix}{b}{join}{a}"])
         if not there:

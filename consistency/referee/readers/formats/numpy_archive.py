@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -262,19 +262,17 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
     clock, axes, poses = archive.times(steps), archive.axes(n), []
     if r.relative is not None:  # poses, or motions of them
         axes = PLANAR_POSE
-    for run, length in enumerate(archive.lengths(runs, steps)):
-        its = (run, slice(length))
-        rows = np.flatnonzero(there[its])
-        place = steps_of(path, run, rows).__getitem__
-        P, T = np.full((length, n, n), np.nan), None
-        P[rows] = symmetric(covariances[run, rows], place)
+    for one in _runs(archive, estimates, truth, there, clock):
+        its, rows = (one.run, slice(len(one.t))), np.flatnonzero(there[one.run, : len(one.t)])
+        place = one.place.at(rows).__getitem__
+        P, T = np.full(covariances[its].shape, np.nan), None
+        P[rows] = symmetric(covariances[one.run, rows], place)
         if of_truth is not None:
-            T = symmetric(of_truth[run, rows], place)
-        one = _run(path, run, estimates[its], truth[its], there[its], clock)
+            T = symmetric(of_truth[one.run, rows], place)
         poses.append(
             replace(
-                one, covariance=P, stated=np.ones(length, bool), manifold=manifold_of(convention),
-                convention=convention, run=run, true_covariance=T, nis=at(nis, its), nis_dof=at(dof, its),
+                one, covariance=P, stated=np.ones(len(P), bool), manifold=manifold_of(convention), name="",
+                convention=convention, true_covariance=T, nis=at(nis, its), nis_dof=at(dof, its),
                 cross=at(cross, its), by=at(by, its),
             )
         )  # fmt: skip
@@ -348,25 +346,26 @@ def _poses_of(archive: Archive) -> Estimator:
         raise InputError(f"{path}: estimates {estimates.shape} and truth {truth.shape} must both be (runs, steps, 3)")
     runs, steps, _ = estimates.shape
     there = archive.known(runs, steps) & np.isfinite(truth).all(axis=-1)
-    clock, poses = archive.times(steps), []
-    for run, length in enumerate(archive.lengths(runs, steps)):
-        its = (run, slice(length))
-        one = _run(path, run, estimates[its], truth[its], there[its], clock)
-        poses.append(replace(one, name=f"run {run}" if runs > 1 else path.stem))
+    clock = archive.times(steps)
+    poses = [replace(one, run=0) for one in _runs(archive, estimates, truth, there, clock)]
     return Estimator(path.stem, path, poses, PLANAR_POSE, t=clock)
 
 
-def _run(path: Path, run: int, estimate: Array, truth: Array, known: Array, clock: Array) -> Poses:
-    """Estimates (T, n) of one run and their truth where it is ``known``, without covariances, in the plane."""
-    steps, n = estimate.shape
-    t = true_t = np.arange(float(steps))
-    if not known.all():
-        true_t, truth = t[known], truth[known]
-    place = steps_of(path, run, np.arange(steps))
-    return Poses(
-        place, t, estimate, *unstated(steps, n), true_t, truth, "planar", "left", 0.0, files=(path, path),
-        numbered=True, clock=clock[:steps],
-    )  # fmt: skip
+def _runs(archive: Archive, estimates: Array, truth: Array, there: Array, clock: Array) -> Iterator[Poses]:
+    """Estimates (runs, steps, n) and their truth where it is ``there``, without covariances, in the plane."""
+    path, (runs, steps, n) = archive.path, estimates.shape
+    for run, length in enumerate(archive.lengths(runs, steps)):
+        known, own_truth = there[run, :length], truth[run, :length]
+        t = true_t = np.arange(float(length))
+        if not known.all():
+            true_t, own_truth = t[known], own_truth[known]
+        place, name = steps_of(path, run, np.arange(length)), f"run {run}"
+        if runs == 1:
+            name = path.stem
+        yield Poses(
+            place, t, estimates[run, :length], *unstated(length, n), true_t, own_truth, "planar", "left", 0.0, run=run,
+            name=name, files=(path, path), numbered=True, clock=clock[:length],
+        )  # fmt: skip
 
 
 def _of_nees(archive: Archive) -> Record:

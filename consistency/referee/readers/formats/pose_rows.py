@@ -70,8 +70,8 @@ def read_beside(path: Path, columns: Columns | None = None) -> Lines | None:
     if head is None or roles is None or not roles.quaternion:
         return None
     lines = _named(path, head, roles, True, columns)
-    known = lines.rows(np.isfinite(lines.values).all(axis=1))
-    return replace(known, rest=None, note=f"{path}: the truth stands in columns beside the estimates")
+    finite = np.asarray(np.isfinite(lines.values).all(axis=1))
+    return replace(lines.rows(finite), rest=None, note=f"{path}: the truth stands in columns beside the estimates")
 
 
 def on_plane(lines: Lines, unit: str) -> TableRows:
@@ -105,9 +105,9 @@ def _named(path: Path, head: Head, roles: Roles, true: bool, columns: Columns | 
     t, unit = times_of(lines, roles.time, times, roles.unit)
     if roles.squared:
         stated = [np.sign(each) * np.sqrt(np.abs(each)) for each in stated]
-    values = np.column_stack([t, *own, *stated])
+    rows = np.column_stack([t, *own, *stated])
     note = _named_note(path, head, roles, true, UNIT_NAMES[unit])
-    return increasing(replace(lines, values=values, note=note, rest=np.column_stack(rest) if rest else None))
+    return increasing(replace(lines, values=rows, note=note, rest=np.column_stack(rest) if rest else None))
 
 
 def _named_note(path: Path, head: Head, roles: Roles, true: bool, clock: str) -> str:

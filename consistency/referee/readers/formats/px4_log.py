@@ -64,13 +64,13 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
         raise InputError(f"{path}: holds no innovation with a variance; nothing was fused")
     if sensor in groups and sensor not in sensors:
         raise InputError(f"--filter {sensor}: is never fused in {path}; there are: {', '.join(sensors)}")
-    components = [part for parts in sensors.values() for part in parts]
-    name, parts = sensor, [sensor]
-    if sensor not in components:
-        name = choose(path, "filter", list(sensors), sensor, "sensor")
-        parts = sensors[name]
+    if sensor is not None and any(sensor in parts for parts in sensors.values()):
+        sensors[sensor] = [sensor]  # one component
+    else:
+        sensor = str(choose(path, "filter", list(sensors), sensor, "sensor"))
+    parts = sensors[sensor]
     nis, dof, held = pairs.nis(parts)
-    return numbered_log(name, pairs.t, nis, dof, _notes(path, name, pairs, dof, held, log))
+    return numbered_log(sensor, pairs.t, nis, dof, _notes(path, sensor, pairs, dof, held, log))
 
 
 def _loaded(path: Path) -> Any:

@@ -91,34 +91,38 @@ def _require_whole(path: Path, bags: Sequence[Path]) -> None:
 def _run_of(bag: Path, r: Reading) -> SpaceRun:
     """Estimates and truth of a bag, whose covariances stand in the lines, and notes on their frames."""
     with _opened(bag) as reader:
-        topic, truth = _chosen(bag, reader, r.topic), r.truth_topic
-        if truth is None:
-            there = _others(reader, topic)
-            raise InputError(f"{bag}: needs --truth-topic, of poses or PARENT:CHILD of /tf; there are: {there}")
-        own, true = _lines(bag, reader, topic), _lines(bag, reader, truth)
-        notes = _other_frames(bag, (topic, _frames(reader, topic)), (truth, _frames(reader, truth)))
-    numbers = 4 if isinstance(true, Fixes) else POSE  # of a row before its covariance
+        run = _run_on(bag, reader, r, _chosen(bag, reader, r.topic), ", of poses or PARENT:CHILD of /tf")
+    numbers = 4 if isinstance(run.true, Fixes) else POSE  # of a row before its covariance
     if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: with a bag it is '{COLUMNS}', of the messages")
-    if r.truth_covariance is not None and not (true.values[:, numbers:] > 0).any():
-        raise InputError(f"{bag}: --truth-covariance {COLUMNS}: the messages of {truth} state none")
-    if not np.isfinite(true.values[:, 1:numbers]).all():
-        raise InputError(f"{bag}: the truth on {truth} is not finite")
-    return SpaceRun(own, true, (bag, f"{truth} of {bag}"), notes=notes)
+    if r.truth_covariance is not None and not (run.true.values[:, numbers:] > 0).any():
+        raise InputError(f"{bag}: --truth-covariance {COLUMNS}: the messages of {r.truth_topic} state none")
+    if not np.isfinite(run.true.values[:, 1:numbers]).all():
+        raise InputError(f"{bag}: the truth on {r.truth_topic} is not finite")
+    return run
 
 
 def _bare_run(bag: Path, r: Reading) -> SpaceRun:
     """Poses of a bag, of a topic with or without covariances."""
     with _opened(bag) as reader:
-        topic, truth = r.topic, r.truth_topic
+        topic = r.topic
         if topic not in _topics(reader, POSES):
             topic = _chosen(bag, reader, topic)
-        if truth is None:
-            raise InputError(f"{bag}: needs --truth-topic; there are: {_others(reader, topic)}")
-        own, true = _lines(bag, reader, topic), _lines(bag, reader, truth)
-    if isinstance(own, Fixes) or isinstance(true, Fixes):
+        run = _run_on(bag, reader, r, topic)
+    if isinstance(run.own, Fixes) or isinstance(run.true, Fixes):
         raise InputError(f"{bag}: positions by satellite have no orientations, which motions need")
-    return SpaceRun(own, true, (bag, f"{truth} of {bag}"))
+    return run
+
+
+def _run_on(bag: Path, reader: Any, r: Reading, topic: str, needed: str = "") -> SpaceRun:
+    """A run on a topic beside that of the truth; ``needed`` says in a message what the latter may be."""
+    truth = r.truth_topic
+    if truth is None:
+        there = [name for name in _topics(reader, POSES) if name != topic]
+        raise InputError(f"{bag}: needs --truth-topic{needed}; there are: {_listed(there, reader)}")
+    own, true = _lines(bag, reader, topic), _lines(bag, reader, truth)
+    notes = _other_frames(bag, (topic, _frames(reader, topic)), (truth, _frames(reader, truth)))
+    return SpaceRun(own, true, (bag, f"{truth} of {bag}"), notes=notes)
 
 
 def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
@@ -176,12 +180,6 @@ def _opened(bag: Path) -> Iterator[Any]:
 
 def _topics(reader: Any, kinds: Sequence[str]) -> list[str]:
     return sorted({connection.topic for connection in reader.connections if connection.msgtype in kinds})
-
-
-def _others(reader: Any, topic: str) -> str:
-    """Topics of poses but one, for messages."""
-    there = [name for name in _topics(reader, POSES) if name != topic]
-    return _listed(there, reader)
 
 
 def _listed(topics: Sequence[str], reader: Any) -> str:

@@ -104,6 +104,7 @@ class TableRows(FileRows):
         refuse(bad, self.place, full)
 
     def rows(self, keep: Array) -> TableRows:
+        """Some of the rows."""
         return replace(self, data={name: cells[keep] for name, cells in self.data.items()}, line=self.line[keep])
 
     def renamed(self, columns: Columns | None) -> TableRows:
@@ -144,6 +145,7 @@ class Lines(FileRows):
         return replace(self, values=self.values[:, columns].copy())
 
     def rows(self, keep: Array | slice) -> Lines:
+        """Some of the lines."""
         rest = self.rest
         if rest is not None:
             rest = rest[keep]
@@ -229,7 +231,7 @@ def _cells(values: Array) -> Column:
 
 
 def _read_csv(path: Path) -> TableRows:
-    table = _Csv(path)
+    table = CsvTable(path)
     found = parsed(path, table.rows, table.is_whole)
     if not table.names:
         raise InputError(f"{path}: is empty")
@@ -239,7 +241,7 @@ def _read_csv(path: Path) -> TableRows:
     return TableRows(path, data, found.line, "line", found.open_line, found.cut)
 
 
-class _Csv:
+class CsvTable:
     """A CSV file while it is read."""
 
     def __init__(self, path: Path) -> None:
@@ -319,8 +321,9 @@ def _number(cell: object) -> float:
             return float(cell)
         except ValueError:
             return math.nan
-    is_number = isinstance(cell, int | float | np.number) and not isinstance(cell, bool)
-    return float(cell) if is_number else math.nan
+    if isinstance(cell, int | float | np.number) and not isinstance(cell, bool):
+        return float(cell)
+    return math.nan
 
 
 def _no_number(cells: Array) -> str:

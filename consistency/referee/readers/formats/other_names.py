@@ -66,8 +66,8 @@ def true_columns(sheet: TableRows, axes: Sequence[str]) -> TableRows | None:
     for key in KEYS:
         if key in sheet:
             data[key] = sheet.data[key]
-    known = np.asarray(~np.isnan(values).any(axis=1))
-    return replace(sheet, data=data).rows(known)
+    complete = np.asarray(~np.isnan(values).any(axis=1))
+    return replace(sheet, data=data).rows(complete)
 
 
 def state_places(names: Sequence[str], axes: Sequence[str], spellings: Sequence[str]) -> dict[str, int]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.sheet import Lines, increasing
-from consistency.referee.readers.formats.text_blocks import Numbered, parsed
+from consistency.referee.readers.formats.text_blocks import LineParser, parsed
 from consistency.referee.types import Array
 
 A, F = 6378137.0, 1.0 / 298.257223563  # m and 1: semi-major axis and flattening of WGS 84 (NIMA TR8350.2, table 3.1)
@@ -142,7 +142,7 @@ def read_solution(path: Path) -> Fixes:
         The file has no header that names these columns, a row is broken, or times do not increase.
     """
     solution = _Solution(path)
-    found = parsed(path, solution.rows, solution.is_whole)
+    found = parsed(solution)
     if not found.parts:
         raise InputError(f"{path}: holds no solution")
     names = ["t", *solution.names]
@@ -165,36 +165,31 @@ def read_solution(path: Path) -> Fixes:
     return lines
 
 
-class _Solution:
+class _Solution(LineParser):
     """A solution while it is read: its clock, and the names of its columns but the time."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.clock = ""
-        self.names: list[str] = []
+    clock = ""
+    names: Sequence[str] = ()
 
     @property
     def width(self) -> int:
         """Fields of a row: the time has two, and an angle in degrees, minutes and seconds three."""
         return 2 + len(self.names) + 2 * sum(map(ANGLES.count, self.names))
 
-    def rows(self, lines: list[Numbered]) -> tuple[Array, list[int]]:
-        """Numbers of some rows, the time first, and the numbers of their lines; headers are kept."""
-        rows, numbers = [], []
-        for number, line in lines:
-            if line.startswith("%"):
-                words = line[1:].split()
-                if words and words[0] in AHEAD:
-                    self.clock, self.names = words[0], words[1:]
-                continue
-            rows.append(self._row(f"{self.path}, line {number}", line.replace(",", " ").split()))
-            numbers.append(number)
-        return np.array(rows), numbers
-
     def is_whole(self, line: str, above: object) -> bool:
         return line.startswith("%") or len(line.replace(",", " ").split()) == self.width
 
-    def _row(self, where: str, fields: list[str]) -> list[float]:
+    def part(self, rows: list[list[float]], numbers: list[int]) -> Array:
+        return np.array(rows)
+
+    def row(self, number: int, line: str) -> list[float] | None:
+        """The time, and numbers under the names of the header."""
+        where, fields = f"{self.path}, line {number}", line.replace(",", " ").split()
+        if line.startswith("%"):
+            words = line[1:].split()
+            if words and words[0] in AHEAD:
+                self.clock, self.names = words[0], words[1:]
+            return None
         if not self.names:
             raise InputError(f"{where}: stands under no header '%  GPST  latitude(deg) ...'")
         if len(fields) != self.width:

@@ -190,12 +190,11 @@ def stream_nis(lines: Iterable[str], name: str) -> Iterator[tuple[str, float, fl
         text = line.lstrip("\ufeff").strip()
         if not text or text.startswith("#"):
             continue
-        is_header = not table.names
-        columns, numbers = table.rows([(number, text)])
-        if is_header:
+        fields = table.row(number, text)
+        if fields is None:
             _require_one_run(name, table.names)
             continue
-        row = TableRows(table.path, columns, np.array(numbers), "line")
+        row = TableRows(table.path, table.part([fields], [number]), np.array([number]), "line")
         nis, dof = float(row.numbers("nis")[0]), float(row.numbers("nis_dof")[0])
         if dof >= MOST_DOF:
             raise InputError(f"{row.place(0)}: nis_dof must be {DOF_NEEDED}, got {dof:g}")

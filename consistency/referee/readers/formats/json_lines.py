@@ -12,22 +12,28 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import keys_once, reading
-from consistency.referee.readers.formats.text_blocks import Numbered, Parsed, parsed
+from consistency.referee.readers.formats.text_blocks import LineParser, Parsed, parsed
 from consistency.referee.types import Array
 
 GPSD = "is a report of gpsd, whose epx, epy and epv are of unknown certainty; solve the receiver's raw data with RTKLIB"
 
 
+class _Objects(LineParser):
+    def row(self, number: int, line: str) -> dict[str, Any]:
+        return _row(self.path, number, line)
+
+    def is_whole(self, line: str, above: object) -> bool:
+        return line.rstrip().endswith("}")
+
+
 def read_json_lines(path: Path) -> tuple[dict[str, Array], Parsed]:
     """Columns of a file of JSON lines, with None or NaN where a line lacks a key, and the lines that they are of."""
-
-    def objects(lines: list[Numbered]) -> tuple[list[dict[str, Any]], list[int]]:
-        return [_row(path, number, line) for number, line in lines], [number for number, _ in lines]
-
-    found = parsed(path, objects, lambda line, _: line.rstrip().endswith("}"))
+    found = parsed(_Objects(path))
     rows = list(chain.from_iterable(found.parts))
-    names = dict.fromkeys(chain.from_iterable(rows))
-    return {name: _column([row.get(name) for row in rows]) for name in names}, found
+    columns = {}
+    for name in dict.fromkeys(chain.from_iterable(rows)):
+        columns[name] = _column([row.get(name) for row in rows])
+    return columns, found
 
 
 def _row(path: Path, number: int, line: str) -> dict[str, Any]:
@@ -54,7 +60,6 @@ def _cells(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 def _column(cells: list[Any]) -> Array:
     """Floats where all cells are numbers or missing, else objects."""
-    if not {type(cell) for cell in cells} <= {int, float, type(None)}:
-        return np.array([*cells, None], object)[:-1]
-    finite = [np.nan if cell is None else min(max(cell, -1e308), 1e308) for cell in cells]
-    return np.array(finite, float)
+    if set(map(type, cells)) <= {int, float, type(None)}:
+        return np.array([np.nan if cell is None else min(max(cell, -1e308), 1e308) for cell in cells], float)
+    return np.array([*cells, None], object)[:-1]

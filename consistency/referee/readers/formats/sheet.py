@@ -17,7 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.referee.readers.formats.column_renaming import Columns, renamed
-from consistency.referee.readers.formats.text_blocks import Numbered, parsed
+from consistency.referee.readers.formats.text_blocks import LineParser, line_of, parsed
 from consistency.referee.readers.places import cut_note, exact, listed, refuse
 from consistency.referee.types import Array, Indices
 
@@ -74,7 +74,7 @@ class TableRows(FileRows):
         cells = self.data[column]
         values = cells
         if cells.dtype.kind != "f":
-            values = np.array([_number(cell) for cell in cells], float)
+            values = np.array(list(map(_number, cells)), float)
         values = bounded(values)
         unread = np.isnan(values) & ~self.empty(column)
         self._refuse(unread, column, _no_number(cells[unread]))
@@ -113,7 +113,7 @@ class TableRows(FileRows):
         return replace(self, data=dict(zip(names, self.data.values(), strict=True)))
 
     def texts(self, column: str) -> Array:
-        return np.array([str(cell) for cell in self.data[column]], object)
+        return np.array(list(map(str, self.data[column])), object)
 
     def empty(self, column: str) -> Array:
         cells = self.data[column]
@@ -207,8 +207,10 @@ def frame_rows(frame: Any, name: str) -> TableRows:
     InputError
         It holds no row, or a column is duplicated.
     """
-    require_distinct([str(column) for column in frame.columns], name)
-    data = {str(column): _cells(np.asarray(frame[column])) for column in frame.columns}
+    require_distinct(list(map(str, frame.columns)), name)
+    data = {}
+    for column in frame.columns:
+        data[str(column)] = _cells(np.asarray(frame[column]))
     rows = len(next(iter(data.values()), ()))
     if not rows:
         raise InputError(f"{name}: holds no row")
@@ -232,57 +234,31 @@ def _cells(values: Array) -> Column:
 
 def _read_csv(path: Path) -> TableRows:
     table = CsvTable(path)
-    found = parsed(path, table.rows, table.is_whole)
+    found = parsed(table)
     if not table.names:
         raise InputError(f"{path}: is empty")
     if not found.parts:
         raise InputError(f"{path}: holds no row under its header")
-    data = {name: _joined([part[name] for part in found.parts]) for name in table.names}
+    data = {}
+    for name in table.names:
+        data[name] = _joined([part[name] for part in found.parts])
     return TableRows(path, data, found.line, "line", found.open_line, found.cut)
 
 
-class CsvTable:
-    """A CSV file while it is read."""
+class CsvTable(LineParser):
+    """A CSV file while it is read; its first line is the header."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.names: list[str] = []
-        self.separator = ","
+    names: Sequence[str] = ()
+    separator = ","
+    plain = True  # no field of the block is a number in Python alone
 
-    def rows(self, lines: list[Numbered]) -> tuple[dict[str, Column], list[int]]:
-        """Columns of some lines and the numbers of these lines; the first line of all is the header."""
-        if not self.names and lines:
-            header = lines[0][1]
-            self.separator = separator_of(header)
-            self.names = [name.strip().strip('"') for name in header.split(self.separator)]
-            require_distinct(self.names, self.path)
-            lines = lines[1:]
-        rows = [self._fields(number, line) for number, line in lines]
-        numbers = [number for number, _ in lines]
-        if "filter" not in self.names and not any("_" in line or not line.isascii() for _, line in lines):
-            values = _floats(rows, len(self.names))
-            if values is not None:
-                return dict(zip(self.names, values.T, strict=True)), numbers
-        columns = {}
-        for name, cells in zip(self.names, zip(*rows, strict=True), strict=False):
-            columns[name] = _column([cell.lstrip() for cell in cells], name == "filter")
-        return columns, numbers
-
-    def is_whole(self, line: str, above: dict[str, Column]) -> bool:
-        """Whether a line is as long as the rows above it, with numbers where they have numbers."""
-        if '"' in line:
-            return line.count('"') % 2 == 0
-        cells = [cell.strip() for cell in line.split(self.separator)]
-        if len(cells) != len(above):
-            return False
-        alike = (
-            column.dtype.kind != "f" or cell in EMPTY or not math.isnan(_number(cell))
-            for cell, column in zip(cells, above.values(), strict=True)
-        )  # fmt: skip
-        return all(alike)
-
-    def _fields(self, number: int, line: str) -> list[str]:
+    def row(self, number: int, line: str) -> list[str] | None:
         """Fields of a line, out of quotes where some are in them."""
+        if not self.names:
+            self.separator = separator_of(line)
+            self.names = [name.strip().strip('"') for name in line.split(self.separator)]
+            require_distinct(self.names, self.path)
+            return None
         fields = line.split(self.separator)
         if '"' in line:
             if line.count('"') % 2:
@@ -293,7 +269,31 @@ class CsvTable:
         if len(fields) != len(self.names):
             what = f"has {len(fields)} columns, the header has {len(self.names)}"
             raise InputError(f"{self.path}, line {number}: {what}")
+        self.plain &= "_" not in line and line.isascii()
         return fields
+
+    def part(self, rows: list[list[str]], numbers: list[int]) -> dict[str, Column]:
+        """Columns of floats where all cells are numbers or empty; of text or truth values elsewhere."""
+        values = floats(rows) if self.plain and "filter" not in self.names else None
+        self.plain = True
+        if values is not None:
+            return dict(zip(self.names, values.T, strict=True))
+        columns = {}
+        for name, cells in zip(self.names, zip(*rows, strict=True), strict=True):
+            columns[name] = _column(list(map(str.lstrip, cells)), name == "filter")
+        return columns
+
+    def is_whole(self, line: str, above: dict[str, Column]) -> bool:
+        """Whether a line is as long as the rows above it, with numbers where they have numbers."""
+        if '"' in line:
+            return line.count('"') % 2 == 0
+        cells = list(map(str.strip, line.split(self.separator)))
+        if len(cells) != len(above):
+            return False
+        for cell, column in zip(cells, above.values(), strict=True):
+            if column.dtype.kind == "f" and cell not in EMPTY and math.isnan(_number(cell)):
+                return False
+        return True
 
 
 def separator_of(line: str) -> str:
@@ -304,7 +304,7 @@ def separator_of(line: str) -> str:
 def _column(cells: list[str], is_text: bool) -> Column:
     filled: list[Any] = [None if cell in EMPTY else cell for cell in cells]
     if not is_text:
-        values = np.array([_number(cell) for cell in filled], float)
+        values = np.array(list(map(_number, filled)), float)
         if all(cell is None for cell in itertools.compress(filled, np.isnan(values))):
             return values
         if all(cell is None or cell in TRUTHS for cell in filled):
@@ -355,57 +355,62 @@ def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
 
 def read_rows(path: Path, widths: Sequence[int], layout: str, header: int = 0) -> Lines:
     """A text file of numbers, every line but ``header``, counted from 1, of the same one of the ``widths``."""
-    width = 0
-
-    def numbers(lines: list[Numbered]) -> tuple[Array, list[int]]:
-        nonlocal width
-        lines = [(number, line) for number, line in lines if number != header]
-        rows = [_split(line) for _, line in lines]
-        if not rows:
-            return np.empty((0, 0)), []
-        values = _floats(rows, width or len(rows[0]))
-        if values is None or values.shape[1] not in widths:
-            raise _unlike(path, lines, widths, width, layout)
-        width = values.shape[1]
-        return bounded(values), [number for number, _ in lines]
-
-    found = parsed(path, numbers, lambda line, above: _floats([_split(line)], above.shape[1]) is not None)
+    found = parsed(_NumberLines(path, widths, layout, header))
     if not found.parts:
         raise InputError(f"{path}: is empty; each line should be {layout}")
     return Lines(path, np.concatenate(found.parts), found.line, open_line=found.open_line, cut=found.cut)
 
 
-def _split(line: str) -> list[str]:
+class _NumberLines(LineParser):
+    """Lines of numbers while they are read."""
+
+    def __init__(self, path: Path, widths: Sequence[int], layout: str, header: int) -> None:
+        super().__init__(path)
+        self.widths, self.layout, self.header = widths, layout, header
+        self.width = 0  # of the lines before, 0 without any
+
+    def row(self, number: int, line: str) -> list[str] | None:
+        if number == self.header:
+            return None
+        fields = _fields(line)
+        if len(fields) == self.width:
+            return fields
+        where = f"{self.path}, line {number}: has {len(fields)} columns"
+        if len(fields) not in self.widths:
+            hint = ""
+            if ";" in line:
+                hint = "; columns apart by semicolons need names, and numbers decimal points"
+            raise InputError(f"{where}; should be {self.layout}{hint}")
+        if self.width:
+            raise InputError(f"{where}, the lines before {self.width}")
+        self.width = len(fields)
+        self.part([fields], [number])  # which refuses names of columns
+        return fields
+
+    def part(self, rows: list[list[str]], numbers: list[int]) -> Array:
+        values = floats(rows)
+        if values is not None:
+            return bounded(values)
+        bad = next(k for k, fields in enumerate(rows) if floats([fields]) is None)
+        text = line_of(self.path, numbers[bad]).strip()[:60]
+        raise InputError(f"{self.path}, line {numbers[bad]}: not a number in '{text}'; should be {self.layout}")
+
+    def is_whole(self, line: str, above: Array) -> bool:
+        fields = _fields(line)
+        return len(fields) == self.width and floats([fields]) is not None
+
+
+def _fields(line: str) -> list[str]:
     return line.replace(",", " ").split()
 
 
-def _floats(rows: list[list[str]], width: int) -> Array | None:
-    """Rows of ``width`` fields as numbers (N, width); None where one has another length, or holds something else."""
-    if any(len(row) != width for row in rows):
-        return None
+def floats(rows: list[list[str]]) -> Array | None:
+    """Rows of as many fields each as numbers (N, fields); None where one holds something else."""
     try:
         values = np.fromiter(map(float, itertools.chain.from_iterable(rows)), float)
     except ValueError:
         return None
-    return values.reshape(len(rows), width)
-
-
-def _unlike(path: Path, lines: list[Numbered], widths: Sequence[int], width: int, layout: str) -> InputError:
-    """Refusal of the first of some lines that is not numbers of one width, after lines of ``width`` if it is not 0."""
-    for number, line in lines:
-        count = len(_split(line))
-        where = f"{path}, line {number}"
-        if count not in widths:
-            hint = ""
-            if ";" in line:
-                hint = "; columns apart by semicolons need names, and numbers decimal points"
-            return InputError(f"{where}: has {count} columns; should be {layout}{hint}")
-        width = width or count
-        if count != width:
-            return InputError(f"{where}: has {count} columns, the lines before {width}")
-        if _floats([_split(line)], width) is None:
-            return InputError(f"{where}: not a number in '{line.strip()[:60]}'; should be {layout}")
-    raise AssertionError("all lines are alike")
+    return values.reshape(len(rows), -1)
 
 
 def increasing(lines: Lines) -> Lines:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import itertools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
@@ -19,7 +20,6 @@ BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as
 REFUSAL = "not a text file; known are .csv, .parquet, .npz, and .txt or .tum"
 BOM = b"\xef\xbb\xbf"
 WIDE = re.compile(rb"\xff\xfe[^\0]\0|\xfe\xff\0[^\0]")  # the mark of UTF-16 and a character of ASCII
-Numbered = tuple[int, str]  # a line with its number in the file, from 1
 
 
 class Block(NamedTuple):
@@ -29,10 +29,31 @@ class Block(NamedTuple):
     first: int  # number of the first one in the file, from 1
     ends: bool  # the last one has an end; otherwise it is the last line of the file alone
 
-    def lines(self) -> list[Numbered]:
+    def lines(self) -> Iterator[tuple[int, str]]:
         """Lines with their numbers, without comments and empty lines."""
-        numbered = enumerate(self.rows, self.first)
-        return [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+        for number, line in enumerate(self.rows, self.first):
+            text = line.lstrip()
+            if text and text[0] != "#":
+                yield number, line
+
+
+class LineParser:
+    """How the lines of a text file become rows; each layout has its own."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def row(self, number: int, line: str) -> Any:
+        """What a line holds; None where it is no row, but a header."""
+        raise NotImplementedError
+
+    def part(self, rows: list[Any], numbers: list[int]) -> Any:
+        """What the rows of a block are kept as; ``numbers`` are those of their lines."""
+        return rows
+
+    def is_whole(self, line: str, above: Any) -> bool:
+        """Whether a last line without an end is like the part of the file above it; else it is left out."""
+        raise NotImplementedError
 
 
 class Parsed(NamedTuple):
@@ -44,31 +65,24 @@ class Parsed(NamedTuple):
     cut: str = ""  # note on a line that is left out, because it is
 
 
-def parsed(
-    path: Path,
-    parse: Callable[[list[Numbered]], tuple[Any, Sequence[int]]],
-    is_whole: Callable[[str, Any], bool],
-) -> Parsed:
-    """Parse a text file block by block.
-
-    Parameters
-    ----------
-    parse : what some lines hold, and the numbers of those that are rows
-    is_whole : whether a last line without an end is like the part of the file above it; else it is left out
-    """
+def parsed(parser: LineParser) -> Parsed:
+    """A text file, parsed block by block."""
     parts: list[Any] = []
-    numbers: list[Sequence[int]] = []
-    open_line = 0
-    for block in blocks(path):
-        lines = block.lines()
-        if parts and not block.ends and not all(is_whole(line, parts[-1]) for _, line in lines):
-            return Parsed(parts, np.concatenate(numbers), open_line, cut_note(path, block.first))
-        part, rows = parse(lines)
-        if len(rows):
-            parts.append(part)
-            numbers.append(rows)
-            open_line = 0 if block.ends else block.first
-    return Parsed(parts, np.concatenate([[], *numbers]).astype(int), open_line)
+    line_numbers: list[int] = []
+    open_line, cut = 0, ""
+    for block in blocks(parser.path):
+        rows, numbers = [], []
+        for number, line in block.lines():
+            if parts and not block.ends and not parser.is_whole(line, parts[-1]):
+                cut = cut_note(parser.path, number)
+            elif (row := parser.row(number, line)) is not None:
+                rows.append(row)
+                numbers.append(number)
+        if rows:
+            parts.append(parser.part(rows, numbers))
+            line_numbers += numbers
+            open_line = 0 if block.ends else numbers[-1]
+    return Parsed(parts, np.array(line_numbers, int), open_line, cut)
 
 
 def blocks(path: Path) -> Iterator[Block]:
@@ -106,6 +120,12 @@ def blocks(path: Path) -> Iterator[Block]:
 def _lines(path: Path, data: bytes) -> list[str]:
     with reading(path, REFUSAL):
         return data.decode("utf-8").splitlines()
+
+
+def line_of(path: Path, wanted: int) -> str:
+    """A line by its number."""
+    lines = itertools.chain.from_iterable(block.lines() for block in blocks(path))
+    return next(line for number, line in lines if number == wanted)
 
 
 def opened(path: Path) -> BinaryIO:

@@ -125,7 +125,8 @@ def read_stated(path: Path, sensor: str, core: int | None = None) -> NisLog:
     Source: ardupilot.org, "Onboard Message Log Messages" (XKFD, XKF0).
     """
     stated = STATED[sensor]
-    message, parts = stated.message, stated.innovations
+    message = stated.message
+    parts = stated.innovations
     log = _Log(path, [message])
     if not log.rows[message]:
         raise InputError(f"--filter {sensor}: {path} holds no message {message}, which has its innovations")
@@ -173,7 +174,8 @@ class _Log:
         if kind in self.rows:
             self.rows[kind].append(fields)
         elif str(fields["Name"]).endswith("_I_GATE"):
-            name, value = fields["Name"], float(fields["Value"])
+            name = fields["Name"]
+            value = float(fields["Value"])
             self.gates[name] = min(value, self.gates.get(name, np.inf))
 
     def gate(self, prefix: str, names: Iterable[str]) -> float:

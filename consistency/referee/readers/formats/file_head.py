@@ -37,7 +37,8 @@ def head_of(path: Path, columns: Columns | None = None) -> Head | None:
     comment = _is_comment(line)
     if not comment and sum(not _is_comment(text) for _, text in lines) > 1:
         return None
-    names, width = fields_of(line), len(fields_of(row))
+    names = fields_of(line)
+    width = len(fields_of(row))
     if comment:
         text = line.strip().lstrip("#")
         names = fields_of(text)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.sheet import Lines, increasing
+from consistency.referee.readers.formats.number_lines import Lines, increasing
 from consistency.referee.readers.formats.text_blocks import LineParser, parsed
 from consistency.referee.types import Array
 
@@ -71,7 +71,8 @@ class Fixes(Lines):
 def centred(place: Array) -> Array:
     """Latitude, longitude, degrees, and height, m, (..., 3), to x, y, z from the centre of the earth, m."""
     latitude, longitude, height = np.moveaxis(np.asarray(place, float), -1, 0)
-    phi, lam = np.deg2rad(latitude), np.deg2rad(longitude)
+    phi = np.deg2rad(latitude)
+    lam = np.deg2rad(longitude)
     N = A / np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
     out = [(N + height) * np.cos(phi) * np.cos(lam), (N + height) * np.cos(phi) * np.sin(lam)]
     return np.stack([*out, (N * (1.0 - E2) + height) * np.sin(phi)], axis=-1)
@@ -83,7 +84,8 @@ def geodetic(point: Array) -> Array:
     The latitude is the fixed point of tan phi = (z + e^2 N sin phi) / p, which each round brings e^2 nearer.
     """
     x, y, z = np.moveaxis(np.asarray(point, float), -1, 0)
-    p, phi = np.hypot(x, y), np.arctan2(z, (1.0 - E2) * np.hypot(x, y))
+    p = np.hypot(x, y)
+    phi = np.arctan2(z, (1.0 - E2) * np.hypot(x, y))
     for _ in range(8):
         phi = np.arctan2(z + E2 * A * np.sin(phi) / np.sqrt(1.0 - E2 * np.sin(phi) ** 2), p)
     height = p * np.cos(phi) + z * np.sin(phi) - A * np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
@@ -93,8 +95,11 @@ def geodetic(point: Array) -> Array:
 def axes_at(place: Array) -> Array:
     """Rows east, north, up (..., 3, 3) of a place, as directions from the centre of the earth."""
     latitude, longitude, _ = np.moveaxis(np.deg2rad(np.asarray(place, float)), -1, 0)
-    s, c = np.sin(latitude), np.cos(latitude)
-    sl, cl, zero = np.sin(longitude), np.cos(longitude), np.zeros_like(latitude)
+    s = np.sin(latitude)
+    c = np.cos(latitude)
+    sl = np.sin(longitude)
+    cl = np.cos(longitude)
+    zero = np.zeros_like(latitude)
     rows = [[-sl, cl, zero], [-s * cl, -s * sl, c], [c * cl, c * sl, s]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
@@ -152,7 +157,8 @@ def read_solution(path: Path) -> Fixes:
     if kind is None:
         known = "; ".join(map(", ".join, (GEODETIC, CENTRED, BASELINE)))
         raise InputError(f"{path}: holds none of {known}; have RTKLIB write it with out-solformat =llh, =xyz or =enu")
-    t, place = columns["t"], np.column_stack([columns[name] for name in kind])
+    t = columns["t"]
+    place = np.column_stack([columns[name] for name in kind])
     P = _covariance(path, columns, STATED[kind].split())
     if kind is CENTRED:
         place = geodetic(place)
@@ -184,11 +190,13 @@ class _Solution(LineParser):
 
     def row(self, number: int, line: str) -> list[float] | None:
         """The time, and numbers under the names of the header."""
-        where, fields = f"{self.path}, line {number}", line.replace(",", " ").split()
+        where = f"{self.path}, line {number}"
+        fields = line.replace(",", " ").split()
         if line.startswith("%"):
             words = line[1:].split()
             if words and words[0] in AHEAD:
-                self.clock, self.names = words[0], words[1:]
+                self.clock = words[0]
+                self.names = words[1:]
             return None
         if not self.names:
             raise InputError(f"{where}: stands under no header '%  GPST  latitude(deg) ...'")
@@ -224,9 +232,11 @@ def _time(where: str, fields: Sequence[str], clock: str) -> float:
         if "/" in date:
             hour, minute, seconds = time.split(":")
             year, month, day = map(int, date.split("/"))
-            at, second = dt.datetime(year, month, day, int(hour), int(minute)), float(seconds)
+            at = dt.datetime(year, month, day, int(hour), int(minute))
+            second = float(seconds)
         else:
-            at, second = GPS + dt.timedelta(weeks=int(date)), float(time)
+            at = GPS + dt.timedelta(weeks=int(date))
+            second = float(time)
     except (ValueError, OverflowError):
         raise InputError(f"{where}: '{date} {time}' is not a date and time, and no GPS week") from None
     t = (at - UNIX).total_seconds() - AHEAD[clock] + second
@@ -261,6 +271,7 @@ def _covariance(path: Path, columns: dict[str, Array], stated: Sequence[str]) ->
         if f"{name}(m)" not in columns:
             raise InputError(f"{path}: column '{name}(m)' is missing, of the deviations of the position")
         root = columns[f"{name}(m)"]
-        i, j = AXES[name[2]], AXES[name[-1]]
+        i = AXES[name[2]]
+        j = AXES[name[-1]]
         P[:, i, j] = P[:, j, i] = root * np.abs(root)
     return P

@@ -57,7 +57,8 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
         if not np.isfinite(true[part]).all():
             raise InputError(f"{path}: key '{TRUE}{part}' is not finite; leave such steps out")
     states = [part for part in STATE if part in parts]
-    estimate, truth = _states(path, own, states, ""), _states(path, true, states, TRUE)
+    estimate = _states(path, own, states, "")
+    truth = _states(path, true, states, TRUE)
     finite = np.isfinite(estimate).all(axis=-1)
     error = np.full((*finite.shape, 3 * len(states)), np.nan)
     error[finite] = state_error(truth[finite], estimate[finite], convention)

@@ -11,10 +11,11 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, require_name
+from consistency.referee.readers.formats.archive_arrays import Archive, load_arrays
 from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
-from consistency.referee.readers.formats.numpy_archive import Archive, load_arrays
+from consistency.referee.readers.formats.number_lines import bounded
 from consistency.referee.readers.formats.other_names import with_clock
-from consistency.referee.readers.formats.sheet import CsvTable, TableRows, are_dof, bounded, read_sheet
+from consistency.referee.readers.formats.sheet import CsvTable, TableRows, are_dof, read_sheet
 from consistency.referee.readers.formats.table_columns import row_order
 from consistency.referee.readers.places import listed, refuse
 from consistency.referee.types import Array
@@ -115,7 +116,9 @@ def _of_table(path: Path, filter_name: str | None, run: int | None) -> NisLog:
     sheet = with_clock(sheet, required=False)
     nis = sheet.numbers("nis")
     dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
-    name, step, t = path.stem, np.arange(1.0, len(nis) + 1), np.full(len(nis), np.nan)
+    name = path.stem
+    step = np.arange(1.0, len(nis) + 1)
+    t = np.full(len(nis), np.nan)
     if "filter" in sheet:
         name = str(sheet.data["filter"][0])
     if "step" in sheet:
@@ -149,7 +152,8 @@ def _of_archive(path: Path, run: int | None) -> NisLog:
     dof = archive.whole_numbers("nis_dof", nis.shape)
     row = choose(path, "run", list(range(len(nis))), run)
     steps = archive.lengths(*nis.shape)[row]
-    own, t = nis[row, :steps], archive.times(nis.shape[1])[:steps]
+    own = nis[row, :steps]
+    t = archive.times(nis.shape[1])[:steps]
     dof = checked_dof(own, dof[row, :steps], lambda k: f"{path}, run {row}, step {k + 1}")
     return numbered_log(path.stem, t, own, dof)
 
@@ -195,7 +199,8 @@ def stream_nis(lines: Iterable[str], name: str) -> Iterator[tuple[str, float, fl
             _require_one_run(name, table.names)
             continue
         row = TableRows(table.path, table.part([fields], [number]), np.array([number]), "line")
-        nis, dof = float(row.numbers("nis")[0]), float(row.numbers("nis_dof")[0])
+        nis = float(row.numbers("nis")[0])
+        dof = float(row.numbers("nis_dof")[0])
         if dof >= MOST_DOF:
             raise InputError(f"{row.place(0)}: nis_dof must be {DOF_NEEDED}, got {dof:g}")
         if np.isnan(nis) and np.isnan(dof):

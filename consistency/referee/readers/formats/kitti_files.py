@@ -14,9 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, one_line, read_text, reading
+from consistency.referee.readers.formats.number_lines import Lines
 from consistency.referee.readers.formats.pose_rows import on_plane
 from consistency.referee.readers.formats.rotations import are_rotations
-from consistency.referee.readers.formats.sheet import Lines, TableRows
+from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.types import Array
 
 EXAMPLE = "2011-09-26 13:02:25.594360375"
@@ -42,7 +43,8 @@ def read_times(path: Path) -> Array:
     """
     stamps = []
     for number, line in enumerate(read_text(path, "cannot be read").rstrip().splitlines(), 1):
-        where, stamp = f"{path}, line {number}", line.strip()
+        where = f"{path}, line {number}"
+        stamp = line.strip()
         if not STAMP.fullmatch(stamp):
             raise InputError(f"{where}: not a timestamp; should be like {EXAMPLE}")
         with reading(where, "not a timestamp"):
@@ -71,7 +73,8 @@ def read_keys(path: Path, unnamed: str = "") -> dict[str, Array]:
         key, _, values = line.rpartition(":")
         if key.startswith("calib_time"):
             continue
-        name, where = key.strip(), f"line {number + 1}"
+        name = key.strip()
+        where = f"line {number + 1}"
         if key:
             where = f"key '{one_line(name)}'"
         if not name and unnamed:
@@ -187,7 +190,8 @@ def _mount(folder: Path, body: str) -> Array:
         path = place_of(folder, f"calib_{name}.txt")
         if path is None:
             raise InputError(f"{folder}: --body needs calib_{name}.txt, here or in the folder above")
-        rows, part = read_keys(path), np.eye(4)
+        rows = read_keys(path)
+        part = np.eye(4)
         part[:3, :3] = turn(path, rows, "R")
         part[:3, 3] = numbers(path, rows, "T", (3,))
         mount = part @ mount

@@ -113,9 +113,11 @@ def _roles(names: Sequence[str], where: Path) -> Roles | None:
     clock = clock_of(names)
     if not position or clock is None:
         return None
-    what, by = "poses", "by the names of their columns"
+    what = "poses"
+    by = "by the names of their columns"
     if plain[position[0]] == "p_rs_r_x" or (len(plain) == 17 and plain[-3:] == EUROC_END):
-        what, by = "EuRoC", "truth"
+        what = "EuRoC"
+        by = "truth"
     rest: tuple[int, ...] = ()
     if quaternion:
         rest = _rest(plain)
@@ -194,7 +196,8 @@ def unit_in(name: str) -> int | None:
 
 def places_of(names: Sequence[str], spellings: Sequence[Sequence[str]]) -> tuple[int, ...] | None:
     """Places of columns, the first one there of the spellings of each; a longer name may end in one of two words."""
-    plain, found = plain_names(names), []
+    plain = plain_names(names)
+    found = []
     for words in spellings:
         there = [plain.index(word) for word in words if word in plain]
         ends = tuple(f"_{word}" for word in words if "_" in word)

@@ -26,7 +26,8 @@ def with_known_names(sheet: TableRows, axes: Sequence[str]) -> tuple[TableRows, 
     if not places:
         return sheet, ""
     known.require_units([names[place] for place in places.values()], sheet.path)
-    data, taken = dict(sheet.data), []
+    data = dict(sheet.data)
+    taken = []
     for name, place in places.items():
         data[name] = sheet.data[names[place]]
         taken.append(f"{names[place]} as {name}")
@@ -93,7 +94,8 @@ def covariance_places(names: Sequence[str], axes: Sequence[str]) -> dict[str, in
     """
     if _has_own_names({*names}, axes):
         return {}
-    once, labels = only_places(plain_names(names)), _labels(axes)
+    once = only_places(plain_names(names))
+    labels = _labels(axes)
     best: dict[tuple[int, int], int] = {}
     for words, spelling in itertools.product(labels, COVARIANCES):
         found = _entries(once, words, spelling)

@@ -15,9 +15,10 @@ from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_head import head_of
 from consistency.referee.readers.formats.file_kinds import PLACES, SPEEDS, TURNS, is_poses
 from consistency.referee.readers.formats.named_columns import TRUE, clock_of, places_of
+from consistency.referee.readers.formats.number_lines import increasing
 from consistency.referee.readers.formats.other_names import covariance_places, state_places
 from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
-from consistency.referee.readers.formats.sheet import TableRows, increasing
+from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.readers.formats.table_columns import LOWER_NAMES
 from consistency.referee.types import Array
 
@@ -42,8 +43,10 @@ def read_plane(path: Path, motions: bool = False, columns: Columns | None = None
     clock = None if head is None else clock_of(head.names)
     if head is None or clock is None:
         raise InputError(f"{path}: needs names of columns, t with x, y, heading, or t with v, omega")
-    names, (times, stated_unit) = head.names, clock
-    poses, rates = places_of(names, PLACES), places_of(names, (SPEEDS, TURNS))
+    names = head.names
+    times, stated_unit = clock
+    poses = places_of(names, PLACES)
+    rates = places_of(names, (SPEEDS, TURNS))
     moving = poses or rates
     if moving is None:
         raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(names[:12])}")
@@ -54,7 +57,8 @@ def read_plane(path: Path, motions: bool = False, columns: Columns | None = None
     lines, values = read_named(path, head, (*times, *moving, *map(names.index, kept)), columns)
     t, unit = times_of(lines, times, values[: len(times)], stated_unit)
     values = values[len(times) :]
-    pose, of = np.column_stack(values[: len(moving)]), "planar poses"
+    pose = np.column_stack(values[: len(moving)])
+    of = "planar poses"
     if poses is None:
         what = "motions" if motions else "poses"
         of = f"speed and turn rate, each held until the next, integrated to {what}"
@@ -74,7 +78,8 @@ def motions_of(t: Array, v: Array, omega: Array) -> Array:
     row is 0.
     """
     dt = np.diff(t)
-    turn, way = omega[:-1] * dt, v[:-1] * dt
+    turn = omega[:-1] * dt
+    way = v[:-1] * dt
     half = 0.5 * turn
     chord = way * np.sinc(half / np.pi)
     rows = np.column_stack([chord * np.cos(half), chord * np.sin(half), turn])
@@ -86,6 +91,7 @@ def poses_of(motions: Array) -> Array:
     forward, left, turn = motions.T
     heading = np.cumsum(turn)
     before = np.concatenate([[0.0], heading[:-1]])
-    c, s = np.cos(before), np.sin(before)
+    c = np.cos(before)
+    s = np.sin(before)
     steps = np.column_stack([c * forward - s * left, s * forward + c * left])
     return np.column_stack([np.cumsum(steps, axis=0), wrap(heading)])

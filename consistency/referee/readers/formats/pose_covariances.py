@@ -12,8 +12,8 @@ from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.readers.clock_units import nothing_near
 from consistency.referee.readers.formats.file_head import head_of
 from consistency.referee.readers.formats.named_columns import numbered
+from consistency.referee.readers.formats.number_lines import Lines, read_numbers
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, POSE, SPLIT, TRIANGLE
-from consistency.referee.readers.formats.sheet import Lines, read_numbers
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import refuse
 from consistency.referee.readers.runs_to_record import symmetric
@@ -98,7 +98,8 @@ def order_note(path: Path | str, n: int, r: Reading) -> str:
         The declared order does not go with n components.
     """
     order = r.covariance_order
-    blocks, there = blocks_in(n, order or ORDERS[0]), BLOCKS[: n // 3]
+    blocks = blocks_in(n, order or ORDERS[0])
+    there = BLOCKS[: n // 3]
     if sorted(blocks) != sorted(there):
         which = f"the blocks {','.join(there)} of {path} (p position, R rotation, v velocity, bg, ba biases)"
         raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {which}, as they stand")

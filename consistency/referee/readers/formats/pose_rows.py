@@ -20,8 +20,9 @@ from consistency.referee.readers.formats.file_head import Head, fields_of, head_
 from consistency.referee.readers.formats.file_kinds import is_solution
 from consistency.referee.readers.formats.geodetic import read_solution
 from consistency.referee.readers.formats.named_columns import Roles, naming, require_units, roles_of, true_roles_of
+from consistency.referee.readers.formats.number_lines import Lines, increasing, read_numbers, read_rows
 from consistency.referee.readers.formats.rotations import TOLERANCE, are_rotations, quaternions
-from consistency.referee.readers.formats.sheet import Lines, TableRows, increasing, read_numbers, read_rows, read_sheet
+from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.text_blocks import blocks
 from consistency.referee.readers.places import refuse
 from consistency.referee.types import Array, Indices
@@ -111,7 +112,8 @@ def _named(path: Path, head: Head, roles: Roles, true: bool, columns: Columns | 
 
 
 def _named_note(path: Path, head: Head, roles: Roles, true: bool, clock: str) -> str:
-    of, order = roles.kind, "no orientation"
+    of = roles.kind
+    order = "no orientation"
     if not true:
         of = of.replace(" truth", " poses")
     if len(roles.time) == 2:
@@ -157,7 +159,8 @@ def times_of(
     if unit < 10**9:
         return columns[0] / unit, unit
     rows = iter(lines.line.tolist())
-    row, t = next(rows, None), []
+    row = next(rows, None)
+    t = []
     try:
         for block in blocks(lines.path):
             for number, line in block.lines():
@@ -246,7 +249,8 @@ def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
         if (t == np.round(t)).all():
             return t, "the first one the number of the step"
         return t, f"the first one the time in {UNIT_NAMES[unit]}"
-    times, count = lines.path.parent / "times.txt", len(lines.line)
+    times = lines.path.parent / "times.txt"
+    count = len(lines.line)
     if not times.is_file():
         return np.arange(float(count)), "numbered from 0 on, as there is no times.txt beside them"
     t = read_rows(times, (1,), "a time").t

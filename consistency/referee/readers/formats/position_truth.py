@@ -13,7 +13,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import propagated
 from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
-from consistency.referee.readers.formats.sheet import Lines
+from consistency.referee.readers.formats.number_lines import Lines
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
@@ -120,7 +120,8 @@ def _turning(one: Poses) -> tuple[float, float, float] | None:
     """
     known = one.known()
     finite = np.isfinite(one.estimate[known.rows]).all(axis=1)
-    rows, true = known.rows[finite], known.truth[finite, :3]
+    rows = known.rows[finite]
+    true = known.truth[finite, :3]
     if len(rows) < FEWEST:
         return None
     R = Rotation.from_quat(one.estimate[rows, 3:7])

@@ -124,7 +124,8 @@ def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
     clock = next((name for name in CLOCKS if name in shared), None)
     if clock is None:
         raise InputError(f"{path}: {INNOVATIONS} lacks a field 'timestamp'")
-    t, other = _times(path, INNOVATIONS, innovations[clock]), _times(path, VARIANCES, variances[clock])
+    t = _times(path, INNOVATIONS, innovations[clock])
+    other = _times(path, VARIANCES, variances[clock])
     if clock == CLOCKS[0]:  # of several with one stamp the first
         _, rows, match = np.intersect1d(t, other, return_indices=True)
     else:

@@ -18,10 +18,10 @@ from consistency.referee.geometry.groups import inverse, matrices, vectors
 from consistency.referee.parsing import reading
 from consistency.referee.readers.formats.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes
+from consistency.referee.readers.formats.number_lines import Lines
 from consistency.referee.readers.formats.pose_covariances import require_spatial
 from consistency.referee.readers.formats.pose_rows import FULL, POSE
 from consistency.referee.readers.formats.rotations import not_unit
-from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.formats.tum import SpaceRun, poses_of, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
@@ -120,7 +120,8 @@ def _run_on(bag: Path, reader: Any, r: Reading, topic: str, needed: str = "") ->
     if truth is None:
         there = [name for name in _topics(reader, POSES) if name != topic]
         raise InputError(f"{bag}: needs --truth-topic{needed}; there are: {_listed(there, reader)}")
-    own, true = _lines(bag, reader, topic), _lines(bag, reader, truth)
+    own = _lines(bag, reader, topic)
+    true = _lines(bag, reader, truth)
     notes = _other_frames(bag, (topic, _frames(reader, topic)), (truth, _frames(reader, truth)))
     return SpaceRun(own, true, (bag, f"{truth} of {bag}"), notes=notes)
 
@@ -248,7 +249,8 @@ def _lines(bag: Path, reader: Any, topic: str) -> Lines:
 
 def _fixes(bag: Path, topic: str, messages: Sequence[Any]) -> Fixes:
     """Positions of NavSatFix messages, without those that have no fix; of equal stamps the first."""
-    rows, kinds = [], set()
+    rows = []
+    kinds = set()
     for each in messages:
         if each.status.status < 0:
             continue
@@ -260,7 +262,8 @@ def _fixes(bag: Path, topic: str, messages: Sequence[Any]) -> Fixes:
     if not rows:
         raise InputError(f"{bag}: {topic} holds no message with a fix")
     note = f"{bag}: {topic} read as positions by satellite, {len(rows)} of {len(messages)} messages with a fix"
-    values, alone = np.array(rows, float), kinds == {DIAGONAL}
+    values = np.array(rows, float)
+    alone = kinds == {DIAGONAL}
     if alone:
         values[:, 4:] *= np.eye(3).ravel()
         note += ", deviations alone"
@@ -324,7 +327,8 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Lines:
     together = (longest.t >= max(t[0] for t in moving)) & (longest.t <= min(t[-1] for t in moving))
     if not together.any():
         raise InputError(f"{where}: its links are at no time known together")
-    t, T = longest.t[together], np.eye(4)
+    t = longest.t[together]
+    T = np.eye(4)
     for link, forward in chain:
         own = tracks[link]
         step = matrices(truth_at(t, own.t, own.values[:, 1:POSE], "spatial", np.inf).truth)

@@ -64,7 +64,8 @@ def _both(
 ) -> tuple[TableRows, TableRows | None, list[str]]:
     """Estimates and truth, which may stand beside them, with times where steps do not number both, and notes."""
     sheet, read_as = _sheet(estimates, axes, r.columns, bool(r.motions))
-    notes, truth = [sheet.cut, read_as], None
+    notes = [sheet.cut, read_as]
+    truth = None
     if r.truth is not None:
         truth, read_as = _sheet(r.truth, axes, r.truth_columns, body=r.body)
         notes = [sheet.cut, truth.cut, notes[1], read_as]
@@ -181,7 +182,8 @@ def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
 def _innovations(name: str, sheet: TableRows, key: str, axes: Sequence[str]) -> Estimator:
     """Innovations without a truth; a row whose state is broken has no estimate."""
     sheet, runs = columns.by_run(sheet, key)
-    nothing, t = np.zeros((len(sheet), 1)), sheet.numbers(key, finite=True)
+    nothing = np.zeros((len(sheet), 1))
+    t = sheet.numbers(key, finite=True)
     state = np.column_stack([nothing, *(sheet.numbers(axis) for axis in axes if axis in sheet)])
     nis, dof = columns.nis_columns(sheet)
     poses = Poses(
@@ -207,7 +209,8 @@ def _estimator(
     sheet, runs = columns.by_run(sheet, key)
     truth, true_runs = columns.by_run(truth, key)
     covariance, known = unstated(len(sheet), len(axes))
-    notes, stated = _absent(name, truth, runs, true_runs), WHOLE
+    notes = _absent(name, truth, runs, true_runs)
+    stated = WHOLE
     cross = of_truth = None
     if not poses_alone:
         covariance, stated, note = _covariance(name, sheet, axes, convention)
@@ -244,7 +247,8 @@ def _by_run(sheet: TableRows, runs: Array, poses: Poses) -> list[Poses]:
     """The poses of each run, named as in a study of drives, of those of all rows."""
     found = []
     for run in np.unique(runs):
-        rows, name = np.flatnonzero(runs == run), sheet.path.stem
+        rows = np.flatnonzero(runs == run)
+        name = sheet.path.stem
         if "run" in sheet:
             name = f"run {run}"
         one = poses.of_rows(rows)

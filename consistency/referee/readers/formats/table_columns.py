@@ -40,7 +40,8 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
     before, row = order[stuck[0] : stuck[0] + 2]
     of, hint = "", "; several runs need a column 'run'"
     if "run" in sheet:
-        of, hint = f" of run {runs[row]}", ""
+        of = f" of run {runs[row]}"
+        hint = ""
         if "filter" not in sheet:
             hint = "; several estimators need a column 'filter'"
     what = "is less than the one before"
@@ -60,7 +61,8 @@ def by_run(sheet: TableRows, key: str) -> tuple[TableRows, Array]:
 
 def cross_covariances(sheet: TableRows) -> Array | None:
     """Cross-covariances with the row before, columns C_xx, C_xy, C_xh, C_yx, ..., (N, 3, 3); None without any."""
-    columns, missing = [], []
+    columns = []
+    missing = []
     for a, b in itertools.product(POSE, repeat=2):
         short = f"C_{a[0]}{b[0]}"
         there = [name for name in (short, f"C_{a}_{b}") if name in sheet]
@@ -82,7 +84,8 @@ def has_own(sheet: TableRows) -> bool:
 
 def entry_names(a: str, b: str, short: bool) -> tuple[list[str], list[str]]:
     """Names of the covariance of two components in the upper and in the lower triangle; ``short`` ones as P_xh too."""
-    upper, lower = [f"P_{a}_{b}"], [f"P_{b}_{a}"]
+    upper = [f"P_{a}_{b}"]
+    lower = [f"P_{b}_{a}"]
     if short and (a, b) in OWN_NAMES:
         upper.append(OWN_NAMES[a, b])
         lower.append(LOWER_NAMES[a, b])
@@ -158,7 +161,8 @@ def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:
         return None, None
     if "nis_dof" not in sheet:
         raise InputError(f"{sheet.path}: column 'nis_dof' is missing; {NIS_DOF}")
-    nis, dof = sheet.numbers("nis"), sheet.numbers("nis_dof")
+    nis = sheet.numbers("nis")
+    dof = sheet.numbers("nis_dof")
     known = np.isfinite(nis)
     bad = (nis < 0) | np.isinf(nis) | (known & ~are_dof(dof))
     what = "nis {:g} with nis_dof {:g}; nis must be 0 or more, nis_dof a whole number from 0 to below 2^31".format

@@ -69,9 +69,11 @@ def parsed(parser: LineParser) -> Parsed:
     """A text file, parsed block by block."""
     parts: list[Any] = []
     line_numbers: list[int] = []
-    open_line, cut = 0, ""
+    open_line = 0
+    cut = ""
     for block in blocks(parser.path):
-        rows, numbers = [], []
+        rows = []
+        numbers = []
         for number, line in block.lines():
             if parts and not block.ends and not parser.is_whole(line, parts[-1]):
                 cut = cut_note(parser.path, number)
@@ -100,7 +102,9 @@ def blocks(path: Path) -> Iterator[Block]:
             raise InputError(f"{path}: is {'a folder' if path.is_dir() else 'a device'}, not a file")
         file = opened(path)
     with file:
-        data, rest, first = _read(path, file).removeprefix(BOM), [b""], 1
+        data = _read(path, file).removeprefix(BOM)
+        rest = [b""]
+        first = 1
         if WIDE.match(data):
             raise InputError(f"{path}: is text in UTF-16, as PowerShell and Excel write it; save it as UTF-8")
         while data:
@@ -138,3 +142,21 @@ def opened(path: Path) -> BinaryIO:
 def _read(path: Path, file: BinaryIO) -> bytes:
     with reading(path, REFUSAL):
         return file.read(BLOCK)
+
+
+class FileRows:
+    """Rows of a file, each with its place."""
+
+    path: Path
+    line: Indices  # (N,)
+    unit: str  # of these numbers: line, row, message
+    open_line: int  # line of the last row if it has no end, and may be cut short; 0 otherwise
+
+    def place(self, row: int) -> str:
+        return f"{self.path}, {self.unit} {self.line[row]}"
+
+    def open_end(self, row: int = -1) -> str:
+        """What to note of a row if it is cut short; "" where its line has an end."""
+        if not self.open_line or self.line[row] != self.open_line:
+            return ""
+        return cut_note(self.path, self.open_line)

@@ -17,6 +17,7 @@ from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_kinds import is_drive, table_files, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
+from consistency.referee.readers.formats.number_lines import Lines
 from consistency.referee.readers.formats.pose_covariances import ORDERS
 from consistency.referee.readers.formats.pose_rows import (
     DEVIATIONS,
@@ -38,7 +39,6 @@ from consistency.referee.readers.formats.position_truth import (
     require_positions,
 )
 from consistency.referee.readers.formats.rotations import not_unit
-from consistency.referee.readers.formats.sheet import Lines
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import Places, one_of_each_kind, refuse
 from consistency.referee.readers.runs_to_record import symmetric
@@ -197,9 +197,11 @@ def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
     InputError
         A file holds positions alone.
     """
-    poses, pose = [], slice(1, POSE)
+    poses = []
+    pose = slice(1, POSE)
     for run in runs:
-        own, true = run.own, run.true
+        own = run.own
+        true = run.true
         for lines, name in zip((own, true), run.files, strict=True):
             if _is_point(lines):
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")
@@ -218,7 +220,8 @@ def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
 
 def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str]:
     """The poses of a run, or positions where these alone have a truth, and a note on what is not judged."""
-    own, true = run.own, run.true
+    own = run.own
+    true = run.true
     if isinstance(own, Fixes):
         return fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)), ""
     k, note = judged_rest(own, true, r)
@@ -349,7 +352,8 @@ def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[
         raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
     out = []
     for path in files:
-        own_truth, own_covariance = truth or path, covariance
+        own_truth = truth or path
+        own_covariance = covariance
         if truth is not None and truth.is_dir() and not is_drive(truth):
             own_truth = _same_stem(truth, path, "--truth")
         if covariance is not None:

@@ -131,11 +131,10 @@ def read_stated(path: Path, sensor: str, core: int | None = None) -> NisLog:
     if not log.rows[message]:
         raise InputError(f"--filter {sensor}: {path} holds no message {message}, which has its innovations")
     t, fields = log.messages(message, core, (*parts, *stated.variances))
-    own = {part: fields[part] for part in parts}
-    as_logged = Pairs(t, own, {part: fields[name] for part, name in zip(parts, stated.variances, strict=True)})
+    as_logged = Pairs(t, fields, dict(zip(parts, map(fields.get, stated.variances), strict=True)))
     as_logged.require_variances(path, message, " at {t}: {value} is below 0, beside {field}")
     variances = {part: values**stated.power for part, values in as_logged.variance.items()}
-    nis, dof, held = Pairs(t, own, variances).nis(parts)
+    nis, dof, held = Pairs(t, fields, variances).nis(parts)
     note = f"{path}: {sensor}: {int((dof > 0).sum())} innovations in {plural(len(t), 'message')} {message}"
     if held:
         note += f"; {held} repeat the innovation before"
@@ -158,7 +157,7 @@ class _Log:
                 what = "is not a flight log of ArduPilot; one begins with the format of its messages"
                 raise InputError(f"{path}: {what}")
         self.path = path
-        self.rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in kinds}
+        self.rows: dict[str, list[dict[str, Any]]] = {kind: [] for kind in kinds}
         self.gates: dict[str, float] = {}
         said = io.StringIO()  # it prints what it skips
         with (
@@ -180,20 +179,23 @@ class _Log:
 
     def gate(self, prefix: str, names: Iterable[str]) -> float:
         """The smallest of some gates, sigma; NaN where none is known."""
-        keys = [f"{prefix}_{name}_I_GATE" for name in names]
-        stated = [self.gates[key] / 100.0 for key in keys if key in self.gates]
-        return max(LEAST, min(stated)) if stated else np.nan
+        smallest = min(self.gates.get(f"{prefix}_{name}_I_GATE", np.inf) for name in names)
+        return max(LEAST, smallest / 100.0) if np.isfinite(smallest) else np.nan
 
     def messages(self, kind: str, core: int | None, names: Iterable[str]) -> Messages:
         """Fields of the messages of one instance of the EKF."""
-        cores = [int(row.get(CORE, 0)) for row in self.rows[kind]]
-        own = choose(self.path, "run", sorted(set(cores)), core, "core of the EKF")
-        rows = [row for row, its in zip(self.rows[kind], cores, strict=True) if its == own]
-        t = np.array([_time(row) for row in rows])
+        by_core: dict[int, list[dict[str, Any]]] = {}
+        for row in self.rows[kind]:
+            by_core.setdefault(int(row.get(CORE, 0)), []).append(row)
+        rows = by_core[choose(self.path, "run", sorted(by_core), core, "core of the EKF")]
+        t = np.array(list(map(_time, rows)))
         if not np.isfinite(t).all():
             raise InputError(f"{self.path}: {kind} has no field TimeUS")
         require_in_order(self.path, kind, t)
-        return Messages(t, {name: np.array([row.get(name, 0.0) for row in rows], float) for name in names})
+        fields = {}
+        for name in names:
+            fields[name] = np.array([row.get(name, 0.0) for row in rows], float)
+        return Messages(t, fields)
 
 
 def _time(row: dict[str, Any]) -> float:

@@ -48,15 +48,17 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
         )
     parts = [part for part in AXES if part in arrays]
     order = _order(path, arrays, parts)
-    own = {part: _part(path, arrays, part) for part in parts}
-    true = {part: _part(path, arrays, TRUE + part) for part in parts}
+    own = {}
+    true = {}
     for part in parts:
+        own[part] = _part(path, arrays, part)
+        true[part] = _part(path, arrays, TRUE + part)
         if own[part].shape != true[part].shape or own[part].shape[:2] != own["R"].shape[:2]:
             shapes = f"{own[part].shape} and {true[part].shape}, beside R {own['R'].shape}"
             raise InputError(f"{path}: keys '{part}' and '{TRUE}{part}' have shapes {shapes}")
         if not np.isfinite(true[part]).all():
             raise InputError(f"{path}: key '{TRUE}{part}' is not finite; leave such steps out")
-    states = [part for part in STATE if part in parts]
+    states = list(STATE[: len(parts)])
     estimate = _states(path, own, states, "")
     truth = _states(path, true, states, TRUE)
     finite = np.isfinite(estimate).all(axis=-1)
@@ -80,7 +82,7 @@ def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[st
     for part in parts:
         if TRUE + part not in arrays:
             raise InputError(f"{path}: key '{TRUE}{part}' is missing, of the true states")
-    order = [str(part) for part in np.atleast_1d(arrays.get("order", np.array(parts)))]
+    order = list(map(str, np.atleast_1d(arrays.get("order", np.array(parts)))))
     if sorted(order) != sorted(parts):
         raise InputError(f"{path}: key 'order' is {', '.join(order)}; must name {', '.join(parts)}, each once")
     return order
@@ -104,4 +106,4 @@ def _states(path: Path, parts: Mapping[str, Array], order: list[str], prefix: st
     if not are_rotations(R[finite]).all():
         raise InputError(f"{path}: key '{prefix}R' holds a matrix that is not a rotation")
     columns = {**parts, "R": quaternions(R)}
-    return np.concatenate([columns[part] for part in order], axis=-1)
+    return np.concatenate(list(map(columns.__getitem__, order)), axis=-1)

@@ -69,15 +69,14 @@ def roles_of(names: Sequence[str], where: Path) -> Roles | None:
     InputError
         Several columns would do.
     """
-    if any(stem_of(name, TRUE) for name in names):
-        own = []
-        for name in names:
-            is_true = bool(stem_of(name, TRUE))
-            own.append(OTHER if is_true else stem_of(name, OWN[1:]) or name)
-        roles = _roles(own, where)
-        if roles is not None:
-            return roles
-    return _roles(names, where)
+    own: list[str] = []
+    has_truth = False
+    for name in names:
+        is_true = bool(stem_of(name, TRUE))
+        own.append(OTHER if is_true else stem_of(name, OWN[1:]) or name)
+        has_truth |= is_true
+    roles = _roles(own, where) if has_truth else None
+    return roles or _roles(names, where)
 
 
 def true_roles_of(names: Sequence[str], where: Path) -> Roles | None:
@@ -145,12 +144,12 @@ def plain_name(name: str) -> str:
 
 
 def plain_names(names: Iterable[str]) -> list[str]:
-    return [plain_name(name) for name in names]
+    return list(map(plain_name, names))
 
 
 def spelled(spelling: str, words: Iterable[str]) -> list[str]:
     """A spelling such as ``true_{}`` of each word."""
-    return [spelling.format(word) for word in words]
+    return list(map(spelling.format, words))
 
 
 def all_places(plain: Sequence[str], wanted: Sequence[str]) -> tuple[int, ...]:
@@ -174,7 +173,7 @@ def clock_of(names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
             other = name[: -len(seconds)] + rest
             if name.endswith(seconds) and other in plain:
                 return (place, plain.index(other)), 1
-    bare = [without_unit(name) for name in plain]
+    bare = list(map(without_unit, plain))
     for clock in CLOCKS:
         for place, name in enumerate(bare):
             if name == clock or (clock == "header_stamp" and name.endswith(clock)):

@@ -23,15 +23,14 @@ def with_known_names(sheet: TableRows, axes: Sequence[str]) -> tuple[TableRows, 
     """The table with its state and covariance under the names of docs/files.md, where it lacks them, and a note."""
     names = list(sheet.data)
     places = state_places(names, axes, known.OWN) | covariance_places(names, axes)
-    if not places:
-        return sheet, ""
-    known.require_units([names[place] for place in places.values()], sheet.path)
     data = dict(sheet.data)
     taken = []
     for name, place in places.items():
+        known.require_units([names[place]], sheet.path)
         data[name] = sheet.data[names[place]]
         taken.append(f"{names[place]} as {name}")
-    return replace(sheet, data=data), f"{sheet.path}: read {', '.join(taken)}"
+    note = f"{sheet.path}: read {', '.join(taken)}" if taken else ""
+    return replace(sheet, data=data), note
 
 
 def with_clock(sheet: TableRows, required: bool = True) -> TableRows:
@@ -44,12 +43,13 @@ def with_clock(sheet: TableRows, required: bool = True) -> TableRows:
         clock = clock_of([name or "index" for name in sheet.data])
     if clock is None:
         return sheet
-    names = [list(sheet.data)[place] for place in clock[0]]
-    if not required and any(sheet.data[name].dtype.kind != "f" for name in names):
+    names = list(sheet.data)
+    columns = [sheet.data[names[place]] for place in clock[0]]
+    if not required and any(column.dtype.kind != "f" for column in columns):
         return sheet
     from consistency.referee.readers.clock_units import unit_of
 
-    first, *nanoseconds = (sheet.numbers(name) for name in names)
+    first, *nanoseconds = (sheet.numbers(names[place]) for place in clock[0])
     t = first / unit_of(first, clock[1]) + sum(nanoseconds) * 1e-9
     return replace(sheet, data=sheet.data | {"t": t})
 
@@ -74,14 +74,13 @@ def true_columns(sheet: TableRows, axes: Sequence[str]) -> TableRows | None:
 def state_places(names: Sequence[str], axes: Sequence[str], spellings: Sequence[str]) -> dict[str, int]:
     """Places of components whose own names are not there, or of the true ones, by spellings such as ``true_{}``."""
     once = only_places(plain_names(names))
-    words: Sequence[Sequence[str]] = PLACES
-    if tuple(axes) != tuple(POSE):
-        words = [[known.plain_name(axis)] for axis in axes]
+    is_pose = tuple(axes) == tuple(POSE)
     found = {}
-    for axis, own in zip(axes, words, strict=True):
+    for i, axis in enumerate(axes):
         if spellings is known.OWN and axis in names:
             continue
-        for spelling, word in itertools.product(spellings, own):
+        words = PLACES[i] if is_pose else (known.plain_name(axis),)
+        for spelling, word in itertools.product(spellings, words):
             if spelling.format(word) in once:
                 found[axis] = once[spelling.format(word)]
                 break
@@ -114,10 +113,12 @@ def _has_own_names(names: set[str], axes: Sequence[str]) -> bool:
     """Whether all variances, or all deviations, stand under the names of docs/files.md."""
     if any(set(spelled(spelling, axes)) <= names for spelling in known.DEVIATIONS):
         return True
-    short = {axis: axis for axis in axes}
-    if tuple(axes) == tuple(POSE):
-        short["heading"] = "h"
-    return all({f"P_{axis}_{axis}", f"P_{short[axis] * 2}"} & names for axis in axes)
+    is_pose = tuple(axes) == tuple(POSE)
+    for axis in axes:
+        short = "h" if is_pose and axis == "heading" else axis
+        if not {f"P_{axis}_{axis}", f"P_{short}{short}"} & names:
+            return False
+    return True
 
 
 def _entries(once: Mapping[str, int], words: Sequence[str], spelling: str) -> dict[tuple[int, int], int]:
@@ -132,9 +133,10 @@ def _entries(once: Mapping[str, int], words: Sequence[str], spelling: str) -> di
         return {}
     found = {pair: once[name] for pair, name in names.items() if name in once}
     for i, word in enumerate(words):
-        variances = [name for each in known.VARIANCES if (name := each.format(word)) in once]
-        if (i, i) not in found and variances:
-            found[i, i] = once[variances[0]]
+        for spelling in known.VARIANCES:
+            name = spelling.format(word)
+            if (i, i) not in found and name in once:
+                found[i, i] = once[name]
         if (i, i) not in found:
             return {}
     return found
@@ -146,5 +148,5 @@ def _labels(axes: Sequence[str]) -> list[tuple[str, ...]]:
     if labels[0] == tuple(POSE):
         labels = [("x", "y", heading) for heading in (*HEADINGS, *SHORT_HEADINGS)]
     for first in (1, 0):
-        labels.append(tuple(str(first + i) for i in range(len(axes))))
+        labels.append(tuple(map(str, range(first, first + len(axes)))))
     return labels

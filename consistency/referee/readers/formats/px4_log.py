@@ -120,8 +120,7 @@ def _divided(data: Fields) -> tuple[Fields, Fields]:
 
 
 def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
-    shared = [name for name in innovations if name in variances]
-    clock = next((name for name in CLOCKS if name in shared), None)
+    clock = next((name for name in CLOCKS if name in innovations and name in variances), None)
     if clock is None:
         raise InputError(f"{path}: {INNOVATIONS} lacks a field 'timestamp'")
     t = _times(path, INNOVATIONS, innovations[clock])
@@ -132,9 +131,12 @@ def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
         rows, match = associate(t, other, TOGETHER)
     if not len(rows):
         raise InputError(f"{path}: no message of {INNOVATIONS} has its partner in {VARIANCES}; both must be logged")
-    fields = [name for name in shared if not name.startswith("timestamp")]
-    own = {name: np.asarray(innovations[name], float)[rows] for name in fields}
-    of = {name: np.asarray(variances[name], float)[match] for name in fields}
+    own = {}
+    of = {}
+    for name in innovations:
+        if name in variances and not name.startswith("timestamp"):
+            own[name] = np.asarray(innovations[name], float)[rows]
+            of[name] = np.asarray(variances[name], float)[match]
     return Pairs(t[rows], own, of, len(t) + len(other) - 2 * len(rows))
 
 

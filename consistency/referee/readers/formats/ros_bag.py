@@ -59,7 +59,7 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
     """
     bags = [path]
     if not is_one_bag(path):
-        bags = sorted(part for part in path.iterdir() if is_one_bag(part))
+        bags = sorted(filter(is_one_bag, path.iterdir()))
     if poses_alone:
         return [poses_of(path, [_bare_run(bag, r) for bag in bags], r)]
     if r.relative is not None:
@@ -323,8 +323,10 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Lines:
     longest = max(tracks.values(), key=lambda lines: len(lines.t))
     if chain == [(_link(frames), True)]:
         return longest
-    moving = [lines.t for lines in tracks.values() if len(lines.t) > 1] or [longest.t]
-    together = (longest.t >= max(t[0] for t in moving)) & (longest.t <= min(t[-1] for t in moving))
+    together = np.ones(len(longest.t), bool)
+    for lines in tracks.values():
+        if len(lines.t) > 1:
+            together &= (longest.t >= lines.t[0]) & (longest.t <= lines.t[-1])
     if not together.any():
         raise InputError(f"{where}: its links are at no time known together")
     t = longest.t[together]

@@ -63,6 +63,7 @@ class Journal:
             self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
             self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = NORMAL")
+            self._database.execute("PRAGMA wal_autocheckpoint = 0")  # each waits for the disk; see CHECKPOINT_EVERY
             self._database.executescript(SCHEMA)
             rows = self._database.execute("SELECT content FROM study").fetchall()
             self.study: dict[str, Any] = json.loads(rows[0][0]) if rows else {}

@@ -19,6 +19,7 @@ from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array, Indices
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
+VELOCITY = {"vx", "vy", "vz"}
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,15 @@ class Errors:
         """(N, T, n)."""
         assert self.record.error is not None
         return self.record.error
+
+    @property
+    def reported(self) -> dict[str, list[int]]:
+        """The groups and velocity, whose ratio is reported and not tested."""
+        velocity = [i for i, axis in enumerate(self.names) if axis in VELOCITY]
+        groups = dict(self.groups)
+        if 1 < len(velocity) < len(self.names):
+            groups.setdefault("velocity", velocity)
+        return groups
 
     @property
     def covariance(self) -> Array:

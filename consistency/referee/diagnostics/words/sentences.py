@@ -163,10 +163,12 @@ def _fault(v: Findings, s: Scale, faults: Faults) -> str:
         found.append((tails_text(v, faults), ["outliers"]))
     if of_bias:
         found.append((bias_text(v, "bias" not in faults), BIAS))
+    scale = ""
     if of_scale and v.status not in ("biased", "heavy-tailed"):
-        found.append((scale_text(v, faults), SCALE))
+        scale = scale_text(v, faults)
+        found.append((scale, SCALE))
     if _any_of(SHAPE, faults) and v.status not in ("biased", "heavy-tailed"):
-        found.append((shape_text(v, faults), SHAPE))
+        found.append((shape_text(v, faults, scale), SHAPE))
     if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
         found.append((joint_text(v, v.joint), [JOINT]))
     found.sort(key=lambda one: _rank(v, faults, one[1]))

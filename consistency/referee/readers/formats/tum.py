@@ -368,7 +368,8 @@ def _same_stem(folder: Path, path: Path, option: str) -> Path:
     for other in (*trajectory_files(folder), *table_files(folder)):
         if other.stem == path.stem:
             return other
-    raise InputError(f"{option} {folder}: holds no file '{path.stem}' with .txt or .tum, or table, for {path}")
+    what = f"holds no file '{path.stem}' with .txt or .tum, or table, for {path}"
+    raise InputError(f"{option} {folder}: {what}; files of the two folders are paired by name")
 
 
 def read_trajectory(path: Path, true: bool = False, columns: Columns | None = None) -> Lines:

@@ -32,8 +32,8 @@ def renamed(names: Sequence[str], columns: Columns | None, where: Path) -> list[
         if not places:
             what = f"has no column '{old}', which is to be read as '{name}'"
             raise InputError(f"{where}: {what}; there are: {listed(names, 12)}")
-        known.require_units([names[place] for place in places], where)
         for place, rest in places.items():
+            known.require_units([names[place]], where)
             new[place] = _with_unit(name.replace("*", rest), names[place])
     taken = set(chain.from_iterable(map(_alike, new.values())))
     out = []

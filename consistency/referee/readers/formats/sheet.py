@@ -72,6 +72,10 @@ class TableRows(FileRows):
         """Some columns as floats, (N, columns)."""
         return np.column_stack([self.numbers(column, finite) for column in columns])
 
+    def among(self, names: Iterable[str]) -> list[str]:
+        """Those of some names that are columns."""
+        return list(filter(self.data.__contains__, names))
+
     def has(self, *columns: str) -> bool:
         """Whether all of these columns are there."""
         return set(columns) <= set(self.data)

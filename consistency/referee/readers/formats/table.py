@@ -147,7 +147,7 @@ def _require_truth(
     if truth is None and not sheet.has("nis", "nis_dof"):
         others = f"columns nis and nis_dof to be judged by the NIS alone, or columns true_{axes[0]}, … beside the state"
         state = ""
-        if not any(axis in sheet for axis in axes):
+        if not sheet.among(axes):
             state = f"; the columns of another state than {','.join(axes)} are named by --state A,B"
         raise InputError(f"{sheet.path}: needs --truth FILE, or {others}{state}")
     if r.truth_covariance not in (None, COLUMNS):
@@ -184,7 +184,7 @@ def _innovations(name: str, sheet: TableRows, key: str, axes: Sequence[str]) -> 
     sheet, runs = columns.by_run(sheet, key)
     nothing = np.zeros((len(sheet), 1))
     t = sheet.numbers(key, finite=True)
-    state = np.column_stack([nothing, *(sheet.numbers(axis) for axis in axes if axis in sheet)])
+    state = np.column_stack([nothing, *map(sheet.numbers, sheet.among(axes))])
     nis, dof = columns.nis_columns(sheet)
     poses = Poses(
         Places(sheet.place, np.arange(len(sheet))), t, state, *unstated(len(sheet), 1), t, nothing, "vector", "vector",

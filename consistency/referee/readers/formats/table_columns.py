@@ -65,7 +65,7 @@ def cross_covariances(sheet: TableRows) -> Array | None:
     missing = []
     for a, b in itertools.product(POSE, repeat=2):
         short = f"C_{a[0]}{b[0]}"
-        there = [name for name in (short, f"C_{a}_{b}") if name in sheet]
+        there = sheet.among([short, f"C_{a}_{b}"])
         columns += there[:1]
         if not there:
             missing.append(short)
@@ -96,12 +96,12 @@ def stated_deviations(sheet: TableRows, axes: tuple[str, ...]) -> Array | None:
     """Standard deviations (N, n) of a table without cross terms: sigma_x, std_x, sx, or P_x_x alone; None of others."""
     for a, b in itertools.combinations(axes, 2):
         upper, lower = entry_names(a, b, short=True)
-        if any(name in sheet for name in (*upper, *lower)):
+        if sheet.among(upper + lower):
             return None
     variances = []
     for axis in axes:
         names, _ = entry_names(axis, axis, short=True)
-        variances += [name for name in names if name in sheet][:1]
+        variances += sheet.among(names)[:1]
     if len(variances) == len(axes) > 1:
         P = sheet.matrix(variances)
         return np.asarray(np.sign(P) * np.sqrt(np.abs(P)))
@@ -123,7 +123,7 @@ def stated_covariance(sheet: TableRows, axes: tuple[str, ...], own: bool = False
         return out
     for i, j in itertools.combinations_with_replacement(range(n), 2):
         upper, lower = entry_names(axes[i], axes[j], short=axes == POSE)
-        there = [name for name in (*upper, *lower) if name in sheet]
+        there = sheet.among(upper + lower)
         if not there:
             what = f"column '{upper[-1]}' is missing; the covariance of {', '.join(axes)} needs its upper triangle"
             advice = f"{naming(upper[-1])}; --state a,b judges fewer components"

@@ -131,7 +131,7 @@ def read_stated(path: Path, sensor: str, core: int | None = None) -> NisLog:
     if not log.rows[message]:
         raise InputError(f"--filter {sensor}: {path} holds no message {message}, which has its innovations")
     t, fields = log.messages(message, core, (*parts, *stated.variances))
-    as_logged = Pairs(t, fields, dict(zip(parts, map(fields.get, stated.variances), strict=True)))
+    as_logged = Pairs(t, fields, dict(zip(parts, map(fields.__getitem__, stated.variances), strict=True)))
     as_logged.require_variances(path, message, " at {t}: {value} is below 0, beside {field}")
     variances = {part: values**stated.power for part, values in as_logged.variance.items()}
     nis, dof, held = Pairs(t, fields, variances).nis(parts)

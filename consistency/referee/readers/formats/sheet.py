@@ -273,7 +273,7 @@ def _number(cell: object) -> float:
 
 
 def _no_number(cells: Array) -> str:
-    """What cells are that are no numbers."""
+    """What cells hold in place of numbers."""
     if all(isinstance(cell, str) for cell in cells):
         return "not a number"
     if any(hasattr(cell, "__len__") for cell in cells):

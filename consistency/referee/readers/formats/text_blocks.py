@@ -44,7 +44,7 @@ class LineParser:
         self.path = path
 
     def row(self, number: int, line: str) -> Any:
-        """What a line holds; None where it is no row, but a header."""
+        """What a line holds; None where it is a header."""
         raise NotImplementedError
 
     def part(self, rows: list[Any], numbers: list[int]) -> Any:

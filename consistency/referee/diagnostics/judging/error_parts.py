@@ -237,8 +237,8 @@ def bias_of(sample: Sample, step: int | None, location: Location, answers: Answe
 def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float) -> Shape | None:
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found.
 
-    A pair whose correlation is itself shown to be wrong (:func:`_shown_pairs`) comes before the others; ``alone``, which
-    the status depends on, is of the pair farthest off in any case.
+    A pair whose correlation is itself shown to be wrong (:func:`_shown_pairs`) comes before the others. The status
+    depends on ``alone``, which is of the pair farthest off in any case.
     """
     if tests.matrix is None or sample.dof == 1:
         return None

@@ -51,9 +51,10 @@ def reasons(v: Findings, first: str = "") -> list[str]:
     """
     faults = {answer.question: answer for answer in v.answers if answer.found and not answer.tolerated}
     sentence, figures = _sentence_and_figures(v, faults)
-    lines = [*_failures(v), sentence, *figures]
+    failures = _failures(v)
+    lines = [*failures, sentence, *figures]
     if faults:
-        lines = [sentence, *_failures(v), *figures]
+        lines = ["; ".join([sentence, *failures]), *figures]
     if v.innovations is not None:
         lines.append(_nis(v.innovations))
     lines += [*details(v), *_first_steps(v)]
@@ -99,10 +100,12 @@ def _failures(v: Findings) -> list[str]:
     lines = []
     if v.failures:
         first, count = v.failures[0], len({failure.run for failure in v.failures})
-        where = f"{v.unit} {first.run}"
-        if v.unit == "run":
-            where += f" in step {first.step}" if v.landmarks is not None else f" in {v.place(first.step)}"
-        lines.append(f"{count} of {v.runs} {v.unit}s failed, first {where}: {first.reason}")
+        runs, where = v.runs, f"{v.unit} {first.run}"
+        if v.landmarks is not None:  # of a map, which failed runs do not have
+            runs, where = runs + count, f"{where} in step {first.step}"
+        elif v.unit == "run" and first.step > 1:  # without any estimate its step may be unknown
+            where += f" in {v.place(first.step)}"
+        lines.append(f"{count} of {runs} {v.unit}s failed, first {where}: {first.reason}")
     if v.impossible:
         row, step = v.impossible[0]
         count, have = len({run for run, _ in v.impossible}), "have"
@@ -215,6 +218,8 @@ def _no_fault(v: Findings, s: Scale) -> str:
     """Whether the ratio is shown to be right, with that of the worst axis; and what share of lost runs stays open."""
     shown, runs = s.equivalence, plural(v.runs, v.unit)
     none, size, axis = "no fault found", f"covariance ratio {_ratio_of_test(s)}", ""
+    if v.status == "failed":
+        none = "no other fault found"
     if any(answer.tolerated for answer in v.answers):
         none = "no fault beyond the tolerance"
     if v.parts:

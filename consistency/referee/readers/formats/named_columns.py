@@ -209,7 +209,7 @@ def places_of(names: Sequence[str], spellings: Sequence[Sequence[str]]) -> tuple
 
 def numbered(name: str) -> bool:
     """Whether a column has a number of a covariance, and not the names of two components."""
-    return NUMBERED.fullmatch(name.lower()) is not None
+    return any(pattern.fullmatch(name.lower()) for pattern in (NUMBERED, BY_INDEX))
 
 
 def require_units(names: Iterable[str], path: Path) -> None:

@@ -101,8 +101,9 @@ def order_note(path: Path | str, n: int, r: Reading) -> str:
     blocks = blocks_in(n, order or ORDERS[0])
     there = BLOCKS[: n // 3]
     if sorted(blocks) != sorted(there):
-        which = f"the blocks {','.join(there)} of {path} (p position, R rotation, v velocity, bg, ba biases)"
-        raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {which}, as they stand")
+        which = f"the blocks {','.join(there)} of {path} in their order, such as {','.join(reversed(there))}"
+        names = "(p position, R rotation, v velocity, bg, ba biases)"
+        raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {which} {names}")
     if order is None:
         head = None if n == 6 else head_of(Path(path), r.columns)
         if n == 6 or (head is not None and not any(map(numbered, head.names))):
@@ -115,7 +116,7 @@ def require_error(own: Lines, error: str | None) -> None:
     n = components_of(own)
     if n > 6 and error is None:
         what = f"{own.path}: holds a covariance of poses with their velocity, whose error is not known"
-        raise InputError(f"{what}; add --error {', '.join(INERTIAL)}")
+        raise InputError(f"{what}; add --error {', '.join(INERTIAL)} ('guess' is for poses alone)")
     if n == 6:
         require_spatial(error, SPATIAL)
 

@@ -19,7 +19,14 @@ from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_head import Head, fields_of, head_of
 from consistency.referee.readers.formats.file_kinds import is_solution
 from consistency.referee.readers.formats.geodetic import read_solution
-from consistency.referee.readers.formats.named_columns import Roles, naming, require_units, roles_of, true_roles_of
+from consistency.referee.readers.formats.named_columns import (
+    Roles,
+    clock_of,
+    naming,
+    require_units,
+    roles_of,
+    true_roles_of,
+)
 from consistency.referee.readers.formats.number_lines import Lines, increasing, read_numbers, read_rows
 from consistency.referee.readers.formats.rotations import TOLERANCE, are_rotations, quaternions
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
@@ -58,7 +65,7 @@ def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -
     head = head_of(path, columns)
     roles = None if head is None else roles_of(head.names, path)
     if head is None or roles is None or (head.comment and roles.is_tum and len(head.names) in TUM):
-        return _unnamed(path, true)
+        return _unnamed(path, true, head)
     if not (roles.quaternion or true):
         raise InputError(f"{path}: holds no quaternion; a table of a state is read with --state x,y,z; {naming('qx')}")
     return _named(path, head, roles, true, columns)
@@ -179,11 +186,15 @@ def times_of(
 # --- columns without names ---------------------------------------------------------------------------
 
 
-def _unnamed(path: Path, true: bool) -> Lines:
+def _unnamed(path: Path, true: bool, head: Head | None) -> Lines:
     """Rows of a layout that is told by the number of columns, and by what they hold."""
     widths = [*TUM, DEVIATED, *MATRIX_WIDTHS, *STATES]
     if true:
         widths.append(POINT)
+    if head is not None and not head.comment and len(head.names) not in widths:
+        missing = "t" if clock_of(head.names) is None else "x"
+        names = ", ".join(head.names)
+        raise InputError(f"{path}: column '{missing}' is missing; there are: {names}; {naming(missing)}")
     lines = read_rows(path, widths, LAYOUT)
     width = lines.values.shape[1]
     if width == POINT:
